@@ -1,0 +1,1 @@
+"""Benchmarks: what jast is compared with, and how fast it is."""

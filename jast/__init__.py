@@ -1,0 +1,12 @@
+"""jast: find the likeliest failures of a simulated system, explain them, and put an honest probability on them."""
+
+from jast import actions, distributions, rewards, simulators
+from jast.check import check
+from jast.episode import Episode, replay, rollout
+from jast.nominal import nominal
+from jast.policy import Policy
+from jast.simulator import Simulator
+
+__version__ = "0.1.0"
+
+__all__ = ["Episode", "Policy", "Simulator", "actions", "check", "distributions", "nominal", "replay", "rewards", "rollout", "simulators"]

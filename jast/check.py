@@ -1,0 +1,270 @@
+"""check: whether a simulator's functions fit together, said in terms of the function that does not.
+
+Two halves. `contract` traces the functions, for structure, shapes and dtypes: cheap, and possible while the simulator holds tracers, so searches call it as
+they are traced. `check` also runs a handful of steps, for what only numbers show: NaN, densities of zero, randomness that is not a disturbance.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import distributions as D
+from jast.actions import Quantiles, Samples, UniformBox
+from jast.simulator import Simulator
+
+__all__ = ["OBSERVED", "check", "contract"]
+
+OBSERVED = 64
+"""The most numbers that ``observe`` may return."""
+ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
+LANES, STEPS, DRAWS = 32, 8, 64
+ACTIONS = {Samples: "actions.samples", Quantiles: "actions.quantiles", UniformBox: "actions.uniform"}
+
+
+def check(sim, actions=None):
+    """``sim`` itself, once every function was traced and a few steps were run; with ``actions`` (of `jast.actions`), whether they suit it.
+
+    Raises ValueError naming the function at fault (its own exception is the ``__cause__``): what `contract` finds; a log density that is not finite on its own
+    samples; NaN in the state or a distance that is not finite in the undisturbed first steps, or in more than half of the nominal ones; ``init``, ``step`` or
+    ``evaluate`` with another answer the second time; actions that are impossible under p(x | s) in more than half of 64 draws at the start. Only
+    the traced half runs where ``sim`` holds tracers or inside a transformation.
+    """
+    contract(sim, actions)
+    traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((sim, actions)))
+    if traced or isinstance(jnp.zeros(()) + 0, jax.core.Tracer):
+        return sim
+    try:
+        found = jax.device_get(_probe(sim, actions))
+    except jax.errors.JaxRuntimeError as e:  # a host callback that raised
+        raise ValueError(f"check: the first steps raised {_first_line(e)}") from e
+    _densities(found)
+    _numbers(found)
+    _repeats(sim, found["x0"], found["x"])
+    if actions is not None and (share := found["actions"]) > 0.5:
+        box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]" if isinstance(actions, UniformBox) else ""
+        raise ValueError(
+            f"{_name(actions)}: expected disturbances inside the support of p(x | s), received log densities that are not finite in "
+            f"{share:.0%} of {DRAWS} draws at the start{box}"
+        )
+    return sim
+
+
+def contract(sim, actions=None, observed=True):
+    """The traced half of `check`: structure, shapes and dtypes of what the functions return; returns ``sim``, also under jit and vmap.
+
+    ``observed=False`` leaves out ``observe``, for what looks at no observation. Raises ValueError naming the function at fault, in the order start, init,
+    disturbance, evaluate, is_terminal, observe, step, actions.
+    """
+    if not isinstance(sim, Simulator):
+        raise ValueError(f"check: sim must be a jast.Simulator, received {type(sim).__name__}")
+    for name in ("start", "init", "disturbance", "evaluate", "is_terminal", "observe", "step"):
+        if not callable(getattr(sim, name)):
+            raise ValueError(f"{name}: expected a function, received {getattr(sim, name)!r}")
+    jax.eval_shape(lambda: _trace(sim, actions, observed))
+    return sim
+
+
+def _trace(sim, actions, observed):
+    x0 = _draw("start", _call("start", sim.start))
+    state = _arrays("init", _call("init", sim.init, x0))
+    dist = _call("disturbance", sim.disturbance, state)
+    x = _draw("disturbance", dist)
+    pair = _call("evaluate", sim.evaluate, state)
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ValueError(f"evaluate: expected a pair (event, distance), received {_kind(pair)}")
+    _scalar("evaluate: event", pair[0], bool)
+    _scalar("evaluate: distance", pair[1], float)
+    _scalar("is_terminal", _call("is_terminal", sim.is_terminal, state), bool)
+    if observed:
+        seen = _call("observe", sim.observe, state)
+        if not isinstance(seen, ARRAYS) or jnp.ndim(seen) != 1 or not jnp.issubdtype(jnp.result_type(seen), jnp.floating):
+            raise ValueError(f"observe: returns {_kind(seen)}, expected a float vector")
+        if jnp.size(seen) > OBSERVED:
+            raise ValueError(f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}")
+    _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state)
+    if actions is not None:
+        name = _name(actions)
+        if not callable(getattr(actions, "draw", None)):
+            raise ValueError(f"actions: expected one of jast.actions, received {actions!r}")
+        if isinstance(actions, UniformBox):
+            _box(actions, x)
+        _same(f"{name}: disturbance", _call(name, actions.draw, jax.random.key(0), dist), x)
+        if jax.tree.leaves(x0):
+            _same(f"{name}: x0", _call(name, actions.draw_start, jax.random.key(0), sim.start()), x0)
+
+
+def _call(name, function, *args):
+    try:
+        return function(*args)
+    except Exception as e:
+        raise ValueError(f"{name}: raised {type(e).__name__}: {_first_line(e)}") from e
+
+
+def _draw(name, dist):
+    """One traced value of ``dist``, which must be a distribution with a scalar log density."""
+    if not (callable(getattr(dist, "sample", None)) and callable(getattr(dist, "log_prob", None))):
+        raise ValueError(f"{name}: expected a distribution (with sample and log_prob), received {_kind(dist)}")
+    x = _arrays(f"{name}: sample", _call(f"{name}: sample", lambda: D.sample(dist, jax.random.key(0))))
+    log_p = _call(f"{name}: log_prob", dist.log_prob, x)
+    if isinstance(log_p, ARRAYS) and jnp.shape(log_p):
+        raise ValueError(f"{name}: log_prob has shape {jnp.shape(log_p)}, expected (); wrap it in Independent")
+    _scalar(f"{name}: log_prob", log_p, float)
+    return x
+
+
+def _arrays(name, tree):
+    """``tree`` with leaves of explicit dtype; ValueError for a leaf that is not numbers."""
+
+    def array(path, leaf):
+        if not isinstance(leaf, ARRAYS) or jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.extended):
+            raise ValueError(f"{name}: leaf {_path(path)} is {_kind(leaf)}, expected an array of numbers or booleans")
+        return lax.convert_element_type(leaf, jnp.result_type(leaf))
+
+    return jax.tree_util.tree_map_with_path(array, tree)
+
+
+def _scalar(what, value, kind):
+    if not isinstance(value, ARRAYS):
+        raise ValueError(f"{what}: received {_kind(value)}, expected a {kind.__name__} scalar")
+    shape, dtype = jnp.shape(value), jnp.result_type(value)
+    if shape != ():
+        raise ValueError(f"{what} has shape {shape}, expected (): a {kind.__name__} scalar")
+    if not (dtype == jnp.bool_ if kind is bool else jnp.issubdtype(dtype, jnp.floating)):
+        raise ValueError(f"{what} has dtype {dtype}, expected {'bool' if kind is bool else 'a float'}")
+
+
+def _same(what, new, old):
+    """ValueError unless ``new`` has the tree structure, shapes and dtypes of ``old``."""
+    if jax.tree.structure(new) != jax.tree.structure(old):
+        raise ValueError(f"{what} has structure {jax.tree.structure(new)}, expected {jax.tree.structure(old)}")
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(new), jax.tree.leaves(old), strict=True):
+        for part, x, y in (("shape", jnp.shape(a), jnp.shape(b)), ("dtype", jnp.result_type(a), jnp.result_type(b))):
+            if x != y:
+                raise ValueError(f"{what} leaf {_path(path)} has {part} {x}, expected {y}")
+
+
+def _box(box, x):
+    for leaf in jax.tree.leaves(x):
+        for side in ("low", "high"):
+            shape = jnp.shape(getattr(box, side))
+            try:
+                fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
+            except ValueError:
+                fits = False
+            if not fits:
+                raise ValueError(f"actions.uniform: {side} has shape {shape}, expected one that broadcasts to the disturbance's {leaf.shape}")
+
+
+@jax.jit
+def _probe(sim, actions):
+    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps of each."""
+    has_mode = D.has_mode(sim.start()) and D.has_mode(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
+
+    def episode(key, undisturbed):
+        def choose(dist, key):
+            drawn = D.sample(dist, key)
+            if not has_mode:
+                return drawn
+            return jax.tree.map(lambda a, b: jnp.where(undisturbed, jnp.asarray(a, b.dtype), b), D.mode(dist), drawn)
+
+        def seen(state):
+            event, distance = sim.evaluate(state)
+            ends = jnp.asarray(sim.is_terminal(state))
+            done = ends if sim.episodic else jnp.asarray(event) | ends
+            # between its ends an episodic system's distance means nothing
+            invalid = ~jnp.isfinite(distance) & (done if sim.episodic else True)
+            return done, (jax.tree.map(_any_nan, state), invalid)
+
+        def step(carry, t):
+            state, done = carry
+            dist = sim.disturbance(state)
+            x = choose(dist, jax.random.fold_in(key, t))
+            after = _arrays("step", sim.step(state, x))
+            ends, flags = seen(after)
+            flags = (~jnp.isfinite(dist.log_prob(x)), *flags)
+            flags = jax.tree.map(lambda f: f & ~done, flags)
+            state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, after)
+            return (state, done | ends), (flags, x)
+
+        start = sim.start()
+        x0 = choose(start, jax.random.fold_in(key, 0))
+        first = _arrays("init", sim.init(x0))
+        done, flags = seen(first)
+        steps = min(sim.horizon, STEPS)
+        _, (later, xs) = lax.scan(step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32))
+        flags = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), (~jnp.isfinite(start.log_prob(x0)), *flags), later)
+        return flags, x0, jax.tree.map(lambda a: a[0], xs)
+
+    keys = jax.random.split(jax.random.key(0), LANES + 1)
+    flags, x0, x = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
+    here = jax.tree.map(lambda a: a[0], x0)
+    density, state, distance = flags
+    share = None
+    if actions is not None:
+
+        def impossible(key):
+            dist = sim.disturbance(_arrays("init", sim.init(here)))
+            return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
+
+        share = jnp.mean(jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS)), dtype=jnp.float32)
+    return dict(has_mode=has_mode, density=density, state=state, distance=distance, x0=here, x=jax.tree.map(lambda a: a[0], x), actions=share)
+
+
+def _any_nan(a):
+    return jnp.any(jnp.isnan(a)) if jnp.issubdtype(a.dtype, jnp.inexact) else jnp.zeros((), bool)
+
+
+def _densities(found):
+    density = found["density"][:LANES]  # the undisturbed lane is at the modes, where a density may be infinite
+    for t in np.flatnonzero(density.any(axis=0))[:1]:
+        name, where = ("start", "") if t == 0 else ("disturbance", f" at step {t}")
+        raise ValueError(f"{name}: log_prob is not finite in {density[:, t].sum()} of {LANES} of its own samples{where}")
+
+
+def _numbers(found):
+    def bad(flags):  # [LANES + 1, STEPS + 1] -> the first step at which it is wrong, or None
+        steps = np.flatnonzero((flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found["has_mode"])))
+        return steps[0] if steps.size else None
+
+    wrong = [(t, path) for path, flags in jax.tree_util.tree_leaves_with_path(found["state"]) if (t := bad(flags)) is not None]
+    for t, path in sorted(wrong, key=lambda p: p[0])[:1]:
+        raise ValueError(f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN {f'after {t} steps' if t else 'at the start'}, expected a number")
+    if (t := bad(found["distance"])) is not None:
+        raise ValueError(f"evaluate: distance is not finite after {t} steps, expected a number")
+
+
+def _repeats(sim, x0, x):
+    """ValueError unless init, evaluate and step, run twice outside of jit, agree to the bit."""
+    x0, x = jax.tree.map(jnp.asarray, (x0, x))
+    state = _twice("init", sim.init, x0)
+    _twice("evaluate", sim.evaluate, state)
+    _twice("step", sim.step, state, x)
+
+
+def _twice(name, function, *args):
+    first, second = (_arrays(name, _call(name, function, *args)) for _ in range(2))
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(first), jax.tree.leaves(second), strict=True):
+        if np.asarray(a).tobytes() != np.asarray(b).tobytes():
+            raise ValueError(f"{name}: leaf {_path(path)} differs between two runs on the same input; randomness belongs into disturbance or start")
+    return first
+
+
+def _name(actions):
+    return ACTIONS.get(type(actions), f"actions.{type(actions).__name__}")
+
+
+def _first_line(error):
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def _path(path):
+    return jax.tree_util.keystr(path) or "(the whole)"
+
+
+def _kind(value):
+    return f"{jnp.result_type(value)}{list(jnp.shape(value))}" if isinstance(value, ARRAYS) else f"{type(value).__name__} {value!r}"[:120]
+
+
+def _show(value):
+    return np.array2string(np.asarray(value), threshold=8, precision=4)

@@ -1,0 +1,3 @@
+"""Estimation of failure probabilities."""
+
+__all__ = []

@@ -1,0 +1,57 @@
+"""Intervals for a probability. On the host, in double precision whatever the arrays' dtype."""
+
+import math
+
+__all__ = ["clopper_pearson"]
+
+
+def clopper_pearson(k, n, level=0.95):
+    """Exact (low, high) of a binomial probability after ``k`` events in ``n`` trials: covers at least ``level`` of the time (Clopper and Pearson, 1934).
+
+    low is the alpha/2 quantile of Beta(k, n - k + 1), high the 1 - alpha/2 quantile of Beta(k + 1, n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n.
+    Raises ValueError unless 0 <= k <= n, n >= 1 and 0 < level < 1.
+    """
+    if not (n == int(n) and n >= 1):
+        raise ValueError(f"clopper_pearson: n must be a whole number of at least 1, received {n!r}")
+    if not (k == int(k) and 0 <= k <= n):
+        raise ValueError(f"clopper_pearson: k must be a whole number from 0 to n = {n}, received {k!r}")
+    if not 0 < level < 1:
+        raise ValueError(f"clopper_pearson: level must lie between 0 and 1, received {level!r}")
+    k, n, tail = int(k), int(n), (1 - level) / 2
+    # P(X >= k; p) = I_p(k, n - k + 1) and P(X <= k; p) = I_(1-p)(n - k, k + 1): each tail is solved as itself, none as 1 less the other
+    low = 0.0 if k == 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
+    high = 1.0 if k == n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
+    return low, high
+
+
+def _solve(rising):
+    """The root in (0, 1) of an increasing function, by bisection to the last bits."""
+    low, high = 0.0, 1.0
+    while high - low > 1e-15 * high:
+        middle = (low + high) / 2
+        if middle in (low, high):
+            break
+        low, high = (low, middle) if rising(middle) > 0 else (middle, high)
+    return (low + high) / 2
+
+
+def _betainc(a, b, x):
+    """Regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
+    if not 0 < x < 1:
+        return float(x >= 1)
+    if x > (a + 1) / (a + b + 2):  # beyond the bulk the fraction of the mirror image converges faster
+        return 1 - _betainc(b, a, 1 - x)
+    log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x) - math.log(a)
+    tiny = 1e-300
+    c, d = 1.0, 1 / (1 - (a + b) * x / (a + 1) or tiny)  # modified Lentz
+    value = d
+    for m in range(1, 1_000_000):
+        even = m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m))
+        odd = -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1))
+        for term in (even, odd):
+            d = 1 / (1 + term * d or tiny)
+            c = 1 + term / c or tiny
+            value *= c * d
+        if abs(c * d - 1) < 1e-15:
+            break
+    return math.exp(log_front) * value if log_front > -745 else 0.0

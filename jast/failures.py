@@ -1,0 +1,288 @@
+"""The archive of failures: the best distinct ones that a search found, each exactly replayable, in memory and in one file.
+
+An archived episode went through `jast.replay` once and carries its numbers, so that every later replay on the same platform agrees with them to the bit.
+All arrays are NumPy's: they keep their dtype whatever the precision that JAX is set to.
+"""
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast.episode import Episode, _shapes, accumulator, replay
+
+__all__ = ["Failures", "collect", "empty", "load", "merge", "save"]
+
+FORMAT, VERSION = "jast failures", 1
+SCALARS = ("log_prob", "distance", "failure", "length", "reward")
+
+
+class Failures(NamedTuple):
+    """The n best distinct failures, by falling reward. ``failures[i]`` is the i-th field, as in any tuple; an episode is ``failures.episode(i)``."""
+
+    episodes: Episode
+    """Leading axis [n]; ``states`` is None (`jast.replay` gives them)."""
+    counts: np.ndarray
+    """int32 [n]: how often each was found."""
+    tree: np.ndarray
+    """int32 [n]: the tree that found it first (least simulation, then least tree)."""
+    simulation: np.ndarray
+    """int32 [n]: the simulation of that tree."""
+    seen: int
+    """Failing episodes simulated in all, repetitions and those beyond the best n included."""
+    dropped: int
+    """Candidates that did not replay to a failure: a knife edge on which compiled programs differ in the last digit."""
+
+    @property
+    def size(self):
+        """n, the number of episodes held."""
+        return len(self.counts)
+
+    @property
+    def best(self):
+        """The `Episode` of the highest reward, or None where there is no failure."""
+        return self.episode(0) if self.size else None
+
+    def episode(self, i):
+        """The i-th best `Episode`, unbatched; negative ``i`` counts from the end. IndexError outside the archive."""
+        if not -self.size <= i < self.size:
+            raise IndexError(f"Failures.episode: i must be within the {self.size} episodes held, received {i}")
+        return _take(self.episodes, i)
+
+    def __str__(self):
+        found = f"{int(self.seen)} failing episode{'s' * (self.seen != 1)} simulated"
+        if self.dropped:
+            found += f", {int(self.dropped)} did not replay to a failure"
+        if not self.size:
+            return "no failure was found" + (f" ({found})" if self.seen or self.dropped else "")
+        lines = [f"{self.size} distinct failure{'s' * (self.size > 1)} ({found})"]
+        lines.append(f"{'rank':>4} {'reward':>11} {'log p':>11} {'distance':>11} {'length':>6} {'found':>6} {'tree':>6} {'simulation':>10}")
+        e = self.episodes
+        for i in range(min(self.size, 10)):
+            numbers = " ".join(f"{float(v[i]):11.6g}" for v in (e.reward, e.log_prob, e.distance))
+            lines.append(f"{i + 1:4d} {numbers} {int(e.length[i]):6d} {self.counts[i]:6d} {self.tree[i]:6d} {self.simulation[i]:10d}")
+        if self.size > 10:
+            lines.append(f"... and {self.size - 10} more")
+        return "\n".join(lines)
+
+
+def empty(sim):
+    """`Failures` with n = 0, of the shapes and dtypes of ``sim``."""
+    x0, x = jax.eval_shape(_shapes, sim)
+    zero = np.zeros(0, accumulator(sim))
+    x0, x = jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), x0), jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), x)
+    none = np.zeros(0, np.int32)
+    return Failures(Episode(x0, x, zero, zero, np.zeros(0, bool), none, zero), none, none, none, 0, 0)
+
+
+def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64):
+    """The ``top`` best distinct failures among candidate ``episodes`` (an `Episode` with a leading axis [m], NumPy or JAX): `Failures`.
+
+    Every candidate whose ``failure`` holds is replayed; one that no longer fails is dropped and counted. Episodes with the same bytes of x0 and of the first
+    ``length`` disturbances are one failure, their counts added. ``tree`` and ``simulation`` [m]: where each was found (default: tree 0, its position);
+    ``seen``: failing episodes simulated, where more than the candidates were (default: the failing candidates). Ranked by ``reward``, of which more is
+    better. ValueError for axes that disagree, ``top`` below 1, or disturbances that do not fit ``sim``.
+    """
+    episodes = jax.device_get(episodes._replace(states=None))
+    m = np.shape(episodes.length)[0] if np.ndim(episodes.length) == 1 else None
+    if m is None or any(np.shape(leaf)[:1] != (m,) for leaf in jax.tree.leaves(episodes)):
+        raise ValueError(f"collect: episodes must share one leading axis, received the shapes {jax.tree.map(np.shape, episodes)}")
+    tree = _numbers("tree", np.zeros(m, np.int32) if tree is None else tree, m)
+    simulation = _numbers("simulation", np.arange(m) if simulation is None else simulation, m)
+    failing = np.flatnonzero(episodes.failure)
+
+    rows, dropped, known = [], 0, {}  # known: bytes of a candidate -> its row, None where it was dropped
+    for i in failing:
+        candidate = _take(episodes, i)
+        name = _identity(candidate)
+        if name not in known:
+            replayed = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
+            known[name] = len(rows) if replayed.failure else None
+            if replayed.failure:
+                rows.append((jax.tree.map(np.asarray, replayed), []))
+        if known[name] is None:
+            dropped += 1
+        else:
+            rows[known[name]][1].append(i)
+    archive = empty(sim)
+    if rows:
+        kept = jax.tree.map(lambda *leaves: np.stack(leaves), *(row for row, _ in rows))
+        first = np.array([min(found, key=lambda i: (simulation[i], tree[i])) for _, found in rows])
+        archive = Failures(kept, np.array([len(found) for _, found in rows], np.int32), tree[first], simulation[first], 0, 0)
+    return _best("collect", archive, top)._replace(seen=len(failing) if seen is None else int(seen), dropped=dropped)
+
+
+def merge(a, b, top=64):
+    """The ``top`` best distinct failures of two archives of one simulator and one reward: `Failures`; ``seen`` and ``dropped`` are added.
+
+    ValueError where the shapes of the two disagree or ``top`` is below 1.
+    """
+    outline = [(jax.tree.structure(f.episodes), [np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)]) for f in (a, b)]
+    if outline[0] != outline[1]:
+        raise ValueError(f"merge: both archives must be of one simulator, received episodes of shapes {outline[0][1]} and {outline[1][1]}")
+    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), a[:4], b[:4])
+    return _best("merge", Failures(*arrays, 0, 0), top)._replace(seen=a.seen + b.seen, dropped=a.dropped + b.dropped)
+
+
+def save(path, failures, settings=None):
+    """Write ``failures`` and ``settings`` (a dict that JSON can hold: method, seed, counts ...) to the one file ``path``.
+
+    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON: format, version, settings, the structure of x0 and x, and a checksum.
+    An older file of that name stays whole until the new one is. ValueError for settings that JSON cannot hold.
+    """
+    from jast import __version__  # not at import: the package imports this module
+
+    try:
+        settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"save: settings must be a dict that JSON can hold: {error}") from None
+    e = failures.episodes
+    parts = {"x0": e.x0, "disturbances": e.disturbances} | {name: getattr(e, name) for name in SCALARS}
+    parts |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
+    arrays = {f"{name}.{i}": np.asarray(leaf) for name, part in parts.items() for i, leaf in enumerate(jax.tree.leaves(part))}
+    header = dict(format=FORMAT, version=VERSION, package=__version__, settings=settings, seen=int(failures.seen), dropped=int(failures.dropped))
+    header["structure"] = {name: _describe(getattr(e, name)) for name in ("x0", "disturbances")}
+    header["dtypes"] = {name: a.dtype.name for name, a in arrays.items()}
+    header["sha256"] = _checksum(header, arrays)
+
+    path = os.fspath(path)
+    # extended floats have no NumPy name in a file, so they are stored as bits
+    bits = {name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a for name, a in arrays.items()}
+    part = f"{path}.{os.getpid()}.part"
+    try:
+        with open(part, "wb") as file:
+            np.savez_compressed(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        if os.path.exists(part):
+            os.unlink(part)
+
+
+def load(path, sim=None):
+    """Read a file of `save`: ``(Failures, settings)``. Arrays keep the dtypes they were saved with.
+
+    ``sim``, where given, must fit the archive (horizon, structure, shapes, kinds of number; the float precision may differ). It is needed where x0 or x is
+    another structure than dicts, lists, tuples and None. ValueError says why a file is refused: no jast archive, a version unknown here, damaged, or no
+    fit to ``sim``.
+    """
+    with open(path, "rb") as file:
+        data = file.read()
+    if data[:2] != b"PK":
+        raise ValueError(f"load: {path} is not a jast archive of failures")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as pack:
+            arrays = {name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(pack.read(name)), allow_pickle=False) for name in pack.namelist()}
+        header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
+    except Exception as error:  # a damaged zip fails in many ways
+        raise ValueError(f"load: {path} is damaged or truncated ({type(error).__name__}: {error})") from None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"load: {path} is not a jast archive of failures")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"load: {path} has version {header.get('version')!r}; this jast reads version {VERSION}: use the jast that wrote it, {header.get('package')}"
+        )
+    dtypes = header.get("dtypes", {})
+    if set(dtypes) != set(arrays):
+        raise ValueError(f"load: {path} is damaged: the arrays {sorted(set(dtypes) ^ set(arrays))} are missing or too many")
+    arrays = {name: arrays[name].view(jnp.dtype(dtype)) if arrays[name].dtype.name != dtype else arrays[name] for name, dtype in dtypes.items()}
+    if header.pop("sha256", None) != _checksum(header, arrays):
+        raise ValueError(f"load: {path} is damaged: its checksum does not match")
+
+    x0, x = ([arrays[f"{name}.{i}"] for i in range(sum(key.startswith(f"{name}.") for key in arrays))] for name in ("x0", "disturbances"))
+    structure = header["structure"]
+    if sim is not None:
+        like_x0, like_x = jax.eval_shape(_shapes, sim)
+        _fits(path, "x0", structure["x0"], x0, like_x0, ())
+        _fits(path, "disturbances", structure["disturbances"], x, like_x, (sim.horizon,))
+        x0, x = jax.tree.structure(like_x0).unflatten(x0), jax.tree.structure(like_x).unflatten(x)
+    else:
+        x0, x = _rebuild(path, structure["x0"], iter(x0)), _rebuild(path, structure["disturbances"], iter(x))
+    scalars, places = ([arrays[f"{name}.0"] for name in names] for names in (SCALARS, ("counts", "tree", "simulation")))
+    return Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"]), header["settings"]
+
+
+def _take(episodes, i):
+    return jax.tree.map(lambda a: a[i], episodes)
+
+
+def _numbers(name, values, m):
+    values = np.asarray(values)
+    if values.shape != (m,):
+        raise ValueError(f"collect: {name} must have the shape {(m,)}, one number an episode, received {values.shape}")
+    return values.astype(np.int32)
+
+
+def _identity(episode):
+    """What makes two failures one: the bytes of x0 and of the disturbances that were used."""
+    leaves = jax.tree.leaves(episode.x0) + [a[: int(episode.length)] for a in jax.tree.leaves(episode.disturbances)]
+    return int(episode.length), *(np.ascontiguousarray(a).tobytes() for a in leaves)
+
+
+def _best(caller, failures, top):
+    """The best ``top``, with equal ones put together; ``seen`` and ``dropped`` are left to the caller."""
+    if isinstance(top, bool) or not isinstance(top, int | np.integer) or top < 1:
+        raise ValueError(f"{caller}: top must be an int of at least 1, received {top!r}")
+    # equal rewards are ordered by when they were found, so that the order of the candidates does not matter
+    order = np.lexsort((failures.tree, failures.simulation, -failures.episodes.reward))
+    groups = {}
+    for i in order:
+        groups.setdefault(_identity(_take(failures.episodes, i)), []).append(i)
+    groups = list(groups.values())[:top]
+    kept = np.array([found[0] for found in groups], np.int64)
+    first = np.array([min(found, key=lambda i: (failures.simulation[i], failures.tree[i])) for found in groups], np.int64)
+    counts = np.array([failures.counts[found].sum() for found in groups], np.int32)
+    return Failures(_take(failures.episodes, kept), counts, failures.tree[first], failures.simulation[first], 0, 0)
+
+
+def _plain(value):
+    """NumPy's and JAX's numbers and arrays as JSON has them."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} {value!r} is not a number, text, list or dict")
+
+
+def _checksum(header, arrays):
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode() + np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
+
+
+def _describe(tree):
+    """A pytree's structure in JSON: its nodes as [kind, names, children], an array as "array"."""
+    if tree is None:
+        return ["None", [], []]
+    below, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda node: node is not tree)
+    if len(below) == 1 and below[0][1] is tree:
+        return "array"
+    plain = type(tree) in (tuple, list) or (type(tree) is dict and all(isinstance(key, str) for key in tree))
+    names = sorted(tree) if plain and isinstance(tree, dict) else [] if plain else [jax.tree_util.keystr(path) for path, _ in below]
+    return [type(tree).__name__ if plain else f"the class {type(tree).__name__}", names, [_describe(child) for _, child in below]]
+
+
+def _rebuild(path, structure, leaves):
+    if structure == "array":
+        return next(leaves)
+    kind, names, below = structure
+    if kind.startswith("the class"):
+        raise ValueError(f"load: {path} holds values of {kind}, which only its simulator can restore: load(path, sim)")
+    below = [_rebuild(path, child, leaves) for child in below]
+    return {"None": lambda: None, "tuple": lambda: tuple(below), "list": lambda: below, "dict": lambda: dict(zip(names, below, strict=True))}[kind]()
+
+
+def _fits(path, name, structure, arrays, like, rows):
+    expected = _describe(like)
+    if structure != expected:
+        raise ValueError(f"load: {path} does not fit sim: {name} has the structure {structure}, expected {expected}")
+    for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
+        kinds = [next((k for k in (jnp.floating, jnp.signedinteger, jnp.unsignedinteger) if jnp.issubdtype(d, k)), d) for d in (a.dtype, s.dtype)]
+        if a.shape[1:] != (*rows, *s.shape) or kinds[0] != kinds[1]:
+            raise ValueError(f"load: {path} does not fit sim: {name} has {a.dtype.name}{list(a.shape[1:])}, expected {s.dtype.name}{[*rows, *s.shape]}")

@@ -1,0 +1,60 @@
+"""Policies: who chooses the disturbances. One protocol for the nominal model, a box, a recording and a learned failure policy."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast import distributions as D
+
+__all__ = ["Policy", "nominal_policy", "recorded", "undisturbed"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Policy:
+    """Chooses disturbances: ``start() -> Distribution`` over x0 and ``disturbance(state, t) -> Distribution`` over x_t, t = 0, 1, ...; a pytree."""
+
+    start: Callable[[], Any]
+    disturbance: Callable[[Any, Any], Any]
+
+    def __post_init__(self):
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if callable(value) and not isinstance(value, Partial):
+                object.__setattr__(self, f.name, Partial(value))
+
+
+def nominal_policy(sim):
+    """The simulator's own disturbance model."""
+    return Policy(sim.start, Partial(_nominal, sim.disturbance))
+
+
+def undisturbed(sim):
+    """The mode of every disturbance (the median where a distribution names no mode)."""
+    return Policy(Partial(_mode_start, sim.start), Partial(_mode_step, sim.disturbance))
+
+
+def recorded(disturbances, x0=()):
+    """Plays back ``disturbances`` [T, ...] from the start ``x0``; the last row is repeated beyond T."""
+    disturbances, x0 = jax.tree.map(jnp.asarray, (disturbances, x0))
+    return Policy(Partial(D.Deterministic, x0) if jax.tree.leaves(x0) else D.Fixed, Partial(_row, disturbances))
+
+
+def _nominal(disturbance, state, t):
+    return disturbance(state)
+
+
+def _mode_start(start):
+    return D.Deterministic(D.mode(start()))
+
+
+def _mode_step(disturbance, state, t):
+    return D.Deterministic(D.mode(disturbance(state)))
+
+
+def _row(disturbances, state, t):
+    return D.Deterministic(jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], disturbances))

@@ -1,0 +1,82 @@
+"""The one contract: a simulated system as a pytree of pure functions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast.distributions import Fixed
+
+__all__ = ["Simulator", "fixed", "never", "ravel"]
+
+
+def fixed():
+    """p(x0) of a system with one start: draws the empty x0, ``()``."""
+    return Fixed()
+
+
+def never(state):
+    """``is_terminal`` of a system that only failures and the horizon end."""
+    return jnp.zeros((), bool)
+
+
+def ravel(state):
+    """The numbers of a state as one float vector: the default ``observe``."""
+    leaves = [jnp.ravel(jnp.asarray(leaf)) for leaf in jax.tree.leaves(state)]
+    floats = [a.dtype for a in leaves if jnp.issubdtype(a.dtype, jnp.floating)]
+    dtype = jnp.result_type(*floats) if floats else jnp.zeros(()).dtype
+    return jnp.concatenate([a.astype(dtype) for a in leaves]) if leaves else jnp.zeros((0,), dtype)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Simulator:
+    """A system under test in its environment, as pure functions of pytrees; itself a pytree.
+
+    All randomness is the disturbances (x0, x1, ..., xT), each with its density, so an episode is its disturbances. The functions are wrapped in
+    `jax.tree_util.Partial`: arguments bound by a ``Partial`` are traced, so simulators that differ only in them share one compiled program and
+    `jax.vmap` over a batch of them is a parameter sweep. Plain functions and lambdas are static, by identity: define them once.
+
+    At a state, in this order: a failure ends the episode, then ``is_terminal``, then the horizon. The miss distance of an episode is the least over s0..sT;
+    of an ``episodic`` one, the last state's, and only there the failure event counts.
+
+    Raises ValueError for a horizon below 1 or a field that is no function. `jast.check` says whether the functions fit together.
+    """
+
+    init: Callable[[Any], Any]
+    """x0 -> state: the state that the initial disturbance puts the system in (x0 is ``()`` with the default ``start``)."""
+    step: Callable[[Any, Any], Any]
+    """(state, x) -> state: one deterministic transition; same shapes and dtypes as its input."""
+    disturbance: Callable[[Any], Any]
+    """state -> Distribution p(x | state): scalar ``log_prob``; x is an array or a pytree of arrays."""
+    evaluate: Callable[[Any], tuple]
+    """state -> (failure event: bool scalar, miss distance: float scalar, smaller is nearer to a failure)."""
+    horizon: int = field(metadata=dict(static=True))
+    """Greatest number of steps of an episode, at least 1; static."""
+    start: Callable[[], Any] = fixed
+    """() -> Distribution p(x0)."""
+    is_terminal: Callable[[Any], Any] = never
+    """state -> bool: ends the episode before the horizon without being a failure."""
+    observe: Callable[[Any], Any] = ravel
+    """state -> float vector, at most 64 numbers: what policies and networks see."""
+    episodic: bool = field(default=False, metadata=dict(static=True))
+    """``evaluate`` means something only at the end of an episode; static."""
+
+    def __post_init__(self):
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if f.metadata.get("static"):
+                continue
+            if isinstance(value, Partial):
+                continue
+            if callable(value):
+                object.__setattr__(self, f.name, Partial(value))
+            elif value is None or isinstance(value, str | int | float | tuple | list | dict):
+                raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")
+        if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
+            raise ValueError(f"Simulator: horizon must be an int of at least 1, received {self.horizon!r}")
+        if not isinstance(self.episodic, bool):
+            raise ValueError(f"Simulator: episodic must be True or False, received {self.episodic!r}")

@@ -1,0 +1,293 @@
+import dataclasses
+import random
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from jax.tree_util import Partial
+
+import jast
+from jast import actions
+from jast import distributions as D
+from jast.check import contract
+from jast.estimate.intervals import clopper_pearson
+from jast.simulators import ferry, landing, limit_state, walk1d
+
+
+def line(**changes):
+    fields = dict(
+        init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, disturbance=lambda s: D.Normal(0.0, 1.0), evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
+        horizon=10,
+    )  # fmt: skip
+    return jast.Simulator(**(fields | changes))
+
+
+class Bare:
+    """A distribution of the user's own."""
+
+    def __init__(self, log_prob):
+        self._log_prob = log_prob
+
+    def sample(self, seed):
+        return jax.random.normal(seed)
+
+    def log_prob(self, x):
+        return self._log_prob(x)
+
+
+def explode(*args):
+    raise RuntimeError("no such file")
+
+
+SHAPES = {  # found by tracing
+    "start raises": (dict(start=explode), r"start: raised RuntimeError: no such file"),
+    "start is no distribution": (dict(start=lambda: jnp.zeros(2)), r"start: expected a distribution \(with sample and log_prob\), received float..\[2\]"),
+    "init raises": (dict(init=lambda x0: x0["missing"]), r"init: raised TypeError"),
+    "init of text": (dict(init=lambda x0: dict(a=jnp.zeros(()), name="walk")), r"init: leaf \['name'\] is str 'walk', expected an array"),
+    "init of a key": (dict(init=lambda x0: jax.random.key(0)), r"init: leaf .* is key<fry>\[\], expected an array"),
+    "disturbance raises": (dict(disturbance=explode), r"disturbance: raised RuntimeError"),
+    "disturbance is a number": (dict(disturbance=lambda s: s), r"disturbance: expected a distribution .*received float..\[\]"),
+    "disturbance is None": (dict(disturbance=lambda s: None), r"disturbance: expected a distribution .*received NoneType"),
+    "log_prob is a vector": (
+        dict(disturbance=lambda s: D.Normal(jnp.zeros(3), jnp.ones(3))),
+        r"disturbance: log_prob has shape \(3,\), expected \(\); wrap it in Independent",
+    ),
+    "start log_prob is a vector": (dict(start=lambda: D.Normal(jnp.zeros(2), jnp.ones(2))), r"start: log_prob has shape \(2,\), expected \(\); wrap it"),
+    "log_prob is a whole number": (dict(disturbance=lambda s: Bare(lambda x: jnp.int32(0))), r"disturbance: log_prob has dtype int32, expected a float"),
+    "log_prob raises": (dict(disturbance=lambda s: Bare(explode)), r"disturbance: log_prob: raised RuntimeError"),
+    "evaluate raises": (dict(evaluate=explode), r"evaluate: raised RuntimeError"),
+    "evaluate is no pair": (dict(evaluate=lambda s: s >= 5), r"evaluate: expected a pair \(event, distance\), received bool\[\]"),
+    "evaluate is a triple": (dict(evaluate=lambda s: (s >= 5, s, s)), r"evaluate: expected a pair"),
+    "event is a vector": (dict(evaluate=lambda s: (jnp.stack([s, s]) >= 5, s)), r"evaluate: event has shape \(2,\), expected \(\)"),
+    "event is a float": (dict(evaluate=lambda s: (s, s)), r"evaluate: event has dtype float.., expected bool"),
+    "event is None": (dict(evaluate=lambda s: (None, s)), r"evaluate: event: received NoneType None, expected a bool scalar"),
+    "distance is a vector": (dict(evaluate=lambda s: (s >= 5, jnp.stack([s, s]))), r"evaluate: distance has shape \(2,\), expected \(\)"),
+    "distance is a whole number": (dict(evaluate=lambda s: (s >= 5, jnp.int32(1))), r"evaluate: distance has dtype int32, expected a float"),
+    "log_prob is None": (dict(disturbance=lambda s: Bare(lambda x: None)), r"disturbance: log_prob: received NoneType None, expected a float scalar"),
+    "observe is a list": (dict(observe=lambda s: [s, s]), r"observe: returns list .*, expected a float vector"),
+    "is_terminal is a float": (dict(is_terminal=lambda s: s), r"is_terminal has dtype float.., expected bool"),
+    "is_terminal is a vector": (dict(is_terminal=lambda s: jnp.stack([s, s]) > 1), r"is_terminal has shape \(2,\)"),
+    "is_terminal branches": (dict(is_terminal=lambda s: True if s > 3 else False), r"is_terminal: raised TracerBoolConversionError"),
+    "observe is a scalar": (dict(observe=lambda s: s), r"observe: returns float..\[\], expected a float vector"),
+    "observe is whole numbers": (dict(observe=lambda s: jnp.zeros(3, jnp.int32)), r"observe: returns int32\[3\], expected a float vector"),
+    "observe is long": (dict(observe=lambda s: jnp.zeros(200)), r"observe: returns 200 numbers, expected at most 64"),
+    "step raises": (dict(step=explode), r"step: raised RuntimeError"),
+    "step grows": (
+        dict(init=lambda x0: dict(path=jnp.zeros(1)), step=lambda s, x: dict(path=jnp.append(s["path"], x)), evaluate=lambda s: (False, 0.0)),
+        r"step: state leaf \['path'\] has shape \(2,\), expected \(1,\)",
+    ),
+    "step changes the dtype": (dict(step=lambda s, x: (s + x).astype(jnp.float16)), r"step: state leaf .* has dtype float16, expected float"),
+    "step changes the structure": (dict(step=lambda s, x: (s, x)), r"step: state has structure .*, expected"),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shapes(name):
+    changes, match = SHAPES[name]
+    sim = line(**changes)
+    for function in (jast.check, contract):
+        with pytest.raises(ValueError, match=match):
+            function(sim)
+    with pytest.raises(ValueError, match=match):  # where a search is traced, too
+        jax.jit(lambda b: contract(line(**changes)) and b)(1.0)
+
+
+NUMBERS = {  # found by running
+    "log_prob is NaN": (dict(disturbance=lambda s: D.Normal(0.0, jnp.asarray(jnp.nan))), r"disturbance: log_prob is not finite in 32 of 32 .* at step 1"),
+    "log_prob is NaN later": (dict(disturbance=lambda s: Bare(lambda x: jnp.where(s == 0, 0.0, jnp.nan))), r"disturbance: log_prob is not .* at step 2"),
+    "start log_prob is -inf": (dict(start=lambda: Bare(lambda x: jnp.asarray(-jnp.inf))), r"start: log_prob is not finite in 32 of 32 of its own samples"),
+    "sample is outside of the support": (dict(disturbance=lambda s: D.where(s > 9, Shifted(), Shifted())), r"disturbance: log_prob is not finite"),
+    "init is NaN": (
+        dict(init=lambda x0: dict(x=jnp.asarray(jnp.nan)), step=lambda s, x: s, evaluate=lambda s: (False, 1.0)),
+        r"init: state leaf \['x'\] is NaN",
+    ),
+    "step is NaN": (dict(step=lambda s, x: s / s), r"step: state leaf .* is NaN after 1 steps"),
+    "distance is NaN": (dict(evaluate=lambda s: (s >= 5, s * jnp.nan)), r"evaluate: distance is not finite after 0 steps"),
+    "distance is NaN undisturbed": (dict(evaluate=lambda s: (s >= 5, jnp.log(s * 0 + 1) / s)), r"evaluate: distance is not finite after 0 steps"),
+    "init is random": (dict(init=lambda x0: jnp.asarray(np.random.rand())), r"init: leaf \(the whole\) differs between two runs"),
+    "step is random": (dict(step=lambda s, x: s + x + random.random()), r"step: leaf \(the whole\) differs between two runs on the same input"),
+    "evaluate is random": (dict(evaluate=lambda s: (s >= 5, 5 - s + random.random())), r"evaluate: leaf \[1\] differs between two runs"),
+}
+
+
+class Shifted(D.Uniform):
+    """Draws from where its density is zero."""
+
+    def __init__(self):
+        super().__init__(0.0, 1.0)
+
+    def sample(self, *, seed, sample_shape=()):
+        return super().sample(seed=seed, sample_shape=sample_shape) + 7
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers(name):
+    changes, match = NUMBERS[name]
+    sim = contract(line(**changes))
+    with pytest.raises(ValueError, match=match):
+        jast.check(sim)
+
+
+def test_the_cause_is_kept():
+    with pytest.raises(ValueError) as error:
+        jast.check(line(step=explode))
+    assert isinstance(error.value.__cause__, RuntimeError)
+
+
+def test_what_is_no_simulator():
+    for bad in (3, None, lambda: 0, walk1d):
+        with pytest.raises(ValueError, match="sim must be a jast.Simulator, received"):
+            jast.check(bad)
+    with pytest.raises(ValueError, match="step must be a function, received None"):
+        line(step=None)
+    broken = dataclasses.replace(walk1d())
+    object.__setattr__(broken, "evaluate", 5)
+    with pytest.raises(ValueError, match="evaluate: expected a function, received 5"):
+        jast.check(broken)
+
+
+GOOD = dict(
+    ferry=ferry, walk=walk1d, landing=landing, limit=lambda: limit_state(lambda x: 5 - x.sum(), 100), weak=lambda: line(init=lambda x0: 0.0),
+    seeds=lambda: line(disturbance=lambda s: D.seeds(), step=lambda s, x: s + jax.random.normal(jax.random.key(x), dtype=s.dtype)),
+    nan_after_the_end=lambda: line(init=lambda x0: jnp.asarray(4.9), step=lambda s, x: jnp.where(s >= 5, jnp.nan, s + jnp.abs(x))),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_good_simulators_pass(name):
+    sim = GOOD[name]()
+    assert jast.check(sim) is sim and jast.check(sim, actions.samples()) is sim
+    assert jax.jit(lambda s: jast.check(s) and 1)(sim) == 1  # traced: shapes only
+    jax.vmap(lambda b: jast.check(walk1d(threshold=b)) and b)(jnp.asarray([1.0, 2.0]))
+
+
+# actions
+
+
+def test_actions():
+    assert jast.check(ferry(), actions.uniform(0.0, 1.0)) and jast.check(ferry(), actions.quantiles())
+    with pytest.raises(ValueError, match=r"actions\.uniform: expected disturbances inside the support.* \d+% of 64 draws at the start on the box \[2.*, 9"):
+        jast.check(ferry(), actions.uniform(2.0, 9.0))
+    with pytest.raises(ValueError, match=r"actions\.uniform: expected disturbances inside the support"):
+        jast.check(ferry(), actions.uniform(-4.0, 5.0))
+    assert jast.check(ferry(), actions.uniform(-0.2, 1.2))  # a little wider does no harm
+
+
+@pytest.mark.parametrize("function", [jast.check, contract])
+def test_action_shapes(function):
+    with pytest.raises(ValueError, match=r"actions\.uniform: low has shape \(3,\), expected one that broadcasts to the disturbance's \(\)"):
+        function(walk1d(), actions.uniform(jnp.zeros(3), 1.0))
+    with pytest.raises(ValueError, match=r"actions\.uniform: high has shape \(2,\).*\(5,\)"):
+        function(limit_state(lambda x: x.sum(), 5), actions.uniform(0.0, jnp.ones(2)))
+    gamma = line(disturbance=lambda s: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
+    with pytest.raises(ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"):
+        function(gamma, actions.quantiles())
+    started = line(start=lambda: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
+    with pytest.raises(ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"):
+        function(started, actions.quantiles())
+    with pytest.raises(ValueError, match="actions: expected one of jast.actions, received 'uniform'"):
+        function(walk1d(), "uniform")
+
+
+# nominal
+
+
+@pytest.mark.parametrize("k, n", [(0, 10), (10, 10), (3, 10), (1, 100_000), (10_870, 100_000), (99_999, 100_000), (40, 1_000_000_000)])
+@pytest.mark.parametrize("level", [0.95, 0.9, 0.999])
+def test_clopper_pearson_is_scipys(k, n, level):
+    low, high = clopper_pearson(k, n, level)
+    tail = (1 - level) / 2
+    assert low == pytest.approx(0 if k == 0 else scipy.stats.beta.ppf(tail, k, n - k + 1), rel=1e-6, abs=0)
+    assert high == pytest.approx(1 if k == n else scipy.stats.beta.ppf(1 - tail, k + 1, n - k), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "bad, match", [((1, 0), "n must be"), ((5, 4), "k must be"), ((-1, 4), "k must be"), ((1, 4, 1.0), "level must"), ((0.5, 4), "k must")]
+)
+def test_clopper_pearson_names_what_is_wrong(bad, match):
+    with pytest.raises(ValueError, match=f"clopper_pearson: {match}"):
+        clopper_pearson(*bad)
+
+
+def test_nominal_is_a_loop_of_rollouts(key):
+    n = 1100  # more than one chunk, and not a multiple of it
+    found = jast.nominal(key, walk1d(), episodes=n)
+    episodes = jax.vmap(lambda i: jast.rollout(jax.random.fold_in(key, i), walk1d()))(jnp.arange(n))
+    assert (found.failures, found.episodes, found.invalid) == (int(episodes.failure.sum()), n, 0)
+    assert found.mean_distance == pytest.approx(float(episodes.distance.mean()), rel=1e-4)
+    assert found.interval == clopper_pearson(found.failures, n) and found.rate == found.failures / n
+    assert float(found.undisturbed.distance) == 10 and int(found.undisturbed.length) == 30
+    text = str(found)
+    assert "no failure" in text and f"{found.failures} of {n}" in text and len(text.splitlines()) < 8
+
+
+def test_nominal_says_when_the_system_fails_undisturbed(key):
+    with pytest.warns(UserWarning, match="fails undisturbed"):
+        found = jast.nominal(key, line(step=lambda s, x: s + 1), episodes=10)
+    assert found.failures == 10 and found.interval[1] == 1 and "FAILS" in str(found)
+
+
+def test_nominal_counts_invalid_episodes(key):
+    sim = line(step=lambda s, x: jnp.where(x > 1, jnp.nan, s), horizon=1)
+    with pytest.warns(UserWarning, match="of 2000 nominal episodes are invalid"):
+        found = jast.nominal(key, sim, episodes=2000)
+    share = scipy.stats.norm.sf(1)
+    assert abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000) and found.mean_distance == pytest.approx(5) and found.failures == 0
+    with pytest.warns(UserWarning, match="of 5 nominal"):
+        assert np.isnan(jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5).mean_distance)
+
+
+def test_nominal_of_seeds_has_no_undisturbed_episode(key):
+    found = jast.nominal(key, GOOD["seeds"](), episodes=100)
+    assert found.undisturbed is None and "not defined" in str(found)
+
+
+@pytest.mark.parametrize("episodes", [0, -1, 1.5, True])
+def test_nominal_wants_episodes(key, episodes):
+    with pytest.raises(ValueError, match="nominal: episodes must be a whole number"):
+        jast.nominal(key, walk1d(), episodes=episodes)
+
+
+def test_nominal_checks_the_simulator(key):
+    with pytest.raises(ValueError, match="evaluate: expected a pair"):
+        jast.nominal(key, line(evaluate=lambda s: s), episodes=10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jast.nominal(key, line(observe=lambda s: jnp.zeros(200)), episodes=10)  # it observes nothing
+
+
+def test_a_second_instance_does_not_recompile(key):
+    traces = []
+
+    def step(drift, s, x):
+        traces.append(1)
+        return s + x + drift
+
+    base = line()
+    make = lambda drift: dataclasses.replace(base, step=Partial(step, jnp.asarray(drift)))
+    for use in (lambda s: jast.rollout(key, s), lambda s: jast.replay(s, jnp.zeros((3,))), lambda s: jast.nominal(key, s, episodes=20)):
+        use(make(0.1))
+        first = len(traces)
+        use(make(0.2))
+        extra = len(traces) - first
+        assert extra <= 2, "only contract's shape check may trace again"
+
+
+def test_a_host_callback_that_raises():
+    def step(s, x):
+        return jax.pure_callback(explode, jax.ShapeDtypeStruct((), s.dtype), s, x, vmap_method="sequential")
+
+    with pytest.raises(ValueError, match="raised.*"):
+        jast.check(line(step=step))
+
+
+def test_no_key_is_used_twice(key):
+    with jax.debug_key_reuse(True):
+        sim = ferry(adversary=(16.5, 0.0))
+        jast.check(sim, actions.uniform(0.0, 1.0))
+        keys = jax.random.split(key, 2)
+        assert jast.rollout(keys[0], sim).length == 21
+        assert jast.nominal(keys[1], sim, episodes=10).episodes == 10

@@ -1,0 +1,226 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jast import distributions as D
+
+DTYPES = ["float32", "float64"]
+unit = st.floats(0.0, 1.0, width=32)
+
+
+def tolerance(dtype, single, double):
+    return single if dtype == "float32" else double
+
+
+@pytest.fixture(params=DTYPES)
+def dtype(request):
+    """float32, and float64 inside its context, in every run of the suite."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+def supported(dtype):
+    """(distribution, its quantile function by SciPy or None) for each class that `quantile` knows."""
+    f = lambda v: jnp.asarray(v, dtype)
+    chol = np.array([[1.0, 0.0], [0.5, 2.0]])
+    u2 = np.array([0.2, 0.9])
+    return {
+        "uniform": (D.Uniform(f(-1), f(3)), lambda u: -1 + 4 * u),
+        "normal": (D.Normal(f(1), f(2)), lambda u: scipy.stats.norm.ppf(u, 1, 2)),
+        "diag": (D.MultivariateNormalDiag(f([0, 1]), f([1, 3])), lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3])),
+        "tri": (D.MultivariateNormalTri(f([0, 1]), f(chol)), lambda u: np.array([0, 1]) + chol @ scipy.stats.norm.ppf(u2)),
+        "logistic": (D.Logistic(f(1), f(0.5)), lambda u: scipy.stats.logistic.ppf(u, 1, 0.5)),
+        "laplace": (D.Laplace(f(1), f(0.5)), lambda u: scipy.stats.laplace.ppf(u, 1, 0.5)),
+        "bernoulli": (D.Bernoulli(probs=f(0.3)), lambda u: scipy.stats.bernoulli.ppf(u, 0.3)),
+        "categorical": (D.Categorical(probs=f([0.2, 0.5, 0.3])), lambda u: scipy.stats.rv_discrete(values=([0, 1, 2], [0.2, 0.5, 0.3])).ppf(u)),
+        "independent": (D.Independent(D.Normal(f([0, 1]), f([1, 3])), 1), lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3])),
+        "exp": (D.Transformed(D.Normal(f(0), f(1)), jnp.exp), lambda u: scipy.stats.lognorm.ppf(u, 1)),
+        "tent": (D.tent(f(0.5)), lambda u: scipy.stats.triang.ppf(0.125 + u * 0.75, 0.5, -0.5, 2)),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(supported("float32")))
+def test_quantile_is_scipys(name, dtype):
+    d, truth = supported(dtype)[name]
+    like = D.event_like(d)
+    assert D.has_quantile(d)
+    for u in (0.03, 0.25, 0.5, 0.71, 0.97):
+        x = D.quantile(d, jnp.asarray(u if not like.shape else [0.2, 0.9], dtype))
+        assert (x.shape, x.dtype) == (like.shape, like.dtype)
+        np.testing.assert_allclose(x, truth(u), rtol=tolerance(dtype, 2e-5, 1e-9), atol=tolerance(dtype, 1e-6, 1e-12))
+
+
+def test_quantiles_of_a_joint(dtype):
+    d = D.Joint((D.Normal(jnp.asarray(0, dtype), jnp.asarray(1, dtype)), D.Categorical(probs=jnp.asarray([0.5, 0.5], dtype))))
+    x, n = D.quantile(d, (jnp.asarray(0.975, dtype), jnp.asarray(0.7, dtype)))
+    assert float(x) == pytest.approx(1.959964, rel=1e-5) and int(n) == 1
+
+
+@pytest.mark.parametrize("bijector, truth", [("neg", 1.2), ("pos", -1.2)])
+def test_quantile_of_a_decreasing_transform(bijector, truth):
+    sign = -1.0 if bijector == "neg" else 1.0
+    d = D.Transformed(D.Normal(0.0, 1.0), lambda x: sign * x)
+    u = float(scipy.stats.norm.cdf(-1.2))
+    assert float(D.quantile(d, jnp.asarray(u))) == pytest.approx(-1.2, rel=1e-4)  # symmetric: the same value, from the other end
+    assert float(D.quantile(D.Transformed(D.Uniform(0.0, 1.0), lambda x: sign * x), jnp.asarray(0.2))) == pytest.approx(0.2 if sign > 0 else -0.8, rel=1e-5)
+
+
+def test_value_errors_name_the_distribution():
+    gamma = D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0))
+    with pytest.raises(ValueError, match="quantile: Gamma has no quantile function"):
+        D.quantile(gamma, jnp.asarray(0.5))
+    with pytest.raises(ValueError, match="Seeds has neither a mode nor a median"):
+        D.mode(D.seeds())
+    assert not D.has_quantile(gamma) and not D.has_mode(D.seeds()) and D.has_mode(D.Fixed())
+
+
+# tent
+
+
+@pytest.mark.parametrize("center, width, low, high", [(0.5, 1, 0, 1), (0.0, 1, 0, 1), (1.0, 1, 0, 1), (0.9, 0.3, 0, 1), (2.0, 5, -1, 4)])
+def test_tent(center, width, low, high, dtype, key):
+    d = D.tent(*(jnp.asarray(v, dtype) for v in (center, width, low, high)))
+    grid = jnp.linspace(low, high, 200_001, dtype=dtype)
+    p = np.exp(np.asarray(jax.vmap(d.log_prob)(grid), np.float64))
+    x = np.asarray(grid, np.float64)
+    assert np.trapezoid(p, x) == pytest.approx(1, rel=tolerance(dtype, 1e-5, 1e-8))
+    # the mode-normalised log density is the published step reward, with no normaliser in between
+    inside = np.abs(x - center) < width * 0.999
+    expected = np.log(1 - np.abs(x - center)[inside] / width)
+    np.testing.assert_allclose(
+        np.asarray(jax.vmap(lambda v: D.log_density(d, v, "mode"))(grid))[inside], expected, rtol=1e-3, atol=tolerance(dtype, 1e-3, 1e-10)
+    )
+    np.testing.assert_allclose(D.log_density(d, grid[7], "raw") - D.log_mode(d), D.log_density(d, grid[7], "mode"), rtol=1e-4, atol=1e-4)
+    u = jnp.linspace(0, 1, 101, dtype=dtype)
+    q = np.asarray(jax.vmap(d.quantile)(u), np.float64)
+    assert (np.diff(q) >= 0).all() and q[0] >= low and q[-1] <= high
+    cdf = np.interp(q, x, np.concatenate([[0], np.cumsum((p[1:] + p[:-1]) / 2 * np.diff(x))]))
+    np.testing.assert_allclose(cdf, u, atol=tolerance(dtype, 2e-4, 1e-6))
+    mean, second = np.trapezoid(p * x, x), np.trapezoid(p * x * x, x)
+    draws = np.asarray(d.sample(seed=key, sample_shape=(20_000,)), np.float64)
+    assert abs(draws.mean() - mean) < 4 * np.sqrt((second - mean**2) / 20_000)
+    assert float(D.mode(d)) == pytest.approx(center)
+
+
+@settings(max_examples=60, deadline=None)
+@given(center=unit, a=unit)
+def test_tent_by_the_mode_is_the_papers_reward(center, a):
+    got = float(D.log_density(D.tent(jnp.float32(center)), jnp.float32(a), "mode"))
+    gap = np.float32(1) - np.abs(np.float32(a) - np.float32(center))
+    assert got == (-np.inf if gap <= 0 else pytest.approx(np.log(gap), rel=1e-5, abs=1e-6))
+
+
+@settings(max_examples=60, deadline=None)
+@given(center=unit, u=unit)
+def test_tent_quantile_stays_in_the_support(center, u):
+    assert 0 <= float(D.tent(jnp.float32(center)).quantile(jnp.float32(u))) <= 1
+
+
+def test_tent_outside_of_its_support_is_impossible_and_its_gradient_finite():
+    d = D.tent(jnp.asarray(0.5))
+    assert float(d.log_prob(jnp.asarray(1.2))) == -np.inf
+    assert np.isfinite(jax.grad(lambda x: D.tent(x).log_prob(jnp.asarray(1.2)))(jnp.asarray(0.5)))
+
+
+# where, seeds, Fixed, Deterministic
+
+
+def test_where_is_the_chosen_one(key, dtype):
+    a, b = D.Uniform(jnp.asarray(0, dtype), jnp.asarray(1, dtype)), D.tent(jnp.asarray(0.2, dtype))
+    x, u = jnp.asarray(0.6, dtype), jnp.asarray(0.3, dtype)
+    for pred, chosen in ((True, a), (False, b)):
+        d = D.where(pred, a, b)
+        assert d.sample(seed=key) == chosen.sample(seed=key)
+        assert d.log_prob(x) == chosen.log_prob(x)
+        assert D.mode(d) == D.mode(chosen)
+        assert D.quantile(d, u) == D.quantile(chosen, u)
+        assert D.log_density(d, x, "mode") == D.log_density(chosen, x, "mode")
+        assert d.sample(seed=key, sample_shape=(3,)).shape == (3,) and d.log_prob(x).dtype == dtype
+
+
+def test_where_under_vmap_and_jit(key):
+    @jax.jit
+    def draw(pred, key):
+        d = D.where(pred, D.tent(jnp.asarray(0.9)), D.Normal(0.0, 1.0))
+        x = D.sample(d, key)
+        return x, d.log_prob(x)
+
+    keys, preds = jax.random.split(key, 6), jnp.arange(6) % 2 == 0
+    x, log_p = jax.vmap(draw)(preds, keys)
+    for i in range(6):
+        one = D.tent(jnp.asarray(0.9)) if preds[i] else D.Normal(0.0, 1.0)
+        assert x[i] == pytest.approx(float(one.sample(seed=keys[i])), rel=1e-5) and log_p[i] == pytest.approx(float(one.log_prob(x[i])), rel=1e-4)
+
+
+def test_seeds(key):
+    d = D.seeds((3,))
+    x = d.sample(seed=key)
+    assert (x.shape, x.dtype, float(d.log_prob(x))) == ((3,), jnp.uint32, 0.0)
+    assert D.log_density(d, x, "mode") == 0
+    assert len({int(v) for v in D.seeds().sample(seed=key, sample_shape=(1000,))}) > 990
+
+
+def test_fixed_and_deterministic(key):
+    assert D.Fixed().sample(seed=key) == () and D.mode(D.Fixed()) == () and D.Fixed().log_prob(()) == 0 and D.quantile(D.Fixed(), ()) == ()
+    d = D.Deterministic((jnp.ones(2), jnp.int32(3)))
+    assert D.sample(d, key)[1] == 3 and d.log_prob(D.mode(d)) == 0
+    assert D.log_density(d, D.mode(d), "mode") == 0
+
+
+# densities
+
+
+@pytest.mark.parametrize("name", list(supported("float32")))
+def test_log_density_is_raw_or_less_that_of_the_mode(name, dtype, key):
+    d, _ = supported(dtype)[name]
+    x = D.sample(d, key)
+    with jax.numpy_dtype_promotion("standard"):  # distrax's Bernoulli multiplies whole numbers and floats
+        raw, by_mode, top = D.log_density(d, x), D.log_density(d, x, "mode"), D.log_mode(d)
+        at_mode = D.log_density(d, D.mode(d), "mode")
+    assert raw.shape == by_mode.shape == () and raw.dtype == by_mode.dtype == dtype
+    np.testing.assert_allclose(raw - top, by_mode, rtol=1e-4, atol=tolerance(dtype, 1e-4, 1e-9))
+    if name != "exp":  # its "mode" is the median
+        assert by_mode <= 1e-5 and abs(float(at_mode)) < 1e-5
+
+
+def test_joint_and_independent(key):
+    d = D.Joint({"a": D.Normal(0.0, 1.0), "n": D.Categorical(probs=jnp.asarray([0.1, 0.9])), "v": D.Independent(D.Normal(jnp.zeros(3), jnp.ones(3)), 1)})
+    x = D.sample(d, key)
+    assert x["v"].shape == (3,) and jnp.issubdtype(x["n"].dtype, jnp.integer)
+    parts = scipy.stats.norm.logpdf(x["a"]) + np.log([0.1, 0.9])[int(x["n"])] + scipy.stats.norm.logpdf(x["v"]).sum()
+    assert float(D.log_density(d, x)) == pytest.approx(parts, rel=1e-5)
+    top = scipy.stats.norm.logpdf(0) * 4 + np.log(0.9)
+    assert float(D.log_mode(d)) == pytest.approx(top, rel=1e-5)
+    assert float(D.log_density(d, x, "mode")) == pytest.approx(parts - top, rel=1e-4)
+    assert D.mode(d)["n"] == 1 and (D.mode(d)["v"] == 0).all()
+
+
+def test_a_distribution_of_the_users_own_need_be_no_pytree(key):
+    class Own:
+        def sample(self, seed):
+            return jax.random.normal(seed)
+
+        def log_prob(self, x):
+            return -x * x
+
+    assert D.event_like(Own()).shape == () and not D.has_mode(Own()) and not D.has_quantile(Own())
+
+
+@settings(max_examples=40, deadline=None)
+@given(loc=st.floats(-10, 10, width=32), scale=st.floats(0.125, 8, width=32), u=st.floats(0.015625, 0.984375, width=32))
+def test_normal_quantile_inverts_the_distribution_function(loc, scale, u):
+    x = D.quantile(D.Normal(jnp.float32(loc), jnp.float32(scale)), jnp.float32(u))
+    assert scipy.stats.norm.cdf(float(x), loc, scale) == pytest.approx(u, abs=1e-5)
+
+
+def test_quantiles_of_uniform_numbers_are_draws(key):
+    for name in ("tent", "bernoulli", "laplace"):
+        d, _ = supported("float32")[name]
+        u = jax.random.uniform(key, (20_000,), jnp.float32)
+        x = np.asarray(jax.jit(jax.vmap(lambda v, d=d: D.quantile(d, v)))(u), np.float64)
+        other = np.asarray(d.sample(seed=jax.random.fold_in(key, 1), sample_shape=(20_000,)), np.float64)
+        assert abs(x.mean() - other.mean()) < 4 * np.sqrt((x.var() + other.var()) / 20_000)
