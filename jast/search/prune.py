@@ -1,0 +1,117 @@
+"""Action pruning (MCFS-AP A1): the robust child becomes the root, its subtree stays, and the old root's statistics are kept for training."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast.search.records import unpack
+from jast.search.simulate import replay_to, select_lanes, step_state
+from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, child_key, node_shapes, random_start
+
+__all__ = ["Roots", "prune"]
+
+
+class Roots(NamedTuple):
+    """What is known of B roots at the end of their turn: K is the greatest number of children."""
+
+    state: Any
+    """[B, ...] the simulator's state at the root."""
+    depth: jax.Array
+    """[B] int32: levels above the root."""
+    actions: Any
+    """[B, K, ...] the disturbances x of the children."""
+    starts: Any
+    """[B, K, ...] the x0 of the children, which are the choices at depth 0 of a random start; ``()`` for a system with one start."""
+    visits: jax.Array
+    """[B, K] int32: 0 where there is no such child."""
+    q: jax.Array
+    """[B, K] float: mean reward from the root on, the child's own step included."""
+    valid: jax.Array
+    """[B] bool: the tree was searching from this root."""
+
+
+def prune(problem, axes, tree, children, memoize="node"):
+    """Make the most visited child of each root the root (ties: the first made): the tree and the old roots' `Roots`.
+
+    ``children``: the greatest number of children a node can have, static. A tree whose new root is an episode's end is at its end.
+    """
+    (lanes,) = tree.key.shape
+    root, level = tree.root, tree.depth
+    searching = tree.alive & ~tree.ended
+    state = _root_state(problem, axes, tree, memoize)
+    tree = _settle(tree)
+    rows, visits, total, child, reward = _children(tree, children)
+    q = jnp.where(visits > 0, total / jnp.maximum(visits, 1) - tree.root_reward[:, None], 0)
+
+    keys = jax.vmap(lambda slot: child_key(tree.key, root, jnp.broadcast_to(slot, (lanes,))), out_axes=1)(jnp.arange(children, dtype=jnp.int32))
+    actions, starts = jax.vmap(_draws, in_axes=(axes, 0, 0))(problem, keys, state)
+    roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
+
+    slot = jnp.argmax(visits, axis=1).astype(jnp.int32)
+    n, to, reward = (_pick(a, slot) for a in (visits, child, reward))
+    move = searching & (n > 0)
+    new = jnp.where(move, jnp.abs(to).astype(jnp.int32), root)
+    place = jnp.arange(tree.trail.shape[0], dtype=jnp.int32)[:, None]
+    edge = _pick(rows, slot // PAGE) * ROW + slot % PAGE
+    tree = tree._replace(
+        path=jnp.where(move[None] & (place[:-1] == level[None]), edge[None], tree.path),
+        trail=jnp.where(move[None] & (place == level[None] + 1), new[None], tree.trail),
+        root=new,
+        root_visits=jnp.where(move, n.astype(jnp.int32), tree.root_visits),
+        root_reward=jnp.where(move, reward, tree.root_reward),
+        depth=level + move.astype(jnp.int32),
+        alive=tree.alive & move & (to > 0),
+    )
+    if memoize == "root":
+        after = jax.vmap(step_state, in_axes=(axes, 0, 0, 0))(problem, child_key(tree.key, root, slot), level, state)
+        tree = tree._replace(base=select_lanes(move, after, state))
+    return tree, roots
+
+
+def _settle(tree):
+    """The visits and returns of this turn, added to the edges above the root: the backup of Algorithm 1 goes to the first root."""
+    place = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
+    at = jnp.where(place < tree.depth[None], tree.path, tree.edges.size)
+    places = jnp.stack([at + VISITS, at + RETURNS]).reshape(-1)
+    values = jnp.broadcast_to(tree.turn[:, None], (2, *at.shape)).reshape(-1)
+    return tree._replace(edges=tree.edges.at[places].add(values, mode="drop"), turn=jnp.zeros_like(tree.turn))
+
+
+def _children(tree, children):
+    """Of each root's children: their pages' rows [B, pages], and [B, children] visits, returns, ids and rewards; 0 where there is none."""
+    (lanes,) = tree.key.shape
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    edges = tree.edges.reshape(-1, ROW)
+
+    def page(carry, _):
+        row, there = carry
+        record = jnp.where(there[:, None], edges[row], 0)
+        link = record[:, CHILD + LINK].astype(jnp.int32)
+        return (jnp.where(link > 0, link * lanes + lane, row), there & (link > 0)), (row, record)
+
+    start = (tree.root * lanes + lane, jnp.ones((lanes,), bool))
+    _, (rows, records) = lax.scan(page, start, None, length=-(-children // PAGE))
+    columns = (records[:, :, c : c + PAGE].swapaxes(0, 1).reshape(lanes, -1)[:, :children] for c in (VISITS, RETURNS, CHILD, REWARD))
+    return rows.T, *columns
+
+
+def _root_state(problem, axes, tree, memoize):
+    if memoize == "node":
+        (lanes,) = tree.key.shape
+        like = node_shapes(tree, memoize)
+        return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
+    return tree.base if memoize == "root" else replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
+
+
+def _draws(problem, keys, state):
+    """One lane: the actions of all children of a node, as disturbances and, of a random start, as x0."""
+    dist = problem.sim.disturbance(state)
+    actions = jax.vmap(lambda key: problem.actions.draw(key, dist))(keys)
+    starts = jax.vmap(lambda key: problem.actions.draw_start(key, problem.sim.start()))(keys) if random_start(problem.sim) else ()
+    return actions, starts
+
+
+def _pick(array, index):
+    return jnp.take_along_axis(array, index[:, None], axis=1)[:, 0]

@@ -1,0 +1,83 @@
+"""What every search returns, how its episodes are counted and ranked, and its archive of failures."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast.episode import Episode
+from jast.failures import Failures
+
+__all__ = ["History", "SearchResult", "table"]
+
+
+class History(NamedTuple):
+    """How the search went, at C moments of it."""
+
+    simulations: Any
+    """[C] int: episodes simulated by each tree so far."""
+    best_reward: Any
+    """[C, trees] float: reward of each tree's best episode so far (failures before all others)."""
+    failures: Any
+    """[C] int: failing episodes so far, over all trees."""
+
+
+class SearchResult(NamedTuple):
+    """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap` all are traced arrays and ``failures`` is None."""
+
+    best: Episode
+    """The best episode: the failure of the highest reward, or the episode of the highest reward where none failed; with its states."""
+    best_reward_per_tree: Any
+    """[trees] float: reward of each tree's best episode, likewise; -inf where the simulator returned no finite number."""
+    failures: Failures | None
+    """The archive: the best distinct failures, replayed (`jast.failures`)."""
+    episodes: Any
+    """int: episodes simulated."""
+    simulator_steps: Any
+    """int: calls of ``step``; an episode that starts from a kept state costs only its new steps."""
+    first_failure: Any
+    """int: how many episodes were simulated up to and including the first that failed, or None (-1 when traced)."""
+    failing_share: Any
+    """float: share of the simulated episodes that failed. The share of the trees is ``failing_trees``."""
+    failing: Any
+    """[trees] bool: whether the tree found a failure."""
+    history: History | None
+    invalid: Any
+    """int: episodes in which the simulator, a density or the reward gave NaN or infinity; they count as no failure, with reward -inf."""
+    settings: dict | None
+    """What was asked for: method, counts, seed."""
+    roots: Any = None
+    """Of trees: the statistics of every root, for training (`jast.search.tree.Roots`, one for each prune)."""
+
+    @property
+    def failing_trees(self):
+        """Share of the trees that found a failure: the rate of Table 1 of the MCFS-AP paper."""
+        return self.failing.mean()
+
+    def __str__(self):
+        return table({(self.settings or {}).get("method", "search"): self}) + "\n" + _words(self)
+
+
+def table(results):
+    """A readable table of several searches, a dict name -> `SearchResult`."""
+    lines = [f"{'method':14} {'episodes':>10} {'steps':>12} {'failing':>9} {'trees':>7} {'first':>9} {'best reward':>12} {'mean best':>10}"]
+    for name, r in results.items():
+        first = "-" if r.first_failure is None else str(r.first_failure)
+        best = np.asarray(r.best_reward_per_tree)
+        lines.append(
+            f"{name:14} {r.episodes:10d} {r.simulator_steps:12d} {100 * r.failing_share:8.3f}% {100 * r.failing_trees:6.1f}% {first:>9} "
+            f"{float(r.best.reward):12.4f} {best[np.isfinite(best)].mean() if np.isfinite(best).any() else -np.inf:10.4f}"
+        )
+    return "\n".join(lines)
+
+
+def _words(result):
+    if bool(result.best.failure):
+        e = result.best
+        text = f"likeliest failure: reward {float(e.reward):.4f}, log p {float(e.log_prob):.4f}, distance {float(e.distance):.4f}, {int(e.length)} steps"
+    else:
+        text = f"no failure was found; the nearest episode came to distance {float(result.best.distance):.4f}"
+    if result.invalid:
+        text += f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward returned NaN or infinity"
+    note = (result.settings or {}).get("interrupted")
+    return text + (f"\ninterrupted: {note}" if note else "")
+

@@ -1,0 +1,145 @@
+"""One simulation in every tree: select, expand, roll out, back up."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast.episode import Progress, accumulator
+from jast.search.records import pack, unpack
+from jast.search.select import select
+from jast.search.tree import CHILD, FAILURE, FRESH, INVALID, LINK, PAGE, RAN, RETURNS, REWARD, ROW, VISITS, Node, child_key, levels, node_shapes, transition
+
+__all__ = ["grow", "replay_to", "select_lanes", "step_state"]
+
+
+def grow(problem, axes, tree, begin_at, end_at, memoize="node"):
+    """Run simulations ``begin_at`` .. ``end_at - 1`` in every tree (traced: one program for any number); none where all trees are at their end."""
+    end_at = jnp.where(jnp.any(tree.alive), end_at, begin_at)
+    return lax.fori_loop(begin_at, end_at, lambda i, tree: _simulation(problem, axes, tree, i, memoize), tree)
+
+
+def _simulation(problem, axes, tree, i, memoize):
+    lanes = tree.key.shape[0]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    walk = select(problem.settings, tree)
+    fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
+    move = jax.vmap(transition, in_axes=(axes, 0, 0, 0))
+    nothing = jnp.zeros((lanes,), bool)
+    zero = jnp.zeros((lanes,), tree.edges.dtype)
+
+    def expand():
+        """The new child of each tree; and the node it is a child of, or the episode's end that selection ran into."""
+        at = jnp.where(fresh, walk.node, -walk.best.child)
+        desk = lax.dynamic_update_slice_in_dim(tree.desk, tree.nodes[at, lane][None], i % 2, 0)
+        like = node_shapes(tree, memoize)
+        node = jax.vmap(lambda w: unpack(w, like))(lax.dynamic_index_in_dim(desk, i % 2, keepdims=False))
+        state, replayed = (node.state, jnp.zeros_like(at)) if memoize == "node" else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
+        before = Progress(state, zero, walk.reward, node.distance, nothing, nothing, nothing)
+        child = move(problem, child_key(tree.key, walk.node, walk.best.slot), walk.depth, before)
+        return desk, child._replace(log_prob=zero), replayed, node.reward, node.failure, node.invalid
+
+    # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA copies the tree
+    nobody = lambda: (tree.desk, *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:]))
+    desk, child, replayed, known_reward, known_failure, known_invalid = lax.cond(jnp.any(tree.alive), expand, nobody)
+
+    # roll out; lanes that have ended step on, and only what is summed up is masked
+    key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(tree.key, i)
+
+    def roll(carry):
+        level, steps, at = carry
+        live = ~at.done
+        after = move(problem, jax.vmap(jax.random.fold_in)(key, level), level, at)
+        kept = Progress(after.state, *(jnp.where(live, b, a) for a, b in zip(at[1:], after[1:], strict=True)))
+        return level + 1, steps + _one(live), kept._replace(log_prob=zero)
+
+    steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))  # a random start is a level, but no step
+    _, steps, end = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, (walk.depth + 1, steps, child._replace(done=child.done | ~fresh)))
+
+    value = jnp.where(fresh, end.reward, known_reward)
+    finite = jnp.isfinite(value)
+    worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
+    backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
+    first = tree.ended & tree.alive
+    failed, invalid = jnp.where(fresh, end.failure, known_failure), jnp.where(fresh, end.invalid, known_invalid)
+    bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
+    bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
+    kept = Node(walk.node, walk.best.slot, child.reward, child.distance, child.failure, child.invalid, child.state if memoize == "node" else ())
+    return tree._replace(
+        edges=_back_up(tree, walk, fresh, child, backed, i + 1),
+        nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
+        desk=desk,
+        pages=tree.pages + _one(fresh & _fills(walk)),
+        root_visits=tree.root_visits + _one(tree.alive),
+        turn=tree.turn + jnp.where(tree.alive, jnp.stack([jnp.ones_like(backed), backed]), 0),
+        worst=worst,
+        steps=tree.steps + steps + jnp.where(fresh, replayed, 0),
+        log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
+        outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
+        alive=tree.alive & ~tree.ended,
+    )
+
+
+def _back_up(tree, walk, fresh, child, value, new):
+    """The edges with one more visit and return along each path, and the new children in their slots."""
+    lanes = value.shape[0]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    nowhere = tree.edges.size
+
+    def level(carry):
+        d, edges = carry
+        at = jnp.where((d >= tree.depth) & (d < walk.depth + _one(tree.alive & ~tree.ended)), walk.path[d], nowhere)
+        places, values = jnp.concatenate([at + VISITS, at + RETURNS]), jnp.concatenate([jnp.ones_like(value), value])
+        return d + 1, edges.at[places].add(values, mode="drop")
+
+    deepest = jnp.max(jnp.where(tree.alive, walk.depth, -1))
+    _, edges = lax.while_loop(lambda c: c[0] <= deepest, level, (jnp.min(tree.depth), tree.edges))
+    ids = jnp.where(child.done, -new, new).astype(edges.dtype)
+    slot = jnp.where(fresh, walk.best.edge, nowhere)
+    link = jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + CHILD + LINK, nowhere)  # the page is full now: another goes on
+    places = jnp.concatenate([slot + CHILD, slot + REWARD, link])
+    return edges.at[places].set(jnp.concatenate([ids, child.reward, tree.pages.astype(edges.dtype)]), mode="drop")
+
+
+def _fills(walk):
+    """Whether the chosen slot is the last of its page."""
+    return walk.best.edge % ROW == PAGE - 1
+
+
+def replay_to(problem, axes, tree, trail, depth, memoize):
+    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept, and the simulator steps that it took to get there."""
+    (lanes,) = tree.key.shape
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+    like = node_shapes(tree, memoize)
+    first = tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
+    move = jax.vmap(step_state, in_axes=(axes, 0, 0, 0))
+    running = tree.alive & ~tree.ended
+
+    def body(carry):
+        level, state = carry
+        node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
+        live = running & (level < depth)
+        after = move(problem, child_key(tree.key, node.parent, node.slot), level, state)
+        return level + _one(live), select_lanes(live, after, state)
+
+    _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, tree.base))
+    chosen = levels(problem.sim) - problem.sim.horizon  # a random start is a level, but no step
+    return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
+
+
+def step_state(problem, key, level, state):
+    """One lane: the state that the action of this key leads to."""
+    zero, nothing = jnp.zeros((), accumulator(problem.sim)), jnp.zeros((), bool)
+    return transition(problem, key, level, Progress(state, zero, zero, zero, nothing, nothing, nothing)).state
+
+
+def select_lanes(pred, a, b):
+    """Leaves [B, ...] of ``a`` where ``pred`` [B], else of ``b``."""
+    return jax.tree.map(lambda x, y: jnp.where(pred.reshape(-1, *(1,) * (x.ndim - 1)), x, y), a, b)
+
+
+def _one(pred):
+    return pred.astype(jnp.int32)
+
+
+def _bit(pred, bit):
+    return jnp.where(pred, bit, 0).astype(jnp.uint8)
