@@ -13,9 +13,8 @@ from jast import distributions as D
 from jast import rewards
 from jast.policy import nominal_policy
 
-__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "replay", "rollout"]
+__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "play_back", "replay", "rollout"]
 
-STANDARD = rewards.standard()
 
 
 class Episode(NamedTuple):
@@ -107,7 +106,7 @@ def _arrive(sim, reward, before, state, log_p, last, approach):
     )
 
 
-def rollout(key, sim, policy=None, reward=STANDARD):
+def rollout(key, sim, policy=None, reward=rewards.STANDARD):
     """Simulate one episode: `Episode`. ``jax.vmap`` over keys, simulators or policies gives many; differentiable in the simulator's and policy's parameters.
 
     ``policy`` chooses the disturbances (default: the simulator's own model, the nominal system), ``reward`` scores them. The key is consumed. An episode in
@@ -119,7 +118,7 @@ def rollout(key, sim, policy=None, reward=STANDARD):
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(episode)):
         return episode
     # a draw that is fused into the step is not rounded to what is recorded (a multiply-add), so the recording is played
-    return _replay(sim, reward, episode.x0, episode.disturbances, episode.length)
+    return play_back(sim, reward, episode.x0, episode.disturbances, episode.length)
 
 
 @jax.jit
@@ -131,7 +130,7 @@ def _rollout(key, sim, policy, reward):
     return _play(sim, reward, x0, lambda state, t, key: D.sample(policy.disturbance(state, t), key), keys[1:], sim.horizon)
 
 
-def replay(sim, episode, x0=None, reward=STANDARD):
+def replay(sim, episode, x0=None, reward=rewards.STANDARD):
     """Run recorded disturbances again: `Episode` with its states. Exact: the same input gives the same bits.
 
     ``episode`` is an `Episode`, or its disturbances [T, ...] with T <= horizon (a pytree where x is one) and, for a system with a random start, ``x0``.
@@ -150,11 +149,12 @@ def replay(sim, episode, x0=None, reward=STANDARD):
         raise ValueError(f"replay: disturbances must have between 0 and {sim.horizon} rows (the horizon), received {jax.tree.map(jnp.shape, disturbances)}")
     disturbances = _fitted("disturbances", disturbances, jax.tree.map(lambda s: jax.ShapeDtypeStruct((steps, *s.shape), s.dtype), like))
     steps = jnp.asarray(steps if length is None else length, jnp.int32)
-    return _replay(sim, rewards.as_pytree(reward), x0, _pad(disturbances, sim.horizon), steps)
+    return play_back(sim, rewards.as_pytree(reward), x0, _pad(disturbances, sim.horizon), steps)
 
 
 @jax.jit
-def _replay(sim, reward, x0, disturbances, steps):
+def play_back(sim, reward, x0, disturbances, steps):
+    """`replay` without its checks: ``disturbances`` [horizon, ...], of which at most ``steps`` rows are played; may be vmapped."""
     return _play(sim, reward, x0, lambda state, t, x: x, disturbances, steps)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from jast.episode import Episode, _shapes, accumulator, replay
 
-__all__ = ["Failures", "collect", "empty", "load", "merge", "save"]
+__all__ = ["Failures", "collect", "empty", "identity", "load", "merge", "save"]
 
 FORMAT, VERSION = "jast failures", 1
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")
@@ -100,7 +100,7 @@ def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64
     rows, dropped, known = [], 0, {}  # known: bytes of a candidate -> its row, None where it was dropped
     for i in failing:
         candidate = _take(episodes, i)
-        name = _identity(candidate)
+        name = identity(candidate)
         if name not in known:
             replayed = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
             known[name] = len(rows) if replayed.failure else None
@@ -220,7 +220,7 @@ def _numbers(name, values, m):
     return values.astype(np.int32)
 
 
-def _identity(episode):
+def identity(episode):
     """What makes two failures one: the bytes of x0 and of the disturbances that were used."""
     leaves = jax.tree.leaves(episode.x0) + [a[: int(episode.length)] for a in jax.tree.leaves(episode.disturbances)]
     return int(episode.length), *(np.ascontiguousarray(a).tobytes() for a in leaves)
@@ -234,7 +234,7 @@ def _best(caller, failures, top):
     order = np.lexsort((failures.tree, failures.simulation, -failures.episodes.reward))
     groups = {}
     for i in order:
-        groups.setdefault(_identity(_take(failures.episodes, i)), []).append(i)
+        groups.setdefault(identity(_take(failures.episodes, i)), []).append(i)
     groups = list(groups.values())[:top]
     kept = np.array([found[0] for found in groups], np.int64)
     first = np.array([min(found, key=lambda i: (failures.simulation[i], failures.tree[i])) for found in groups], np.int64)

@@ -107,3 +107,6 @@ def _checked(name, density):
 
 def _like(value, log_p):
     return jnp.asarray(value, jnp.result_type(log_p))
+
+
+STANDARD = standard()

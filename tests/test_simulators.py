@@ -8,7 +8,7 @@ import scipy.stats
 from jax.tree_util import Partial
 
 import jast
-from jast.episode import _replay, _rollout
+from jast.episode import play_back, _rollout
 from jast.simulators import ferry, landing, landing_probability, limit_state, walk1d
 
 
@@ -197,7 +197,7 @@ def shifted(level, x):
 def test_a_second_instance_does_not_recompile(first, second, key):
     play = lambda sim: jast.rollout(key, sim)
     play(first())
-    before = _rollout._cache_size(), _replay._cache_size()
+    before = _rollout._cache_size(), play_back._cache_size()
     play(second())
-    assert (_rollout._cache_size(), _replay._cache_size()) == before
+    assert (_rollout._cache_size(), play_back._cache_size()) == before
     assert jax.tree.structure(first()) == jax.tree.structure(second())

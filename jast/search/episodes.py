@@ -1,0 +1,267 @@
+"""What searches over independent episodes share: lanes in lockstep, counting, the best distinct episodes, the loop on the host and its result.
+
+Episode n of tree k draws the disturbance of level t with the key folded from (tree key k, n, t); the start, where it is random, is level 0. So an episode
+is known by its number, whatever the chunks it was simulated in.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import distributions as D
+from jast import failures as archive
+from jast import rewards
+from jast.check import ACTIONS, contract
+from jast.episode import Episode, advance, begin, replay
+from jast.search.records import pack
+from jast.search.result import History, SearchResult
+
+__all__ = ["Played", "Tally", "distinct", "drive", "finish", "is_traced", "play", "prepare", "random_start", "tally", "whole"]
+
+
+class Played(NamedTuple):
+    """Simulated episodes, one a lane."""
+
+    episode: Episode
+    """Leading axis [lanes]; ``disturbances`` [lanes, horizon, ...], or None where they were not recorded."""
+    invalid: Any
+    """[lanes] bool: the reward is not finite, as the simulator, a density or the reward was not; no failure then, reward -inf."""
+    tag: Any
+    """[lanes] uint32: a hash of x0 and the disturbances, to tell repetitions."""
+
+
+class Tally(NamedTuple):
+    """Counts of the episodes of a chunk: int32 scalars, but for ``failing``."""
+
+    episodes: Any
+    steps: Any
+    failures: Any
+    invalid: Any
+    first: Any
+    """How many episodes of the search were simulated up to and including its first failing one; ``NEVER`` where none of these failed."""
+    failing: Any
+    """[trees] bool: whether the tree found a failure."""
+
+
+NEVER = np.int32(2**31 - 1)
+
+
+def play(sim, reward, at, draw_start, draw, live, record=False):
+    """Simulate one episode a lane, all lanes a step at a time: `Played`.
+
+    ``at(level)``: what the lanes' draws at a level depend on, with leading axis [lanes]; ``draw_start(one, dist)`` and ``draw(one, dist)`` make of one lane's
+    part of it x0 or x. Lanes that are not ``live`` [lanes] bool come back as episodes of length 0 and mean nothing. Ended lanes step on, and only what is
+    summed up is masked.
+    """
+    start = int(random_start(sim))
+
+    def first(one):
+        x0 = draw_start(one, sim.start()) if start else ()
+        progress = begin(sim, reward, x0)
+        return x0, progress, _fold(jnp.uint32(0x9E3779B9), x0)
+
+    def move(one, progress, tag, last):
+        x = draw(one, sim.disturbance(progress.state))
+        return x, advance(sim, reward, progress, x, last), _fold(tag, x)
+
+    x0, progress, tag = jax.vmap(first)(at(0)) if start else jax.vmap(lambda _: first(None))(live)
+    rows = None
+    if record:
+        like = jax.eval_shape(lambda p: jax.vmap(move, (0, 0, 0, None))(at(start), p, tag, False)[0], progress)
+        rows = jax.tree.map(lambda s: jnp.zeros((sim.horizon, *s.shape), s.dtype), like)
+
+    def step(carry):
+        t, length, tag, rows, before = carry
+        on = ~before.done
+        x, after, folded = jax.vmap(move, (0, 0, 0, None))(at(t + start), before, tag, t + 1 >= sim.horizon)
+        kept = after._replace(**{name: jnp.where(on, getattr(after, name), getattr(before, name)) for name in before._fields[1:]})
+        if record:
+            rows = jax.tree.map(lambda a, b: a.at[t].set(jnp.where(_to_rank(on, b), b, jnp.zeros((), b.dtype))), rows, x)
+        return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), rows, kept
+
+    carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, rows, progress._replace(done=progress.done | ~live)
+    _, length, tag, rows, end = lax.while_loop(lambda c: jnp.any(~c[4].done), step, carry)
+    finite = jnp.isfinite(end.reward)
+    rows = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), rows)
+    value = jnp.where(finite, end.reward, -jnp.inf)
+    return Played(Episode(x0, rows, end.log_prob, end.distance, end.failure & finite, length, value), ~finite, tag)
+
+
+def tally(played, live, order, tree=None, trees=1):
+    """The `Tally` of the ``live`` lanes of ``played``; ``order`` [lanes]: each one's place in the search, from 0; ``tree`` [lanes] of ``trees``, default 0."""
+    e = played.episode
+    count = lambda p: jnp.sum(p & live, dtype=jnp.int32)
+    failing = e.failure & live
+    of_tree = jnp.any(failing)[None] if tree is None else jnp.zeros((trees,), bool).at[tree].max(failing)
+    steps = jnp.sum(jnp.where(live, e.length, 0), dtype=jnp.int32)
+    first = jnp.min(jnp.where(failing, order + 1, NEVER))
+    return Tally(count(live), steps, count(e.failure), count(played.invalid), first, of_tree)
+
+
+def add(a, b):
+    """Two tallies as one."""
+    return Tally(*(x + y for x, y in zip(a[:4], b[:4], strict=True)), jnp.minimum(a.first, b.first), a.failing | b.failing)
+
+
+def nothing(trees=1):
+    """The `Tally` of no episode."""
+    zero = jnp.zeros((), jnp.int32)
+    return Tally(zero, zero, zero, zero, jnp.asarray(NEVER), jnp.zeros((trees,), bool))
+
+
+def distinct(failure, reward, tag, number, count, k):
+    """The k best distinct of n episodes: (their places [k], n where there are no more; their counts [k]).
+
+    Failures before the others, then by falling reward; those of a reward that is not finite never. Equal reward and tag is a repetition, of which the least
+    ``number`` stands for all, with their ``count`` added.
+    """
+    (n,) = reward.shape
+    group = jnp.where(jnp.isfinite(reward), jnp.where(failure, 0, 1), 2)
+    group, value, tag, _, place, count = lax.sort((group, -reward, tag, number, jnp.arange(n, dtype=jnp.int32), count), num_keys=4)
+    differs = [a[1:] != a[:-1] for a in (group, value, tag)]
+    new = jnp.concatenate([jnp.ones((1,), bool), differs[0] | differs[1] | differs[2]])
+    to = jnp.where(group < 2, jnp.cumsum(new, dtype=jnp.int32) - 1, k)
+    places = jnp.full((k,), n, jnp.int32).at[jnp.where(new, to, k)].set(place, mode="drop")
+    return places, jnp.zeros((k,), jnp.int32).at[to].add(count, mode="drop")
+
+
+def random_start(sim):
+    """Whether x0 is more than the empty disturbance."""
+    return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
+
+
+def is_traced(*trees):
+    """Whether inputs are traced, or everything is."""
+    leaves = [*jax.tree.leaves(trees), jnp.zeros(()) + 0]
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+def whole(function, **values):
+    """The values as Python ints; ValueError naming the setting unless each is a whole number from 1 to 2^31 - 1."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value < 2**31:
+            raise ValueError(f"{function}: {name} must be a whole number from 1 to 2^31 - 1, received {value!r}")
+    return [int(v) for v in values.values()]
+
+
+def prepare(function, key, sim, reward, actions, **settings):
+    """``(reward, settings)`` as the search takes them, once `contract` holds: the reward as a pytree, the settings with names and seed (None if traced)."""
+    contract(sim, actions, observed=False)
+    reward = rewards.as_pytree(reward)
+    if is_traced(key, sim, reward, actions, settings):
+        return reward, None
+    seed = key if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else jax.random.key_data(key)
+    func = getattr(reward, "func", reward)
+    name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
+    settings = jax.tree.map(lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist(), settings)
+    return reward, dict(method=function, **settings, seed=np.asarray(seed).tolist(), reward=name, actions=ACTIONS.get(type(actions), type(actions).__name__))
+
+
+class Log(NamedTuple):
+    """What the host knows of a search: exact counts, as Python ints."""
+
+    tally: Tally
+    history: History
+    done: int
+    """Episodes of each tree."""
+    interrupted: str | None
+
+
+def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None):
+    """``(carry, Log)`` after ``carry, tally, best [trees] = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
+
+    ``callback(step, info)`` after each chunk: its number from 0, and a dict of ``episodes``, ``failures`` and ``best_reward``. A KeyboardInterrupt ends the
+    search after the last whole chunk, and is raised again where there is none.
+    """
+    total, done, moments, interrupted, bar = None, 0, [], None, None
+    if progress:
+        from tqdm import tqdm  # slow to import
+
+        bar = tqdm(total=ends[-1] * trees, unit="episode", unit_scale=True)
+    try:
+        for step, end in enumerate(ends):
+            reached, counted, best = jax.block_until_ready(chunk(carry, done, end))
+            counted, best = jax.device_get((counted, best))
+            # Python's ints do not overflow
+            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
+            total = counted if total is None else _sum(total, counted)
+            carry, done = reached, end
+            moments.append((done, best, total.failures))
+            if bar is not None:
+                bar.update(counted.episodes)
+                bar.set_postfix(failures=total.failures, best=f"{best.max():.4g}")
+            if callback is not None:
+                callback(step, dict(episodes=total.episodes, failures=total.failures, best_reward=float(best.max())))
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        interrupted = f"after {done * trees} of {ends[-1] * trees} episodes"
+    finally:
+        if bar is not None:
+            bar.close()
+    simulations, best, failures = (np.array(v) for v in zip(*moments, strict=True))
+    return carry, Log(total, History(simulations, best, failures), done, interrupted)
+
+
+def finish(sim, reward, log, best, candidates, tree, simulation, counts, settings, top):
+    """The `SearchResult` on the host.
+
+    ``best``: the best episode that was simulated; ``candidates``: episodes [m] that failed, with the tree and number at which each was first found and how
+    often. All are replayed, and what is said of them is what the replay says.
+    """
+    candidates = jax.device_get(candidates)
+    candidates = candidates._replace(failure=np.ones(len(simulation), bool))  # so that one that no longer fails is counted as dropped
+    found = archive.collect(sim, reward, candidates, tree, simulation, log.tally.failures, top)
+    times = {place: int(n) for *place, n in ()} | {(int(k), int(i)): int(n) for k, i, n in zip(tree, simulation, counts, strict=True)}
+    found = found._replace(counts=np.array([times[int(k), int(i)] for k, i in zip(found.tree, found.simulation, strict=True)], np.int32))
+    best = jax.device_get(replay(sim, found.best if found.size else best, reward=reward))
+    n = log.tally
+    return SearchResult(
+        best=best,
+        best_reward_per_tree=log.history.best_reward[-1],
+        failures=found,
+        episodes=n.episodes,
+        simulator_steps=n.steps,
+        first_failure=None if n.first == NEVER else n.first,
+        failing_share=n.failures / n.episodes,
+        failing=n.failing,
+        history=log.history,
+        invalid=n.invalid,
+        settings=settings | ({"interrupted": log.interrupted} if log.interrupted else {}),
+    )
+
+
+def finish_traced(sim, reward, n, best, best_reward):
+    """The `SearchResult` inside a transformation: no archive and no history."""
+    return SearchResult(
+        best=replay(sim, best, reward=reward),
+        best_reward_per_tree=best_reward,
+        failures=None,
+        episodes=n.episodes,
+        simulator_steps=n.steps,
+        first_failure=jnp.where(n.first == NEVER, -1, n.first),
+        failing_share=n.failures.astype(best_reward.dtype) / n.episodes.astype(best_reward.dtype),
+        failing=n.failing,
+        history=None,
+        invalid=n.invalid,
+        settings=None,
+    )
+
+
+def _sum(a, b):
+    return Tally(*(x + y for x, y in zip(a[:4], b[:4], strict=True)), min(a.first, b.first), a.failing | b.failing)
+
+
+def _fold(tag, x):
+    """The hash with the bits of one more disturbance: a multiply and a shift a word, as it is paid at every step."""
+    for word in pack(x) if jax.tree.leaves(x) else ():
+        tag = (tag ^ word) * jnp.uint32(0x85EBCA6B)
+        tag = tag ^ (tag >> 15)
+    return tag
+
+
+def _to_rank(pred, like):
+    return pred.reshape(pred.shape + (1,) * (like.ndim - pred.ndim))

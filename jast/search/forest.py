@@ -1,0 +1,230 @@
+"""Monte Carlo forest search with action pruning: MCFS-AP of Lytskjold and Mengshoel, Algorithm 1."""
+
+import os
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import actions as A
+from jast import rewards
+from jast.check import contract
+from jast.counter import tree_keys
+from jast.episode import Episode, replay
+from jast.failures import collect, identity
+from jast.search import memory
+from jast.search.result import History, SearchResult
+from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
+from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, widths
+
+__all__ = ["WIDENING", "forest"]
+
+SAMPLES = A.samples()
+WIDENING = {"default": (2.0, 0.5), "paper": (0.5, 0.6)}
+LANES = 128  # trees in lockstep in one thread: enough to fill vector units, few enough to stay near the processor
+
+
+def forest(
+    key, sim, *, trees=200, prunes=18, simulations=500, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, widening=None, mode="default",
+    memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
+):  # fmt: skip
+    """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
+
+    A simulation walks down from the root by eq. 3, Q(s, a) + ``exploration`` sqrt(ln N(s) / (1 + N(s, a))), where a node has at most k N^alpha + 1
+    children, ``widening`` = (k, alpha), alpha in [0, 1]; takes a child never visited, rolls out at random to the episode's end, and backs its reward up as a
+    mean. After ``simulations`` of them the most visited child becomes the root and keeps its subtree; a tree ends early when its root is an episode's end.
+
+    ``mode="paper"`` has the published widening (0.5, 0.6), ``"default"`` the better-tuned (2, 0.5); a ``widening`` of your own overrides both. ``actions`` and
+    ``reward``: `jast.actions`, `jast.rewards`. ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same
+    trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``: failures kept in the archive.
+
+    Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither changes a result. ``available``: bytes that the trees in
+    flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.
+    A KeyboardInterrupt ends the search with an honest result of what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
+
+    Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
+    """
+    return search(
+        "forest", key, sim, trees=trees, prunes=prunes, simulations=simulations, reward=reward, actions=actions, exploration=exploration,
+        widening=_widening("forest", mode, widening, WIDENING), mode=mode, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
+        progress=progress, callback=callback,
+    )  # fmt: skip
+
+
+def search(method, key, sim, *, trees, prunes, simulations, reward, actions, exploration, widening, mode, memoize, top, threads, lanes, available, progress, callback):
+    """A forest by its settings, all given: what `forest` and `mcts` call."""
+    for name, value in dict(trees=trees, prunes=prunes, simulations=simulations, top=top, threads=threads or 1, lanes=lanes or 1).items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{method}: {name} must be an int of at least 1, received {value!r}")
+    if memoize not in ("auto", "node", "root", "none"):
+        raise ValueError(f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}')
+    reward = rewards.as_pytree(reward)
+    contract(sim, actions, observed=False)
+    prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
+    total = prunes * simulations
+    if total >= 2**24:
+        raise ValueError(f"{method}: prunes * simulations must be below 2**24, received {prunes} * {simulations}: grow more trees instead")
+    table = widths(total, *widening)
+    problem = jax.tree.map(jnp.asarray, Problem(sim, reward, actions, Settings(jnp.asarray(exploration, jnp.float32), table)))
+    children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
+    plan = Plan(int(prunes), int(simulations), min(children, 4096), "node" if memoize == "auto" else memoize)
+    settings = dict(
+        method=method, mode=mode, trees=int(trees), prunes=int(prunes), simulations=int(simulations), reward=_name(reward), actions=_name(actions), memoize=memoize,
+    )  # fmt: skip
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, key))):
+        return _traced(grow_traced(problem, tree_keys(key, trees), plan), trees)
+    settings |= dict(exploration=float(exploration), widening=[float(v) for v in widening], seed=np.asarray(_data(key)).tolist())
+    plan, threads, lanes = _fit(method, problem, plan, trees, threads, lanes, available, auto=memoize == "auto")
+    settings["memoize"] = plan.memoize
+    if progress:
+        from tqdm import tqdm
+    bar = tqdm(total=trees * total, unit="sim", unit_scale=True, desc=method) if progress else None
+    done = [0]
+
+    def on_chunk(n):
+        done[0] += n
+        if bar is not None:
+            bar.update(n)
+        if callback is not None:
+            callback(done[0], trees * total)
+
+    chunk = max(1, min(simulations, 500))
+    harvests, interrupted = grow_all(problem, tree_keys(key, trees), plan, threads=threads, lanes=lanes, chunk=chunk, candidates=max(256, 4 * top), on_chunk=on_chunk)
+    if bar is not None:
+        bar.close()
+    if interrupted:
+        settings["interrupted"] = f"after {done[0]} of {trees * total} simulations"
+    if not harvests:
+        raise KeyboardInterrupt
+    return _result(sim, reward, harvests, settings, top)
+
+
+def _fit(method, problem, plan, trees, threads, lanes, available, auto):
+    """The plan with its memoization settled, and the threads and lanes with which it fits into memory; ValueError if it does not."""
+    if threads is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = max(1, min(cores, trees // 8)) if jax.default_backend() == "cpu" else 1
+    given, free = lanes, memory.available() if available is None else available
+    if lanes is None:
+        rounds = -(-trees // (threads * LANES))
+        lanes = -(-trees // (threads * rounds)) if jax.default_backend() == "cpu" else trees
+    lanes = min(lanes, trees)
+    threads = min(threads, -(-trees // lanes))
+    for memoize in (["node", "root"] if auto else [plan.memoize]):
+        plan = plan._replace(memoize=memoize)
+        one = bytes_per_tree(problem, plan)
+        within = lanes if free is None else int(0.8 * free // (one * threads))
+        if within >= (lanes if given or memoize == "node" and auto and lanes <= 8 else min(lanes, 8)) or (within >= 1 and memoize != "node" and not given):
+            break
+    if free is not None and (within < 1 or (given and within < lanes)):
+        raise ValueError(
+            f"{method}: {lanes} trees in each of {threads} threads take {memory.readable(one * lanes * threads)} ({memory.readable(one)} a tree of "
+            f"{plan.prunes} x {plan.simulations} simulations, memoize={plan.memoize!r}), {memory.readable(free)} are free; use fewer lanes, threads or simulations"
+        )
+    if auto and plan.memoize == "root":
+        warnings.warn(f'{method}: states at every node do not fit into memory, so they are kept at roots: memoize="root"', stacklevel=4)
+    return plan, threads, max(1, min(lanes, within))
+
+
+def _result(sim, reward, harvests, settings, top):
+    log, outcome = (np.concatenate(parts, axis=1) for parts in (_rows([h.log for h in harvests]), _rows([h.outcome for h in harvests])))
+    has = lambda bit: (outcome & bit) > 0
+    ran, failed = has(RAN), has(FAILURE)
+    order = (failed & ran).reshape(-1)
+    episodes = int(ran.sum())
+    first = int(ran.reshape(-1)[: order.argmax() + 1].sum()) if order.any() else None
+    fresh_failure = failed & has(FRESH)
+    value = np.where(ran, log, -np.inf)
+    per_tree = np.where(fresh_failure.any(0), np.where(fresh_failure, value, -np.inf).max(0), value.max(0))
+    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(h.found for h in harvests))
+    tree, simulation = (np.concatenate([getattr(h, f) for h in harvests]) for f in ("tree", "simulation"))
+    chosen = _distinct(found, tree, simulation, top)
+    archive = collect(sim, reward, _take(found, chosen), tree[chosen], simulation[chosen], seen=int(failed.sum()), top=top)
+    best = archive.best
+    if best is None:
+        ahead = np.argmax(np.where(found.failure, -np.inf, found.reward)) if not found.failure.all() else 0
+        best = _take(found, ahead)
+    roots = None
+    if harvests[0].roots is not None:
+        turns = min(h.roots.depth.shape[0] for h in harvests)
+        roots = jax.tree.map(lambda *parts: np.concatenate([p[:turns] for p in parts], axis=1), *(h.roots for h in harvests))
+    return SearchResult(
+        best=jax.device_get(replay(sim, best, reward=reward)),
+        best_reward_per_tree=per_tree,
+        failures=archive,
+        episodes=episodes,
+        simulator_steps=int(sum(h.steps.astype(np.int64).sum() for h in harvests)),
+        first_failure=first,
+        failing_share=float(failed.sum() / max(episodes, 1)),
+        failing=fresh_failure.any(0),
+        history=_history(value, fresh_failure, failed),
+        invalid=int(has(INVALID).sum()),
+        settings=settings,
+        roots=roots,
+    )
+
+
+def _distinct(found, tree, simulation, top):
+    """Candidates worth a replay: failures by falling reward, up to a few more distinct ones than the archive holds."""
+    names, chosen, seen = set(), [], set()
+    for i in np.argsort(-found.reward, kind="stable"):
+        if not found.failure[i] or (tree[i], simulation[i]) in seen:
+            continue
+        seen.add((tree[i], simulation[i]))
+        names.add(identity(_take(found, i)))
+        if len(names) > top + 8:
+            break
+        chosen.append(i)
+    return np.array(chosen, np.int64)
+
+
+def _history(value, failure, failed):
+    moments = np.unique(np.linspace(1, value.shape[0], min(value.shape[0], 200)).astype(int))
+    best = np.maximum.accumulate(value, axis=0)[moments - 1]
+    best_failure = np.maximum.accumulate(np.where(failure, value, -np.inf), axis=0)[moments - 1]
+    best = np.where(np.maximum.accumulate(failure, axis=0)[moments - 1], best_failure, best)
+    return History(moments, best, np.cumsum(failed.sum(1))[moments - 1])
+
+
+def _traced(found, trees):
+    """`SearchResult` of traced arrays."""
+    steps = found.first.shape[0]
+    failing = found.best.failure
+    score = jnp.where(jnp.any(failing), jnp.where(failing, found.best.reward, -jnp.inf), found.best.reward)
+    episodes = jnp.sum(found.episodes)
+    first = jnp.where(jnp.any(found.failures > 0), jnp.min(found.first) * steps + jnp.argmin(found.first) + 1, -1)
+    return SearchResult(
+        jax.tree.map(lambda a: a[jnp.argmax(score)], found.best), found.best.reward, None, episodes, jnp.sum(found.steps), first,
+        jnp.sum(found.failures) / jnp.maximum(episodes, 1), failing, None, jnp.sum(found.invalid), None,
+    )  # fmt: skip
+
+
+def _widening(method, mode, widening, modes):
+    if mode not in modes:
+        raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
+    if widening is None:
+        return modes[mode]
+    if not isinstance(widening, tuple | list) or len(widening) != 2:
+        raise ValueError(f"{method}: widening must be a pair (k, alpha), received {widening!r}")
+    k, alpha = widening
+    if not any(isinstance(v, jax.core.Tracer) for v in widening) and not (k > 0 and 0 <= alpha <= 1):
+        raise ValueError(f"{method}: widening must have k > 0 and 0 <= alpha <= 1, received {widening!r}")
+    return k, alpha
+
+
+def _rows(parts):
+    """Interrupted groups may have fewer rows that ran, never fewer rows."""
+    return parts
+
+
+def _take(episodes, i):
+    return Episode(*jax.tree.map(lambda a: a[i], tuple(episodes[:-1])))
+
+
+def _name(thing):
+    return getattr(getattr(thing, "func", None), "__name__", type(thing).__name__.lower())
+
+
+def _data(key):
+    return jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key

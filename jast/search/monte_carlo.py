@@ -1,0 +1,129 @@
+"""Random search: independent episodes and nothing learned from any. The baseline of every other search."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast import actions as choices
+from jast import rewards
+from jast.counter import tree_keys
+from jast.episode import accumulator
+from jast.search import episodes as E
+
+__all__ = ["monte_carlo"]
+
+LANES = 4096
+MOMENTS = 200
+"""Of the history, about: a moment is at least a block of ``LANES`` episodes."""
+
+
+class Found(NamedTuple):
+    """The best so far: one episode of all, and the top distinct failures, by their numbers."""
+
+    failure: Any
+    reward: Any
+    number: Any
+    top_reward: Any
+    """[top], falling; -inf where there are fewer."""
+    top_number: Any
+    top_tag: Any
+    top_count: Any
+
+
+def monte_carlo(
+    key, sim, *, episodes=100_000, reward=rewards.standard(), actions=choices.samples(), top=64, progress=False, callback=None  # noqa: B008
+):  # fmt: skip
+    """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree. Maximises ``reward``.
+
+    With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up to chance. A random start is drawn likewise (from its own
+    distribution where actions are a box). The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``: distinct failures
+    kept, static like ``episodes``. Memory does not grow with ``episodes``. ``progress=True`` shows a bar; ``callback(step, info)`` is called after every
+    chunk, of which there are about 200; KeyboardInterrupt between chunks gives the result so far, with ``settings["interrupted"]``.
+
+    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or the
+    actions do not fit together.
+    """
+    episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
+    reward, settings = E.prepare("monte_carlo", key, sim, reward, actions, episodes=episodes)
+    lanes = min(LANES, max(128, 1 << (episodes - 1).bit_length()))
+    key = tree_keys(key, 1)[0]
+    if settings is None:
+        if episodes * sim.horizon >= 2**31:
+            raise ValueError(f"monte_carlo: episodes times the horizon must be below 2^31 inside a transformation, received {episodes} x {sim.horizon}")
+        found, counted = _chunk(key, sim, reward, actions, _nothing(sim, 1), 0, episodes, lanes)
+        best = jax.tree.map(lambda a: a[0], _rebuild(key, sim, reward, actions, found.number[None]))
+        return E.finish_traced(sim, reward, counted, best, found.reward[None])
+
+    def chunk(found, begin, end):
+        found, counted = _chunk(key, sim, reward, actions, found, begin, end, lanes)
+        return found, counted, found.reward[None]
+
+    blocks = max(1, min(-(-episodes // (lanes * MOMENTS)), (2**31 - 1) // (lanes * sim.horizon)))  # the steps of a chunk are counted in int32
+    ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
+    found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback)
+    rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))
+    found, rebuilt = jax.device_get((found, rebuilt))
+    n = int((found.top_reward > -jnp.inf).sum())
+    best, candidates = jax.tree.map(lambda a: a[0], rebuilt), jax.tree.map(lambda a: a[1 : n + 1], rebuilt)
+    return E.finish(sim, reward, log, best, candidates, [0] * n, found.top_number[:n], found.top_count[:n], settings, top)
+
+
+def _nothing(sim, top):
+    zero, lowest = jnp.zeros((), jnp.int32), jnp.asarray(-jnp.inf, accumulator(sim))
+    none = jnp.zeros((top,), jnp.int32)
+    return Found(jnp.zeros((), bool), lowest, zero, jnp.full((top,), lowest), none, none.astype(jnp.uint32), none)
+
+
+@partial(jax.jit, static_argnames="lanes")
+def _chunk(key, sim, reward, actions, found, begin, end, lanes):
+    """Episodes ``begin`` .. ``end - 1``, a block of lanes at a time: (`Found`, `Tally`)."""
+
+    def block(carry):
+        at, found, counted = carry
+        number = at + jnp.arange(lanes, dtype=jnp.int32)
+        live = (number < end) & (number >= at)
+        played = _play(key, sim, reward, actions, number, live)
+        return at + lanes, _keep(found, played, number, live), E.add(counted, E.tally(played, live, number))
+
+    begin, end = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
+    # compared by what is left, as the end may be the last int32
+    _, found, counted = lax.while_loop(lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, found, E.nothing()))
+    return found, counted
+
+
+def _play(key, sim, reward, actions, number, live, record=False):
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+    at = lambda level: jax.vmap(jax.random.fold_in, (0, None))(keys, level)
+    return E.play(sim, reward, at, actions.draw_start, actions.draw, live, record)
+
+
+@jax.jit
+def _rebuild(key, sim, reward, actions, number):
+    """The episodes of these numbers [m], with their disturbances."""
+    return _play(key, sim, reward, actions, number, jnp.ones(number.shape, bool), record=True).episode
+
+
+def _keep(found, played, number, live):
+    e = played.episode
+    value = jnp.where(live, e.reward, -jnp.inf)
+    failing = live & e.failure
+    any_failure = jnp.any(failing)
+    i = jnp.argmax(jnp.where(failing | ~any_failure, value, -jnp.inf))
+    better = (any_failure & ~found.failure) | ((any_failure == found.failure) & (value[i] > found.reward))
+    pick = lambda a, b: jnp.where(better, a, b)
+    found = found._replace(failure=found.failure | any_failure, reward=pick(value[i], found.reward), number=pick(number[i], found.number))
+
+    def merge(found):
+        values = jnp.concatenate([found.top_reward, jnp.where(failing, value, -jnp.inf)])
+        numbers, tags = jnp.concatenate([found.top_number, number]), jnp.concatenate([found.top_tag, played.tag])
+        counts = jnp.concatenate([found.top_count, jnp.ones_like(number)])
+        (k,) = found.top_reward.shape
+        places, counts = E.distinct(jnp.ones(values.shape, bool), values, tags, numbers, counts, k)
+        taken = [a.at[places].get(mode="fill", fill_value=fill) for a, fill in ((values, -jnp.inf), (numbers, 0), (tags, 0))]
+        return found._replace(**dict(zip(("top_reward", "top_number", "top_tag", "top_count"), (*taken, counts), strict=True)))
+
+    # rarely anything enters, and sorting is dear; a repetition of the least kept one is to be counted, too
+    return lax.cond(jnp.any(failing & (value >= found.top_reward[-1])), merge, lambda found: found, found)

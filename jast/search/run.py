@@ -1,0 +1,217 @@
+"""Running a tree search: trees in groups over threads, in chunks that can be watched and interrupted; or all in one traced program."""
+
+import concurrent.futures
+import functools
+import threading
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+from jast.counter import tree_keys
+from jast.episode import Episode, play_back
+from jast.search import simulate
+from jast.search.prune import prune
+from jast.search.rebuild import rebuild
+from jast.search.tree import FAILURE, FRESH, INVALID, RAN, make
+
+__all__ = ["Plan", "Harvest", "bytes_per_tree", "grow_all", "grow_traced"]
+
+
+class Plan(NamedTuple):
+    """The static part of a search."""
+
+    prunes: int
+    simulations: int
+    """Per root."""
+    children: int
+    """Greatest number of children of a node."""
+    memoize: str
+
+
+class Harvest(NamedTuple):
+    """What is kept of a group of trees: B trees of S simulations."""
+
+    log: Any
+    """[S, B] reward of each simulation's episode."""
+    outcome: Any
+    """[S, B] bits FAILURE, FRESH, INVALID, RAN of `jast.search.tree`."""
+    steps: Any
+    """[B] simulator steps."""
+    roots: Any
+    """`Roots` with a leading axis [turns]."""
+    found: Episode
+    """[n] the best failing episodes, or the best ones of trees without failure."""
+    tree: Any
+    """[n] where they were found."""
+    simulation: Any
+
+
+@functools.partial(jax.jit, static_argnames=("simulations", "memoize"))
+def _make(problem, keys, simulations, memoize):
+    return make(problem, _shared(problem), keys, simulations, memoize)
+
+
+@functools.partial(jax.jit, static_argnames=("memoize",), donate_argnames=("tree",))
+def _grow(problem, tree, begin_at, end_at, memoize):
+    return simulate.grow(problem, _shared(problem), tree, begin_at, end_at, memoize)
+
+
+@functools.partial(jax.jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
+def _prune(problem, tree, children, memoize):
+    return prune(problem, _shared(problem), tree, children, memoize)
+
+
+@functools.partial(jax.jit, static_argnames=("memoize",))
+def _rebuild(problem, tree, lane, i, memoize):
+    return rebuild(problem, _shared(problem), tree, lane, i, memoize)
+
+
+def _shared(problem):
+    """`axes` of a problem that all trees share."""
+    return jax.tree.map(lambda _: None, problem)
+
+
+def bytes_per_tree(problem, plan):
+    """Bytes that one tree takes while it grows, from the shapes of its arrays."""
+    simulations = plan.prunes * plan.simulations
+    tree = jax.eval_shape(lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize), problem, tree_keys(jax.random.key(0), 2))
+    return sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree)) // 2
+
+
+def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk):
+    """Grow one tree a key, ``lanes`` at a time in each of ``threads`` threads: a list of `Harvest` in the order of the keys, and whether it was interrupted.
+
+    ``on_chunk(simulations)`` is called from the main thread when so many more simulations are done; a KeyboardInterrupt there, or from the keyboard, ends all
+    trees at their next chunk.
+    """
+    trees = keys.shape[0]
+    groups = [np.arange(start, min(start + lanes, trees)) for start in range(0, trees, lanes)]
+    done, lock, stop = [0], threading.Lock(), threading.Event()
+
+    def report(n):
+        with lock:
+            done[0] += n
+
+    def one(group):
+        if stop.is_set():
+            return None
+        return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
+
+    told, interrupted = 0, False
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(one, group) for group in groups]
+        waiting = set(futures)
+        while waiting:
+            try:
+                _, waiting = concurrent.futures.wait(waiting, timeout=0.05, return_when=concurrent.futures.FIRST_EXCEPTION)
+                if done[0] > told:
+                    told, news = done[0], done[0] - told
+                    on_chunk(news)
+            except KeyboardInterrupt:
+                stop.set()
+                interrupted = True
+    return [h for h in (f.result() for f in futures) if h is not None], interrupted
+
+
+def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
+    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize)
+    turns = []
+    for turn in range(plan.prunes):
+        first, end = turn * plan.simulations, (turn + 1) * plan.simulations
+        for at in range(first, end, chunk):
+            tree = jax.block_until_ready(_grow(problem, tree, at, min(at + chunk, end), plan.memoize))
+            report((min(at + chunk, end) - at) * len(group))
+            if stop.is_set():
+                break
+        tree, roots = _prune(problem, tree, plan.children, plan.memoize)
+        turns.append(jax.device_get(jax.tree.map(lambda a: a[: len(group)], roots)))
+        if stop.is_set() or not bool(jnp.any(tree.alive)):
+            break
+    log, outcome, steps = (np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps))
+    lane, i = _candidates(log, outcome, candidates)
+    wanted = candidates + len(group)
+    found = _rebuild(problem, tree, np.resize(lane, wanted).astype(np.int32), np.resize(i, wanted).astype(np.int32), plan.memoize)
+    found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
+    roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
+    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32))
+
+
+def _candidates(log, outcome, most):
+    """Trees and simulations of the best episode of each tree and of the ``most`` best failures."""
+    fresh = (outcome & FRESH) > 0
+    failure = fresh & ((outcome & FAILURE) > 0)
+    value = np.where(fresh, log, -np.inf)
+    own = np.where(failure.any(0), np.where(failure, value, -np.inf).argmax(0), value.argmax(0))
+    lanes = np.arange(log.shape[1])
+    i, lane = np.nonzero(failure)
+    order = np.argsort(-log[i, lane], kind="stable")[:most]
+    return np.concatenate([lanes, lane[order]]), np.concatenate([own, i[order]])
+
+
+class Traced(NamedTuple):
+    """What a traced search knows of each tree, [B]."""
+
+    best: Episode
+    failures: Any
+    episodes: Any
+    steps: Any
+    invalid: Any
+    first: Any
+    """The first failing simulation, or S."""
+
+
+def grow_traced(problem, keys, plan):
+    """The whole search as one traced program, for `jax.jit` and `jax.vmap`: `Traced`. Under `jax.vmap` the batch becomes more trees, not a batch of programs."""
+    leaves, treedef = jax.tree.flatten(problem)
+    return _batchable(treedef, plan, (None,) * len(leaves))(keys, leaves)
+
+
+def _batchable(treedef, plan, axes):
+    def whole(keys, leaves):
+        return _traced(treedef.unflatten(leaves), treedef.unflatten(axes), keys, plan)
+
+    function = custom_vmap(whole)
+
+    @function.def_vmap
+    def rule(size, batched, keys, leaves):
+        keys_batched, leaf_batched = batched
+        keys = keys if keys_batched else jnp.broadcast_to(keys[None], (size, *keys.shape))
+        lanes = keys.shape[1]
+
+        def spread(leaf, is_batched, axis):
+            if not is_batched:
+                return (leaf, None) if axis is None else (jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)), 0)
+            leaf = leaf if axis == 0 else jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
+            return leaf.reshape(size * lanes, *leaf.shape[2:]), 0
+
+        pairs = [spread(*each) for each in zip(leaves, leaf_batched, axes, strict=True)]
+        out = _batchable(treedef, plan, tuple(axis for _, axis in pairs))(keys.reshape(-1), [leaf for leaf, _ in pairs])
+        out = jax.tree.map(lambda a: a.reshape(size, lanes, *a.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return function
+
+
+def _traced(problem, axes, keys, plan):
+    tree = make(problem, axes, keys, plan.prunes * plan.simulations, plan.memoize)
+
+    def turn(n, tree):
+        tree = simulate.grow(problem, axes, tree, n * plan.simulations, (n + 1) * plan.simulations, plan.memoize)
+        return prune(problem, axes, tree, plan.children, plan.memoize)[0]
+
+    tree = lax.fori_loop(0, plan.prunes, turn, tree)
+    has = lambda bit: (tree.outcome & bit) > 0
+    failing = has(FRESH) & has(FAILURE)
+    value = jnp.where(has(FRESH) & jnp.where(jnp.any(failing, axis=0), failing, True), tree.log, -jnp.inf)
+    best = jnp.argmax(value, axis=0).astype(jnp.int32)
+    lane = jnp.arange(keys.shape[0], dtype=jnp.int32)
+    found = rebuild(problem, axes, tree, lane, best, plan.memoize)
+    count = lambda bit: jnp.sum(has(bit), axis=0, dtype=jnp.int32)
+    first = jnp.where(jnp.any(has(FAILURE), axis=0), jnp.argmax(has(FAILURE), axis=0), tree.log.shape[0]).astype(jnp.int32)
+    exact = jax.vmap(lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0))(problem, found)
+    return Traced(exact, count(FAILURE), count(RAN), tree.steps, count(INVALID), first)
+
