@@ -16,11 +16,18 @@ __all__ = ["Quantiles", "Samples", "UniformBox", "quantiles", "samples", "unifor
 class Samples:
     """See `samples`."""
 
+    places_start = False
+    focus = 1.0  # draws of the model are near its mode already
+
     def draw(self, key, dist):
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the state."""
         return D.sample(dist, key)
 
     draw_start = draw
+
+    def near(self, x, dist, scale, start=False):
+        """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
+        return _towards_mode(x, dist, scale)
 
 
 @jax.tree_util.register_dataclass
@@ -28,10 +35,17 @@ class Samples:
 class Quantiles:
     """See `quantiles`."""
 
-    def draw(self, key, dist):
-        return D.quantile(dist, _uniform_like(key, dist))
+    places_start = True  # `place` serves x0 as well
+    focus = 1.0
 
-    draw_start = draw
+    def draw(self, key, dist):
+        return self.place(_uniform_like(key, dist), dist)
+
+    def place(self, u, dist):
+        """The action at the point ``u`` in [0, 1)^d."""
+        return D.quantile(dist, u)
+
+    draw_start, near = draw, Samples.near
 
 
 @jax.tree_util.register_dataclass
@@ -41,15 +55,30 @@ class UniformBox:
 
     low: Any
     high: Any
+    places_start = False
+    focus = 0.2  # a box knows nothing of the model
 
     def draw(self, key, dist):
-        return self.at(_uniform_like(key, dist), dist)
+        return self.place(_uniform_like(key, dist), dist)
 
     def draw_start(self, key, dist):
         """The box is one of steps: a random start is drawn from its own distribution."""
         return D.sample(dist, key)
 
-    def at(self, u, dist):
+    def near(self, x, dist, scale, start=False):
+        """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""
+        if start:
+            return _towards_mode(x, dist, scale)
+
+        def shrink(x, m):
+            if not jnp.issubdtype(x.dtype, jnp.floating):
+                return x
+            low, high = (jnp.asarray(v).astype(x.dtype) for v in (self.low, self.high))
+            return jnp.clip(m + jnp.asarray(scale, x.dtype) * (x - (low + high) / 2), low, high)
+
+        return jax.tree.map(shrink, x, D.mode(dist))
+
+    def place(self, u, dist):
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to ``high``, both included."""
 
         def place(u, s):
@@ -82,3 +111,10 @@ def _uniform_like(key, dist):
     leaves, treedef = jax.tree.flatten(event)
     keys = [key] if len(leaves) == 1 else [jax.random.fold_in(key, i) for i in range(len(leaves))]
     return treedef.unflatten([jax.random.uniform(k, s.shape, D.float_dtype(s.dtype)) for k, s in zip(keys, leaves, strict=True)])
+
+
+def _towards_mode(x, dist, scale):
+    def shrink(x, m):
+        return m + jnp.asarray(scale, x.dtype) * (x - m) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return jax.tree.map(shrink, x, D.mode(dist))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend.random import define_prng_impl
 
-__all__ = ["COUNTER", "tree_keys"]
+__all__ = ["COUNTER", "coin", "tree_keys"]
 
 
 def _mix(h):
@@ -58,6 +58,11 @@ def _size(shape):
 
 
 COUNTER = define_prng_impl(key_shape=(2,), seed=_seed, split=_split, random_bits=_random_bits, fold_in=_fold_in, name="jast_counter", tag="cnt")
+
+
+def coin(key):
+    """A fair bool by one bit of a counter key's own words, which its stream does not show."""
+    return (jax.random.key_data(key)[..., 1] & 1).astype(bool)
 
 
 def tree_keys(key, n):

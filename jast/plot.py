@@ -67,11 +67,15 @@ def ferry(episode, sim=None, ax=None):
     return ax
 
 
-def history(results, ax=None):
+def history(results, ax=None, total=False):
     """How the best reward grew with the episodes of a tree: the mean over trees with its 95 % band, and (dashed) the best over trees.
+
+    ``total=True``: the best over trees with the episodes of all trees, by which searches of different numbers of trees compare.
 
     ``results``: a search result, or a dict of name -> result, whose ``history`` has ``simulations`` [C] and ``best_reward`` [C, trees]. Returns the Axes.
     """
+    from matplotlib.ticker import EngFormatter
+
     results = results if isinstance(results, dict) else {"": results}
     with _axes(ax, (6.8, 4.2)) as ax:
         means, bests = [], []
@@ -81,14 +85,18 @@ def history(results, ax=None):
             if best.ndim != 2 or episodes.shape != best.shape[:1]:
                 raise ValueError(f"plot.history: history must have simulations [C] and best_reward [C, trees], received {episodes.shape} and {best.shape}")
             colour, trees = COLOURS[i % len(COLOURS)], best.shape[1]
+            if total:
+                episodes, best, trees = episodes * trees, np.fmax.reduce(best, 1, keepdims=True), 1
             mean = best.mean(1)
-            label = f"{name + ': ' if name else ''}mean of {trees} tree{'s' * (trees > 1)}"
+            label = name if total else f"{name + ': ' if name else ''}mean of {trees} tree{'s' * (trees > 1)}"
             means += ax.plot(episodes, mean, color=colour, label=label, zorder=3)
             if trees > 1:
                 half = 1.96 * best.std(1, ddof=1) / np.sqrt(trees)
                 ax.fill_between(episodes, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
                 bests += ax.plot(episodes, best.max(1), color=colour, linestyle=(0, (4, 2)), linewidth=1.3, label="best of them")
-        ax.set(xlabel="episodes a tree", ylabel="best reward so far")
+        ax.set(xlabel="episodes" if total else "episodes a tree", ylabel="best reward so far")
+        if total:
+            ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         ax.legend([*means, *bests], [line.get_label() for line in (*means, *bests)], loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
     return ax
 

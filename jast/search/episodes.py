@@ -19,7 +19,7 @@ from jast.episode import Episode, advance, begin, replay
 from jast.search.records import pack
 from jast.search.result import History, SearchResult
 
-__all__ = ["Played", "Tally", "distinct", "drive", "finish", "is_traced", "play", "prepare", "random_start", "tally", "whole"]
+__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "random_start", "tally", "whole"]
 
 
 class Played(NamedTuple):
@@ -49,45 +49,48 @@ class Tally(NamedTuple):
 NEVER = np.int32(2**31 - 1)
 
 
-def play(sim, reward, at, draw_start, draw, live, record=False):
+def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False):
     """Simulate one episode a lane, all lanes a step at a time: `Played`.
 
-    ``at(level)``: what the lanes' draws at a level depend on, with leading axis [lanes]; ``draw_start(one, dist)`` and ``draw(one, dist)`` make of one lane's
-    part of it x0 or x. Lanes that are not ``live`` [lanes] bool come back as episodes of length 0 and mean nothing. Ended lanes step on, and only what is
-    summed up is masked.
+    ``keys`` [lanes]: of the episodes. ``draw_start(key, row, dist)`` and ``draw(key, row, dist)`` make x0 and x with the key of their level; ``rows``: a pair
+    of pytrees, [1, lanes, ...] for x0 and [horizon, lanes, ...] for x, that the draws depend on. Lanes that are not ``live`` [lanes] bool come back as
+    episodes of length 0 and mean nothing. Ended lanes step on, and only what is summed up is masked.
     """
     start = int(random_start(sim))
+    rows = ((), ()) if rows is None else rows
+    at = lambda level, rows, t: (jax.vmap(jax.random.fold_in, (0, None))(keys, level), jax.tree.map(lambda a: a[t], rows))
 
-    def first(one):
-        x0 = draw_start(one, sim.start()) if start else ()
+    def first(key, row):
+        x0 = draw_start(key, row, sim.start()) if start else ()
         progress = begin(sim, reward, x0)
         return x0, progress, _fold(jnp.uint32(0x9E3779B9), x0)
 
-    def move(one, progress, tag, last):
-        x = draw(one, sim.disturbance(progress.state))
+    def move(key, row, progress, tag, last):
+        x = draw(key, row, sim.disturbance(progress.state))
         return x, advance(sim, reward, progress, x, last), _fold(tag, x)
 
-    x0, progress, tag = jax.vmap(first)(at(0)) if start else jax.vmap(lambda _: first(None))(live)
-    rows = None
+    move = jax.vmap(move, (0, 0, 0, 0, None))
+    x0, progress, tag = jax.vmap(first)(*at(0, rows[0], 0))
+    xs = None
     if record:
-        like = jax.eval_shape(lambda p: jax.vmap(move, (0, 0, 0, None))(at(start), p, tag, False)[0], progress)
-        rows = jax.tree.map(lambda s: jnp.zeros((sim.horizon, *s.shape), s.dtype), like)
+        like = jax.eval_shape(lambda p: move(*at(start, rows[1], 0), p, tag, False)[0], progress)
+        xs = jax.tree.map(lambda s: jnp.zeros((sim.horizon, *s.shape), s.dtype), like)
 
     def step(carry):
-        t, length, tag, rows, before = carry
+        t, length, tag, xs, before = carry
         on = ~before.done
-        x, after, folded = jax.vmap(move, (0, 0, 0, None))(at(t + start), before, tag, t + 1 >= sim.horizon)
+        x, after, folded = move(*at(t + start, rows[1], t), before, tag, t + 1 >= sim.horizon)
         kept = after._replace(**{name: jnp.where(on, getattr(after, name), getattr(before, name)) for name in before._fields[1:]})
         if record:
-            rows = jax.tree.map(lambda a, b: a.at[t].set(jnp.where(_to_rank(on, b), b, jnp.zeros((), b.dtype))), rows, x)
-        return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), rows, kept
+            xs = jax.tree.map(lambda a, b: a.at[t].set(jnp.where(_to_rank(on, b), b, jnp.zeros((), b.dtype))), xs, x)
+        return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), xs, kept
 
-    carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, rows, progress._replace(done=progress.done | ~live)
-    _, length, tag, rows, end = lax.while_loop(lambda c: jnp.any(~c[4].done), step, carry)
+    carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, xs, progress._replace(done=progress.done | ~live)
+    _, length, tag, xs, end = lax.while_loop(lambda c: jnp.any(~c[4].done), step, carry)
     finite = jnp.isfinite(end.reward)
-    rows = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), rows)
+    xs = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), xs)
     value = jnp.where(finite, end.reward, -jnp.inf)
-    return Played(Episode(x0, rows, end.log_prob, end.distance, end.failure & finite, length, value), ~finite, tag)
+    return Played(Episode(x0, xs, end.log_prob, end.distance, end.failure & finite, length, value), ~finite, tag)
 
 
 def tally(played, live, order, tree=None, trees=1):
@@ -165,45 +168,45 @@ class Log(NamedTuple):
 
     tally: Tally
     history: History
-    done: int
-    """Episodes of each tree."""
     interrupted: str | None
 
 
-def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None):
+def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="search"):
     """``(carry, Log)`` after ``carry, tally, best [trees] = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
 
-    ``callback(step, info)`` after each chunk: its number from 0, and a dict of ``episodes``, ``failures`` and ``best_reward``. A KeyboardInterrupt ends the
-    search after the last whole chunk, and is raised again where there is none.
+    ``callback(done, total)`` after each chunk: the episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised again
+    where there is none.
     """
-    total, done, moments, interrupted, bar = None, 0, [], None, None
+    whole, bar = ends[-1] * trees, None
     if progress:
         from tqdm import tqdm  # slow to import
 
-        bar = tqdm(total=ends[-1] * trees, unit="episode", unit_scale=True)
+        bar = tqdm(total=whole, unit="sim", unit_scale=True, desc=name)
+    kept = carry, 0, None, []
     try:
-        for step, end in enumerate(ends):
-            reached, counted, best = jax.block_until_ready(chunk(carry, done, end))
+        for end in ends:
+            carry, done, total, moments = kept
+            carry, counted, best = jax.block_until_ready(chunk(carry, done, end))
             counted, best = jax.device_get((counted, best))
-            # Python's ints do not overflow
-            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
-            total = counted if total is None else _sum(total, counted)
-            carry, done = reached, end
-            moments.append((done, best, total.failures))
+            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)  # Python's ints do not overflow
+            if total is not None:
+                sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
+                counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
+            kept = carry, end, counted, [*moments, (end, best, counted.failures)]  # at once: an interruption finds all of a chunk or nothing
             if bar is not None:
-                bar.update(counted.episodes)
-                bar.set_postfix(failures=total.failures, best=f"{best.max():.4g}")
+                bar.update(end * trees - bar.n)
+                bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}")
             if callback is not None:
-                callback(step, dict(episodes=total.episodes, failures=total.failures, best_reward=float(best.max())))
+                callback(end * trees, whole)
     except KeyboardInterrupt:
-        if not done:
+        if kept[2] is None:
             raise
-        interrupted = f"after {done * trees} of {ends[-1] * trees} episodes"
     finally:
         if bar is not None:
             bar.close()
-    simulations, best, failures = (np.array(v) for v in zip(*moments, strict=True))
-    return carry, Log(total, History(simulations, best, failures), done, interrupted)
+    carry, done, total, moments = kept
+    history = History(*(np.array(v) for v in zip(*moments, strict=True)))
+    return carry, Log(total, history, f"after {done * trees} of {whole} episodes" if done < ends[-1] else None)
 
 
 def finish(sim, reward, log, best, candidates, tree, simulation, counts, settings, top):
@@ -215,7 +218,7 @@ def finish(sim, reward, log, best, candidates, tree, simulation, counts, setting
     candidates = jax.device_get(candidates)
     candidates = candidates._replace(failure=np.ones(len(simulation), bool))  # so that one that no longer fails is counted as dropped
     found = archive.collect(sim, reward, candidates, tree, simulation, log.tally.failures, top)
-    times = {place: int(n) for *place, n in ()} | {(int(k), int(i)): int(n) for k, i, n in zip(tree, simulation, counts, strict=True)}
+    times = {(int(k), int(i)): int(n) for k, i, n in zip(tree, simulation, counts, strict=True)}  # repetitions are no candidates, but were counted
     found = found._replace(counts=np.array([times[int(k), int(i)] for k, i in zip(found.tree, found.simulation, strict=True)], np.int32))
     best = jax.device_get(replay(sim, found.best if found.size else best, reward=reward))
     n = log.tally
@@ -249,10 +252,6 @@ def finish_traced(sim, reward, n, best, best_reward):
         invalid=n.invalid,
         settings=None,
     )
-
-
-def _sum(a, b):
-    return Tally(*(x + y for x, y in zip(a[:4], b[:4], strict=True)), min(a.first, b.first), a.failing | b.failing)
 
 
 def _fold(tag, x):

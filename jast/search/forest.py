@@ -14,20 +14,21 @@ from jast.counter import tree_keys
 from jast.episode import Episode, replay
 from jast.failures import collect, identity
 from jast.search import memory
+from jast.search.choice import Choice
 from jast.search.result import History, SearchResult
 from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
 from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, widths
 
-__all__ = ["WIDENING", "forest"]
+__all__ = ["MODES", "forest"]
 
 SAMPLES = A.samples()
-WIDENING = {"default": (2.0, 0.5), "paper": (0.5, 0.6)}
+MODES = {"default": dict(widening=(2.0, 0.5), spread=True, focus=None), "paper": dict(widening=(0.5, 0.6), spread=False, focus=1.0)}
 LANES = 128  # trees in lockstep in one thread: enough to fill vector units, few enough to stay near the processor
 
 
 def forest(
-    key, sim, *, trees=200, prunes=18, simulations=500, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, widening=None, mode="default",
-    memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
+    key, sim, *, trees=200, prunes=18, simulations=500, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None,
+    spread=None, focus=None, memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
 
@@ -35,9 +36,13 @@ def forest(
     children, ``widening`` = (k, alpha), alpha in [0, 1]; takes a child never visited, rolls out at random to the episode's end, and backs its reward up as a
     mean. After ``simulations`` of them the most visited child becomes the root and keeps its subtree; a tree ends early when its root is an episode's end.
 
-    ``mode="paper"`` has the published widening (0.5, 0.6), ``"default"`` the better-tuned (2, 0.5); a ``widening`` of your own overrides both. ``actions`` and
-    ``reward``: `jast.actions`, `jast.rewards`. ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same
-    trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``: failures kept in the archive.
+    ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``:
+    the children of a node cover the action space evenly; ``focus``: every second child, and about every second step of a rollout, is drawn closer to the mode
+    of the disturbance by this factor, 0.2 for a uniform box and 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the tails, for
+    failures too rare for the model's own draws. Each may be given on its own. ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
+
+    ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"
+    takes "node" where it fits. ``top``: failures kept in the archive.
 
     Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither changes a result. ``available``: bytes that the trees in
     flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.
@@ -46,15 +51,15 @@ def forest(
     Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
     """
     return search(
-        "forest", key, sim, trees=trees, prunes=prunes, simulations=simulations, reward=reward, actions=actions, exploration=exploration,
-        widening=_widening("forest", mode, widening, WIDENING), mode=mode, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
-        progress=progress, callback=callback,
+        "forest", key, sim, _settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations, reward=reward,
+        actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
     )  # fmt: skip
 
 
-def search(method, key, sim, *, trees, prunes, simulations, reward, actions, exploration, widening, mode, memoize, top, threads, lanes, available, progress, callback):
-    """A forest by its settings, all given: what `forest` and `mcts` call."""
-    for name, value in dict(trees=trees, prunes=prunes, simulations=simulations, top=top, threads=threads or 1, lanes=lanes or 1).items():
+def search(method, key, sim, settled, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, threads, lanes, available, progress, callback):
+    """A forest by its settings, all given: what `forest` and `mcts` call. ``settled``: mode, widening, spread and focus."""
+    mode, widening, spread, focus = settled
+    for name, value in dict(trees=trees, prunes=prunes, simulations=simulations, top=top, threads=1 if threads is None else threads, lanes=1 if lanes is None else lanes).items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{method}: {name} must be an int of at least 1, received {value!r}")
     if memoize not in ("auto", "node", "root", "none"):
@@ -66,7 +71,8 @@ def search(method, key, sim, *, trees, prunes, simulations, reward, actions, exp
     if total >= 2**24:
         raise ValueError(f"{method}: prunes * simulations must be below 2**24, received {prunes} * {simulations}: grow more trees instead")
     table = widths(total, *widening)
-    problem = jax.tree.map(jnp.asarray, Problem(sim, reward, actions, Settings(jnp.asarray(exploration, jnp.float32), table)))
+    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=isinstance(focus, jax.core.Tracer) or focus != 1)
+    problem = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)))
     children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
     plan = Plan(int(prunes), int(simulations), min(children, 4096), "node" if memoize == "auto" else memoize)
     settings = dict(
@@ -74,7 +80,8 @@ def search(method, key, sim, *, trees, prunes, simulations, reward, actions, exp
     )  # fmt: skip
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, key))):
         return _traced(grow_traced(problem, tree_keys(key, trees), plan), trees)
-    settings |= dict(exploration=float(exploration), widening=[float(v) for v in widening], seed=np.asarray(_data(key)).tolist())
+    settings |= dict(exploration=float(exploration), widening=[float(v) for v in widening], spread=spread, focus=float(focus))
+    settings["seed"] = np.asarray(_data(key)).tolist()
     plan, threads, lanes = _fit(method, problem, plan, trees, threads, lanes, available, auto=memoize == "auto")
     settings["memoize"] = plan.memoize
     if progress:
@@ -128,7 +135,7 @@ def _fit(method, problem, plan, trees, threads, lanes, available, auto):
 
 
 def _result(sim, reward, harvests, settings, top):
-    log, outcome = (np.concatenate(parts, axis=1) for parts in (_rows([h.log for h in harvests]), _rows([h.outcome for h in harvests])))
+    log, outcome = (np.concatenate([getattr(h, field) for h in harvests], axis=1) for field in ("log", "outcome"))
     has = lambda bit: (outcome & bit) > 0
     ran, failed = has(RAN), has(FAILURE)
     order = (failed & ran).reshape(-1)
@@ -200,22 +207,19 @@ def _traced(found, trees):
     )  # fmt: skip
 
 
-def _widening(method, mode, widening, modes):
+def _settled(method, modes, mode, widening, spread, focus, actions):
+    """The mode and what it says of widening, spread and focus where the user does not; checked."""
     if mode not in modes:
         raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
-    if widening is None:
-        return modes[mode]
-    if not isinstance(widening, tuple | list) or len(widening) != 2:
-        raise ValueError(f"{method}: widening must be a pair (k, alpha), received {widening!r}")
-    k, alpha = widening
-    if not any(isinstance(v, jax.core.Tracer) for v in widening) and not (k > 0 and 0 <= alpha <= 1):
-        raise ValueError(f"{method}: widening must have k > 0 and 0 <= alpha <= 1, received {widening!r}")
-    return k, alpha
-
-
-def _rows(parts):
-    """Interrupted groups may have fewer rows that ran, never fewer rows."""
-    return parts
+    given = dict(widening=widening, spread=spread, focus=focus)
+    widening, spread, focus = (modes[mode][name] if value is None else value for name, value in given.items())
+    focus = getattr(actions, "focus", 1.0) if focus is None else focus
+    traced = lambda *values: any(isinstance(v, jax.core.Tracer) for v in values)
+    if not isinstance(widening, tuple | list) or len(widening) != 2 or not (traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
+        raise ValueError(f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received {widening!r}")
+    if not traced(focus) and not focus > 0:
+        raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
+    return mode, widening, bool(spread), focus
 
 
 def _take(episodes, i):

@@ -1,24 +1,23 @@
 """Monte Carlo tree search with progressive widening, from one root: the paper's MCTS-SA, the classic of adaptive stress testing."""
 
 from jast import rewards
-from jast.search.forest import SAMPLES, _widening, search
+from jast.search.forest import SAMPLES, _settled, search
 
-__all__ = ["WIDENING", "mcts"]
+__all__ = ["MODES", "mcts"]
 
-WIDENING = {"default": (1.0, 0.5), "paper": (0.5, 0.6)}
+MODES = {"default": dict(widening=(1.0, 0.5), spread=True, focus=None), "paper": dict(widening=(0.5, 0.6), spread=False, focus=1.0)}
 
 
 def mcts(
-    key, sim, *, trees=1, simulations=9000, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, widening=None, mode="default", memoize="auto", top=64,
-    threads=None, lanes=None, available=None, progress=False, callback=None,
+    key, sim, *, trees=1, simulations=9000, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None, spread=None, focus=None,
+    memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``simulations`` from their first root: `SearchResult`. The reward is maximised.
 
-    `jast.search.forest` without its action pruning, and with all its settings; ``mode="paper"`` has the published widening (0.5, 0.6) of MCTS-SA, ``"default"``
-    (1, 0.5). Raises ValueError as `jast.search.forest` does.
+    `jast.search.forest` without its action pruning, with its settings and errors; ``mode="paper"`` is the published MCTS-SA, ``"default"`` has ``widening``
+    (1, 0.5).
     """
     return search(
-        "mcts", key, sim, trees=trees, prunes=1, simulations=simulations, reward=reward, actions=actions, exploration=exploration,
-        widening=_widening("mcts", mode, widening, WIDENING), mode=mode, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
-        progress=progress, callback=callback,
+        "mcts", key, sim, _settled("mcts", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=1, simulations=simulations, reward=reward,
+        actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
     )  # fmt: skip

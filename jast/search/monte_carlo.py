@@ -33,18 +33,19 @@ class Found(NamedTuple):
     top_count: Any
 
 
-def monte_carlo(
-    key, sim, *, episodes=100_000, reward=rewards.standard(), actions=choices.samples(), top=64, progress=False, callback=None  # noqa: B008
-):  # fmt: skip
+SAMPLES = choices.samples()
+
+
+def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=SAMPLES, top=64, progress=False, callback=None):
     """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree. Maximises ``reward``.
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up to chance. A random start is drawn likewise (from its own
     distribution where actions are a box). The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``: distinct failures
-    kept, static like ``episodes``. Memory does not grow with ``episodes``. ``progress=True`` shows a bar; ``callback(step, info)`` is called after every
-    chunk, of which there are about 200; KeyboardInterrupt between chunks gives the result so far, with ``settings["interrupted"]``.
+    kept, static like ``episodes``. Memory does not grow with ``episodes``. ``progress=True`` shows a bar; ``callback(done, total)`` is called after every
+    chunk, of which there are about 200; KeyboardInterrupt ends the search with the result of the whole chunks, and ``settings["interrupted"]``.
 
-    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or the
-    actions do not fit together.
+    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or
+    the actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
     reward, settings = E.prepare("monte_carlo", key, sim, reward, actions, episodes=episodes)
@@ -63,7 +64,7 @@ def monte_carlo(
 
     blocks = max(1, min(-(-episodes // (lanes * MOMENTS)), (2**31 - 1) // (lanes * sim.horizon)))  # the steps of a chunk are counted in int32
     ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
-    found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback)
+    found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback, name="monte_carlo")
     rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))
     found, rebuilt = jax.device_get((found, rebuilt))
     n = int((found.top_reward > -jnp.inf).sum())
@@ -96,8 +97,8 @@ def _chunk(key, sim, reward, actions, found, begin, end, lanes):
 
 def _play(key, sim, reward, actions, number, live, record=False):
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-    at = lambda level: jax.vmap(jax.random.fold_in, (0, None))(keys, level)
-    return E.play(sim, reward, at, actions.draw_start, actions.draw, live, record)
+    draw_start, draw = (lambda key, row, dist, f=f: f(key, dist) for f in (actions.draw_start, actions.draw))
+    return E.play(sim, reward, keys, draw_start, draw, live, record=record)
 
 
 @jax.jit

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.search.records import unpack
-from jast.search.simulate import replay_to, select_lanes, step_state
-from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, child_key, node_shapes, random_start
+from jast.search.simulate import child_state, replay_to, select_lanes
+from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, choose_child, node_keys, node_shapes
 
 __all__ = ["Roots", "prune"]
 
@@ -37,7 +37,6 @@ def prune(problem, axes, tree, children, memoize="node"):
 
     ``children``: the greatest number of children a node can have, static. A tree whose new root is an episode's end is at its end.
     """
-    (lanes,) = tree.key.shape
     root, level = tree.root, tree.depth
     searching = tree.alive & ~tree.ended
     state = _root_state(problem, axes, tree, memoize)
@@ -45,8 +44,9 @@ def prune(problem, axes, tree, children, memoize="node"):
     rows, visits, total, child, reward = _children(tree, children)
     q = jnp.where(visits > 0, total / jnp.maximum(visits, 1) - tree.root_reward[:, None], 0)
 
-    keys = jax.vmap(lambda slot: child_key(tree.key, root, jnp.broadcast_to(slot, (lanes,))), out_axes=1)(jnp.arange(children, dtype=jnp.int32))
-    actions, starts = jax.vmap(_draws, in_axes=(axes, 0, 0))(problem, keys, state)
+    slots = jnp.arange(children, dtype=jnp.int32)
+    draw = lambda p, key, state: jax.vmap(lambda slot: choose_child(p, key, slot, state))(slots)
+    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0))(problem, node_keys(tree.key, root), state)
     roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
 
     slot = jnp.argmax(visits, axis=1).astype(jnp.int32)
@@ -65,7 +65,7 @@ def prune(problem, axes, tree, children, memoize="node"):
         alive=tree.alive & move & (to > 0),
     )
     if memoize == "root":
-        after = jax.vmap(step_state, in_axes=(axes, 0, 0, 0))(problem, child_key(tree.key, root, slot), level, state)
+        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0))(problem, node_keys(tree.key, root), slot, level, state)
         tree = tree._replace(base=select_lanes(move, after, state))
     return tree, roots
 
@@ -103,14 +103,6 @@ def _root_state(problem, axes, tree, memoize):
         like = node_shapes(tree, memoize)
         return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
     return tree.base if memoize == "root" else replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
-
-
-def _draws(problem, keys, state):
-    """One lane: the actions of all children of a node, as disturbances and, of a random start, as x0."""
-    dist = problem.sim.disturbance(state)
-    actions = jax.vmap(lambda key: problem.actions.draw(key, dist))(keys)
-    starts = jax.vmap(lambda key: problem.actions.draw_start(key, problem.sim.start()))(keys) if random_start(problem.sim) else ()
-    return actions, starts
 
 
 def _pick(array, index):

@@ -6,7 +6,7 @@ from jax import lax
 
 from jast.episode import Episode, Progress, accumulator
 from jast.search.records import unpack
-from jast.search.tree import FAILURE, FRESH, child_key, levels, node_shapes, random_start, transition
+from jast.search.tree import FAILURE, FRESH, choose_child, choose_rollout, levels, node_keys, node_shapes, take
 
 __all__ = ["rebuild"]
 
@@ -38,13 +38,10 @@ def _one(problem, axes, tree, lane, i, memoize):
 
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
-        chosen = child_key(key[None], parents[up_there][None], slots[up_there][None])[0]
-        own = jax.random.fold_in(rolling, level)
-        words = jnp.where(level < depth, jax.random.key_data(chosen), jax.random.key_data(own))
-        this = jax.random.wrap_key_data(words, impl=jax.random.key_impl(key))
-        x = problem.actions.draw(this, sim.disturbance(at.state))
-        x0 = problem.actions.draw_start(this, sim.start()) if random_start(sim) else ()
-        after = transition(problem, this, level, at)
+        chosen = choose_child(problem, node_keys(key[None], parents[up_there][None])[0], slots[up_there], at.state)
+        rolled = choose_rollout(problem, jax.random.fold_in(rolling, level), at.state)
+        x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
+        after = take(problem, level, at, action)
         kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)
         return kept, (x0, jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x), ~at.done)
 

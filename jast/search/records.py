@@ -41,6 +41,8 @@ def unpack(words, like):
 def _words(a):
     if a.dtype == jnp.bool_:
         return a.astype(jnp.uint32)
+    if jnp.issubdtype(a.dtype, jnp.complexfloating):
+        return _words(jnp.stack([a.real, a.imag], axis=-1).reshape(-1))
     if a.dtype.itemsize < 4:
         return lax.bitcast_convert_type(a, {1: jnp.uint8, 2: jnp.uint16}[a.dtype.itemsize]).astype(jnp.uint32)
     return lax.bitcast_convert_type(a, jnp.uint32).reshape(-1)
@@ -49,6 +51,9 @@ def _words(a):
 def _value(words, dtype):
     if dtype == jnp.bool_:
         return words != 0
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        parts = _value(words, jnp.finfo(dtype).dtype).reshape(-1, 2)
+        return lax.complex(parts[:, 0], parts[:, 1])
     if dtype.itemsize < 4:
         return lax.bitcast_convert_type(words.astype({1: jnp.uint8, 2: jnp.uint16}[dtype.itemsize]), dtype)
     return lax.bitcast_convert_type(words.reshape(-1, 2) if dtype.itemsize == 8 else words, dtype)

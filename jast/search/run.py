@@ -1,6 +1,7 @@
 """Running a tree search: trees in groups over threads, in chunks that can be watched and interrupted; or all in one traced program."""
 
 import concurrent.futures
+import contextlib
 import functools
 import threading
 from typing import Any, NamedTuple
@@ -96,10 +97,15 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
         with lock:
             done[0] += n
 
+    settings = _surroundings()
+
     def one(group):
         if stop.is_set():
             return None
-        return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
+        with contextlib.ExitStack() as stack:
+            for setting, value in settings:
+                stack.enter_context(setting(value))
+            return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
 
     told, interrupted = 0, False
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:
@@ -114,7 +120,23 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
             except KeyboardInterrupt:
                 stop.set()
                 interrupted = True
+            except BaseException:  # of the callback: it need not wait for the rest of the search
+                stop.set()
+                raise
     return [h for h in (f.result() for f in futures) if h is not None], interrupted
+
+
+def _surroundings():
+    """What ``with`` statements around a search have set: JAX keeps it for each thread apart, so the search's own threads must be told."""
+    config = jax.config
+    return (
+        (jax.enable_x64, config.jax_enable_x64),
+        (jax.default_device, config.jax_default_device),
+        (jax.default_matmul_precision, config.jax_default_matmul_precision),
+        (jax.numpy_dtype_promotion, config.jax_numpy_dtype_promotion),
+        (jax.numpy_rank_promotion, config.jax_numpy_rank_promotion),
+        (jax.debug_nans, config.jax_debug_nans),
+    )
 
 
 def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):

@@ -7,9 +7,9 @@ from jax import lax
 from jast.episode import Progress, accumulator
 from jast.search.records import pack, unpack
 from jast.search.select import select
-from jast.search.tree import CHILD, FAILURE, FRESH, INVALID, LINK, PAGE, RAN, RETURNS, REWARD, ROW, VISITS, Node, child_key, levels, node_shapes, transition
+from jast.search.tree import CHILD, FAILURE, FRESH, INVALID, LINK, PAGE, RAN, RETURNS, REWARD, ROW, VISITS, Node, choose_child, choose_rollout, levels, node_keys, node_shapes, take
 
-__all__ = ["grow", "replay_to", "select_lanes", "step_state"]
+__all__ = ["child_state", "grow", "replay_to", "select_lanes"]
 
 
 def grow(problem, axes, tree, begin_at, end_at, memoize="node"):
@@ -23,7 +23,6 @@ def _simulation(problem, axes, tree, i, memoize):
     lane = jnp.arange(lanes, dtype=jnp.int32)
     walk = select(problem.settings, tree)
     fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
-    move = jax.vmap(transition, in_axes=(axes, 0, 0, 0))
     nothing = jnp.zeros((lanes,), bool)
     zero = jnp.zeros((lanes,), tree.edges.dtype)
 
@@ -35,7 +34,7 @@ def _simulation(problem, axes, tree, i, memoize):
         node = jax.vmap(lambda w: unpack(w, like))(lax.dynamic_index_in_dim(desk, i % 2, keepdims=False))
         state, replayed = (node.state, jnp.zeros_like(at)) if memoize == "node" else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
         before = Progress(state, zero, walk.reward, node.distance, nothing, nothing, nothing)
-        child = move(problem, child_key(tree.key, walk.node, walk.best.slot), walk.depth, before)
+        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0))(problem, node_keys(tree.key, walk.node), walk.best.slot, walk.depth, before)
         return desk, child._replace(log_prob=zero), replayed, node.reward, node.failure, node.invalid
 
     # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA copies the tree
@@ -48,7 +47,7 @@ def _simulation(problem, axes, tree, i, memoize):
     def roll(carry):
         level, steps, at = carry
         live = ~at.done
-        after = move(problem, jax.vmap(jax.random.fold_in)(key, level), level, at)
+        after = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0))(problem, key, level, at)
         kept = Progress(after.state, *(jnp.where(live, b, a) for a, b in zip(at[1:], after[1:], strict=True)))
         return level + 1, steps + _one(live), kept._replace(log_prob=zero)
 
@@ -111,14 +110,14 @@ def replay_to(problem, axes, tree, trail, depth, memoize):
     lane = jnp.arange(lanes, dtype=jnp.int32)
     like = node_shapes(tree, memoize)
     first = tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
-    move = jax.vmap(step_state, in_axes=(axes, 0, 0, 0))
+    move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0))
     running = tree.alive & ~tree.ended
 
     def body(carry):
         level, state = carry
         node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
-        after = move(problem, child_key(tree.key, node.parent, node.slot), level, state)
+        after = move(problem, node_keys(tree.key, node.parent), node.slot, level, state)
         return level + _one(live), select_lanes(live, after, state)
 
     _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, tree.base))
@@ -126,10 +125,18 @@ def replay_to(problem, axes, tree, trail, depth, memoize):
     return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
 
 
-def step_state(problem, key, level, state):
-    """One lane: the state that the action of this key leads to."""
+def _child(problem, node_key, slot, level, before):
+    return take(problem, level, before, choose_child(problem, node_key, slot, before.state))
+
+
+def _rolled(problem, key, level, before):
+    return take(problem, level, before, choose_rollout(problem, jax.random.fold_in(key, level), before.state))
+
+
+def child_state(problem, node_key, slot, level, state):
+    """One lane: the simulator's state at a node's child."""
     zero, nothing = jnp.zeros((), accumulator(problem.sim)), jnp.zeros((), bool)
-    return transition(problem, key, level, Progress(state, zero, zero, zero, nothing, nothing, nothing)).state
+    return _child(problem, node_key, slot, level, Progress(state, zero, zero, zero, nothing, nothing, nothing)).state
 
 
 def select_lanes(pred, a, b):

@@ -7,7 +7,7 @@ out of range where there is nothing to write, and no tree array is an operand of
  - Edges: a node's children sit in pages of ``PAGE`` slots, each slot with the child's visits, the sum of its returns and its id. The first page of a node has
    the node's id; when a page fills up, the next free one is linked behind it, so a node may have any number of children. One page is one cache line an array.
  - A slot that was never visited needs no storage: the number of children is a function of the node's visits alone (`widths`), and the action of a slot is drawn
-   from a key addressed by (tree, node, slot). Unvisited slots score alike, so they are visited in order.
+   from its address (tree, node, slot). Unvisited slots score alike, so they are visited in order.
  - Returns are those of whole episodes; Q(s, a) subtracts the reward up to s.
 """
 
@@ -21,7 +21,10 @@ from jast import distributions as D
 from jast.episode import Progress, advance, begin
 from jast.search.records import pack
 
-__all__ = ["Node", "Problem", "Settings", "Tree", "child_key", "levels", "make", "node_shapes", "random_start", "transition", "widths"]
+__all__ = [
+    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "node_keys", "node_shapes", "random_start", "take",
+    "widths",
+]  # fmt: skip
 
 PAGE = 15
 LINK = PAGE  # a page's last entry is no child: its CHILD is the page that continues this one, or 0
@@ -46,7 +49,8 @@ class Problem(NamedTuple):
 
     sim: Any
     reward: Any
-    actions: Any
+    choice: Any
+    """`jast.search.choice.Choice`."""
     settings: Settings
 
 
@@ -143,7 +147,7 @@ def make(problem, axes, keys, simulations, memoize="node"):
 
     def origin(problem, key):
         if random_start(problem.sim):
-            x0 = problem.actions.draw_start(key, problem.sim.start())  # any state will do: the first level chooses x0
+            x0 = problem.choice.actions.draw_start(key, problem.sim.start())  # any state will do: the first level chooses x0
             first = begin(problem.sim, problem.reward, x0)
             zero = jnp.zeros((), bool)
             return Progress(first.state, jnp.zeros_like(first.reward), jnp.zeros_like(first.reward), jnp.full_like(first.distance, jnp.inf), zero, zero, zero)
@@ -187,19 +191,31 @@ def node_shapes(tree, memoize):
     return Node(number, number, real, real, flag, flag, state)
 
 
-def transition(problem, key, level, before):
-    """One lane: draw the action of this key at ``before`` and take it; at level 0 of a random start, choose x0."""
-    sim, reward, actions = problem[:3]
+def choose_child(problem, node_key, slot, state):
+    """One lane: (x0, x), the action of a node's child, for a first level that chooses x0 and for any other; x0 is ``()`` for a system with one start."""
+    sim, choice = problem.sim, problem.choice
+    x0 = choice.child(node_key, slot, sim.start(), start=True) if random_start(sim) else ()
+    return x0, choice.child(node_key, slot, sim.disturbance(state))
+
+
+def choose_rollout(problem, key, state):
+    """One lane: (x0, x) of a rollout."""
+    sim, choice = problem.sim, problem.choice
+    x0 = choice.roll(key, sim.start(), start=True) if random_start(sim) else ()
+    return x0, choice.roll(key, sim.disturbance(state))
+
+
+def take(problem, level, before, action):
+    """One lane: the `Progress` that the action leads to."""
+    sim, reward = problem.sim, problem.reward
+    x0, x = action
     start = int(random_start(sim))
-    x = actions.draw(key, sim.disturbance(before.state))
     after = advance(sim, reward, before, x, level + 1 - start >= sim.horizon)
     if start:
-        first = begin(sim, reward, actions.draw_start(key, sim.start()))
-        after = jax.tree.map(lambda a, b: jnp.where(level == 0, a, b), first, after)
+        after = jax.tree.map(lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after)
     return after
 
 
-def child_key(keys, node, slot):
-    """[B] the keys from which the actions of these children are drawn."""
-    fold = jax.vmap(jax.random.fold_in)
-    return fold(fold(keys, node.astype(jnp.uint32) | _NODE), slot)
+def node_keys(keys, node):
+    """[B] the keys from which the actions of these nodes' children are drawn."""
+    return jax.vmap(jax.random.fold_in)(keys, node.astype(jnp.uint32) | _NODE)

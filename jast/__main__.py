@@ -1,0 +1,153 @@
+"""``python -m jast``: search one of the built-in systems for its likeliest failure, beside a Monte Carlo baseline of as many simulations."""
+
+import argparse
+import contextlib
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jast import actions, failures, nominal, plot, rewards, simulators
+from jast.check import check
+from jast.estimate.intervals import clopper_pearson
+from jast.search.cem import cem
+from jast.search.forest import forest
+from jast.search.mcts import mcts
+from jast.search.monte_carlo import monte_carlo
+from jast.search.result import table
+
+STANDARD = rewards.standard(event_bonus=30.0, density="mode")
+SYSTEMS = {  # name: the simulator, the reward and the actions of a search
+    "ferry": (simulators.ferry, STANDARD, actions.uniform(0.0, 1.0)),
+    "ferry-b": (lambda: simulators.ferry(adversary=(17.0, 0.0)), STANDARD, actions.uniform(0.0, 1.0)),
+    "walk1d": (simulators.walk1d, STANDARD, actions.uniform(-1.0, 1.0)),
+    "landing": (simulators.landing, rewards.shaped(100.0, event_bonus=30.0, density="mode"), actions.uniform(-0.15, 0.15)),
+}
+ITERATIONS = 10  # of the cross-entropy method, which keeps a tenth of the samples of each
+
+
+def main(argv=None):
+    """Run the command line ``argv`` (default: the process's) and print what was found; returns the exit status."""
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.prunes is not None and options.method != "forest":
+        parser.error(f"argument --prunes: only of --method forest, not of {options.method}")
+    if options.paper and options.method not in ("forest", "mcts"):
+        parser.error(f"argument --paper: only with --method forest or mcts, not with {options.method}")
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        parser.error(f"argument --output: {e}")
+    try:
+        return _run(options)
+    except ValueError as e:
+        if not str(e).startswith(f"{options.method.replace('-', '_')}: "):  # a count that the search refuses
+            raise
+        parser.error(str(e))
+    except KeyboardInterrupt:
+        print("\ninterrupted before there was a result", file=sys.stderr)
+        return 130
+
+
+def _parser():
+    parser = argparse.ArgumentParser("python -m jast", description="Find the likeliest failure of a built-in system, with Monte Carlo as the baseline.")
+    add = parser.add_argument
+    add("--simulator", choices=SYSTEMS, default="ferry", help="system under test (default: ferry; ferry-b is its easier variant S0b)")
+    add("--method", choices=["forest", "mcts", "cem", "monte-carlo"], default="forest", help="search (default: forest)")
+    add("--trees", type=_count, default=200, metavar="N", help="independent searches (default: 200)")
+    add("--simulations", type=_count, metavar="N", help="simulations per root (forest, default: 500) or per tree (the others, default: 9000)")
+    add("--prunes", type=_count, metavar="N", help="roots of a tree of the forest (default: 18)")
+    add("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    add("--output", type=Path, default=Path("jast-output"), metavar="FOLDER", help="folder for the archive and the pictures (default: jast-output)")
+    add("--paper", action="store_true", help="forest and mcts: the published widening in place of the better-tuned one")
+    add("--quiet", action="store_true", help="no progress bars")
+    return parser
+
+
+def _count(text):
+    if not text.isdecimal() or not 1 <= int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, received {text!r}")
+    return int(text)
+
+
+def _run(options):
+    make, reward, chosen = SYSTEMS[options.simulator]
+    sim = check(make(), chosen)
+    keys = jax.random.split(jax.random.key(options.seed), 3)
+    print(f"{options.simulator}, seed {options.seed}: as it is, without a search\n{nominal(keys[0], sim, episodes=100_000)}\n", flush=True)
+
+    common = dict(reward=reward, actions=chosen, progress=not options.quiet)
+    found = _search(keys[1], sim, options, common)
+    results = {options.method: found}
+    stopped = "interrupted" in found.settings
+    if options.method != "monte-carlo" and not stopped:
+        with contextlib.suppress(KeyboardInterrupt):
+            results["monte-carlo"] = monte_carlo(keys[2], sim, episodes=found.episodes, **common)
+        stopped = "monte-carlo" not in results or "interrupted" in results["monte-carlo"].settings
+    print(f"{table(results)}\n{_shares(results)}\n\n{_episode(found.best)}\n\n{found.failures}\n")
+
+    archive = options.output / "failures.npz"
+    failures.save(archive, found.failures, found.settings | dict(simulator=options.simulator))
+    print(f"saved {archive}")
+    _draw(options, sim, results)
+    if stopped:
+        print("interrupted: these are the results of what was done")
+    return 130 if stopped else 0
+
+
+def _search(key, sim, options, common):
+    trees, each = options.trees, options.simulations or (500 if options.method == "forest" else 9000)
+    mode = "paper" if options.paper else "default"
+    if options.method == "forest":
+        return forest(key, sim, trees=trees, prunes=options.prunes or 18, simulations=each, mode=mode, **common)
+    if options.method == "mcts":
+        return mcts(key, sim, trees=trees, simulations=each, mode=mode, **common)
+    if options.method == "monte-carlo":
+        return monte_carlo(key, sim, episodes=trees * each, **common)
+    samples = -(-each // ITERATIONS)
+    return cem(key, sim, samples=samples, elites=-(-samples // 10), iterations=ITERATIONS, trees=trees, **common)
+
+
+def _shares(results):
+    """What is counted of independent trials, with its interval: trees, and the episodes of Monte Carlo. Those of a tree depend on each other."""
+    lines = []
+    for name, r in results.items():
+        k, n, what = (r.failures.seen, r.episodes, "episodes") if name == "monte-carlo" else (int(r.failing.sum()), len(r.failing), "trees")
+        low, high = clopper_pearson(k, n)
+        lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, 95 % [{100 * low:.4g}, {100 * high:.4g}]")
+    return "\n".join(lines)
+
+
+def _episode(episode):
+    """The episode in numbers: what happened, and the disturbances that brought it about."""
+    title = "likeliest failure" if episode.failure else "no failure was found; the best episode"
+    numbers = dict(reward=episode.reward, log_p=episode.log_prob, distance=episode.distance)
+    lines = [f"{title}: " + ", ".join(f"{name.replace('_', ' ')} {float(v):.4f}" for name, v in numbers.items()) + f", {int(episode.length)} steps"]
+    parts = {"x0": episode.x0, "x": jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances)}
+    for path, a in jax.tree_util.tree_leaves_with_path(parts):
+        text = np.array2string(np.asarray(a), precision=4, max_line_width=120, suppress_small=True, threshold=300, prefix="    ")
+        lines.append(f"  {path[0].key}{jax.tree_util.keystr(path[1:])}: {text}")
+    return "\n".join(lines)
+
+
+def _draw(options, sim, results):
+    try:
+        import matplotlib
+    except ImportError:
+        print("no pictures: matplotlib is not installed; to have them: pip install 'jast[plot]'")
+        return
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    best = results[options.method].best
+    first = plot.ferry(best, sim) if options.simulator.startswith("ferry") else plot.disturbances(best)[0]
+    for name, ax in dict(episode=first, history=plot.history(results, total=True)).items():
+        path = options.output / f"{name}.png"
+        ax.figure.savefig(path, dpi=120)
+        plt.close(ax.figure)
+        print(f"saved {path}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

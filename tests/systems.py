@@ -1,0 +1,52 @@
+"""Small systems that several tests search."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+import jast
+from jast.distributions import Categorical, Independent, Joint, Normal
+
+S0 = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
+"""The reward and the actions of the published ferry."""
+
+
+class Ring(NamedTuple):
+    """The last three gusts, in a ring buffer, and where the next one goes."""
+
+    gusts: jax.Array
+    at: jax.Array
+    hits: jax.Array
+
+
+def _ring_start():
+    return Joint({"gust": Normal(0.0, 1.0), "hit": Categorical(probs=jnp.array([0.5, 0.5]))})
+
+
+def _ring_init(x0):
+    return Ring(jnp.zeros(3).at[0].set(x0["gust"]), jnp.int32(1), x0["hit"].astype(jnp.int32))
+
+
+def _ring_step(s, x):
+    return Ring(s.gusts.at[s.at % 3].set(x["gust"].sum()), s.at + 1, s.hits + x["hit"])
+
+
+def _ring_disturbance(s):
+    hit = jnp.where(s.hits > 2, 0.2, 0.4)
+    return Joint({"gust": Independent(Normal(jnp.zeros(2), 0.5), 1), "hit": Categorical(probs=jnp.stack([1 - hit, hit]))})
+
+
+def _ring_evaluate(s):
+    return (s.gusts.sum() > 2.5) & (s.hits >= 2), jnp.maximum(2.5 - s.gusts.sum(), 0) + jnp.maximum(2 - s.hits, 0).astype(s.gusts.dtype)
+
+
+def ring():
+    """A memory of three steps with integers in state, start and disturbance; fails in about one of four episodes."""
+    return jast.Simulator(_ring_init, _ring_step, _ring_disturbance, _ring_evaluate, 8, start=_ring_start)
+
+
+def walk(init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, fails=lambda s: s > 3.0, horizon=6, **fields):
+    """A random walk of standard normal steps: what a test changes is all it says."""
+    evaluate = lambda s: (fails(s), jnp.maximum(3.0 - s, 0.0))
+    return jast.Simulator(init, step, lambda s: Normal(jnp.zeros(()), 1.0), evaluate, horizon, **fields)

@@ -1,0 +1,137 @@
+"""The command line: its report, its files, its refusals and its exit status, with counts as small as they go."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+import jast
+from jast import __main__ as cli
+
+ROOT = Path(__file__).parents[1]
+SMALL = ["--trees", "2", "--simulations", "30", "--quiet"]
+
+
+def run(capsys, tmp_path, *argv):
+    """Exit status, standard output and the folder of results."""
+    status = cli.main([*argv, *SMALL, "--output", str(tmp_path / "out")])
+    return status, capsys.readouterr().out, tmp_path / "out"
+
+
+@pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
+def test_every_method_reports_and_saves(capsys, tmp_path, method):
+    status, text, out = run(capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else []))
+    assert status == 0
+    assert "undisturbed    no failure" in text and "95 %" in text and "best episode" in text
+    rows = [line.split()[:2] for line in text.splitlines() if line.startswith((method, "monte-carlo")) and "failing" not in line]
+    episodes = str(2 * 3 * 30 if method == "forest" else 2 * 30)
+    assert rows == [[method, episodes]] + ([["monte-carlo", episodes]] if method != "monte-carlo" else [])
+    held, settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())
+    assert held.size == 0 and settings["simulator"] == "ferry" and settings["method"] == method.replace("-", "_")
+    pytest.importorskip("matplotlib")
+    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in ("episode.png", "history.png"))
+
+
+@pytest.mark.parametrize("simulator", [name for name in cli.SYSTEMS if name != "ferry"])
+def test_every_simulator(capsys, tmp_path, simulator):
+    status, text, out = run(capsys, tmp_path, "--simulator", simulator, "--prunes", "2", "--paper")
+    assert status == 0 and text.startswith(f"{simulator}, seed 0")
+    assert ("\n  x0: " in text) == (simulator == "landing")
+    make, reward, chosen = cli.SYSTEMS[simulator]
+    jast.check(make(), chosen)
+    held, settings = jast.failures.load(out / "failures.npz", make())
+    assert settings["mode"] == "paper" and settings["widening"] == [0.5, 0.6]
+    if held.size:
+        assert "likeliest failure: " in text and f"{held.best.reward:.4f}" in text
+        assert jast.replay(make(), held.best, reward=reward).reward == held.best.reward
+
+
+def test_a_seed_gives_the_same_report(capsys, tmp_path):
+    one, two, other = (run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2", "--seed", seed)[1] for seed in "330")
+    assert one == two != other
+
+
+def test_without_matplotlib_it_goes_on(capsys, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    status, text, out = run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2")
+    assert status == 0 and "pip install 'jast[plot]'" in text
+    assert [path.name for path in out.iterdir()] == ["failures.npz"]
+
+
+def test_help(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0 and all(option in text for option in ("--simulator", "--method", "--paper", "--quiet", "ferry-b"))
+
+
+@pytest.mark.parametrize(
+    "argv, words",
+    [
+        (["--simulator", "boat"], "argument --simulator: invalid choice: 'boat'"),
+        (["--method", "luck"], "argument --method: invalid choice: 'luck'"),
+        (["--trees", "0"], "argument --trees: must be a whole number of at least 1, received '0'"),
+        (["--simulations", "-3"], "argument --simulations: must be a whole number of at least 1, received '-3'"),
+        (["--prunes", "1.5"], "argument --prunes: must be a whole number of at least 1, received '1.5'"),
+        (["--seed", "x"], "argument --seed: invalid int value: 'x'"),
+        (["--method", "mcts", "--prunes", "3"], "argument --prunes: only of --method forest, not of mcts"),
+        (["--method", "cem", "--paper"], "argument --paper: only with --method forest or mcts, not with cem"),
+        (["--output", __file__], "argument --output: "),
+        (["--trees", "1", "--simulations", "2000000000"], "prunes * simulations must be below 2**24"),
+    ],
+)
+def test_bad_arguments(capsys, tmp_path, monkeypatch, argv, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        cli.main(argv)
+    assert end.value.code == 2 and words in capsys.readouterr().err
+
+
+def test_interrupted_at_once(capsys, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "forest", stop)
+    assert cli.main([*SMALL, "--output", str(tmp_path)]) == 130
+    assert "interrupted before there was a result" in capsys.readouterr().err
+
+
+def test_interrupted_baseline_still_reports(capsys, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "monte_carlo", stop)
+    status, text, out = run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2")
+    assert status == 130 and "interrupted: " in text and (out / "failures.npz").exists()
+    assert "monte-carlo" not in text
+
+
+def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch):
+    whole = cli.forest
+
+    def stopped(*args, **kwargs):
+        def callback(done, total):
+            raise KeyboardInterrupt
+
+        return whole(*args, callback=callback, threads=1, lanes=1, **kwargs)
+
+    monkeypatch.setattr(cli, "forest", stopped)
+    status = cli.main(["--simulator", "walk1d", "--trees", "40", "--simulations", "200", "--quiet", "--output", str(tmp_path)])
+    text = capsys.readouterr().out
+    assert status == 130 and "interrupted: " in text and "monte-carlo" not in text
+    assert 0 < int(next(line for line in text.splitlines() if line.startswith("forest")).split()[1]) < 40 * 18 * 200
+
+
+@pytest.mark.long
+def test_as_a_program(tmp_path):
+    command = [sys.executable, "-m", "jast", "--simulator", "walk1d", "--trees", "2", "--prunes", "2", "--simulations", "20"]
+    cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ | cache, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "saved jast-output" in done.stdout and "forest: 100%" in done.stderr
+    assert (tmp_path / "jast-output" / "failures.npz").exists()
+    wrong = subprocess.run([*command, "--trees", "none"], cwd=tmp_path, env=os.environ | cache, capture_output=True, text=True, timeout=300)
+    assert wrong.returncode == 2 and wrong.stderr.splitlines()[-1].startswith("python -m jast: error: argument --trees")

@@ -1,0 +1,449 @@
+"""The tree engine: the trees it builds, against an independent search; what holds in every tree; and what it costs in memory and copies."""
+
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from systems import S0, ring
+
+import jast
+from jast.counter import tree_keys
+from jast.search import forest, records, run, simulate
+from jast.search import tree as T
+from jast.search.records import pack, unpack
+
+FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
+PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())
+SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
+SIZE = dict(trees=5, prunes=3, simulations=120)
+
+
+def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), exploration=10.0):
+    parts = T.Problem(sim, reward, actions, T.Settings(jnp.asarray(exploration, jnp.float32), T.widths(simulations, *widening)))
+    return jax.tree.map(jnp.asarray, parts)
+
+
+def grown(sim, keys, prunes=3, simulations=120, memoize="node", **choices):
+    """The tree after its last prune, the visits N(root) before each, and the `Roots` of each."""
+    total = prunes * simulations
+    p = problem(sim, total, **choices)
+    children = int(p.settings.widths.max())
+    tree = run._make(p, keys, total, memoize)
+    visits, roots = [], []
+    for turn in range(prunes):
+        tree = run._grow(p, tree, turn * simulations, (turn + 1) * simulations, memoize)
+        visits.append(np.asarray(tree.root_visits))
+        tree, turned = run._prune(p, tree, children, memoize)
+        roots.append(jax.device_get(turned))
+    return tree, visits, roots
+
+
+def visited_children(tree, lane):
+    """What the edges of one tree hold: node -> [(visits, sum of returns, child's id, child's reward)] by slot; the only place here that knows the layout."""
+    lanes = tree.key.shape[0]
+    pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, T.ROW)[:, lane]
+    made = np.flatnonzero((np.asarray(tree.outcome)[:, lane] & T.FRESH) > 0) + 1
+    out = {}
+    for node in [0, *made]:
+        page, found = node, []
+        while True:
+            row = pages[page]
+            columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
+            found += [(int(n), w, int(i), r) for n, w, i, r in zip(*columns, strict=True) if n > 0]
+            page = int(row[T.CHILD + T.LINK])
+            if page == 0:
+                break
+        out[int(node)] = found
+    return out
+
+
+# --- against an independent search ----------------------------------------------------------------------------------------------------------------------------
+
+
+def draws(keys, simulations, slots):
+    """Every number that a search of the ferry could draw: of the child in each slot of each node, and of each level of each simulation's rollout."""
+    node, slot = np.divmod(np.arange((simulations + 1) * slots), slots)
+    sim, level = np.divmod(np.arange(simulations * 21), 21)
+    uniform = jax.vmap(lambda key: jax.random.uniform(key, ()))
+
+    @jax.jit
+    def table(key):
+        children = T.child_key(jnp.broadcast_to(key, node.shape), jnp.asarray(node, jnp.int32), jnp.asarray(slot, jnp.int32))
+        rollout = jax.vmap(lambda i, t: jax.random.fold_in(jax.random.fold_in(key, i), t))(jnp.asarray(sim, jnp.int32), jnp.asarray(level, jnp.int32))
+        return uniform(children).reshape(-1, slots), uniform(rollout).reshape(-1, 21)
+
+    return [[np.asarray(a, np.float64) for a in table(key)] for key in keys]
+
+
+def plain_search(child_draws, rollout_draws, prunes, simulations, k, alpha, c):
+    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation."""
+
+    def step(state, a):
+        ferry, x, y, heading, last, nearest = state
+        heading = heading + (10 * a - 5) * np.pi / 100
+        ferry, x, y = ferry + 5, x + 5 * np.sin(heading), y + 5 * np.cos(heading)
+        distance = np.hypot(x - ferry, y - 50)
+        nearest = min(nearest, distance)
+        gain = 0.0 if last is None else np.log(1 - abs(a - last))
+        end = distance < 5 or ferry > 100
+        if end:
+            gain += 30.0 if distance < 5 else -nearest
+        return (ferry, x, y, heading, a, nearest), gain, end
+
+    children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, 16.0, 0.0, 0.0, None, np.hypot(16, 50))}
+    root, ancestors, log, at_prune = 0, [], [], []
+    for turn in range(prunes):
+        for i in range(turn * simulations, (turn + 1) * simulations):
+            node, path = root, list(ancestors)
+            while True:
+                path.append(node)
+                if ends.get(node):
+                    level = total = None
+                    break
+                if count[node] <= k * visits[node] ** alpha * (1 + 1e-14):  # widen by at most one child a visit; 32^0.6 is 8, not a little less
+                    count[node] += 1
+                    children[node].append(None)
+                bonus = np.sqrt(np.log(visits[node]))
+                scores = [c * bonus if child is None else q[child] + c * bonus / np.sqrt(1 + visits[child]) for child in children[node]]
+                slot = int(np.argmax(scores))
+                if children[node][slot] is None:
+                    new = i + 1
+                    states[new], gains[new], ends[new] = step(states[node], child_draws[node, slot])
+                    children[node][slot], children[new], count[new], visits[new], q[new] = new, [], 0, 0, 0.0
+                    path.append(new)
+                    node, level, total = new, len(path) - 1, 0.0
+                    break
+                node = children[node][slot]
+            if total is None:
+                total = 0.0
+            else:
+                state, end = states[node], ends[node]
+                while not end:
+                    state, gain, end = step(state, rollout_draws[i, level])
+                    total, level = total + gain, level + 1
+            for n in reversed(path):
+                total += gains[n]
+                visits[n] += 1
+                q[n] += (total - q[n]) / (visits[n] - (n == 0))
+            log.append(total)
+        at_prune.append([visits[child] for child in children[root] if child is not None])
+        ancestors.append(root)
+        root = children[root][int(np.argmax(at_prune[-1]))]
+    return at_prune, log
+
+
+@pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (0.5, 0.6)])
+def test_builds_the_tree_of_an_independent_search(key, k, alpha):
+    """Same numbers drawn, same tree: visits of all children of every root, and every simulation's reward."""
+    keys = tree_keys(key, 3)
+    tree, _, roots = grown(FERRY, keys, widening=(k, alpha), **S0)
+    for lane, table in enumerate(draws(keys, 360, int(T.widths(360, k, alpha).max()))):
+        at_prune, log = plain_search(*table, 3, 120, k, alpha, 10.0)
+        for turn, expected in enumerate(at_prune):
+            found = roots[turn].visits[lane]
+            assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
+        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-10 if tree.log.dtype == jnp.float64 else 1e-3)
+
+
+def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
+    ferry, choices = jast.simulators.ferry(), dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
+    keys = tree_keys(key, 3)
+    tree, _, roots = grown(ferry, keys, **choices)
+    assert tree.log.dtype == jnp.float64
+    for lane, table in enumerate(draws(keys, 360, int(T.widths(360, 2.0, 0.5).max()))):
+        at_prune, log = plain_search(*table, 3, 120, 2.0, 0.5, 10.0)
+        assert [r.visits[lane][r.visits[lane] > 0].tolist() for r in roots] == at_prune
+        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-10)
+
+
+# --- what holds in every tree ---------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_counts_of_every_node_add_up(name, key):
+    sim, choices = SYSTEMS[name]
+    k, alpha = 2.0, 0.5
+    tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(k, alpha), **choices)
+    np.testing.assert_array_equal(root_visits[0], 121)  # the simulations, and the 1 that a root starts from
+    log, outcome = np.asarray(tree.log), np.asarray(tree.outcome)
+    widest = 0
+    for lane in range(3):
+        nodes = visited_children(tree, lane)
+        ran = (outcome[:, lane] & T.RAN) > 0
+        visits, ends = {0: 1 + int(ran.sum())}, set()
+        for found in nodes.values():
+            visits |= {abs(child): n for n, _, child, _ in found}
+            ends |= {-child for _, _, child, _ in found if child < 0}
+        assert set(visits) == set(nodes)  # every node made has one edge that leads to it
+        for node, found in nodes.items():
+            if node in ends:
+                assert not found
+            else:
+                assert visits[node] == 1 + sum(n for n, *_ in found)
+                assert len(found) <= np.floor(k * visits[node] ** alpha) + 1
+            widest = max(widest, len(found))
+        total = sum(w for _, w, _, _ in nodes[0])
+        np.testing.assert_allclose(total / (visits[0] - 1), log[ran, lane].astype(np.float64).mean(), rtol=1e-5)
+    assert name != "ferry" or widest > T.PAGE  # pages were linked
+
+
+def test_nodes_are_numbered_by_the_simulation_that_made_them(key):
+    tree, *_ = grown(FERRY, tree_keys(key, 3), **S0)
+    ids = [abs(child) for found in visited_children(tree, 0).values() for _, _, child, _ in found]
+    made = np.flatnonzero((np.asarray(tree.outcome)[:, 0] & T.FRESH) > 0) + 1
+    assert sorted(ids) == made.tolist()
+
+
+def test_the_most_visited_child_becomes_the_root(key):
+    tree, root_visits, roots = grown(FERRY, tree_keys(key, 3), **S0)
+    for turn in range(2):
+        most = roots[turn].visits.max(1)
+        np.testing.assert_array_equal(root_visits[turn + 1], most + 120)
+    np.testing.assert_array_equal(roots[2].depth, 2)
+    np.testing.assert_array_equal(tree.depth, 3)
+
+
+def same(a, b):
+    """Whether two results are of the same trees, to the bit."""
+    np.testing.assert_array_equal(a.best_reward_per_tree, b.best_reward_per_tree)
+    np.testing.assert_array_equal(a.history.best_reward, b.history.best_reward)
+    np.testing.assert_array_equal(a.history.failures, b.history.failures)
+    np.testing.assert_array_equal(a.roots.visits, b.roots.visits)
+    np.testing.assert_array_equal(a.roots.q, b.roots.q)
+    assert (a.episodes, a.first_failure, a.failing_share, a.invalid) == (b.episodes, b.first_failure, b.failing_share, b.invalid)
+    np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
+    np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
+    assert a.failures.seen == b.failures.seen
+
+
+def searched(name, **changed):
+    sim, choices = SYSTEMS[name]
+    return forest(jax.random.key(7), sim, **SIZE | choices | changed)
+
+
+once = functools.cache(searched)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_same_key_gives_the_same_result(name):
+    same(once(name), searched(name))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_threads_and_lanes_change_nothing(name):
+    for other in (searched(name, threads=1, lanes=3), searched(name, threads=2, lanes=3)):  # in the last group, lanes are filled up
+        same(once(name), other)
+        assert once(name).simulator_steps == other.simulator_steps
+
+
+def test_a_tree_is_the_same_alone_and_among_others():
+    alone, among = once("ferry", trees=1), once("ferry")
+    np.testing.assert_array_equal(alone.best_reward_per_tree, among.best_reward_per_tree[:1])
+    np.testing.assert_array_equal(alone.roots.visits, among.roots.visits[:, :1])
+    np.testing.assert_array_equal(alone.history.best_reward, among.history.best_reward[:, :1])
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_memoization_changes_the_steps_and_nothing_else(name):
+    node, root, none = once(name), once(name, memoize="root"), once(name, memoize="none")
+    same(node, root)
+    same(node, none)
+    assert node.simulator_steps < root.simulator_steps < none.simulator_steps
+    if name == "ferry":
+        assert none.failures.seen == 0  # so all episodes are of 21 steps, of which a kept root saves its depth
+        assert none.simulator_steps == 5 * 360 * 21
+        assert root.simulator_steps == none.simulator_steps - 5 * 120 * (0 + 1 + 2)
+
+
+# --- widths ---------------------------------------------------------------------------------------------------------------------------------------------------
+
+
+@given(k=st.floats(0.05, 8.0), alpha=st.floats(0.0, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_widths_are_those_of_widening_step_by_step(k, alpha):
+    children, expected = 0, [0]
+    for n in range(1, 402):
+        children += children <= k * n**alpha * (1 + 1e-14)  # n^alpha of a whole result may come out just below it
+        expected.append(children)
+    assert T.widths(400, k, alpha).tolist() == expected
+
+
+@pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (1.0, 0.5), (3.0, 0.0), (1.0, 1.0)])
+def test_traced_widths_are_the_same(k, alpha):
+    traced = jax.jit(lambda k, alpha: T.widths(9000, k, alpha))(k, alpha)
+    np.testing.assert_array_equal(traced, T.widths(9000, k, alpha))
+
+
+@pytest.mark.parametrize(("k", "alpha"), [(0.5, 0.6), (2.0, 0.4)])
+def test_traced_widths_of_an_exponent_that_float32_rounds_are_nearly_the_same(k, alpha):
+    """Where k n^alpha comes within rounding of a whole number, a child may come one visit early or late."""
+    traced = jax.jit(lambda k, alpha: T.widths(9000, k, alpha))(k, alpha)
+    off = np.asarray(traced) - np.asarray(T.widths(9000, k, alpha))
+    assert np.abs(off).max() <= 1 and np.count_nonzero(off) <= 3
+
+
+# --- records --------------------------------------------------------------------------------------------------------------------------------------------------
+
+DTYPES = ["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float16", "bfloat16", "float32", "complex64"]
+WIDE = ["int64", "uint64", "float64", "complex128"]
+NAMED = dict(bfloat16=ml_dtypes.bfloat16)
+
+
+@st.composite
+def arrays(draw, names):
+    """An array of any bits, NaN of any payload included."""
+    dtype = np.dtype(NAMED.get(name := draw(st.sampled_from(names)), name))
+    shape = draw(st.sampled_from([(), (1,), (3,), (2, 3), (0,)]))
+    if dtype == bool:
+        return np.array(draw(st.lists(st.booleans(), min_size=int(np.prod(shape)), max_size=int(np.prod(shape)))), bool).reshape(shape)
+    size = int(np.prod(shape)) * dtype.itemsize
+    return np.frombuffer(draw(st.binary(min_size=size, max_size=size)), dtype).reshape(shape)
+
+
+def round_trip(tree):
+    tree = jax.tree.map(jnp.asarray, tree)
+    words = jax.jit(pack)(tree)
+    like = records.shapes(tree)
+    assert words.dtype == jnp.uint32 and words.shape == (records.width(like),)
+    return jax.tree.map(np.asarray, jax.jit(lambda w: unpack(w, like))(words))
+
+
+def same_bytes(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
+
+
+@given(tree=st.lists(arrays(DTYPES), max_size=4))
+@settings(max_examples=25, deadline=None)
+def test_records_give_back_every_bit(tree):
+    tree = dict(state=tree, empty=(), none=None)
+    same_bytes(tree, round_trip(tree))
+
+
+@given(tree=st.lists(arrays(WIDE + ["float32", "bool"]), min_size=1, max_size=3))
+@settings(max_examples=12, deadline=None)
+def test_records_give_back_every_bit_of_wide_numbers(tree):
+    with jax.enable_x64(True):
+        same_bytes(tree, round_trip(tree))
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [("float32", [0x7FC00001, 0xFFC12345, 0x7F800000, 0x80000000]), ("float16", [0x7E01, 0xFE23, 0x7C00, 0x8000])])
+def test_records_keep_payloads_of_nan(dtype, bits):
+    a = np.array(bits, f"u{np.dtype(dtype).itemsize}").view(dtype)
+    same_bytes(a, round_trip(a))
+
+
+def test_a_record_of_nothing_is_empty():
+    assert pack(()).shape == (0,) and unpack(pack(()), ()) == ()
+
+
+# --- copies ---------------------------------------------------------------------------------------------------------------------------------------------------
+
+
+def compiled_text(sim, simulations, memoize, **choices):
+    p = problem(sim, simulations, **choices)
+    keys = tree_keys(jax.random.key(0), 2)
+    tree = jax.eval_shape(lambda: T.make(p, run._shared(p), keys, simulations, memoize))
+    return run._grow.lower(p, tree, 0, 100, memoize).compile().as_text()
+
+
+def large_copies(text, capacity):
+    """Lines outside ENTRY that copy or select as many numbers as the tree has nodes, or more."""
+    found, entry = [], False
+    for line in text.splitlines():
+        if line and not line[0].isspace():
+            entry = line.startswith("ENTRY")
+        made = re.match(r"\s+(?:ROOT )?%?[\w.-]+ = \w+\[([\d,]*)\]\S* (copy|select|copy-start)\(", line)
+        if made and not entry and np.prod([int(n) for n in made[1].split(",") if n]) >= capacity:
+            found.append(line.strip())
+    return found
+
+
+def test_large_copies_are_seen():
+    """The test below would see one: a select of the whole array in a loop."""
+    body = lambda i, a: jnp.where(a[i % 1000] > 0, a.at[i].set(1.0), a[::-1])
+    text = jax.jit(lambda a: jax.lax.fori_loop(0, 10, body, a)).lower(jnp.zeros(1000)).compile().as_text()
+    assert large_copies(text, 1000)
+
+
+@pytest.mark.parametrize("memoize", ["node", "root", "none"])
+def test_no_array_of_the_tree_is_copied_in_a_loop(memoize):
+    assert not large_copies(compiled_text(FERRY, 307, memoize, **S0), 307)
+
+
+@pytest.mark.parametrize("name", ["landing", "ring"])
+def test_nor_with_other_states(name):
+    sim, choices = SYSTEMS[name]
+    assert not large_copies(compiled_text(sim, 307, "node", **choices), 307)
+
+
+def test_the_program_does_not_grow_with_the_simulations():
+    texts = [compiled_text(FERRY, n, "node", **S0) for n in (307, 2903)]
+    instructions = [len(re.findall(r"^\s.* = ", text, re.MULTILINE)) for text in texts]
+    assert instructions[0] == instructions[1] > 1000
+
+
+# --- memory ---------------------------------------------------------------------------------------------------------------------------------------------------
+
+
+def nbytes(tree):
+    return sum(jax.random.key_data(a).nbytes if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a.nbytes for a in jax.tree.leaves(tree))
+
+
+@pytest.mark.parametrize("memoize", ["node", "root"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_bytes_per_tree_are_those_of_its_arrays(name, memoize):
+    sim, choices = SYSTEMS[name]
+    p = problem(sim, 360, **choices)
+    tree = run._make(p, tree_keys(jax.random.key(0), 4), 360, memoize)
+    assert run.bytes_per_tree(p, run.Plan(3, 120, 39, memoize)) == nbytes(tree) / 4
+
+
+def large(words):
+    """A system with a state of so many 32-bit words."""
+    zero = jnp.zeros((), jnp.int32)
+    init = lambda x0: (jnp.zeros(()), zero + jnp.zeros((words,), jnp.int32))
+    return jast.Simulator(
+        init, lambda s, x: (s[0] + x, s[1] + 1), lambda s: jast.distributions.Normal(0.0, 1.0), lambda s: (s[0] > 9, 9 - s[0]), 6, observe=lambda s: s[0][None]
+    )
+
+
+def per_tree(sim, simulations, memoize):
+    return run.bytes_per_tree(problem(sim, simulations, **PLAIN), run.Plan(1, simulations, 20, memoize))
+
+
+def test_a_node_costs_its_edges_and_its_state():
+    a_node = lambda sim, memoize: (per_tree(sim, 15_000, memoize) - per_tree(sim, 7_500, memoize)) / 7_500
+    real = jnp.zeros(()).dtype.itemsize
+    assert a_node(large(0), "root") < 64 * real * (1 + 1 / 15) + 8 * real + 24
+    assert a_node(large(1000), "root") == a_node(large(0), "root")
+    assert a_node(large(1000), "node") - a_node(large(0), "node") == 4000
+
+
+def test_trees_that_do_not_fit_are_refused_with_the_numbers():
+    ran = []
+    with pytest.raises(ValueError, match=r"forest: 1 trees in each of 1 threads take .* MB .*3 x 120 simulations.*10 kB are free; use fewer"):
+        forest(jax.random.key(0), large(2000), trees=1, prunes=3, simulations=120, available=10_000, memoize="node", callback=lambda *a: ran.append(a))
+    with pytest.raises(ValueError, match="10 kB are free"):
+        forest(jax.random.key(0), FERRY, trees=4, prunes=3, simulations=120, available=10_000)
+    with pytest.raises(ValueError, match="10 kB are free"):
+        forest(jax.random.key(0), FERRY, trees=4, prunes=3, simulations=120, available=10_000, lanes=2)
+    assert not ran
+
+
+def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
+    sim, size = large(2000), dict(trees=2, prunes=3, simulations=120, threads=1)
+    node, root = (run.bytes_per_tree(problem(sim, 360, **PLAIN), run.Plan(3, 120, 39, memoize)) for memoize in ("node", "root"))
+    assert node > 5 * root
+    with pytest.warns(UserWarning, match='kept at roots: memoize="root"'):
+        result = forest(jax.random.key(0), sim, **size, available=2 * 2 * root)
+    assert result.settings["memoize"] == "root" and result.episodes == 720
+    result = forest(jax.random.key(0), sim, **size, available=2 * 2 * node)
+    assert result.settings["memoize"] == "node"
