@@ -34,9 +34,7 @@ def lock():
         right = (x >> 29) == (s[1] * 3 % 8).astype(jnp.uint32)
         return s[0] + right.astype(jnp.int32), s[1] + 1
 
-    return jast.Simulator(
-        lambda x0: (jnp.int32(0), jnp.int32(0)), step, lambda s: seeds(), lambda s: (s[0] >= 10, (10 - s[0]).astype(jnp.float32)), 10
-    )
+    return jast.Simulator(lambda x0: (jnp.int32(0), jnp.int32(0)), step, lambda s: seeds(), lambda s: (s[0] >= 10, (10 - s[0]).astype(jnp.float32)), 10)
 
 
 def check_replays(sim, result, reward, equal):
@@ -78,9 +76,9 @@ def test_ferry(key, equal, choice):
 @pytest.mark.parametrize("choice", [None, actions.samples(), actions.uniform(0.0, 1.0)])
 def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim, reward = ring(), rewards.standard()
-    r = cem(key, sim, actions=choice, **SMALL)
+    r = cem(key, sim, actions=choice, trees=4)
     check_replays(sim, r, reward, equal)
-    assert r.best.reward > monte_carlo(key, sim, episodes=1000).best.reward
+    assert r.failing.all() and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
 
 
 def test_random_start_of_a_rare_failure(key, equal):
@@ -137,14 +135,14 @@ def test_systems_that_never_or_always_fail(key):
 
 def test_under_jit_and_vmap(key):
     betas = jnp.array([3.0, 4.0])
-    search = lambda sim, smoothing=0.1: cem(key, sim, reward=WEIGHED, trees=2, smoothing=smoothing, **SMALL)
-    traced = jax.jit(jax.vmap(lambda b, s: search(hyperplane(b), s)))(betas, jnp.array([0.1, 0.1]))
+    search = lambda sim, smoothing=0.3: cem(key, sim, reward=WEIGHED, trees=2, smoothing=smoothing, **SMALL)
+    traced = jax.jit(jax.vmap(lambda b, s: search(hyperplane(b), s)))(betas, jnp.array([0.3, 0.3]))
     for i, b in enumerate(betas):
         r = search(hyperplane(b))
         # the last digit of an episode may decide who is an elite
         np.testing.assert_allclose(traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=2e-2)
         assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (r.episodes, r.simulator_steps, r.invalid)
-        assert traced.best.reward[i] == pytest.approx(traced.best_reward_per_tree[i].max(), rel=1e-5)
+        assert float(traced.best.reward[i]) == pytest.approx(float(traced.best_reward_per_tree[i].max()), rel=1e-5)
     assert traced.failures is None and traced.history is None and traced.settings is None and traced.failing.shape == (2, 2)
 
 

@@ -16,16 +16,18 @@ import jast
 from jast.counter import tree_keys
 from jast.search import forest, records, run, simulate
 from jast.search import tree as T
+from jast.search.choice import Choice
 from jast.search.records import pack, unpack
 
 FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
 PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())
 SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
-SIZE = dict(trees=5, prunes=3, simulations=120)
+SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
 
 
-def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), exploration=10.0):
-    parts = T.Problem(sim, reward, actions, T.Settings(jnp.asarray(exploration, jnp.float32), T.widths(simulations, *widening)))
+def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0):
+    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0)
+    parts = T.Problem(sim, reward, choice, T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)))
     return jax.tree.map(jnp.asarray, parts)
 
 
@@ -66,22 +68,47 @@ def visited_children(tree, lane):
 # --- against an independent search ----------------------------------------------------------------------------------------------------------------------------
 
 
-def draws(keys, simulations, slots):
-    """Every number that a search of the ferry could draw: of the child in each slot of each node, and of each level of each simulation's rollout."""
-    node, slot = np.divmod(np.arange((simulations + 1) * slots), slots)
-    sim, level = np.divmod(np.arange(simulations * 21), 21)
-    uniform = jax.vmap(lambda key: jax.random.uniform(key, ()))
+def drawn_as_published(keys, simulations, slots):
+    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, last)``, uniform numbers addressed by the keys of the tree, drawn beforehand."""
+    node_slot = jnp.stack(jnp.divmod(jnp.arange((simulations + 1) * slots), slots), axis=1).astype(jnp.int32)
 
     @jax.jit
     def table(key):
-        children = T.child_key(jnp.broadcast_to(key, node.shape), jnp.asarray(node, jnp.int32), jnp.asarray(slot, jnp.int32))
-        rollout = jax.vmap(lambda i, t: jax.random.fold_in(jax.random.fold_in(key, i), t))(jnp.asarray(sim, jnp.int32), jnp.asarray(level, jnp.int32))
-        return uniform(children).reshape(-1, slots), uniform(rollout).reshape(-1, 21)
+        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(node_slot[:, 0])
+        return jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(nodes, node_slot[:, 1]).reshape(-1, slots), rollouts(key, simulations)[0]
 
-    return [[np.asarray(a, np.float64) for a in table(key)] for key in keys]
+    def draw(of_child, of_level):
+        return lambda node, slot, last: of_child[node, slot], lambda i, level, last: of_level[i, level]
+
+    return [draw(*(np.asarray(a, np.float64) for a in table(key))) for key in keys]
 
 
-def plain_search(child_draws, rollout_draws, prunes, simulations, k, alpha, c):
+def drawn_by_default(keys, simulations, focus):
+    """The same for spread and focused actions: golden-ratio steps from a random place for each node; every second child, and steps by a coin, near the last."""
+
+    @jax.jit
+    def table(key):
+        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(jnp.arange(simulations + 1, dtype=jnp.int32))
+        return jax.vmap(lambda k: jax.random.bits(k, (), jnp.uint32))(nodes), *rollouts(key, simulations)
+
+    near = lambda pred, a, last: min(max((0.5 if last is None else last) + focus * (a - 0.5), 0.0), 1.0) if pred else a
+    step = int((5**0.5 - 1) / 2 * 2**32)
+
+    def draw(shift, of_level, coin):
+        place = lambda node, slot: ((int(shift[node]) + step * (slot // 2)) % 2**32 >> 8) / 2**24
+        return lambda node, slot, last: near(slot % 2, place(node, slot), last), lambda i, level, last: near(coin[i, level], float(of_level[i, level]), last)
+
+    return [draw(*map(np.asarray, table(key))) for key in keys]
+
+
+def rollouts(key, simulations):
+    """[simulations, 21] the uniform number and the coin of each level of each simulation."""
+    at = lambda i, level: jax.random.fold_in(jax.random.fold_in(key, i), level)
+    keys = jax.vmap(lambda i: jax.vmap(lambda level: at(i, level))(jnp.arange(21, dtype=jnp.int32)))(jnp.arange(simulations, dtype=jnp.int32))
+    return jax.vmap(jax.vmap(lambda k: jax.random.uniform(k, ())))(keys), jax.random.key_data(keys)[..., 1] & 1
+
+
+def plain_search(child, rollout, prunes, simulations, k, alpha, c):
     """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation."""
 
     def step(state, a):
@@ -110,11 +137,11 @@ def plain_search(child_draws, rollout_draws, prunes, simulations, k, alpha, c):
                     count[node] += 1
                     children[node].append(None)
                 bonus = np.sqrt(np.log(visits[node]))
-                scores = [c * bonus if child is None else q[child] + c * bonus / np.sqrt(1 + visits[child]) for child in children[node]]
+                scores = [c * bonus if n is None else q[n] + c * bonus / np.sqrt(1 + visits[n]) for n in children[node]]
                 slot = int(np.argmax(scores))
                 if children[node][slot] is None:
                     new = i + 1
-                    states[new], gains[new], ends[new] = step(states[node], child_draws[node, slot])
+                    states[new], gains[new], ends[new] = step(states[node], child(node, slot, states[node][4]))
                     children[node][slot], children[new], count[new], visits[new], q[new] = new, [], 0, 0, 0.0
                     path.append(new)
                     node, level, total = new, len(path) - 1, 0.0
@@ -125,41 +152,44 @@ def plain_search(child_draws, rollout_draws, prunes, simulations, k, alpha, c):
             else:
                 state, end = states[node], ends[node]
                 while not end:
-                    state, gain, end = step(state, rollout_draws[i, level])
+                    state, gain, end = step(state, rollout(i, level, state[4]))
                     total, level = total + gain, level + 1
             for n in reversed(path):
                 total += gains[n]
                 visits[n] += 1
                 q[n] += (total - q[n]) / (visits[n] - (n == 0))
             log.append(total)
-        at_prune.append([visits[child] for child in children[root] if child is not None])
+        at_prune.append([visits[n] for n in children[root] if n is not None])
         ancestors.append(root)
         root = children[root][int(np.argmax(at_prune[-1]))]
     return at_prune, log
 
 
-@pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (0.5, 0.6)])
-def test_builds_the_tree_of_an_independent_search(key, k, alpha):
+def agree(key, k, alpha, focus=1.0):
     """Same numbers drawn, same tree: visits of all children of every root, and every simulation's reward."""
     keys = tree_keys(key, 3)
-    tree, _, roots = grown(FERRY, keys, widening=(k, alpha), **S0)
-    for lane, table in enumerate(draws(keys, 360, int(T.widths(360, k, alpha).max()))):
-        at_prune, log = plain_search(*table, 3, 120, k, alpha, 10.0)
+    choices = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
+    tree, _, roots = grown(jast.simulators.ferry(), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices)
+    draws = drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max())) if focus == 1 else drawn_by_default(keys, 360, focus)
+    for lane, (child, rollout) in enumerate(draws):
+        at_prune, log = plain_search(child, rollout, 3, 120, k, alpha, 10.0)
         for turn, expected in enumerate(at_prune):
             found = roots[turn].visits[lane]
             assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
-        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-10 if tree.log.dtype == jnp.float64 else 1e-3)
+        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-6 if tree.log.dtype == jnp.float64 else 1e-3)
+
+
+@pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (0.5, 0.6)])
+def test_builds_the_tree_of_an_independent_search(key, k, alpha):
+    agree(key, k, alpha)
+
+
+def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_actions(key):
+    agree(key, 2.0, 0.5, focus=0.25)
 
 
 def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
-    ferry, choices = jast.simulators.ferry(), dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
-    keys = tree_keys(key, 3)
-    tree, _, roots = grown(ferry, keys, **choices)
-    assert tree.log.dtype == jnp.float64
-    for lane, table in enumerate(draws(keys, 360, int(T.widths(360, 2.0, 0.5).max()))):
-        at_prune, log = plain_search(*table, 3, 120, 2.0, 0.5, 10.0)
-        assert [r.visits[lane][r.visits[lane] > 0].tolist() for r in roots] == at_prune
-        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-10)
+    agree(key, 2.0, 0.5)
 
 
 # --- what holds in every tree ---------------------------------------------------------------------------------------------------------------------------------
@@ -235,9 +265,10 @@ def test_the_same_key_gives_the_same_result(name):
     same(once(name), searched(name))
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", ["ferry", "ring"])
 def test_threads_and_lanes_change_nothing(name):
-    for other in (searched(name, threads=1, lanes=3), searched(name, threads=2, lanes=3)):  # in the last group, lanes are filled up
+    """Groups of three, the last one filled up, in one thread or two; and all trees in one group."""
+    for other in (searched(name, threads=2), searched(name, lanes=None)):
         same(once(name), other)
         assert once(name).simulator_steps == other.simulator_steps
 
@@ -255,10 +286,14 @@ def test_memoization_changes_the_steps_and_nothing_else(name):
     same(node, root)
     same(node, none)
     assert node.simulator_steps < root.simulator_steps < none.simulator_steps
-    if name == "ferry":
-        assert none.failures.seen == 0  # so all episodes are of 21 steps, of which a kept root saves its depth
-        assert none.simulator_steps == 5 * 360 * 21
-        assert root.simulator_steps == none.simulator_steps - 5 * 120 * (0 + 1 + 2)
+
+
+def test_the_steps_of_replays_add_up():
+    """From so far off nothing collides, so all episodes are of 21 steps, of which a kept root saves its depth."""
+    sim, choices = jast.simulators.ferry(adversary=(16.0, -500.0)), SYSTEMS["ferry"][1]
+    root, none = (forest(jax.random.key(7), sim, **SIZE | choices, memoize=memoize) for memoize in ("root", "none"))
+    assert none.simulator_steps == 5 * 360 * 21
+    assert root.simulator_steps == none.simulator_steps - 5 * 120 * (0 + 1 + 2)
 
 
 # --- widths ---------------------------------------------------------------------------------------------------------------------------------------------------
@@ -300,7 +335,7 @@ def arrays(draw, names):
     """An array of any bits, NaN of any payload included."""
     dtype = np.dtype(NAMED.get(name := draw(st.sampled_from(names)), name))
     shape = draw(st.sampled_from([(), (1,), (3,), (2, 3), (0,)]))
-    if dtype == bool:
+    if dtype.kind == "b":
         return np.array(draw(st.lists(st.booleans(), min_size=int(np.prod(shape)), max_size=int(np.prod(shape)))), bool).reshape(shape)
     size = int(np.prod(shape)) * dtype.itemsize
     return np.frombuffer(draw(st.binary(min_size=size, max_size=size)), dtype).reshape(shape)

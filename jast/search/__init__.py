@@ -1,7 +1,9 @@
 """Searches for failures; each returns a `SearchResult`."""
 
+from jast.search.cem import cem
 from jast.search.forest import forest
 from jast.search.mcts import mcts
+from jast.search.monte_carlo import monte_carlo
 from jast.search.result import History, SearchResult, table
 
-__all__ = ["History", "SearchResult", "forest", "mcts", "table"]
+__all__ = ["History", "SearchResult", "cem", "forest", "mcts", "monte_carlo", "table"]

@@ -54,10 +54,10 @@ class Pool(NamedTuple):
 
 
 def cem(
-    key, sim, *, samples=300, elites=30, iterations=30, reward=rewards.STANDARD, actions=None, smoothing=0.1, floor=0.05, fresh=0.1, trees=1, top=64,
+    key, sim, *, samples=300, elites=30, iterations=30, reward=rewards.STANDARD, actions=None, smoothing=0.3, floor=0.05, fresh=0.1, trees=1, top=64,
     progress=False, callback=None,
 ):  # fmt: skip
-    """Search by cross-entropy: `SearchResult`. Maximises ``reward``: ``iterations`` of ``samples`` episodes, drawn like the ``elites`` best distinct ones so far.
+    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, drawn like the ``elites`` best distinct ones so far; maximises ``reward``.
 
     Failures rank before other episodes, each by reward; one whose reward is not finite is never an elite. With ``actions.quantiles()`` and
     ``uniform(low, high)`` x_t is the quantile, or the point of the box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the
@@ -148,7 +148,7 @@ def _fit(proposals, pool, real, plan):
     z, reward, length = jax.tree.map(lambda a: a[: plan.elites], (pool.latent, pool.episode.reward, pool.episode.length))
     known = reward[:, None] > -jnp.inf
     horizon = jax.tree.leaves(pool.episode.disturbances)[0].shape[1]
-    counts = known, known & (jnp.arange(horizon) < length[:, None])
+    counts = known, known & (jnp.arange(horizon, dtype=jnp.int32)[None] < length[:, None])
     return tuple(P.fit(g, v, n, real.smoothing, real.floor) if g != () else () for g, v, n in zip(proposals, z, counts, strict=True))
 
 

@@ -28,8 +28,8 @@ __all__ = [
 
 PAGE = 15
 LINK = PAGE  # a page's last entry is no child: its CHILD is the page that continues this one, or 0
-VISITS, RETURNS, CHILD, REWARD = 0, 16, 32, 48  # columns of a page's row in Tree.edges
-ROW = 64
+VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))  # columns of a page's row in Tree.edges
+ROW = 4 * (PAGE + 1)
 
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
 _NODE = jnp.uint32(1 << 31)  # addresses of children, apart from those of simulations

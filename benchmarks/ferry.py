@@ -1,0 +1,122 @@
+"""The ferry S0: golden episodes, the paper's Table 1 without networks, and what the default search makes of it.
+
+``python -m benchmarks.ferry [--json] [--quick] [--trees N]``. Every tree has 9000 simulations. Rates have 95 % Clopper-Pearson intervals, means
+1.96 standard errors. Published rows: Lytskjold and Mengshoel, Table 1, 200 trees each.
+"""
+
+import argparse
+import json
+import pathlib
+import time
+
+import jax
+import numpy as np
+
+import jast
+from jast.estimate.intervals import clopper_pearson
+
+DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
+REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
+BOX = jast.actions.uniform(0.0, 1.0)
+
+
+def golden():
+    """Greatest error of the rewards of the published episodes, in float32 and float64; None where the data is absent."""
+    path = DATA / "golden_episodes.json"
+    if not path.exists():
+        return None
+    episodes = json.loads(path.read_text())["episodes"]
+    errors = {}
+    for bits in (32, 64):
+        with jax.enable_x64(bits == 64):
+            sim = jast.simulators.ferry()
+            found = [float(jast.replay(sim, np.array(e["seeds"]), reward=REWARD).reward) for e in episodes]
+        errors[f"float{bits}"] = float(np.max(np.abs(np.array(found) - [e["reward"] for e in episodes])))
+    return {"episodes": len(episodes), "greatest_error": errors}
+
+
+def row(search, seed):
+    """One row: what a search of many trees found."""
+    start = time.process_time(), time.perf_counter()
+    result = search(jax.random.key(seed))
+    cpu, wall = time.process_time() - start[0], time.perf_counter() - start[1]
+    best = np.asarray(result.best_reward_per_tree, np.float64)
+    n, failing = best.size, int(np.sum(best > 0))
+    runs = [best[i : i + 200].max() for i in range(0, n - 199, 200)]
+    return {
+        "trees": n,
+        "rate": failing / n,
+        "rate_95": list(clopper_pearson(failing, n)),
+        "mean_best": best.mean(),
+        "mean_best_95": 1.96 * best.std() / np.sqrt(n),
+        "mean_best_failing": best[best > 0].mean() if failing else None,
+        "best": best.max(),
+        "best_of_200": [min(runs), float(np.median(runs)), max(runs)] if runs else None,
+        "failing_episodes": result.failing_share,
+        "episodes": result.episodes,
+        "steps": result.simulator_steps,
+        "cpu_s": cpu,
+        "wall_s": wall,
+        "failing_trees_per_cpu_s": failing / cpu,
+    }
+
+
+def rows(trees, quick):
+    """Name -> search of S0 (and S0b)."""
+    s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
+
+    def forest(sim=s0, **settings):
+        return lambda key: jast.search.forest(key, sim, trees=trees, reward=REWARD, actions=BOX, **settings)
+
+    def mcts(**settings):
+        return lambda key: jast.search.mcts(key, s0, trees=trees, reward=REWARD, actions=BOX, **settings)
+
+    table = {
+        "forest, paper": forest(mode="paper"),
+        "mcts, paper": mcts(mode="paper"),
+        "forest, default": forest(),
+        "mcts, default": mcts(),
+        "forest, S0b, paper": forest(s0b, mode="paper"),
+        "forest, S0b, default": forest(s0b),
+        "monte carlo": lambda key: jast.search.monte_carlo(key, s0, episodes=9000 * trees, reward=REWARD, actions=BOX),
+    }
+    if not quick:
+        table |= {
+            "forest, widening (2, 0.5) alone": forest(spread=False, focus=1.0),
+            "forest, and spread": forest(focus=1.0),
+            "cem": lambda key: jast.search.cem(key, s0, trees=trees, samples=900, elites=90, iterations=10, reward=REWARD, actions=BOX),
+        }
+    return table
+
+
+PUBLISHED = {"forest, paper": (29.5, 1.927, 28.061), "mcts, paper": (35.5, 2.304, 28.245)}
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quick", action="store_true", help="100 trees a row")
+    parser.add_argument("--trees", type=int, help="trees a row (default 1000)")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args(argv)
+    trees = args.trees or (100 if args.quick else 1000)
+    report = {"golden": golden(), "seed": args.seed, "rows": {}}
+    if not args.json:
+        print("golden episodes:", report["golden"] or "data not found")
+        print(f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7} {'of 200: least, median':>21} {'CPU s':>7}")
+    for name, search in rows(trees, args.quick).items():
+        report["rows"][name] = r = row(search, args.seed)
+        if not args.json:
+            low, high = (100 * v for v in r["rate_95"])
+            of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
+            mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
+            print(f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f} {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}", flush=True)
+            if name in PUBLISHED:
+                rate, mean, best = PUBLISHED[name]
+                print(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
+    if args.json:
+        print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()
