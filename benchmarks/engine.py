@@ -55,8 +55,8 @@ def rollouts(problem, keys, simulations):
 
         def roll(carry):
             level, at = carry
-            draw = lambda k, t, p: take(problem, t, p, choose_rollout(problem, jax.random.fold_in(k, t), p.state))
-            after = jax.vmap(draw)(key, level, at)
+            draw = lambda k, tree_key, t, p: take(problem, t, p, choose_rollout(problem, jax.random.fold_in(k, t), tree_key, p.state))
+            after = jax.vmap(draw)(key, keys, level, at)
             kept = Progress(after.state, *(jnp.where(at.done, a, b) for a, b in zip(at[1:], after[1:], strict=True)))
             return level + 1, kept._replace(log_prob=at.log_prob)
 
@@ -202,13 +202,15 @@ def peer(repeats, lanes=200, simulations=500):
 
         reward, gone, after = jax.vmap(one)(action, embedding)
         shape = (*action.shape, 10)
-        return mctx.RecurrentFnOutput(reward, jnp.where(gone, 0.0, 1.0), jnp.zeros(shape), jnp.zeros(action.shape)), after
+        return mctx.RecurrentFnOutput(
+            reward=reward, discount=jnp.where(gone, 0.0, 1.0), prior_logits=jnp.zeros(shape), value=jnp.zeros(action.shape)
+        ), after
 
     @jax.jit
     def policy(key):
         start = At(jnp.int32(0), begin(sim, REWARD, ()))
         start = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), start)
-        root = mctx.RootFnOutput(jnp.zeros((lanes, 10)), jnp.zeros(lanes), start)
+        root = mctx.RootFnOutput(prior_logits=jnp.zeros((lanes, 10)), value=jnp.zeros(lanes), embedding=start)
         return mctx.muzero_policy((), key, root, recurrent, simulations, dirichlet_fraction=0.0).action
 
     keys = tree_keys(jax.random.key(0), lanes)

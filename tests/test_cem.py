@@ -34,7 +34,7 @@ def lock():
         right = (x >> 29) == (s[1] * 3 % 8).astype(jnp.uint32)
         return s[0] + right.astype(jnp.int32), s[1] + 1
 
-    return jast.Simulator(lambda x0: (jnp.int32(0), jnp.int32(0)), step, lambda s: seeds(), lambda s: (s[0] >= 10, (10 - s[0]).astype(jnp.float32)), 10)
+    return jast.Simulator(lambda x0: (jnp.int32(0), jnp.int32(0)), step, lambda s: seeds(), lambda s: (s[0] >= 10, (10 - s[0]).astype(float)), 10)
 
 
 def check_replays(sim, result, reward, equal):
@@ -111,7 +111,7 @@ def test_counts_of_repetitions(key):
     """One failure only: every time it was found is counted."""
     sim = jast.Simulator(
         lambda x0: jnp.int32(0), lambda s, x: x.astype(jnp.int32), lambda s: jast.distributions.Categorical(probs=jnp.array([0.9, 0.1])),
-        lambda s: (s == 1, (1 - s).astype(jnp.float32)), 1,
+        lambda s: (s == 1, (1 - s).astype(float)), 1,
     )  # fmt: skip
     r = cem(key, sim, trees=2, actions=actions.samples(), samples=50, elites=5, iterations=4)
     assert r.failures.size == 1 and r.failures.counts.sum() == r.failures.seen == round(r.failing_share * 400)

@@ -31,10 +31,13 @@ def _dice(s):
     return seeds()
 
 
-DICE = jast.Simulator(
-    lambda x0: jnp.zeros((), jnp.int32), lambda s, x: s + (x % 6).astype(jnp.int32), _dice, lambda s: (s >= 30, jnp.maximum(30 - s, 0).astype(jnp.zeros(()).dtype)), 8
-)
-SYSTEMS = dict(ferry=FERRY, landing=LANDING, ring=RING, walk1d=jast.simulators.walk1d(threshold=6.0), limit_state=jast.simulators.limit_state(_four_branches, 2), dice=DICE)
+def _count(s):
+    return s >= 30, jnp.maximum(30 - s, 0).astype(jnp.zeros(()).dtype)
+
+
+DICE = jast.Simulator(lambda x0: jnp.zeros((), jnp.int32), lambda s, x: s + (x % 6).astype(jnp.int32), _dice, _count, 8)
+WALK, STATIC = jast.simulators.walk1d(threshold=6.0), jast.simulators.limit_state(_four_branches, 2)
+SYSTEMS = dict(ferry=FERRY, landing=LANDING, ring=RING, walk1d=WALK, limit_state=STATIC, dice=DICE)
 ACTIONS = dict(samples=jast.actions.samples(), quantiles=jast.actions.quantiles(), uniform=jast.actions.uniform(0.0, 1.0))
 
 
@@ -106,8 +109,8 @@ def test_results_are_honest(name):
 
 def test_every_archived_failure_replays_to_the_bit():
     archive = once("ring").failures
-    assert archive.size == 64
-    for i in range(0, archive.size, 5):
+    assert archive.size > 10
+    for i in range(0, archive.size, 3):
         replays(archive.episode(i), RING, BONUS)
 
 
@@ -135,7 +138,7 @@ def test_the_first_failure_is_counted_in_the_order_of_simulation():
 
 def test_settings_say_what_was_asked_and_are_saved_with_the_failures(tmp_path, equal):
     result = once("landing")
-    asked = dict(method="forest", mode="default", trees=6, prunes=3, simulations=60, memoize="node", exploration=10.0, widening=[2.0, 0.5], spread=True, focus=1.0)
+    asked = dict(method="forest", mode="default", memoize="node", exploration=10.0, widening=[2.0, 0.5], spread=True, focus=1.0) | SIZE
     assert json.loads(json.dumps(result.settings)) == result.settings
     assert asked.items() <= result.settings.items()
     F.save(tmp_path / "found.jast", result.failures, result.settings)
@@ -161,7 +164,7 @@ def test_random_starts_are_found():
     np.testing.assert_allclose(result.roots.starts[0][first].std(), 0.1, rtol=0.5)
     mixed = once("ring")
     assert mixed.failures.episodes.x0["hit"].dtype == np.int32 and set(np.unique(mixed.failures.episodes.x0["hit"])) <= {0, 1}
-    assert mixed.failures.episodes.disturbances["gust"].shape == (64, 8, 2)
+    assert mixed.failures.episodes.disturbances["gust"].shape == (mixed.failures.size, 8, 2)
 
 
 def test_mcts_is_a_forest_of_one_root(equal):
@@ -174,10 +177,10 @@ def test_mcts_is_a_forest_of_one_root(equal):
 # --- all kinds of systems and actions -------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "actions"),
-    [(name, "samples") for name in SYSTEMS] + [(n, "quantiles") for n in ("landing", "ring", "limit_state", "dice")] + [(n, "uniform") for n in ("ferry", "ring", "dice")],
-)
+KINDS = dict(samples=SYSTEMS, quantiles=("landing", "ring", "limit_state", "dice"), uniform=("ferry", "ring", "dice"))
+
+
+@pytest.mark.parametrize(("actions", "name"), [(actions, name) for actions, names in KINDS.items() for name in names])
 def test_all_actions_search_all_systems(name, actions):
     reward = S0["reward"] if name == "ferry" else BONUS
     if (name, actions) == ("dice", "quantiles"):
@@ -272,11 +275,10 @@ def test_an_error_of_the_callback_ends_the_search_at_once():
     def fail(done, total):
         raise RuntimeError("enough")
 
-    searched("ferry", simulations=60)  # so that all is compiled
     began = time.perf_counter()
     with pytest.raises(RuntimeError, match="enough"):
-        forest(jax.random.key(0), FERRY, trees=600, prunes=18, simulations=2000, lanes=6, threads=1, **S0, callback=fail)
-    assert time.perf_counter() - began < 60
+        forest(jax.random.key(0), FERRY, trees=6000, prunes=18, simulations=400, lanes=6, threads=1, **S0, callback=fail)
+    assert time.perf_counter() - began < 60  # all of it would take minutes
 
 
 def test_the_callback_is_told_of_every_simulation():
@@ -288,8 +290,10 @@ def test_the_callback_is_told_of_every_simulation():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("trees", 0), ("prunes", -1), ("simulations", 0), ("simulations", 2.5), ("top", 0), ("threads", 0), ("lanes", 0), ("widening", (1.0,)), ("widening", 2.0),
-        ("widening", (0.0, 0.5)), ("widening", (1.0, 1.5)), ("widening", (float("nan"), 0.5)), ("mode", "published"), ("memoize", "leaf"), ("trees", True), ("focus", 0.0), ("focus", -1.0),
+        ("trees", 0), ("prunes", -1), ("simulations", 0), ("simulations", 2.5), ("top", 0), ("threads", 0), ("lanes", 0), ("widening", (1.0,)),
+        ("widening", 2.0), ("widening", (0.0, 0.5)), ("widening", (1.0, 1.5)),
+        ("widening", (float("nan"), 0.5)), ("mode", "published"), ("memoize", "leaf"), ("trees", True),
+        ("focus", 0.0), ("focus", -1.0),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(name, value):

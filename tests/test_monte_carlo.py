@@ -1,5 +1,7 @@
 """Random search: its counts and rate against a known truth, episodes known by their numbers, an archive that replays, and traced runs."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,21 +12,22 @@ import jast
 from jast import actions, rewards
 from jast.distributions import Categorical, Normal, seeds
 from jast.search import episodes as E
-from jast.search import monte_carlo as module
 from jast.search.monte_carlo import monte_carlo
+
+module = importlib.import_module("jast.search.monte_carlo")  # the package has the function by that name
 
 
 def lottery():
     """Four draws of seeds; fails where the low bits of all are zero: once in 2^8 episodes."""
     step = lambda s, x: s + (x % 4).astype(jnp.int32)
-    return jast.Simulator(lambda x0: jnp.int32(0), step, lambda s: seeds(), lambda s: (s == 0, s.astype(jnp.float32)), 4, episodic=True)
+    return jast.Simulator(lambda x0: jnp.int32(0), step, lambda s: seeds(), lambda s: (s == 0, s.astype(float)), 4, episodic=True)
 
 
 def coins():
     """Six coins that show heads in three of ten; fails at the fourth head."""
     step = lambda s, x: s + x.astype(jnp.int32)
     return jast.Simulator(
-        lambda x0: jnp.int32(0), step, lambda s: Categorical(probs=jnp.array([0.7, 0.3])), lambda s: (s >= 4, jnp.maximum(4 - s, 0).astype(jnp.float32)), 6
+        lambda x0: jnp.int32(0), step, lambda s: Categorical(probs=jnp.array([0.7, 0.3])), lambda s: (s >= 4, jnp.maximum(4 - s, 0).astype(float)), 6
     )
 
 

@@ -14,7 +14,7 @@ from systems import S0, ring
 
 import jast
 from jast.counter import tree_keys
-from jast.search import forest, records, run, simulate
+from jast.search import forest, records, run
 from jast.search import tree as T
 from jast.search.choice import Choice
 from jast.search.records import pack, unpack
@@ -75,7 +75,8 @@ def drawn_as_published(keys, simulations, slots):
     @jax.jit
     def table(key):
         nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(node_slot[:, 0])
-        return jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(nodes, node_slot[:, 1]).reshape(-1, slots), rollouts(key, simulations)[0]
+        children = jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(nodes, node_slot[:, 1])
+        return children.reshape(-1, slots), rollouts(key, simulations)[0]
 
     def draw(of_child, of_level):
         return lambda node, slot, last: of_child[node, slot], lambda i, level, last: of_level[i, level]

@@ -1,7 +1,7 @@
 """The cross-entropy method over disturbance sequences: draw episodes, keep the elites, draw the next ones like them.
 
-Algorithm 3.3 of de Boer, Kroese, Mannor and Rubinstein (2005), A tutorial on the cross-entropy method, with smoothed updating (their remark 3.3), for
-proposals that are independent over time, each step with its own (`jast.search.proposals`).
+The cross-entropy method for optimisation with smoothed updating (de Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy method), for
+proposals that are independent over time, each step with its own (`jast.search.proposals`). Unlike there, elites are the best of all iterations.
 """
 
 from functools import partial
@@ -57,7 +57,7 @@ def cem(
     key, sim, *, samples=300, elites=30, iterations=30, reward=rewards.STANDARD, actions=None, smoothing=0.3, floor=0.05, fresh=0.1, trees=1, top=64,
     progress=False, callback=None,
 ):  # fmt: skip
-    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, drawn like the ``elites`` best distinct ones so far; maximises ``reward``.
+    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the ``elites`` best distinct ones so far; maximises ``reward``.
 
     Failures rank before other episodes, each by reward; one whose reward is not finite is never an elite. With ``actions.quantiles()`` and
     ``uniform(low, high)`` x_t is the quantile, or the point of the box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the

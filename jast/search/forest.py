@@ -37,8 +37,8 @@ def forest(
     mean. After ``simulations`` of them the most visited child becomes the root and keeps its subtree; a tree ends early when its root is an episode's end.
 
     ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``:
-    the children of a node cover the action space evenly; ``focus``: every second child, and about every second step of a rollout, is drawn closer to the mode
-    of the disturbance by this factor, 0.2 for a uniform box and 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the tails, for
+    the children of a node cover the action space evenly; ``focus``: every second child, and in half of the trees every second rollout step, is drawn closer to
+    the mode of the disturbance by this factor, 0.2 for a uniform box and 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the tails, for
     failures too rare for the model's own draws. Each may be given on its own. ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
 
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"

@@ -39,7 +39,7 @@ def _one(problem, axes, tree, lane, i, memoize):
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
         chosen = choose_child(problem, node_keys(key[None], parents[up_there][None])[0], slots[up_there], at.state)
-        rolled = choose_rollout(problem, jax.random.fold_in(rolling, level), at.state)
+        rolled = choose_rollout(problem, jax.random.fold_in(rolling, level), key, at.state)
         x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
         after = take(problem, level, at, action)
         kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)

@@ -47,7 +47,7 @@ def _simulation(problem, axes, tree, i, memoize):
     def roll(carry):
         level, steps, at = carry
         live = ~at.done
-        after = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0))(problem, key, level, at)
+        after = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0))(problem, key, tree.key, level, at)
         kept = Progress(after.state, *(jnp.where(live, b, a) for a, b in zip(at[1:], after[1:], strict=True)))
         return level + 1, steps + _one(live), kept._replace(log_prob=zero)
 
@@ -129,8 +129,8 @@ def _child(problem, node_key, slot, level, before):
     return take(problem, level, before, choose_child(problem, node_key, slot, before.state))
 
 
-def _rolled(problem, key, level, before):
-    return take(problem, level, before, choose_rollout(problem, jax.random.fold_in(key, level), before.state))
+def _rolled(problem, key, tree_key, level, before):
+    return take(problem, level, before, choose_rollout(problem, jax.random.fold_in(key, level), tree_key, before.state))
 
 
 def child_state(problem, node_key, slot, level, state):

@@ -198,11 +198,11 @@ def choose_child(problem, node_key, slot, state):
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
 
-def choose_rollout(problem, key, state):
-    """One lane: (x0, x) of a rollout."""
+def choose_rollout(problem, key, tree_key, state):
+    """One lane: (x0, x) of a rollout's level, by its own key and its tree's."""
     sim, choice = problem.sim, problem.choice
-    x0 = choice.roll(key, sim.start(), start=True) if random_start(sim) else ()
-    return x0, choice.roll(key, sim.disturbance(state))
+    x0 = choice.roll(key, tree_key, sim.start(), start=True) if random_start(sim) else ()
+    return x0, choice.roll(key, tree_key, sim.disturbance(state))
 
 
 def take(problem, level, before, action):
