@@ -202,9 +202,7 @@ def peer(repeats, lanes=200, simulations=500):
 
         reward, gone, after = jax.vmap(one)(action, embedding)
         shape = (*action.shape, 10)
-        return mctx.RecurrentFnOutput(
-            reward=reward, discount=jnp.where(gone, 0.0, 1.0), prior_logits=jnp.zeros(shape), value=jnp.zeros(action.shape)
-        ), after
+        return mctx.RecurrentFnOutput(reward=reward, discount=jnp.where(gone, 0.0, 1.0), prior_logits=jnp.zeros(shape), value=jnp.zeros(action.shape)), after
 
     @jax.jit
     def policy(key):

@@ -110,7 +110,10 @@ def main(argv=None):
             low, high = (100 * v for v in r["rate_95"])
             of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
             mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
-            print(f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f} {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}", flush=True)
+            print(
+                f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f} {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}",
+                flush=True,
+            )
             if name in PUBLISHED:
                 rate, mean, best = PUBLISHED[name]
                 print(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")

@@ -16,7 +16,6 @@ from jast.policy import nominal_policy
 __all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "play_back", "replay", "rollout"]
 
 
-
 class Episode(NamedTuple):
     """One episode, or many along leading axes. Rows from ``length`` on are zero and mean nothing."""
 

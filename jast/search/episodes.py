@@ -195,7 +195,7 @@ def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="s
             kept = carry, end, counted, [*moments, (end, best, counted.failures)]  # at once: an interruption finds all of a chunk or nothing
             if bar is not None:
                 bar.update(end * trees - bar.n)
-                bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}")
+                bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}", refresh=False)
             if callback is not None:
                 callback(end * trees, whole)
     except KeyboardInterrupt:

@@ -1,29 +1,13 @@
 """Monte Carlo forest search with action pruning: MCFS-AP of Lytskjold and Mengshoel, Algorithm 1."""
 
-import os
-import warnings
-
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from jast import actions as A
 from jast import rewards
-from jast.check import contract
-from jast.counter import tree_keys
-from jast.episode import Episode, replay
-from jast.failures import collect, identity
-from jast.search import memory
-from jast.search.choice import Choice
-from jast.search.result import History, SearchResult
-from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
-from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, widths
+from jast.search.trees import grow_trees, settled
 
 __all__ = ["MODES", "forest"]
 
 SAMPLES = A.samples()
 MODES = {"default": dict(widening=(2.0, 0.5), spread=True, focus=None), "paper": dict(widening=(0.5, 0.6), spread=False, focus=1.0)}
-LANES = 128  # trees in lockstep in one thread: enough to fill vector units, few enough to stay near the processor
 
 
 def forest(
@@ -50,185 +34,7 @@ def forest(
 
     Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
     """
-    return search(
-        "forest", key, sim, _settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations, reward=reward,
+    return grow_trees(
+        "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations, reward=reward,
         actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
     )  # fmt: skip
-
-
-def search(method, key, sim, settled, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, threads, lanes, available, progress, callback):
-    """A forest by its settings, all given: what `forest` and `mcts` call. ``settled``: mode, widening, spread and focus."""
-    mode, widening, spread, focus = settled
-    for name, value in dict(trees=trees, prunes=prunes, simulations=simulations, top=top, threads=1 if threads is None else threads, lanes=1 if lanes is None else lanes).items():
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{method}: {name} must be an int of at least 1, received {value!r}")
-    if memoize not in ("auto", "node", "root", "none"):
-        raise ValueError(f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}')
-    reward = rewards.as_pytree(reward)
-    contract(sim, actions, observed=False)
-    prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
-    total = prunes * simulations
-    if total >= 2**24:
-        raise ValueError(f"{method}: prunes * simulations must be below 2**24, received {prunes} * {simulations}: grow more trees instead")
-    table = widths(total, *widening)
-    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=isinstance(focus, jax.core.Tracer) or focus != 1)
-    problem = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)))
-    children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
-    plan = Plan(int(prunes), int(simulations), min(children, 4096), "node" if memoize == "auto" else memoize)
-    settings = dict(
-        method=method, mode=mode, trees=int(trees), prunes=int(prunes), simulations=int(simulations), reward=_name(reward), actions=_name(actions), memoize=memoize,
-    )  # fmt: skip
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, key))):
-        return _traced(grow_traced(problem, tree_keys(key, trees), plan), trees)
-    settings |= dict(exploration=float(exploration), widening=[float(v) for v in widening], spread=spread, focus=float(focus))
-    settings["seed"] = np.asarray(_data(key)).tolist()
-    plan, threads, lanes = _fit(method, problem, plan, trees, threads, lanes, available, auto=memoize == "auto")
-    settings["memoize"] = plan.memoize
-    if progress:
-        from tqdm import tqdm
-    bar = tqdm(total=trees * total, unit="sim", unit_scale=True, desc=method) if progress else None
-    done = [0]
-
-    def on_chunk(n):
-        done[0] += n
-        if bar is not None:
-            bar.update(n)
-        if callback is not None:
-            callback(done[0], trees * total)
-
-    chunk = max(1, min(simulations, 500))
-    harvests, interrupted = grow_all(problem, tree_keys(key, trees), plan, threads=threads, lanes=lanes, chunk=chunk, candidates=max(256, 4 * top), on_chunk=on_chunk)
-    if bar is not None:
-        bar.close()
-    if interrupted:
-        settings["interrupted"] = f"after {done[0]} of {trees * total} simulations"
-    if not harvests:
-        raise KeyboardInterrupt
-    return _result(sim, reward, harvests, settings, top)
-
-
-def _fit(method, problem, plan, trees, threads, lanes, available, auto):
-    """The plan with its memoization settled, and the threads and lanes with which it fits into memory; ValueError if it does not."""
-    if threads is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        threads = max(1, min(cores, trees // 8)) if jax.default_backend() == "cpu" else 1
-    given, free = lanes, memory.available() if available is None else available
-    if lanes is None:
-        rounds = -(-trees // (threads * LANES))
-        lanes = -(-trees // (threads * rounds)) if jax.default_backend() == "cpu" else trees
-    lanes = min(lanes, trees)
-    threads = min(threads, -(-trees // lanes))
-    for memoize in (["node", "root"] if auto else [plan.memoize]):
-        plan = plan._replace(memoize=memoize)
-        one = bytes_per_tree(problem, plan)
-        within = lanes if free is None else int(0.8 * free // (one * threads))
-        if within >= (lanes if given or memoize == "node" and auto and lanes <= 8 else min(lanes, 8)) or (within >= 1 and memoize != "node" and not given):
-            break
-    if free is not None and (within < 1 or (given and within < lanes)):
-        raise ValueError(
-            f"{method}: {lanes} trees in each of {threads} threads take {memory.readable(one * lanes * threads)} ({memory.readable(one)} a tree of "
-            f"{plan.prunes} x {plan.simulations} simulations, memoize={plan.memoize!r}), {memory.readable(free)} are free; use fewer lanes, threads or simulations"
-        )
-    if auto and plan.memoize == "root":
-        warnings.warn(f'{method}: states at every node do not fit into memory, so they are kept at roots: memoize="root"', stacklevel=4)
-    return plan, threads, max(1, min(lanes, within))
-
-
-def _result(sim, reward, harvests, settings, top):
-    log, outcome = (np.concatenate([getattr(h, field) for h in harvests], axis=1) for field in ("log", "outcome"))
-    has = lambda bit: (outcome & bit) > 0
-    ran, failed = has(RAN), has(FAILURE)
-    order = (failed & ran).reshape(-1)
-    episodes = int(ran.sum())
-    first = int(ran.reshape(-1)[: order.argmax() + 1].sum()) if order.any() else None
-    fresh_failure = failed & has(FRESH)
-    value = np.where(ran, log, -np.inf)
-    per_tree = np.where(fresh_failure.any(0), np.where(fresh_failure, value, -np.inf).max(0), value.max(0))
-    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(h.found for h in harvests))
-    tree, simulation = (np.concatenate([getattr(h, f) for h in harvests]) for f in ("tree", "simulation"))
-    chosen = _distinct(found, tree, simulation, top)
-    archive = collect(sim, reward, _take(found, chosen), tree[chosen], simulation[chosen], seen=int(failed.sum()), top=top)
-    best = archive.best
-    if best is None:
-        ahead = np.argmax(np.where(found.failure, -np.inf, found.reward)) if not found.failure.all() else 0
-        best = _take(found, ahead)
-    roots = None
-    if harvests[0].roots is not None:
-        turns = min(h.roots.depth.shape[0] for h in harvests)
-        roots = jax.tree.map(lambda *parts: np.concatenate([p[:turns] for p in parts], axis=1), *(h.roots for h in harvests))
-    return SearchResult(
-        best=jax.device_get(replay(sim, best, reward=reward)),
-        best_reward_per_tree=per_tree,
-        failures=archive,
-        episodes=episodes,
-        simulator_steps=int(sum(h.steps.astype(np.int64).sum() for h in harvests)),
-        first_failure=first,
-        failing_share=float(failed.sum() / max(episodes, 1)),
-        failing=fresh_failure.any(0),
-        history=_history(value, fresh_failure, failed),
-        invalid=int(has(INVALID).sum()),
-        settings=settings,
-        roots=roots,
-    )
-
-
-def _distinct(found, tree, simulation, top):
-    """Candidates worth a replay: failures by falling reward, up to a few more distinct ones than the archive holds."""
-    names, chosen, seen = set(), [], set()
-    for i in np.argsort(-found.reward, kind="stable"):
-        if not found.failure[i] or (tree[i], simulation[i]) in seen:
-            continue
-        seen.add((tree[i], simulation[i]))
-        names.add(identity(_take(found, i)))
-        if len(names) > top + 8:
-            break
-        chosen.append(i)
-    return np.array(chosen, np.int64)
-
-
-def _history(value, failure, failed):
-    moments = np.unique(np.linspace(1, value.shape[0], min(value.shape[0], 200)).astype(int))
-    best = np.maximum.accumulate(value, axis=0)[moments - 1]
-    best_failure = np.maximum.accumulate(np.where(failure, value, -np.inf), axis=0)[moments - 1]
-    best = np.where(np.maximum.accumulate(failure, axis=0)[moments - 1], best_failure, best)
-    return History(moments, best, np.cumsum(failed.sum(1))[moments - 1])
-
-
-def _traced(found, trees):
-    """`SearchResult` of traced arrays."""
-    steps = found.first.shape[0]
-    failing = found.best.failure
-    score = jnp.where(jnp.any(failing), jnp.where(failing, found.best.reward, -jnp.inf), found.best.reward)
-    episodes = jnp.sum(found.episodes)
-    first = jnp.where(jnp.any(found.failures > 0), jnp.min(found.first) * steps + jnp.argmin(found.first) + 1, -1)
-    return SearchResult(
-        jax.tree.map(lambda a: a[jnp.argmax(score)], found.best), found.best.reward, None, episodes, jnp.sum(found.steps), first,
-        jnp.sum(found.failures) / jnp.maximum(episodes, 1), failing, None, jnp.sum(found.invalid), None,
-    )  # fmt: skip
-
-
-def _settled(method, modes, mode, widening, spread, focus, actions):
-    """The mode and what it says of widening, spread and focus where the user does not; checked."""
-    if mode not in modes:
-        raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
-    given = dict(widening=widening, spread=spread, focus=focus)
-    widening, spread, focus = (modes[mode][name] if value is None else value for name, value in given.items())
-    focus = getattr(actions, "focus", 1.0) if focus is None else focus
-    traced = lambda *values: any(isinstance(v, jax.core.Tracer) for v in values)
-    if not isinstance(widening, tuple | list) or len(widening) != 2 or not (traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
-        raise ValueError(f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received {widening!r}")
-    if not traced(focus) and not focus > 0:
-        raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
-    return mode, widening, bool(spread), focus
-
-
-def _take(episodes, i):
-    return Episode(*jax.tree.map(lambda a: a[i], tuple(episodes[:-1])))
-
-
-def _name(thing):
-    return getattr(getattr(thing, "func", None), "__name__", type(thing).__name__.lower())
-
-
-def _data(key):
-    return jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key

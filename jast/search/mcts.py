@@ -1,7 +1,8 @@
 """Monte Carlo tree search with progressive widening, from one root: the paper's MCTS-SA, the classic of adaptive stress testing."""
 
 from jast import rewards
-from jast.search.forest import SAMPLES, _settled, search
+from jast.search.forest import SAMPLES
+from jast.search.trees import grow_trees, settled
 
 __all__ = ["MODES", "mcts"]
 
@@ -17,7 +18,7 @@ def mcts(
     `jast.search.forest` without its action pruning, with its settings and errors; ``mode="paper"`` is the published MCTS-SA, ``"default"`` has ``widening``
     (1, 0.5).
     """
-    return search(
-        "mcts", key, sim, _settled("mcts", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=1, simulations=simulations, reward=reward,
+    return grow_trees(
+        "mcts", key, sim, settled("mcts", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=1, simulations=simulations, reward=reward,
         actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
     )  # fmt: skip

@@ -80,4 +80,3 @@ def _words(result):
         text += f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward returned NaN or infinity"
     note = (result.settings or {}).get("interrupted")
     return text + (f"\ninterrupted: {note}" if note else "")
-

@@ -236,4 +236,3 @@ def _traced(problem, axes, keys, plan):
     first = jnp.where(jnp.any(has(FAILURE), axis=0), jnp.argmax(has(FAILURE), axis=0), tree.log.shape[0]).astype(jnp.int32)
     exact = jax.vmap(lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0))(problem, found)
     return Traced(exact, count(FAILURE), count(RAN), tree.steps, count(INVALID), first)
-

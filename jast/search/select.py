@@ -109,5 +109,20 @@ def select(settings, tree):
     count, bonus = of_node(tree.root_visits)
     nobody = Best(jnp.full((lanes,), -jnp.inf, dtype), nil, nil, nil, nil, jnp.zeros((lanes,), dtype))
     stay = ~tree.alive | tree.ended
-    start = Walk(tree.root, row, nil, count, bonus, tree.root_reward, tree.depth, nobody, stay, tree.path, tree.trail, jnp.zeros((2, lanes, ROW), dtype), jnp.zeros((2, lanes, PAGE + 1), dtype), jnp.int32(0))
+    start = Walk(
+        tree.root,
+        row,
+        nil,
+        count,
+        bonus,
+        tree.root_reward,
+        tree.depth,
+        nobody,
+        stay,
+        tree.path,
+        tree.trail,
+        jnp.zeros((2, lanes, ROW), dtype),
+        jnp.zeros((2, lanes, PAGE + 1), dtype),
+        jnp.int32(0),
+    )
     return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

@@ -7,7 +7,26 @@ from jax import lax
 from jast.episode import Progress, accumulator
 from jast.search.records import pack, unpack
 from jast.search.select import select
-from jast.search.tree import CHILD, FAILURE, FRESH, INVALID, LINK, PAGE, RAN, RETURNS, REWARD, ROW, VISITS, Node, choose_child, choose_rollout, levels, node_keys, node_shapes, take
+from jast.search.tree import (
+    CHILD,
+    FAILURE,
+    FRESH,
+    INVALID,
+    LINK,
+    PAGE,
+    RAN,
+    RETURNS,
+    REWARD,
+    ROW,
+    VISITS,
+    Node,
+    choose_child,
+    choose_rollout,
+    levels,
+    node_keys,
+    node_shapes,
+    take,
+)
 
 __all__ = ["child_state", "grow", "replay_to", "select_lanes"]
 
