@@ -163,7 +163,7 @@ def test_random_starts_are_found():
     first = result.roots.visits[0] > 0
     np.testing.assert_allclose(result.roots.starts[0][first].std(), 0.1, rtol=0.5)
     mixed = once("ring")
-    assert mixed.failures.episodes.x0["hit"].dtype == np.int32 and set(np.unique(mixed.failures.episodes.x0["hit"])) <= {0, 1}
+    assert np.issubdtype(mixed.failures.episodes.x0["hit"].dtype, np.integer) and set(np.unique(mixed.failures.episodes.x0["hit"])) <= {0, 1}
     assert mixed.failures.episodes.disturbances["gust"].shape == (mixed.failures.size, 8, 2)
 
 

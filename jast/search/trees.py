@@ -104,10 +104,9 @@ def _fit(method, problem, plan, trees, threads, lanes, available, auto):
         if within >= (lanes if given or memoize == "node" and auto and lanes <= 8 else min(lanes, 8)) or (within >= 1 and memoize != "node" and not given):
             break
     if free is not None and (within < 1 or (given and within < lanes)):
-        raise ValueError(
-            f"{method}: {lanes} trees in each of {threads} threads take {memory.readable(one * lanes * threads)} ({memory.readable(one)} a tree of "
-            f"{plan.prunes} x {plan.simulations} simulations, memoize={plan.memoize!r}), {memory.readable(free)} are free; use fewer lanes, threads or simulations"
-        )
+        asked = f"{lanes} trees in each of {threads} threads take {memory.readable(one * lanes * threads)}"
+        shape = f"{memory.readable(one)} a tree of {plan.prunes} x {plan.simulations} simulations, memoize={plan.memoize!r}"
+        raise ValueError(f"{method}: {asked} ({shape}), {memory.readable(free)} are free; use fewer lanes, threads or simulations")
     if auto and plan.memoize == "root":
         warnings.warn(f'{method}: states at every node do not fit into memory, so they are kept at roots: memoize="root"', stacklevel=4)
     return plan, threads, max(1, min(lanes, within))
@@ -179,7 +178,7 @@ def _traced(found):
     failing = found.best.failure
     score = jnp.where(jnp.any(failing), jnp.where(failing, found.best.reward, -jnp.inf), found.best.reward)
     episodes = jnp.sum(found.episodes)
-    first = jnp.where(jnp.any(found.failures > 0), jnp.min(found.first) * steps + jnp.argmin(found.first) + 1, -1)
+    first = jnp.where(jnp.any(found.failures > 0), jnp.min(found.first) * steps + jnp.argmin(found.first).astype(jnp.int32) + 1, -1)
     return SearchResult(
         jax.tree.map(lambda a: a[jnp.argmax(score)], found.best), found.best.reward, None, episodes, jnp.sum(found.steps), first,
         jnp.sum(found.failures) / jnp.maximum(episodes, 1), failing, None, jnp.sum(found.invalid), None,
