@@ -45,7 +45,6 @@ class Walk(NamedTuple):
     trail: jax.Array
     desk: jax.Array
     scores: jax.Array
-    turn: jax.Array
 
 
 def select(settings, tree):
@@ -54,9 +53,10 @@ def select(settings, tree):
     lane = jnp.arange(lanes, dtype=jnp.int32)
     edges, dtype = tree.edges, tree.edges.dtype
     slots = jnp.arange(PAGE + 1, dtype=jnp.int32)[None]
-    place = jnp.arange(tree.trail.shape[0], dtype=jnp.int32)[:, None]
     exploration = jnp.broadcast_to(jnp.asarray(settings.exploration, dtype), (lanes,))
-    lowest, nil = jnp.full((lanes,), -jnp.inf, dtype), jnp.zeros((lanes,), jnp.int32)
+    nil = jnp.zeros((lanes,), jnp.int32)
+
+    first = jnp.minimum(tree.depth[0], 0)  # 0, which XLA does not know: an update of the whole desk would not be one in place
 
     def of_node(visits):
         count = settings.widths[visits] if settings.widths.ndim == 1 else settings.widths[lane, visits]
@@ -65,8 +65,8 @@ def select(settings, tree):
     def read(w):
         """The pages' rows, laid out on the desk (see `Tree.desk`)."""
         rows = edges.reshape(-1, ROW)[w.row]
-        desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], w.turn % 2, 0)
-        return desk, lax.dynamic_index_in_dim(desk, w.turn % 2, keepdims=False)
+        desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
+        return desk, desk[0]
 
     def pick(row, column, j):
         return jnp.take_along_axis(row, (column + j)[:, None], axis=1, mode="promise_in_bounds")[:, 0]
@@ -77,9 +77,10 @@ def select(settings, tree):
         q = jnp.where(n > 0, total / jnp.maximum(n, 1) - w.reward[:, None], 0)
         score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3; the value term joins here
         score = jnp.where(slots < jnp.minimum(w.count - w.offset, PAGE)[:, None], score, -jnp.inf)
-        scores = lax.dynamic_update_slice_in_dim(w.scores, score[None], w.turn % 2, 0)
-        score = lax.dynamic_index_in_dim(scores, w.turn % 2, keepdims=False)
-        j, top = jnp.argmax(score, axis=1).astype(jnp.int32), jnp.max(score, axis=1)
+        scores = lax.dynamic_update_slice_in_dim(w.scores, score[None], first, 0)
+        score = scores[0]
+        j = jnp.argmax(score, axis=1).astype(jnp.int32)
+        top = pick(score, 0, j)
         visits, child, link = pick(row, VISITS, j).astype(jnp.int32), pick(row, CHILD, j).astype(jnp.int32), row[:, CHILD + LINK]
         found = Best(top, w.row * ROW + j, w.offset + j, visits, child, pick(row, REWARD, j))
         better = top > w.best.score  # the first maximum wins
@@ -98,11 +99,10 @@ def select(settings, tree):
             depth=w.depth + descend.astype(jnp.int32),
             best=jax.tree.map(lambda a, b: jnp.where(w.done, b, a), found._replace(score=jnp.where(descend, -jnp.inf, found.score)), w.best),
             done=w.done | (taken & (found.child <= 0)),
-            path=jnp.where(taken[None] & (place[:-1] == w.depth[None]), found.edge[None], w.path),
+            path=w.path.at[jnp.where(taken, w.depth, w.path.shape[0]), lane].set(found.edge, mode="drop"),
             desk=desk,
             scores=scores,
-            turn=w.turn + 1,
-            trail=jnp.where(descend[None] & (place == w.depth[None] + 1), found.child[None], w.trail),
+            trail=w.trail.at[jnp.where(descend, w.depth + 1, w.trail.shape[0]), lane].set(found.child, mode="drop"),
         )
 
     row = tree.root * lanes + lane
@@ -123,6 +123,5 @@ def select(settings, tree):
         tree.trail,
         jnp.zeros((2, lanes, ROW), dtype),
         jnp.zeros((2, lanes, PAGE + 1), dtype),
-        jnp.int32(0),
     )
     return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

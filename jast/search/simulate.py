@@ -48,9 +48,9 @@ def _simulation(problem, axes, tree, i, memoize):
     def expand():
         """The new child of each tree; and the node it is a child of, or the episode's end that selection ran into."""
         at = jnp.where(fresh, walk.node, -walk.best.child)
-        desk = lax.dynamic_update_slice_in_dim(tree.desk, tree.nodes[at, lane][None], i % 2, 0)
+        desk = lax.dynamic_update_slice_in_dim(tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0)
         like = node_shapes(tree, memoize)
-        node = jax.vmap(lambda w: unpack(w, like))(lax.dynamic_index_in_dim(desk, i % 2, keepdims=False))
+        node = jax.vmap(lambda w: unpack(w, like))(desk[0])
         state, replayed = (node.state, jnp.zeros_like(at)) if memoize == "node" else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
         before = Progress(state, zero, walk.reward, node.distance, nothing, nothing, nothing)
         child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0))(problem, node_keys(tree.key, walk.node), walk.best.slot, walk.depth, before)
