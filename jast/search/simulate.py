@@ -98,24 +98,18 @@ def _simulation(problem, axes, tree, i, memoize):
 
 
 def _back_up(tree, walk, fresh, child, value, new):
-    """The edges with one more visit and return along each path, and the new children in their slots."""
-    lanes = value.shape[0]
-    lane = jnp.arange(lanes, dtype=jnp.int32)
+    """The edges with one more visit and return along each path, and the new children in their slots: one scatter, since what is new was 0."""
     nowhere = tree.edges.size
-
-    def level(carry):
-        d, edges = carry
-        at = jnp.where((d >= tree.depth) & (d < walk.depth + _one(tree.alive & ~tree.ended)), walk.path[d], nowhere)
-        places, values = jnp.concatenate([at + VISITS, at + RETURNS]), jnp.concatenate([jnp.ones_like(value), value])
-        return d + 1, edges.at[places].add(values, mode="drop")
-
-    deepest = jnp.max(jnp.where(tree.alive, walk.depth, -1))
-    _, edges = lax.while_loop(lambda c: c[0] <= deepest, level, (jnp.min(tree.depth), tree.edges))
-    ids = jnp.where(child.done, -new, new).astype(edges.dtype)
+    level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
+    last = walk.depth + _one(tree.alive & ~tree.ended)
+    at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(-1)
+    ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
     slot = jnp.where(fresh, walk.best.edge, nowhere)
     link = jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + CHILD + LINK, nowhere)  # the page is full now: another goes on
-    places = jnp.concatenate([slot + CHILD, slot + REWARD, link])
-    return edges.at[places].set(jnp.concatenate([ids, child.reward, tree.pages.astype(edges.dtype)]), mode="drop")
+    places = jnp.concatenate([at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD, link])
+    returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
+    values = jnp.concatenate([jnp.ones_like(returns), returns, ids, child.reward, tree.pages.astype(tree.edges.dtype)])
+    return tree.edges.at[places].add(values, mode="drop")
 
 
 def _fills(walk):
