@@ -58,7 +58,7 @@ def visited_children(tree, lane):
             row = pages[page]
             columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
             found += [(int(n), w, int(i), r) for n, w, i, r in zip(*columns, strict=True) if n > 0]
-            page = int(row[T.CHILD + T.LINK])
+            page = int(row[T.LINK])
             if page == 0:
                 break
         out[int(node)] = found

@@ -88,7 +88,7 @@ def _children(tree, children):
     def page(carry, _):
         row, there = carry
         record = jnp.where(there[:, None], edges[row], 0)
-        link = record[:, CHILD + LINK].astype(jnp.int32)
+        link = record[:, LINK].astype(jnp.int32)
         return (jnp.where(link > 0, link * lanes + lane, row), there & (link > 0)), (row, record)
 
     start = (tree.root * lanes + lane, jnp.ones((lanes,), bool))

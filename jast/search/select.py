@@ -45,6 +45,7 @@ class Walk(NamedTuple):
     trail: jax.Array
     desk: jax.Array
     scores: jax.Array
+    below: jax.Array
 
 
 def select(settings, tree):
@@ -52,7 +53,7 @@ def select(settings, tree):
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)
     edges, dtype = tree.edges, tree.edges.dtype
-    slots = jnp.arange(PAGE + 1, dtype=jnp.int32)[None]
+    slots, columns = jnp.arange(PAGE + 1, dtype=jnp.int32)[None], jnp.array([[CHILD, REWARD]], jnp.int32)
     exploration = jnp.broadcast_to(jnp.asarray(settings.exploration, dtype), (lanes,))
     nil = jnp.zeros((lanes,), jnp.int32)
 
@@ -63,8 +64,8 @@ def select(settings, tree):
         return count, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
 
     def read(w):
-        """The pages' rows, laid out on the desk (see `Tree.desk`)."""
-        rows = edges.reshape(-1, ROW)[w.row]
+        """Visits and returns of the pages, laid out on the desk (see `Tree.desk`)."""
+        rows = edges.reshape(-1, CHILD)[w.row * (ROW // CHILD)]
         desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
         return desk, desk[0]
 
@@ -81,10 +82,13 @@ def select(settings, tree):
         score = scores[0]
         j = jnp.argmax(score, axis=1).astype(jnp.int32)
         top = pick(score, 0, j)
-        visits, child, link = pick(row, VISITS, j).astype(jnp.int32), pick(row, CHILD, j).astype(jnp.int32), row[:, CHILD + LINK]
-        found = Best(top, w.row * ROW + j, w.offset + j, visits, child, pick(row, REWARD, j))
+        edge, link = w.row * ROW + j, row[:, LINK]
         better = top > w.best.score  # the first maximum wins
-        found = jax.tree.map(lambda a, b: jnp.where(better, a, b), found, w.best)
+        edge = jnp.where(better, edge, w.best.edge)
+        below = lax.dynamic_update_slice_in_dim(w.below, edges[edge[:, None] + columns][None], first, 0)
+        child, reward = below[0, :, 0].astype(jnp.int32), below[0, :, 1]
+        visits = jnp.where(better, pick(row, VISITS, j).astype(jnp.int32), w.best.visits)
+        found = Best(jnp.where(better, top, w.best.score), edge, jnp.where(better, w.offset + j, w.best.slot), visits, child, reward)
         more = ~w.done & (link > 0) & (w.offset + PAGE < w.count)  # without a link there is an unvisited slot here, and later ones score the same
         taken = ~w.done & ~more
         descend = taken & (found.child > 0)
@@ -102,6 +106,7 @@ def select(settings, tree):
             path=w.path.at[jnp.where(taken, w.depth, w.path.shape[0]), lane].set(found.edge, mode="drop"),
             desk=desk,
             scores=scores,
+            below=below,
             trail=w.trail.at[jnp.where(descend, w.depth + 1, w.trail.shape[0]), lane].set(found.child, mode="drop"),
         )
 
@@ -121,7 +126,6 @@ def select(settings, tree):
         stay,
         tree.path,
         tree.trail,
-        jnp.zeros((2, lanes, ROW), dtype),
-        jnp.zeros((2, lanes, PAGE + 1), dtype),
+        *(jnp.zeros((2, lanes, n), dtype) for n in (CHILD, PAGE + 1, 2)),
     )
     return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

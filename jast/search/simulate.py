@@ -105,7 +105,7 @@ def _back_up(tree, walk, fresh, child, value, new):
     at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(-1)
     ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
     slot = jnp.where(fresh, walk.best.edge, nowhere)
-    link = jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + CHILD + LINK, nowhere)  # the page is full now: another goes on
+    link = jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere)  # the page is full now: another goes on
     places = jnp.concatenate([at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD, link])
     returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
     values = jnp.concatenate([jnp.ones_like(returns), returns, ids, child.reward, tree.pages.astype(tree.edges.dtype)])

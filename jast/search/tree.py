@@ -27,8 +27,8 @@ __all__ = [
 ]  # fmt: skip
 
 PAGE = 15
-LINK = PAGE  # a page's last entry is no child: its CHILD is the page that continues this one, or 0
 VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))  # columns of a page's row in Tree.edges
+LINK = VISITS + PAGE  # a page's last entry is no child: there stands the page that continues this one, or 0
 ROW = 4 * (PAGE + 1)
 
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
