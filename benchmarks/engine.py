@@ -1,7 +1,8 @@
 """Speed of the tree search, in CPU time of this process and as ratios within one run: ``python -m benchmarks.engine [--json] [--quick]``.
 
 Rates are simulations (episodes) per CPU second, compilation excluded; each figure is the best of several alternated repetitions, which on a shared machine is
-the least disturbed one. ``XLA`` may cut kernels over threads; set ``PJRT_NPROC=1`` in the environment to measure one core.
+the least disturbed one. The rates are those of one core: they are measured in a process whose XLA has one thread (``PJRT_NPROC=1``); with more it cuts kernels
+over threads, which wait for each other at the cost of CPU time. The search's own threads, which use all cores, are measured in ``cores``.
 """
 
 import argparse
@@ -121,12 +122,19 @@ def capacity(repeats, lanes=200):
 
 
 def cores(repeats, trees=200):
-    """Wall time of one thread with half of the processors' work each, against all of it in one."""
+    """How many times faster two threads, of half of the trees each, are than one, in wall time."""
     search = lambda threads: jast.search.forest(
         jax.random.key(0), jast.simulators.ferry(), trees=trees, prunes=6, reward=REWARD, actions=BOX, mode="paper", threads=threads, lanes=trees // 2
     )
     pairs = [(cpu(lambda: search(1).best_reward_per_tree)[1], cpu(lambda: search(2).best_reward_per_tree)[1]) for _ in range(repeats + 1)][1:]
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
+
+
+def alone(name, *arguments):
+    """A measurement of this module in a process whose XLA has one thread."""
+    code = f"import json; from benchmarks import engine; print(json.dumps(engine.{name}(*{arguments!r})))"
+    env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
+    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout.splitlines()[-1])
 
 
 def compile_time():
@@ -231,12 +239,12 @@ def main(argv=None):
         "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "bytes_per_tree_of_9000": one,
         "bytes_per_node": one / 9000,
-        **rates(repeats),
-        "capacity": capacity(repeats),
+        **alone("rates", repeats),
+        "capacity": alone("capacity", repeats),
         "cores": cores(repeats),
-        "peer_at_200_x_500": peer(repeats),
+        "peer_at_200_x_500": alone("peer", repeats),
         "compile_s": compile_time(),
-        "memoization": memoization(*((32, 4, 100) if args.quick else (100, 18, 100))),
+        "memoization": alone("memoization", *((32, 4, 100) if args.quick else (100, 18, 100))),
     }
     if args.json:
         print(json.dumps(report, indent=1))

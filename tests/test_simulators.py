@@ -8,7 +8,7 @@ import scipy.stats
 from jax.tree_util import Partial
 
 import jast
-from jast.episode import play_back, _rollout
+from jast.episode import _rollout, play_back
 from jast.simulators import ferry, landing, landing_probability, limit_state, walk1d
 
 

@@ -19,9 +19,9 @@ class Choice:
     """A search's `jast.actions` and how it draws them.
 
     ``spread``: the children of a node are points of a low-discrepancy sequence (the additive recurrence with the generalised golden ratio, shifted at random
-    for each node) where the actions are points of a cube, so that a few children cover it. ``focus``: every second child is ``mode + focus (x - mode)``, with the
-    mode of the disturbance: below 1 likelier and in finer steps, above 1 in the tails; so are half of the rollout steps of half of the trees, for there it helps
-    on some systems and hurts on others. Off where the disturbance has no mode or is all integers.
+    for each node) where the actions are points of a cube, so that a few children cover it. ``focus``: every second child is ``mode + focus (x - mode)``, with
+    the mode of the disturbance: below 1 likelier and in finer steps, above 1 in the tails; so are half of the rollout steps of half of the trees, because
+    there it helps on some systems and hurts on others. Off where the disturbance has no mode or is all integers.
     """
 
     actions: Any

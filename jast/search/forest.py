@@ -22,8 +22,9 @@ def forest(
 
     ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``:
     the children of a node cover the action space evenly; ``focus``: every second child, and in half of the trees every second rollout step, is drawn closer to
-    the mode of the disturbance by this factor, 0.2 for a uniform box and 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the tails, for
-    failures too rare for the model's own draws. Each may be given on its own. ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
+    the mode of the disturbance by this factor: 0.2 for a uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the
+    tails, for failures too rare for the model's own draws; where failures lie at the edge of a tight box, 1 finds more. Each may be given on its own.
+    ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
 
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"
     takes "node" where it fits. ``top``: failures kept in the archive.
@@ -35,6 +36,7 @@ def forest(
     Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
     """
     return grow_trees(
-        "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations, reward=reward,
-        actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
+        "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations,
+        reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
+        progress=progress, callback=callback,
     )  # fmt: skip

@@ -19,6 +19,7 @@ def mcts(
     (1, 0.5).
     """
     return grow_trees(
-        "mcts", key, sim, settled("mcts", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=1, simulations=simulations, reward=reward,
-        actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available, progress=progress, callback=callback,
+        "mcts", key, sim, settled("mcts", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=1, simulations=simulations,
+        reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
+        progress=progress, callback=callback,
     )  # fmt: skip

@@ -187,7 +187,7 @@ class Traced(NamedTuple):
 
 
 def grow_traced(problem, keys, plan):
-    """The whole search as one traced program, for `jax.jit` and `jax.vmap`: `Traced`. Under `jax.vmap` the batch becomes more trees, not a batch of programs."""
+    """The whole search as one traced program, for `jax.jit` and `jax.vmap`: `Traced`. Under `jax.vmap` the batch becomes more trees, not more programs."""
     leaves, treedef = jax.tree.flatten(problem)
     return _batchable(treedef, plan, (None,) * len(leaves))(keys, leaves)
 
