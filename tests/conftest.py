@@ -42,3 +42,10 @@ def equal():
             np.testing.assert_array_equal(x.view(f"u{x.itemsize}") if x.dtype != bool else x, y.view(f"u{y.itemsize}") if y.dtype != bool else y)
 
     return check
+
+
+@pytest.fixture(autouse=True, scope="module")
+def let_programs_go():
+    """Compiled programs of one file are of no use to the next, and a process can hold only so many of them (each maps memory)."""
+    yield
+    jax.clear_caches()

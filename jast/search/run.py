@@ -105,7 +105,11 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
         with contextlib.ExitStack() as stack:
             for setting, value in settings:
                 stack.enter_context(setting(value))
-            return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
+            try:
+                return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
+            except BaseException:
+                stop.set()  # the other groups need not finish either
+                raise
 
     told, interrupted = 0, False
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:

@@ -5,7 +5,8 @@ out of range where there is nothing to write, and no tree array is an operand of
 
  - Node ids: node ``i + 1`` is made by simulation i, in every tree; 0 is the first root. So making a node is one contiguous row write.
  - Edges: a node's children sit in pages of ``PAGE`` slots, each slot with the child's visits, the sum of its returns and its id. The first page of a node has
-   the node's id; when a page fills up, the next free one is linked behind it, so a node may have any number of children. One page is one cache line an array.
+   the node's id; when a page fills up, the next free one is linked behind it, so a node may have any number of children. What a selection reads of every page,
+   visits and returns, stands together: two cache lines in float32.
  - A slot that was never visited needs no storage: the number of children is a function of the node's visits alone (`widths`), and the action of a slot is drawn
    from its address (tree, node, slot). Unvisited slots score alike, so they are visited in order.
  - Returns are those of whole episodes; Q(s, a) subtracts the reward up to s.
@@ -22,7 +23,7 @@ from jast.episode import Progress, advance, begin
 from jast.search.records import pack
 
 __all__ = [
-    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "node_keys", "node_shapes", "random_start", "take",
+    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "random_start", "take",
     "widths",
 ]  # fmt: skip
 
@@ -140,10 +141,22 @@ def random_start(sim):
     return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
 
 
+def _pages(simulations):
+    """One for each node, and one more whenever one is full."""
+    return simulations + 1 + simulations // PAGE + 1
+
+
+def most_lanes(simulations):
+    """How many trees of so many simulations one `Tree` can hold: places in its edges are int32."""
+    return (2**31 - 1 - ROW) // (_pages(simulations) * ROW)
+
+
 def make(problem, axes, keys, simulations, memoize="node"):
     """Trees of one root each, with room for ``simulations``; ``axes`` says which parts of ``problem`` differ between trees (0) or not (None)."""
     (lanes,) = keys.shape
-    pages = simulations + 1 + simulations // PAGE + 1
+    pages = _pages(simulations)
+    if lanes > most_lanes(simulations):
+        raise ValueError(f"search: at most {most_lanes(simulations)} trees of {simulations} simulations fit into one program's 32-bit places, received {lanes}")
 
     def origin(problem, key):
         if random_start(problem.sim):

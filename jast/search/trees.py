@@ -15,7 +15,7 @@ from jast.search.choice import Choice
 from jast.search.episodes import prepare, whole
 from jast.search.result import History, SearchResult
 from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
-from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, widths
+from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, most_lanes, widths
 
 __all__ = ["grow_trees", "settled"]
 
@@ -95,15 +95,15 @@ def _fit(method, problem, plan, trees, threads, lanes, available, auto):
     if lanes is None:
         rounds = -(-trees // (threads * LANES))
         lanes = -(-trees // (threads * rounds)) if jax.default_backend() == "cpu" else trees
-    lanes = min(lanes, trees)
+    lanes = min(lanes, trees, most_lanes(plan.prunes * plan.simulations))
     threads = min(threads, -(-trees // lanes))
     for memoize in ["node", "root"] if auto else [plan.memoize]:
         plan = plan._replace(memoize=memoize)
         one = bytes_per_tree(problem, plan)
         within = lanes if free is None else int(0.8 * free // (one * threads))
-        if within >= (lanes if given or memoize == "node" and auto and lanes <= 8 else min(lanes, 8)) or (within >= 1 and memoize != "node" and not given):
+        if within >= (lanes if given else min(lanes, 8)):
             break
-    if free is not None and (within < 1 or (given and within < lanes)):
+    if within < 1 or (given and within < lanes):
         asked = f"{lanes} trees in each of {threads} threads take {memory.readable(one * lanes * threads)}"
         shape = f"{memory.readable(one)} a tree of {plan.prunes} x {plan.simulations} simulations, memoize={plan.memoize!r}"
         raise ValueError(f"{method}: {asked} ({shape}), {memory.readable(free)} are free; use fewer lanes, threads or simulations")
