@@ -46,7 +46,7 @@ def grow_trees(
     trees, prunes, simulations, top, *_ = whole(method, trees=trees, prunes=prunes, simulations=simulations, top=top, **given)
     if memoize not in ("auto", "node", "root", "none"):
         raise ValueError(f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}')
-    names = dict(mode=mode, trees=trees, simulations=simulations, exploration=exploration, widening=widening, spread=spread, focus=focus)
+    names = dict(mode=mode, trees=trees, simulations=simulations, exploration=exploration, widening=list(widening), spread=spread, focus=focus)
     reward, settings = prepare(method, key, sim, reward, actions, **names)
     prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
