@@ -84,7 +84,7 @@ def rows(trees, quick):
         table |= {
             "forest, widening (2, 0.5) alone": forest(spread=False, focus=1.0),
             "forest, and spread": forest(focus=1.0),
-            "cem": lambda key: jast.search.cem(key, s0, trees=trees, samples=900, elites=90, iterations=10, reward=REWARD, actions=BOX),
+            "cem": lambda key: jast.search.cem(key, s0, trees=trees, reward=REWARD, actions=BOX),
         }
     return table
 
