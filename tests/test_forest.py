@@ -389,5 +389,5 @@ def test_the_published_failure_rates_on_s0(search, share, within):
     """Share of 1000 trees of 9000 simulations that find a collision: MCFS-AP without networks, and MCTS-SA."""
     size = dict(prunes=18, simulations=500) if search is forest else dict(simulations=9000)
     result = search(jax.random.key(0), FERRY, trees=1000, mode="paper", **size, **S0)
-    assert result.episodes == 9_000_000
+    assert 0.999 * 9_000_000 < result.episodes <= 9_000_000  # a tree whose root is a collision ends early
     assert abs(result.failing_trees - share) < within
