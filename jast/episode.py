@@ -13,7 +13,7 @@ from jast import distributions as D
 from jast import rewards
 from jast.policy import nominal_policy
 
-__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "play_back", "replay", "rollout"]
+__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "play_back", "random_start", "replay", "rollout"]
 
 
 class Episode(NamedTuple):
@@ -60,6 +60,11 @@ def accumulator(sim):
         return sim.start().log_prob(x0), dist.log_prob(D.sample(dist, jax.random.key(0))), sim.evaluate(state)[1]
 
     return jnp.result_type(*(jnp.zeros((), a.dtype) for a in jax.eval_shape(numbers)[1:]))
+
+
+def random_start(sim):
+    """Whether x0 is a choice: ``start`` is not `fixed`."""
+    return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
 
 
 def begin(sim, reward, x0):

@@ -50,3 +50,8 @@ def walk(init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, fails=lambda s:
     """A random walk of standard normal steps: what a test changes is all it says."""
     evaluate = lambda s: (fails(s), jnp.maximum(3.0 - s, 0.0))
     return jast.Simulator(init, step, lambda s: Normal(jnp.zeros(()), 1.0), evaluate, horizon, **fields)
+
+
+def two_densities():
+    """Breaks the contract: a disturbance of two numbers that has a density each."""
+    return jast.Simulator(lambda x0: jnp.zeros(2), lambda s, x: s + x, lambda s: Normal(s, 1.0), lambda s: (s[0] > 1, s[0]), 3)

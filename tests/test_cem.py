@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
-from systems import S0, ring, walk
+from systems import S0, ring, two_densities, walk
 
 import jast
 from jast import actions, rewards
-from jast.distributions import Normal, seeds
+from jast.distributions import seeds
 from jast.search import proposals as P
 from jast.search.cem import cem
 from jast.search.monte_carlo import monte_carlo
@@ -186,4 +186,4 @@ def test_bad_settings(key, settings, message):
 
 def test_bad_simulator(key):
     with pytest.raises(ValueError, match="disturbance: log_prob has shape"):
-        cem(key, jast.Simulator(lambda x0: jnp.zeros(2), lambda s, x: s + x, lambda s: Normal(s, 1.0), lambda s: (s[0] > 1, s[0]), 3))
+        cem(key, two_densities())

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import S0, ring, walk
+from systems import S0, ring, two_densities, walk
 
 import jast
 from jast import actions, rewards
-from jast.distributions import Categorical, Normal, seeds
+from jast.distributions import Categorical, seeds
 from jast.search import episodes as E
 from jast.search.monte_carlo import monte_carlo
 
@@ -188,7 +188,7 @@ def test_bad_settings(key, settings, message):
 
 def test_bad_simulator(key):
     with pytest.raises(ValueError, match="disturbance: log_prob has shape"):
-        monte_carlo(key, jast.Simulator(lambda x0: jnp.zeros(2), lambda s, x: s + x, lambda s: Normal(s, 1.0), lambda s: (s[0] > 1, s[0]), 3))
+        monte_carlo(key, two_densities())
 
 
 def test_best_distinct_episodes():

@@ -17,7 +17,7 @@ from jast import distributions as D
 from jast import rewards
 from jast.check import contract
 from jast.counter import tree_keys
-from jast.episode import Episode, _shapes, accumulator
+from jast.episode import Episode, _shapes, accumulator, random_start
 from jast.search import episodes as E
 from jast.search import proposals as P
 
@@ -131,7 +131,7 @@ def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
 def _propose(keys, sim, real, plan, pool, proposals):
     """Of one tree: the rows [samples, 1, ...] that x0 is made of (``()``: one start), and [samples, horizon, ...] those of x."""
     elite = jax.tree.map(lambda a: a[: plan.elites], pool.episode)
-    start = E.random_start(sim)
+    start = random_start(sim)
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
     parents = (jax.tree.map(lambda a: a[:, None], elite.x0), known), (elite.disturbances, jnp.where(known > 0, elite.length, -1))
 

@@ -11,15 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast import distributions as D
 from jast import failures as archive
 from jast import rewards
 from jast.check import ACTIONS, contract
-from jast.episode import Episode, advance, begin, replay
+from jast.episode import Episode, advance, begin, random_start, replay
 from jast.search.records import pack
 from jast.search.result import History, SearchResult
 
-__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "random_start", "tally", "whole"]
+__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "tally", "whole"]
 
 
 class Played(NamedTuple):
@@ -82,7 +81,7 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False):
         x, after, folded = move(*at(t + start, rows[1], t), before, tag, t + 1 >= sim.horizon)
         kept = after._replace(**{name: jnp.where(on, getattr(after, name), getattr(before, name)) for name in before._fields[1:]})
         if record:
-            xs = jax.tree.map(lambda a, b: a.at[t].set(jnp.where(_to_rank(on, b), b, jnp.zeros((), b.dtype))), xs, x)
+            xs = jax.tree.map(lambda a, b: a.at[t].set(jax.vmap(jnp.where)(on, b, jnp.zeros_like(b))), xs, x)
         return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), xs, kept
 
     carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, xs, progress._replace(done=progress.done | ~live)
@@ -129,11 +128,6 @@ def distinct(failure, reward, tag, number, count, k):
     to = jnp.where(group < 2, jnp.cumsum(new, dtype=jnp.int32) - 1, k)
     places = jnp.full((k,), n, jnp.int32).at[jnp.where(new, to, k)].set(place, mode="drop")
     return places, jnp.zeros((k,), jnp.int32).at[to].add(count, mode="drop")
-
-
-def random_start(sim):
-    """Whether x0 is more than the empty disturbance."""
-    return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
 
 
 def is_traced(*trees):
@@ -260,7 +254,3 @@ def _fold(tag, x):
         tag = (tag ^ word) * jnp.uint32(0x85EBCA6B)
         tag = tag ^ (tag >> 15)
     return tag
-
-
-def _to_rank(pred, like):
-    return pred.reshape(pred.shape + (1,) * (like.ndim - pred.ndim))

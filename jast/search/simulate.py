@@ -154,7 +154,7 @@ def child_state(problem, node_key, slot, level, state):
 
 def select_lanes(pred, a, b):
     """Leaves [B, ...] of ``a`` where ``pred`` [B], else of ``b``."""
-    return jax.tree.map(lambda x, y: jnp.where(pred.reshape(-1, *(1,) * (x.ndim - 1)), x, y), a, b)
+    return jax.tree.map(lambda x, y: jax.vmap(jnp.where)(pred, x, y), a, b)
 
 
 def _one(pred):

@@ -18,13 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast import distributions as D
-from jast.episode import Progress, advance, begin
+from jast.episode import Progress, advance, begin, random_start
 from jast.search.records import pack
 
 __all__ = [
-    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "random_start", "take",
-    "widths",
+    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "take", "widths",
 ]  # fmt: skip
 
 PAGE = 15
@@ -134,11 +132,6 @@ def widths(simulations, k, alpha):
 def levels(sim):
     """Levels of choices in an episode: x_1 .. x_horizon, and x0 where the start is random."""
     return sim.horizon + random_start(sim)
-
-
-def random_start(sim):
-    """Whether x0 is a choice: ``start`` is not `fixed`."""
-    return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
 
 
 def _pages(simulations):

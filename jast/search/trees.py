@@ -56,7 +56,7 @@ def grow_trees(
     choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=isinstance(focus, jax.core.Tracer) or focus != 1)
     problem = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)))
     children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
-    plan = Plan(prunes, simulations, min(children, 4096), "node" if memoize == "auto" else memoize)
+    plan = Plan(prunes, simulations, children, "node" if memoize == "auto" else memoize)
     if settings is None:
         return _traced(grow_traced(problem, tree_keys(key, trees), plan))
     plan, threads, lanes = _fit(method, problem, plan, trees, threads, lanes, available, auto=memoize == "auto")
@@ -116,7 +116,7 @@ def _result(sim, reward, harvests, settings, top):
     log, outcome = (np.concatenate([getattr(h, field) for h in harvests], axis=1) for field in ("log", "outcome"))
     has = lambda bit: (outcome & bit) > 0
     ran, failed = has(RAN), has(FAILURE)
-    order = (failed & ran).reshape(-1)
+    order = failed.reshape(-1)
     episodes = int(ran.sum())
     first = int(ran.reshape(-1)[: order.argmax() + 1].sum()) if order.any() else None
     fresh_failure = failed & has(FRESH)
@@ -128,12 +128,9 @@ def _result(sim, reward, harvests, settings, top):
     archive = collect(sim, reward, _take(found, chosen), tree[chosen], simulation[chosen], seen=int(failed.sum()), top=top)
     best = archive.best
     if best is None:
-        ahead = np.argmax(np.where(found.failure, -np.inf, found.reward)) if not found.failure.all() else 0
-        best = _take(found, ahead)
-    roots = None
-    if harvests[0].roots is not None:
-        turns = min(h.roots.depth.shape[0] for h in harvests)
-        roots = jax.tree.map(lambda *parts: np.concatenate([p[:turns] for p in parts], axis=1), *(h.roots for h in harvests))
+        best = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
+    turns = min(h.roots.depth.shape[0] for h in harvests)
+    roots = jax.tree.map(lambda *parts: np.concatenate([p[:turns] for p in parts], axis=1), *(h.roots for h in harvests))
     return SearchResult(
         best=jax.device_get(replay(sim, best, reward=reward)),
         best_reward_per_tree=per_tree,
