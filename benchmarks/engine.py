@@ -56,7 +56,7 @@ def rollouts(problem, keys, simulations):
 
         def roll(carry):
             level, at = carry
-            draw = lambda k, tree_key, t, p: take(problem, t, p, choose_rollout(problem, jax.random.fold_in(k, t), tree_key, p.state))
+            draw = lambda k, tree_key, t, p: take(problem, t, p, choose_rollout(problem, k, tree_key, t, p.state))
             after = jax.vmap(draw)(key, keys, level, at)
             kept = Progress(after.state, *(jnp.where(at.done, a, b) for a, b in zip(at[1:], after[1:], strict=True)))
             return level + 1, kept._replace(log_prob=at.log_prob)

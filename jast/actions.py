@@ -29,6 +29,14 @@ class Samples:
         """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
         return _towards_mode(x, dist, scale)
 
+    def at(self, u, dist):
+        """The disturbance at the point ``u`` of [0, 1)^d; uniform points are draws of ``dist``."""
+        return D.quantile(dist, u)
+
+    def locate(self, x, dist):
+        """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
+        return D.cdf(dist, x)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class Quantiles:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(dist, u)
 
-    draw_start, near = draw, Samples.near
+    draw_start, near, at, locate = draw, Samples.near, place, Samples.locate
 
 
 @jax.tree_util.register_dataclass
@@ -73,7 +81,7 @@ class UniformBox:
         def shrink(x, m):
             if not jnp.issubdtype(x.dtype, jnp.floating):
                 return x
-            low, high = (jnp.asarray(v).astype(x.dtype) for v in (self.low, self.high))
+            low, high = self._ends(x.dtype)
             return jnp.clip(m + jnp.asarray(scale, x.dtype) * (x - (low + high) / 2), low, high)
 
         return jax.tree.map(shrink, x, D.mode(dist))
@@ -82,12 +90,29 @@ class UniformBox:
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to ``high``, both included."""
 
         def place(u, s):
-            low, high = (jnp.asarray(v).astype(u.dtype) for v in (self.low, self.high))
+            low, high = self._ends(u.dtype)
             if jnp.issubdtype(s.dtype, jnp.floating):
                 return low + u * (high - low)
             return jnp.floor(low + u * (high - low + 1)).astype(s.dtype)
 
         return jax.tree.map(place, u, D.event_like(dist))
+
+    at = place
+
+    def locate(self, x, dist):
+        """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box nearest to it. Integers: the middle of the cell."""
+
+        def locate(x):
+            dtype = D.float_dtype(x.dtype)
+            low, high = self._ends(dtype)
+            if jnp.issubdtype(x.dtype, jnp.floating):
+                return D.fraction(x, low, high)
+            return D.fraction(jnp.clip(x.astype(dtype), low, high) + 0.5, low, high + 1)
+
+        return jax.tree.map(locate, x)
+
+    def _ends(self, dtype):
+        return (jnp.asarray(v).astype(dtype) for v in (self.low, self.high))
 
 
 def samples():

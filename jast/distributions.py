@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy import special
+from jax.scipy.linalg import solve_triangular
 
 with warnings.catch_warnings():  # tensorflow-probability, below distrax, touches deprecated names of jax
     warnings.simplefilter("ignore")
@@ -34,8 +35,8 @@ with warnings.catch_warnings():  # tensorflow-probability, below distrax, touche
 
 __all__ = [
     "Bernoulli", "Beta", "Categorical", "Deterministic", "Distribution", "Fixed", "Gamma", "Independent", "Joint", "Laplace", "Logistic",
-    "MultivariateNormalDiag", "MultivariateNormalTri", "Normal", "Seeds", "Tent", "Transformed", "Uniform", "Where", "event_like", "float_dtype",
-    "has_mode", "has_quantile", "log_density", "log_mode", "mode", "quantile", "sample", "seeds", "tent", "where",
+    "MultivariateNormalDiag", "MultivariateNormalTri", "Normal", "Seeds", "Tent", "Transformed", "Uniform", "Where", "cdf", "event_like", "float_dtype",
+    "fraction", "has_cdf", "has_mode", "has_quantile", "log_density", "log_mode", "mode", "quantile", "sample", "seeds", "tent", "where",
 ]  # fmt: skip
 
 
@@ -144,6 +145,9 @@ class Tent(Distribution):
         z = jnp.where(mass < 0.5, jnp.sqrt(2 * mass) - 1, 1 - jnp.sqrt(jnp.maximum(2 - 2 * mass, 0)))
         return jnp.clip(self._center + self._width * z, self._low, self._high)
 
+    def cdf(self, value):
+        return fraction(*(self._cdf_full(v) for v in (value, self._low, self._high)))
+
     def _sample_n(self, key, n):
         return self.quantile(jax.random.uniform(key, (n, *self.batch_shape), self._center.dtype))
 
@@ -185,6 +189,9 @@ class Where(Distribution):
     def quantile(self, u):
         return self._select(quantile(self._a, u), quantile(self._b, u))
 
+    def cdf(self, value):
+        return self._select(cdf(self._a, value), cdf(self._b, value))
+
 
 def tent(center, width=1.0, low=0.0, high=1.0):
     """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero ``width`` away, cut to ``[low, high]``."""
@@ -218,7 +225,7 @@ def mode(d):
         return d.mode()
     except (NotImplementedError, AttributeError):
         pass
-    half = jax.tree.map(lambda s: jnp.full(s.shape, 0.5, float_dtype(s.dtype)), event_like(d))
+    half = _half(d)
     try:
         return quantile(d, half)
     except ValueError:
@@ -227,17 +234,22 @@ def mode(d):
 
 def has_mode(d):
     """Whether `mode` is defined for ``d`` (host-side)."""
-    try:
-        jax.eval_shape(lambda: mode(d))  # closed over, as ``d`` need not be a pytree
-    except ValueError:
-        return False
-    return True
+    return _defined(lambda: mode(d))
 
 
 def has_quantile(d):
     """Whether `quantile` is defined for ``d`` (host-side)."""
+    return _defined(lambda: quantile(d, _half(d)))
+
+
+def has_cdf(d):
+    """Whether `cdf` is defined for ``d`` (host-side)."""
+    return _defined(lambda: cdf(d, sample(d, jax.random.key(0))))
+
+
+def _defined(function):
     try:
-        jax.eval_shape(lambda: quantile(d, jax.tree.map(lambda s: jnp.full(s.shape, 0.5, float_dtype(s.dtype)), event_like(d))))
+        jax.eval_shape(function)  # of no arguments, as a distribution need not be a pytree
     except ValueError:
         return False
     return True
@@ -298,10 +310,94 @@ def quantile(d, u):
         return quantile(d.distribution, u)
     if isinstance(d, Joint):
         return jax.tree.map(quantile, d.distributions, u, is_leaf=_is_distribution)
-    if isinstance(d, Transformed) and d.bijector.event_ndims_in == 0 and d.bijector.event_ndims_out == 0:
+    if _of_scalars(d):
         x0, x1 = (d.bijector.forward(quantile(d.distribution, jnp.full_like(u, q))) for q in (0.25, 0.75))
         return d.bijector.forward(quantile(d.distribution, jnp.where(x1 >= x0, u, 1 - u)))
     raise ValueError(f"quantile: {type(d).__name__} has no quantile function here; use jast.actions.samples()")
+
+
+def cdf(d, x):
+    """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
+
+    An integer has the middle of the interval of ``u`` that gives it. Outside of the support: 0 or 1. ValueError names a distribution that cannot.
+    """
+    if hasattr(d, "quantile"):
+        if _inverts(d):
+            return d.cdf(x)
+        raise ValueError(f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it")
+    if isinstance(d, Fixed):
+        return ()
+    if isinstance(d, Uniform):
+        return fraction(x, d.low, d.high)
+    if isinstance(d, Normal):
+        return special.ndtr(_standard(x - d.loc, d.scale))
+    if isinstance(d, MultivariateNormalDiag):
+        return special.ndtr(_standard(x - d.loc, d.scale_diag))
+    if isinstance(d, MultivariateNormalTri):
+        far = jnp.sqrt(jnp.finfo(d.loc.dtype).max)  # an infinite one would make others NaN
+        return special.ndtr(solve_triangular(d.scale_tri, jnp.clip(x - d.loc, -far, far), lower=d.is_lower))
+    if isinstance(d, Logistic):
+        return special.expit(_standard(x - d.loc, d.scale))
+    if isinstance(d, Laplace):
+        z = _standard(x - d.loc, d.scale)
+        tail = jnp.exp(-jnp.abs(z)) / 2
+        return jnp.where(z < 0, tail, 1 - tail)
+    if isinstance(d, Bernoulli):
+        return _cell(x, (1 - d.probs)[..., None])
+    if isinstance(d, Categorical):
+        return _cell(x, jnp.cumsum(d.probs, axis=-1)[..., :-1])
+    if isinstance(d, Independent):
+        return cdf(d.distribution, x)
+    if isinstance(d, Joint):
+        return jax.tree.map(cdf, d.distributions, x, is_leaf=_is_distribution)
+    if _of_scalars(d):
+        x0, x1 = (d.bijector.forward(quantile(d.distribution, jnp.full_like(x, q))) for q in (0.25, 0.75))
+        try:
+            u = cdf(d.distribution, d.bijector.inverse(x))
+        except NotImplementedError:
+            raise ValueError(f"cdf: {type(d).__name__} has a bijector without inverse") from None
+        u = jnp.where(x1 >= x0, u, 1 - u)
+        inside = (u > 0) & (u < 1)  # off the support the inverse may be NaN, or of either end
+        return jnp.where(inside, u, (x >= (x0 + x1) / 2).astype(u.dtype))
+    raise ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
+
+
+def fraction(x, low, high):
+    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is no way."""
+    none = high == low
+    return jnp.where(none, 0.5, jnp.clip((x - low) / jnp.where(none, 1, high - low), 0, 1))
+
+
+def _inverts(d):
+    """Whether the ``cdf`` of ``d`` is of the class that defines its ``quantile``, or of one below: distrax's may be another function."""
+    first = next((c for c in type(d).__mro__ if {"cdf", "quantile"} & vars(c).keys()), None)
+    return hasattr(d, "cdf") and (first is None or "cdf" in vars(first))
+
+
+def _of_scalars(d):
+    return isinstance(d, Transformed) and d.bijector.event_ndims_in == 0 and d.bijector.event_ndims_out == 0
+
+
+def _standard(gap, scale):
+    """``gap / scale``; where the scale is 0, a gap of 0 stays 0."""
+    return gap / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
+
+
+def _cell(x, inner):
+    """Middle of the ``x``-th of the intervals of [0, 1] that begin at 0 and at each of ``inner`` (on the last axis); 0 or 1 where there is none."""
+    end = jnp.zeros((*inner.shape[:-1], 1), inner.dtype)
+    starts, last = jnp.concatenate([end, inner, end + 1], axis=-1), inner.shape[-1]
+    v = jnp.asarray(x).astype(inner.dtype)
+    i = jnp.clip(jnp.floor(v), 0, last).astype(jnp.int32)[..., None]
+    low, high = (jnp.take_along_axis(starts, j, axis=-1)[..., 0] for j in (i, i + 1))
+    middle = (low + high) / 2
+    middle = jnp.where(middle < high, middle, low)  # an interval holds its start alone
+    return jnp.clip(jnp.where((v < 0) | (v > last), v, middle), 0, 1).astype(float_dtype(jnp.result_type(x)))
+
+
+def _half(d):
+    """0.5 for each number of a value of ``d``."""
+    return jax.tree.map(lambda s: jnp.full(s.shape, 0.5, float_dtype(s.dtype)), event_like(d))
 
 
 def _open(u):

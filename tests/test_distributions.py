@@ -58,6 +58,8 @@ def test_quantiles_of_a_joint(dtype):
     d = D.Joint((D.Normal(jnp.asarray(0, dtype), jnp.asarray(1, dtype)), D.Categorical(probs=jnp.asarray([0.5, 0.5], dtype))))
     x, n = D.quantile(d, (jnp.asarray(0.975, dtype), jnp.asarray(0.7, dtype)))
     assert float(x) == pytest.approx(1.959964, rel=1e-5) and int(n) == 1
+    u, v = D.cdf(d, (x, n))
+    assert float(u) == pytest.approx(0.975, rel=1e-5) and float(v) == 0.75 and u.dtype == v.dtype == dtype
 
 
 @pytest.mark.parametrize("bijector, truth", [("neg", 1.2), ("pos", -1.2)])
@@ -76,6 +78,222 @@ def test_value_errors_name_the_distribution():
     with pytest.raises(ValueError, match="Seeds has neither a mode nor a median"):
         D.mode(D.seeds())
     assert not D.has_quantile(gamma) and not D.has_mode(D.seeds()) and D.has_mode(D.Fixed())
+
+
+# cdf
+
+
+def supported_too(dtype):
+    """`supported`'s distributions, and more that `cdf` inverts."""
+    f = lambda v: jnp.asarray(v, dtype)
+    return {name: d for name, (d, _) in supported(dtype).items()} | {
+        "upper": D.MultivariateNormalTri(f([0, 1]), f([[1, 0.5], [0, 2]]), is_lower=False),
+        "wide tent": D.tent(f(2), f(5), f(-1), f(4)),
+        "narrow tent": D.tent(f(0.9), f(0.3)),
+        "logits": D.Categorical(logits=f([0.3, -2, 1])),
+        "rolls": D.Independent(D.Categorical(probs=f([[0.2, 0.5, 0.3], [0.6, 0, 0.4]])), 1),
+        "bool": D.Bernoulli(probs=f(0.3), dtype=bool),
+        "decreasing": D.Transformed(D.Normal(f(0), f(1)), lambda x: jnp.exp(-x)),
+        "affine": D.Transformed(D.Uniform(f(0), f(2)), lambda x: 3 - 2 * x),
+        "vector of exp": D.Independent(D.Transformed(D.Normal(f([0, 1]), f([1, 0.5])), jnp.exp), 1),
+        "where": D.where(False, D.Normal(f(0), f(1)), D.tent(f(0.2))),
+        "where of ints": D.where(True, D.Categorical(probs=f([0.5, 0.5])), D.Bernoulli(probs=f(0.1))),
+        "joint": D.Joint({"n": D.Categorical(probs=f([0.1, 0.9])), "v": D.Independent(D.Normal(f([0, 0, 1]), f([1, 2, 3])), 1), "x": D.Uniform(f(0), f(1))}),
+    }  # fmt: skip
+
+
+def points(d, n, low=0.0, high=1.0):
+    """n points [n, ...] of [low, high]^d: an even grid in each coordinate, in an order of its own."""
+    leaves, treedef = jax.tree.flatten(D.event_like(d))
+    rng = np.random.default_rng(0)
+    grids = [np.stack([rng.permutation(np.linspace(low, high, n)) for _ in range(int(np.prod(s.shape)))], 1).reshape(n, *s.shape) for s in leaves]
+    return treedef.unflatten([jnp.asarray(g, D.float_dtype(s.dtype)) for g, s in zip(grids, leaves)])
+
+
+@pytest.mark.parametrize("name", list(supported_too("float32")))
+def test_cdf_inverts_quantile(name, dtype):
+    d = supported_too(dtype)[name]
+    assert D.has_cdf(d) and D.has_quantile(d)
+
+    @jax.jit
+    @jax.vmap
+    def there_and_back(u):
+        x = D.quantile(d, u)
+        again = D.cdf(d, x)
+        return x, again, D.quantile(d, again)
+
+    u = points(d, 501)
+    x, again, x_again = there_and_back(u)
+    assert jax.tree.structure(again) == jax.tree.structure(x)
+    for leaves in zip(*map(jax.tree.leaves, (u, again, x, x_again)), strict=True):
+        u, v, a, b = map(np.asarray, leaves)
+        assert (v.shape, v.dtype) == (a.shape, u.dtype) and ((v >= 0) & (v <= 1)).all()
+        if not np.issubdtype(a.dtype, np.floating):
+            np.testing.assert_array_equal(a, b)
+            continue
+        np.testing.assert_allclose(v, u, rtol=0, atol=tolerance(dtype, 2e-6, 1e-14))
+        inner = (u > 0.02) & (u < 0.98)  # nearer to the ends a number u has many x
+        np.testing.assert_allclose(b[inner], a[inner], rtol=tolerance(dtype, 1e-4, 1e-12), atol=tolerance(dtype, 1e-5, 1e-13))
+
+
+def test_cdf_of_arrays_is_elementwise(dtype):
+    f = lambda v: jnp.asarray(v, dtype)
+    tosses = D.Independent(D.Bernoulli(probs=f([[0.5, 0.2], [0.9, 0.0]])), 2)
+    u = D.cdf(tosses, jnp.asarray([[1, 0], [1, 0]]))
+    np.testing.assert_allclose(u, [[0.75, 0.4], [0.55, 0.5]], rtol=1e-6)
+    with jax.numpy_rank_promotion("allow"):  # distrax's Bernoulli, asked for its dtype, draws
+        assert u.dtype == dtype and D.quantile(tosses, u).tolist() == [[1, 0], [1, 0]]
+    tents, x = D.tent(f([0.1, 2.0, 4.0]), f(5), f(-1), f(4)), f([0.5, -0.9, 3.9])
+    np.testing.assert_allclose(D.quantile(tents, D.cdf(tents, x)), x, rtol=1e-4)
+    assert D.cdf(tents, f([-2, 4.1, np.inf])).tolist() == [0, 1, 1]
+
+
+def closed_forms():
+    """SciPy's distribution function for each of `supported`; of integers, the middle of its step."""
+    middle = lambda d: lambda x: (d.cdf(x - 1) + d.cdf(x)) / 2
+    chol = np.array([[1.0, 0.0], [0.5, 2.0]])
+    return {
+        "uniform": lambda x: scipy.stats.uniform.cdf(x, -1, 4),
+        "normal": lambda x: scipy.stats.norm.cdf(x, 1, 2),
+        "diag": lambda x: scipy.stats.norm.cdf(x, [0, 1], [1, 3]),
+        "tri": lambda x: scipy.stats.norm.cdf((x - np.array([0, 1])) @ np.linalg.inv(chol).T),
+        "logistic": lambda x: scipy.stats.logistic.cdf(x, 1, 0.5),
+        "laplace": lambda x: scipy.stats.laplace.cdf(x, 1, 0.5),
+        "bernoulli": middle(scipy.stats.bernoulli(0.3)),
+        "categorical": middle(scipy.stats.rv_discrete(values=([0, 1, 2], [0.2, 0.5, 0.3]))),
+        "independent": lambda x: scipy.stats.norm.cdf(x, [0, 1], [1, 3]),
+        "exp": lambda x: scipy.stats.lognorm.cdf(x, 1),
+        "tent": lambda x: (scipy.stats.triang.cdf(x, 0.5, -0.5, 2) - 0.125) / 0.75,
+    }
+
+
+@pytest.mark.parametrize("name", list(supported("float32")))
+def test_cdf_is_scipys(name, dtype):
+    d, _ = supported(dtype)[name]
+    x = jax.jit(jax.vmap(lambda u: D.quantile(d, u)))(points(d, 200, 0.01, 0.99))
+    u = jax.jit(jax.vmap(lambda x: D.cdf(d, x)))(x)
+    x = np.asarray(x, np.float64 if x.dtype == dtype else x.dtype)
+    np.testing.assert_allclose(u, closed_forms()[name](x), rtol=tolerance(dtype, 1e-5, 1e-9), atol=tolerance(dtype, 1e-6, 1e-12))
+
+
+@pytest.mark.parametrize("name", [name for name in supported_too("float32") if name not in ("joint", "tri", "upper")])
+def test_cdf_never_falls_and_ends_at_0_and_1(name, dtype):
+    """From far below the support, infinity included, to far above it. Coordinates that are not independent are below."""
+    d = supported_too(dtype)[name]
+    like = D.event_like(d)
+    if jnp.issubdtype(like.dtype, jnp.integer):
+        ends, x = (0, 1), np.arange(-4, 8)
+    elif like.dtype == bool:
+        ends, x = (0.35, 0.85), np.array([False, True])
+    else:
+        ends, x = (0, 1), np.concatenate([[-np.inf, -1e30, -300], np.linspace(-12, 12, 2001), [300, 1e30, np.inf]])
+    x = jnp.asarray(np.broadcast_to(x.reshape(-1, *[1] * len(like.shape)), (x.size, *like.shape)), like.dtype)
+    u = np.asarray(jax.jit(jax.vmap(lambda v: D.cdf(d, v)))(x))
+    assert np.isfinite(u).all() and (np.diff(u, axis=0) >= -tolerance(dtype, 2e-7, 1e-15)).all()
+    np.testing.assert_allclose(u[0], ends[0], rtol=1e-6)
+    np.testing.assert_allclose(u[-1], ends[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["tri", "upper"])
+def test_cdf_of_dependent_coordinates_is_no_nan(name, dtype):
+    d = supported_too(dtype)[name]
+    for far in ([np.inf, 0], [0, -np.inf], [np.inf, np.inf], [-1e30, 1e30]):
+        u = D.cdf(d, jnp.asarray(far, dtype))
+        assert ((u >= 0) & (u <= 1)).all()
+    independent = D.MultivariateNormalTri(jnp.zeros(2, dtype), 0.5 * jnp.eye(2, dtype=dtype))
+    assert D.cdf(independent, jnp.asarray([np.inf, 0], dtype)).tolist() == [1, 0.5]
+
+
+def test_cdf_outside_of_the_range_of_a_bijector(dtype):
+    f = lambda v: jnp.asarray(v, dtype)
+    above, below = D.Transformed(D.Normal(f(0), f(1)), jnp.exp), D.Transformed(D.Normal(f(0), f(1)), lambda x: -jnp.exp(x))
+    assert [float(D.cdf(above, f(x))) for x in (-2, 0, 1)] == [0, 0, 0.5]
+    assert [float(D.cdf(below, f(x))) for x in (-1, 0, 2)] == [0.5, 1, 1]
+    inverse = D.Transformed(D.Uniform(f(1), f(2)), lambda x: 1 / x)  # on [1/2, 1], and the inverse of -1 is below 1
+    assert [float(D.cdf(inverse, f(x))) for x in (-1, 0, 0.4, 0.5, 0.8, 1, 9)] == pytest.approx([0, 0, 0, 0, 0.75, 1, 1], rel=1e-6)
+
+
+def test_cdf_where_there_is_no_spread(dtype):
+    f = lambda v: jnp.asarray(v, dtype)
+    x = f([1, 2, 3])
+    for d in (D.Normal(f([2, 2, 2]), f([0, 0, 0])), D.Laplace(f([2, 2, 2]), f([0, 0, 0])), D.MultivariateNormalDiag(f([2, 2, 2]), f([0, 0, 0]))):
+        assert D.cdf(d, x).tolist() == [0, 0.5, 1]
+    assert D.cdf(D.Uniform(f(2), f(2)), f(2)) == 0.5
+
+
+@jax.jit
+def integers_again(weights):
+    """Each of the integers by `cdf` and `quantile` of a Categorical, and of a Bernoulli by its first two weights; the probabilities of both."""
+    again = lambda d: lambda x: D.quantile(d, D.cdf(d, x))
+    die, coin = D.Categorical(probs=weights), D.Bernoulli(probs=weights[0])
+    return jax.vmap(again(die))(jnp.arange(weights.size)), die.probs, jax.vmap(again(coin))(jnp.arange(2)), jnp.stack([1 - coin.probs, coin.probs])
+
+
+@settings(max_examples=100, deadline=None)
+@given(weights=st.lists(st.one_of(st.just(0.0), st.floats(2.0**-20, 1.0, width=32)), min_size=9, max_size=9).filter(any), double=st.booleans())
+def test_cdf_of_every_integer_leads_back_to_it(weights, double):
+    with jax.enable_x64(double):
+        rolls, die, tosses, coin = map(np.asarray, integers_again(jnp.asarray(weights, jnp.zeros(()).dtype)))
+    assert (rolls == np.arange(9))[die > 0].all() and (tosses == np.arange(2))[coin > 0].all()
+
+
+def test_cdf_of_an_integer_with_one_number_for_itself():
+    eps = 2.0**-24
+    d = D.Categorical(probs=jnp.asarray([0.5, 2 * eps, 0.5 - 2 * eps], jnp.float32))
+    assert [int(D.quantile(d, D.cdf(d, jnp.asarray(i)).astype(jnp.float32))) for i in range(3)] == [0, 1, 2]
+    assert [float(D.cdf(D.Categorical(probs=jnp.ones(1)), jnp.asarray(i))) for i in (-1, 0, 1)] == [0, 0.5, 1]
+
+
+@settings(max_examples=60, deadline=None)
+@given(center=unit, a=unit, b=unit)
+def test_tent_cdf_rises_and_inverts_its_quantile(center, a, b):
+    d = D.tent(jnp.float32(center))
+    low, high = (float(d.cdf(jnp.float32(v))) for v in sorted((a, b)))
+    assert 0 <= low <= high + 1e-6 and high <= 1
+    assert float(d.cdf(d.quantile(jnp.float32(a)))) == pytest.approx(a, abs=2e-6)
+
+
+def test_cdf_of_the_users_own(key):
+    class Square(D.Distribution):  # x = u^2, so that cdf(x) = sqrt(x)
+        event_shape = ()
+
+        def _sample_n(self, key, n):
+            return self.quantile(jax.random.uniform(key, (n,)))
+
+        def log_prob(self, x):
+            return -jnp.log(x) / 2
+
+        def quantile(self, u):
+            return u * u
+
+    class Inverted(Square):
+        def cdf(self, x):
+            return jnp.sqrt(x)
+
+    class Shifted(D.Normal):  # distrax's cdf is still that of the normal one
+        def quantile(self, u):
+            return D.quantile(D.Normal(1.0, 1.0), u)
+
+    assert D.has_cdf(Inverted()) and D.cdf(Inverted(), jnp.asarray(0.25)) == 0.5
+    assert D.cdf(D.Joint([Inverted(), D.Uniform(0.0, 2.0)]), [jnp.asarray(0.25), jnp.asarray(0.5)]) == [0.5, 0.25]
+    for d in (Square(), Shifted(0.0, 1.0)):
+        assert D.has_quantile(d) and not D.has_cdf(d)
+        with pytest.raises(ValueError, match=f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it"):
+            D.cdf(d, jnp.asarray(0.25))
+
+
+def test_cdf_names_the_distribution_that_has_no_quantile():
+    one = jnp.asarray(1.0)
+    for d in (D.Gamma(one, one), D.Beta(one, one), D.seeds(), D.Deterministic(one)):
+        assert not D.has_cdf(d)
+        for e in (d, D.where(True, d, d)) + ((D.Joint([D.Normal(0.0, 1.0), d]),) if d.event_shape == () else ()):
+            with pytest.raises(ValueError, match=f"cdf: {type(d).__name__} has no quantile function here to invert"):
+                x = D.sample(d, jax.random.key(0))
+                D.cdf(e, [one, x] if isinstance(e, D.Joint) else x)
+    twice = D.Transformed(D.Normal(0.0, 1.0), lambda x: x + jnp.exp(x))
+    assert D.has_quantile(twice) and not D.has_cdf(twice)
+    with pytest.raises(ValueError, match="cdf: Transformed has a bijector without inverse"):
+        D.cdf(twice, one)
 
 
 # tent
@@ -166,6 +384,7 @@ def test_seeds(key):
 
 def test_fixed_and_deterministic(key):
     assert D.Fixed().sample(seed=key) == () and D.mode(D.Fixed()) == () and D.Fixed().log_prob(()) == 0 and D.quantile(D.Fixed(), ()) == ()
+    assert D.has_cdf(D.Fixed()) and D.cdf(D.Fixed(), ()) == ()
     d = D.Deterministic((jnp.ones(2), jnp.int32(3)))
     assert D.sample(d, key)[1] == 3 and d.log_prob(D.mode(d)) == 0
     assert D.log_density(d, D.mode(d), "mode") == 0
@@ -207,7 +426,7 @@ def test_a_distribution_of_the_users_own_need_be_no_pytree(key):
         def log_prob(self, x):
             return -x * x
 
-    assert D.event_like(Own()).shape == () and not D.has_mode(Own()) and not D.has_quantile(Own())
+    assert D.event_like(Own()).shape == () and not D.has_mode(Own()) and not D.has_quantile(Own()) and not D.has_cdf(Own())
 
 
 @settings(max_examples=40, deadline=None)

@@ -12,7 +12,7 @@ MODES = {"default": dict(widening=(2.0, 0.5), spread=True, focus=None), "paper":
 
 def forest(
     key, sim, *, trees=200, prunes=18, simulations=500, heads=None, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None,
-    spread=None, focus=None, memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
+    spread=None, focus=None, head_settings=None, memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
 
@@ -37,10 +37,9 @@ def forest(
 
     Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
     """
-    if heads is not None:
-        raise ValueError(f"forest: heads must be None, networks are not in this version; received {heads!r}")
     return grow_trees(
         "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations,
+        heads=heads, head_settings=head_settings,
         reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
         progress=progress, callback=callback,
     )  # fmt: skip

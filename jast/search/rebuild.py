@@ -6,7 +6,7 @@ from jax import lax
 
 from jast.episode import Episode, Progress, accumulator
 from jast.search.records import unpack
-from jast.search.tree import FAILURE, FRESH, choose_child, choose_rollout, levels, node_keys, node_shapes, take
+from jast.search.tree import FAILURE, FRESH, choose_child, choose_rollout, levels, node_keys, node_shapes, of_lanes, take
 
 __all__ = ["rebuild"]
 
@@ -20,7 +20,7 @@ def rebuild(problem, axes, tree, lane, i, memoize="node"):
 
 
 def _one(problem, axes, tree, lane, i, memoize):
-    problem = jax.tree.map(lambda axis, leaf: leaf if axis is None else leaf[lane], axes, problem, is_leaf=lambda x: x is None)
+    problem = of_lanes(problem, axes, lane)
     like, key, sim = node_shapes(tree, memoize), tree.key[lane], problem.sim
     height = levels(sim)
     outcome = tree.outcome[i, lane]
@@ -39,7 +39,7 @@ def _one(problem, axes, tree, lane, i, memoize):
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
         chosen = choose_child(problem, node_keys(key[None], parents[up_there][None])[0], slots[up_there], at.state)
-        rolled = choose_rollout(problem, jax.random.fold_in(rolling, level), key, at.state)
+        rolled = choose_rollout(problem, rolling, key, level, at.state)
         x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
         after = take(problem, level, at, action)
         kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)

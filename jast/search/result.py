@@ -46,7 +46,11 @@ class SearchResult(NamedTuple):
     settings: dict | None
     """What was asked for: method, counts, seed."""
     roots: Any = None
-    """Of trees: the statistics of every root, for training (`jast.search.tree.Roots`, one for each prune)."""
+    """Of trees: the statistics of every root (`jast.search.prune.Roots`, one for each prune)."""
+    heads: Any = None
+    """`jast.heads.Heads` as the search left them, to be used again; None without."""
+    lessons: tuple = ()
+    """Of each round of training: name of the head -> `jast.heads.Lesson`."""
 
     @property
     def failing_trees(self):
@@ -78,5 +82,11 @@ def _words(result):
         text = f"no failure was found; the nearest episode came to distance {float(result.best.distance):.4f}"
     if result.invalid:
         text += f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward returned NaN or infinity"
+    for n, lesson in enumerate(result.lessons):
+        for name, of in lesson.items():
+            if of.rejected:
+                text += f"\nround {n + 1}: training of the {name} head was rejected, its loss was {of.loss}; the parameters from before were kept"
+    if dropped := sum(of.dropped for lesson in result.lessons for of in lesson.values()):
+        text += f"\n{dropped} samples for the heads were left out: observe, a disturbance or a reward was not finite"
     note = (result.settings or {}).get("interrupted")
     return text + (f"\ninterrupted: {note}" if note else "")

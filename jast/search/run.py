@@ -15,6 +15,7 @@ from jax.custom_batching import custom_vmap
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
 from jast.search import simulate
+from jast.search.edges import edges_of
 from jast.search.prune import prune
 from jast.search.rebuild import rebuild
 from jast.search.tree import FAILURE, FRESH, INVALID, RAN, make
@@ -31,6 +32,10 @@ class Plan(NamedTuple):
     children: int
     """Greatest number of children of a node."""
     memoize: str
+    pages: int | None = None
+    """Of a tree (`jast.search.tree.pages_of`)."""
+    edges: bool = False
+    """Whether all edges are kept for training."""
 
 
 class Harvest(NamedTuple):
@@ -49,11 +54,13 @@ class Harvest(NamedTuple):
     tree: Any
     """[n] where they were found."""
     simulation: Any
+    edges: Any = ()
+    """`Edges`, where the plan asks for them."""
 
 
-@functools.partial(jax.jit, static_argnames=("simulations", "memoize"))
-def _make(problem, keys, simulations, memoize):
-    return make(problem, _shared(problem), keys, simulations, memoize)
+@functools.partial(jax.jit, static_argnames=("simulations", "memoize", "pages"))
+def _make(problem, keys, simulations, memoize, pages=None):
+    return make(problem, _shared(problem), keys, simulations, memoize, pages)
 
 
 @functools.partial(jax.jit, static_argnames=("memoize",), donate_argnames=("tree",))
@@ -64,6 +71,11 @@ def _grow(problem, tree, begin_at, end_at, memoize):
 @functools.partial(jax.jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
 def _prune(problem, tree, children, memoize):
     return prune(problem, _shared(problem), tree, children, memoize)
+
+
+@functools.partial(jax.jit, static_argnames=("children",))
+def _edges(problem, tree, children):
+    return edges_of(problem, _shared(problem), tree, children)
 
 
 @functools.partial(jax.jit, static_argnames=("memoize",))
@@ -79,15 +91,15 @@ def _shared(problem):
 def bytes_per_tree(problem, plan):
     """Bytes that one tree takes while it grows, from the shapes of its arrays."""
     simulations = plan.prunes * plan.simulations
-    tree = jax.eval_shape(lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize), problem, tree_keys(jax.random.key(0), 2))
+    tree = jax.eval_shape(lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize, plan.pages), problem, tree_keys(jax.random.key(0), 2))
     return sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree)) // 2
 
 
-def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk):
+def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk, first=0):
     """Grow one tree a key, ``lanes`` at a time in each of ``threads`` threads: a list of `Harvest` in the order of the keys, and whether it was interrupted.
 
-    ``on_chunk(simulations)`` is called from the main thread when so many more simulations are done; a KeyboardInterrupt there, or from the keyboard, ends all
-    trees at their next chunk.
+    ``first``: the number of the first tree. ``on_chunk(simulations)`` is called from the main thread when so many more simulations are done; a
+    KeyboardInterrupt there, or from the keyboard, ends all trees at their next chunk.
     """
     trees = keys.shape[0]
     groups = [np.arange(start, min(start + lanes, trees)) for start in range(0, trees, lanes)]
@@ -106,7 +118,7 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
             for setting, value in settings:
                 stack.enter_context(setting(value))
             try:
-                return _one_group(problem, keys[np.resize(group, lanes)], group, plan, chunk, candidates, report, stop)
+                return _one_group(problem, keys[np.resize(group, lanes)], group + first, plan, chunk, candidates, report, stop)
             except BaseException:
                 stop.set()  # the other groups need not finish either
                 raise
@@ -144,7 +156,7 @@ def _surroundings():
 
 
 def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
-    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize)
+    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages)
     turns = []
     for turn in range(plan.prunes):
         first, end = turn * plan.simulations, (turn + 1) * plan.simulations
@@ -163,7 +175,8 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
     found = _rebuild(problem, tree, np.resize(lane, wanted).astype(np.int32), np.resize(i, wanted).astype(np.int32), plan.memoize)
     found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
     roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
-    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32))
+    edges = jax.device_get(jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))) if plan.edges else ()
+    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32), edges)
 
 
 def _candidates(log, outcome, most):
@@ -223,7 +236,7 @@ def _batchable(treedef, plan, axes):
 
 
 def _traced(problem, axes, keys, plan):
-    tree = make(problem, axes, keys, plan.prunes * plan.simulations, plan.memoize)
+    tree = make(problem, axes, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages)
 
     def turn(n, tree):
         tree = simulate.grow(problem, axes, tree, n * plan.simulations, (n + 1) * plan.simulations, plan.memoize)

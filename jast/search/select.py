@@ -1,6 +1,6 @@
 """Selection: from the root down to a child that was never visited, or to an episode's end."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,8 @@ class Walk(NamedTuple):
     """Slots in the pages before."""
     count: jax.Array
     """Children of the node."""
+    grows: jax.Array
+    """bool: it will have one more at its next visit."""
     bonus: jax.Array
     """Exploration weight times sqrt(ln N(s))."""
     reward: jax.Array
@@ -46,10 +48,18 @@ class Walk(NamedTuple):
     desk: jax.Array
     scores: jax.Array
     below: jax.Array
+    values: Any
+    """Desk of the pages' v(s, a), ``()`` without a value head; so are the next two."""
+    last: Any
+    """[H, B] last page's row of the path's nodes."""
+    new: Any
+    """[H, B] the slot that will be new at the next visit, or 0 (the first child needs no value while it is alone)."""
 
 
-def select(settings, tree):
+def select(problem, tree):
     """Walk down to a child that was never visited, or to an episode's end: MCFS-AP eq. 3 and progressive widening, a page an iteration."""
+    settings, guide, valued = problem.settings, problem.guide, problem.values
+    eager = valued and guide.eager
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)
     edges, dtype = tree.edges, tree.edges.dtype
@@ -60,14 +70,18 @@ def select(settings, tree):
     first = jnp.minimum(tree.depth[0], 0)  # 0, which XLA does not know: an update of the whole desk would not be one in place
 
     def of_node(visits):
-        count = settings.widths[visits] if settings.widths.ndim == 1 else settings.widths[lane, visits]
-        return count, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
+        width = lambda n: settings.widths[n] if settings.widths.ndim == 1 else settings.widths[lane, n]
+        count = width(visits)
+        grows = width(visits + 1) > count if eager else ()
+        return count, grows, exploration * jnp.sqrt(jnp.log(visits.astype(dtype)))
 
     def read(w):
         """Visits and returns of the pages, laid out on the desk (see `Tree.desk`)."""
         rows = edges.reshape(-1, CHILD)[w.row * (ROW // CHILD)]
         desk = lax.dynamic_update_slice_in_dim(w.desk, rows[None], first, 0)
         return desk, desk[0]
+
+    number = lambda a: jnp.asarray(a, dtype).reshape(-1, 1)  # of all trees or of each
 
     def pick(row, column, j):
         return jnp.take_along_axis(row, (column + j)[:, None], axis=1, mode="promise_in_bounds")[:, 0]
@@ -76,8 +90,17 @@ def select(settings, tree):
         desk, row = read(w)
         n, total = row[:, VISITS:RETURNS], row[:, RETURNS:CHILD]
         q = jnp.where(n > 0, total / jnp.maximum(n, 1) - w.reward[:, None], 0)
-        score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3; the value term joins here
-        score = jnp.where(slots < jnp.minimum(w.count - w.offset, PAGE)[:, None], score, -jnp.inf)
+        if valued:
+            values = lax.dynamic_update_slice_in_dim(w.values, tree.values.reshape(-1, PAGE + 1)[w.row][None], first, 0)
+            v = values[0]
+            q = number(guide.q_weight) * q + number(guide.v_weight) * v
+        else:
+            values = ()
+        score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3
+        there = slots < jnp.minimum(w.count - w.offset, PAGE)[:, None]
+        if valued and not eager:  # one that was not tried yet stands after those that were
+            there &= (slots == 0) | (n > 0) | (jnp.roll(n, 1, axis=1) > 0)
+        score = jnp.where(there, score, -jnp.inf)
         scores = lax.dynamic_update_slice_in_dim(w.scores, score[None], first, 0)
         score = scores[0]
         j = jnp.argmax(score, axis=1).astype(jnp.int32)
@@ -89,29 +112,35 @@ def select(settings, tree):
         child, reward = below[0, :, 0].astype(jnp.int32), below[0, :, 1]
         visits = jnp.where(better, pick(row, VISITS, j).astype(jnp.int32), w.best.visits)
         found = Best(jnp.where(better, top, w.best.score), edge, jnp.where(better, w.offset + j, w.best.slot), visits, child, reward)
-        more = ~w.done & (link > 0) & (w.offset + PAGE < w.count)  # without a link there is an unvisited slot here, and later ones score the same
+        # without a link there is an unvisited slot here, and later ones score the same; with values all pages are linked
+        more = ~w.done & (link > 0) & (w.offset + PAGE < w.count)
         taken = ~w.done & ~more
         descend = taken & (found.child > 0)
-        count, bonus = of_node(found.visits)
+        count, grows, bonus = of_node(found.visits)
+        level = jnp.where(taken, w.depth, w.path.shape[0])
         return Walk(
             node=jnp.where(descend, found.child, w.node),
             row=jnp.where(more, link.astype(jnp.int32) * lanes + lane, jnp.where(descend, found.child * lanes + lane, w.row)),
             offset=jnp.where(more, w.offset + PAGE, 0),
             count=jnp.where(descend, count, w.count),
+            grows=jnp.where(descend, grows, w.grows) if eager else (),
             bonus=jnp.where(descend, bonus, w.bonus),
             reward=jnp.where(descend, found.reward, w.reward),
             depth=w.depth + descend.astype(jnp.int32),
             best=jax.tree.map(lambda a, b: jnp.where(w.done, b, a), found._replace(score=jnp.where(descend, -jnp.inf, found.score)), w.best),
             done=w.done | (taken & (found.child <= 0)),
-            path=w.path.at[jnp.where(taken, w.depth, w.path.shape[0]), lane].set(found.edge, mode="drop"),
+            path=w.path.at[level, lane].set(found.edge, mode="drop"),
             desk=desk,
             scores=scores,
             below=below,
             trail=w.trail.at[jnp.where(descend, w.depth + 1, w.trail.shape[0]), lane].set(found.child, mode="drop"),
+            values=values,
+            last=w.last.at[level, lane].set(w.row, mode="drop") if eager else (),
+            new=w.new.at[level, lane].set(jnp.where(w.grows, w.count, 0), mode="drop") if eager else (),
         )
 
     row = tree.root * lanes + lane
-    count, bonus = of_node(tree.root_visits)
+    count, grows, bonus = of_node(tree.root_visits)
     nobody = Best(jnp.full((lanes,), -jnp.inf, dtype), nil, nil, nil, nil, jnp.zeros((lanes,), dtype))
     stay = ~tree.alive | tree.ended
     start = Walk(
@@ -119,6 +148,7 @@ def select(settings, tree):
         row,
         nil,
         count,
+        grows,
         bonus,
         tree.root_reward,
         tree.depth,
@@ -127,5 +157,7 @@ def select(settings, tree):
         tree.path,
         tree.trail,
         *(jnp.zeros((2, lanes, n), dtype) for n in (CHILD, PAGE + 1, 2)),
+        jnp.zeros((2, lanes, PAGE + 1), dtype) if valued else (),
+        *(jnp.zeros(tree.path.shape, jnp.int32) if eager else () for _ in range(2)),
     )
     return lax.while_loop(lambda w: jnp.any(~w.done), body, start)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.episode import Progress, accumulator
+from jast.search.foresee import foresee
 from jast.search.records import pack, unpack
 from jast.search.select import select
 from jast.search.tree import (
@@ -25,6 +26,7 @@ from jast.search.tree import (
     levels,
     node_keys,
     node_shapes,
+    of_lanes,
     take,
 )
 
@@ -40,7 +42,7 @@ def grow(problem, axes, tree, begin_at, end_at, memoize="node"):
 def _simulation(problem, axes, tree, i, memoize):
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)
-    walk = select(problem.settings, tree)
+    walk = select(problem, tree)
     fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
     nothing = jnp.zeros((lanes,), bool)
     zero = jnp.zeros((lanes,), tree.edges.dtype)
@@ -82,11 +84,11 @@ def _simulation(problem, axes, tree, i, memoize):
     bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
     bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
     kept = Node(walk.node, walk.best.slot, child.reward, child.distance, child.failure, child.invalid, child.state if memoize == "node" else ())
-    return tree._replace(
-        edges=_back_up(tree, walk, fresh, child, backed, i + 1),
+    tree = tree._replace(
+        edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
         nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
         desk=desk,
-        pages=tree.pages + _one(fresh & _fills(walk)),
+        pages=tree.pages if problem.values else tree.pages + _one(fresh & _fills(walk)),
         root_visits=tree.root_visits + _one(tree.alive),
         turn=tree.turn + jnp.where(tree.alive, jnp.stack([jnp.ones_like(backed), backed]), 0),
         worst=worst,
@@ -95,9 +97,12 @@ def _simulation(problem, axes, tree, i, memoize):
         outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
         alive=tree.alive & ~tree.ended,
     )
+    if not problem.values:
+        return tree
+    return foresee(problem, axes, tree, walk, fresh, lambda lane, level, live: replay_to(problem, axes, tree, walk.trail, level, memoize, lane, live), memoize)
 
 
-def _back_up(tree, walk, fresh, child, value, new):
+def _back_up(tree, walk, fresh, child, value, new, link):
     """The edges with one more visit and return along each path, and the new children in their slots: one scatter, since what is new was 0."""
     nowhere = tree.edges.size
     level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
@@ -105,11 +110,12 @@ def _back_up(tree, walk, fresh, child, value, new):
     at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(-1)
     ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
     slot = jnp.where(fresh, walk.best.edge, nowhere)
-    link = jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere)  # the page is full now: another goes on
-    places = jnp.concatenate([at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD, link])
     returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
-    values = jnp.concatenate([jnp.ones_like(returns), returns, ids, child.reward, tree.pages.astype(tree.edges.dtype)])
-    return tree.edges.at[places].add(values, mode="drop")
+    places, values = [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD], [jnp.ones_like(returns), returns, ids, child.reward]
+    if link:  # where the page is full now, another goes on
+        places.append(jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere))
+        values.append(tree.pages.astype(tree.edges.dtype))
+    return tree.edges.at[jnp.concatenate(places)].add(jnp.concatenate(values), mode="drop")
 
 
 def _fills(walk):
@@ -117,23 +123,28 @@ def _fills(walk):
     return walk.best.edge % ROW == PAGE - 1
 
 
-def replay_to(problem, axes, tree, trail, depth, memoize):
-    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept, and the simulator steps that it took to get there."""
-    (lanes,) = tree.key.shape
-    lane = jnp.arange(lanes, dtype=jnp.int32)
+def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
+    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept, and the simulator steps that it took to get there.
+
+    Or of the trees ``lane`` [m], ``depth`` [m], where ``live`` [m].
+    """
     like = node_shapes(tree, memoize)
-    first = tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
+    key, base, first = tree.key, tree.base, tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
+    running = tree.alive & ~tree.ended if live is None else live
+    if lane is None:
+        lane = jnp.arange(key.shape[0], dtype=jnp.int32)
+    else:
+        problem, key, base, first = of_lanes(problem, axes, lane), key[lane], jax.tree.map(lambda a: a[lane], base), first[lane]
     move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0))
-    running = tree.alive & ~tree.ended
 
     def body(carry):
         level, state = carry
         node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
-        after = move(problem, node_keys(tree.key, node.parent), node.slot, level, state)
+        after = move(problem, node_keys(key, node.parent), node.slot, level, state)
         return level + _one(live), select_lanes(live, after, state)
 
-    _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, tree.base))
+    _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
     chosen = levels(problem.sim) - problem.sim.horizon  # a random start is a level, but no step
     return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
 
@@ -143,7 +154,7 @@ def _child(problem, node_key, slot, level, before):
 
 
 def _rolled(problem, key, tree_key, level, before):
-    return take(problem, level, before, choose_rollout(problem, jax.random.fold_in(key, level), tree_key, before.state))
+    return take(problem, level, before, choose_rollout(problem, key, tree_key, level, before.state))
 
 
 def child_state(problem, node_key, slot, level, state):

@@ -9,6 +9,7 @@ out of range where there is nothing to write, and no tree array is an operand of
    visits and returns, stands together: two cache lines in float32.
  - A slot that was never visited needs no storage: the number of children is a function of the node's visits alone (`widths`), and the action of a slot is drawn
    from its address (tree, node, slot). Unvisited slots score alike, so they are visited in order.
+ - With a value head they do not: then v(s, a) of every child stands in ``Tree.values``, and pages are linked when a child appears, not when it is visited.
  - Returns are those of whole episodes; Q(s, a) subtracts the reward up to s.
 """
 
@@ -17,12 +18,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jast.episode import Progress, advance, begin, random_start
+from jast.search.guide import rolled
 from jast.search.records import pack
 
 __all__ = [
-    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "take", "widths",
+    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "of_lanes", "pages_of",
+    "take", "widths",
 ]  # fmt: skip
 
 PAGE = 15
@@ -51,6 +55,13 @@ class Problem(NamedTuple):
     choice: Any
     """`jast.search.choice.Choice`."""
     settings: Settings
+    guide: Any = ()
+    """`jast.search.guide.Guide`, or ``()`` for a search without heads."""
+
+    @property
+    def values(self):
+        """Whether children have a v(s, a)."""
+        return self.guide != () and self.guide.heads.value is not None
 
 
 class Tree(NamedTuple):
@@ -66,6 +77,8 @@ class Tree(NamedTuple):
     desk: jax.Array
     """[2, B, words] uint32: where the node of a simulation is laid out to be read. XLA would cut a gather from a large array over threads, which for so few
     numbers costs more than it saves, unless the gather ends in an update in place."""
+    values: Any
+    """[pages * B * (PAGE + 1)] float: v(s, a) of each child, rows as in ``edges``; ``()`` without a value head."""
     pages: jax.Array
     """[B] int32: pages in use."""
     root: jax.Array
@@ -134,22 +147,36 @@ def levels(sim):
     return sim.horizon + random_start(sim)
 
 
-def _pages(simulations):
-    """One for each node, and one more whenever one is full."""
-    return simulations + 1 + simulations // PAGE + 1
+def _pages(simulations, levels=0, table=None):
+    """One for each node, and one more whenever one is full; ``levels`` and ``table`` bound how many, where children need a place before they are visited."""
+    more = simulations // PAGE
+    if levels:  # at each level, the visits of all nodes are at most the simulations
+        n = np.arange(1, simulations + 2)
+        children = n if isinstance(table, jax.core.Tracer) else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
+        more = int(simulations * levels * np.max((-(-children // PAGE) - 1) / n)) + levels
+    return simulations + 1 + more + 1
 
 
-def most_lanes(simulations):
-    """How many trees of so many simulations one `Tree` can hold: places in its edges are int32."""
-    return (2**31 - 1 - ROW) // (_pages(simulations) * ROW)
+def pages_of(problem, simulations):
+    """Pages of a tree of so many simulations."""
+    many = problem.values and problem.guide.eager  # children stand on pages before they are visited
+    return _pages(simulations, levels(problem.sim), problem.settings.widths) if many else _pages(simulations)
 
 
-def make(problem, axes, keys, simulations, memoize="node"):
-    """Trees of one root each, with room for ``simulations``; ``axes`` says which parts of ``problem`` differ between trees (0) or not (None)."""
+def most_lanes(pages):
+    """How many trees of so many pages one `Tree` can hold: places in its edges are int32."""
+    return (2**31 - 1 - ROW) // (pages * ROW)
+
+
+def make(problem, axes, keys, simulations, memoize="node", pages=None):
+    """Trees of one root each, with room for ``simulations`` in so many ``pages`` (default: `pages_of`).
+
+    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None).
+    """
     (lanes,) = keys.shape
-    pages = _pages(simulations)
-    if lanes > most_lanes(simulations):
-        raise ValueError(f"search: at most {most_lanes(simulations)} trees of {simulations} simulations fit into one program's 32-bit places, received {lanes}")
+    pages = pages_of(problem, simulations) if pages is None else pages
+    if lanes > most_lanes(pages):
+        raise ValueError(f"search: at most {most_lanes(pages)} trees of {simulations} simulations fit into one program's 32-bit places, received {lanes}")
 
     def origin(problem, key):
         if random_start(problem.sim):
@@ -169,6 +196,7 @@ def make(problem, axes, keys, simulations, memoize="node"):
         edges=jnp.zeros((pages * lanes * ROW,), dtype),
         nodes=jnp.zeros((simulations + 1, *record.shape), record.dtype).at[0].set(record),
         desk=jnp.zeros((2, *record.shape), record.dtype),
+        values=jnp.zeros((pages * lanes * (PAGE + 1),), dtype) if problem.values else (),
         pages=count + simulations + 1,
         root=count,
         root_visits=count + 1,
@@ -204,11 +232,16 @@ def choose_child(problem, node_key, slot, state):
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
 
-def choose_rollout(problem, key, tree_key, state):
-    """One lane: (x0, x) of a rollout's level, by its own key and its tree's."""
+def choose_rollout(problem, key, tree_key, level, state):
+    """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree."""
     sim, choice = problem.sim, problem.choice
+    simulation, key = key, jax.random.fold_in(key, level)
     x0 = choice.roll(key, tree_key, sim.start(), start=True) if random_start(sim) else ()
-    return x0, choice.roll(key, tree_key, sim.disturbance(state))
+    dist = sim.disturbance(state)
+    x = choice.roll(key, tree_key, dist)
+    if problem.guide != () and problem.guide.heads.policy is not None:
+        x = lax.cond(problem.guide.levels > 0, lambda: rolled(problem.guide, sim, choice.actions, simulation, key, level, state, dist, x), lambda: x)
+    return x0, x
 
 
 def take(problem, level, before, action):
@@ -220,6 +253,11 @@ def take(problem, level, before, action):
     if start:
         after = jax.tree.map(lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after)
     return after
+
+
+def of_lanes(problem, axes, lane):
+    """``problem`` with those of its leaves that differ between trees taken of these trees, [...]; ``axes`` as in `make`."""
+    return jax.tree.map(lambda axis, leaf: leaf if axis is None else leaf[lane], axes, problem, is_leaf=lambda x: x is None)
 
 
 def node_keys(keys, node):

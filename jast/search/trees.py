@@ -10,12 +10,16 @@ import numpy as np
 from jast.counter import tree_keys
 from jast.episode import Episode, replay
 from jast.failures import collect, identity
+from jast.heads.rounds import enrol, teach
+from jast.heads.settings import MODES as HEAD_MODES
+from jast.heads.settings import checked
 from jast.search import memory
 from jast.search.choice import Choice
 from jast.search.episodes import prepare, whole
+from jast.search.guide import guide
 from jast.search.result import History, SearchResult
 from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
-from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, most_lanes, widths
+from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, levels, most_lanes, pages_of, widths
 
 __all__ = ["grow_trees", "settled"]
 
@@ -38,8 +42,9 @@ def settled(method, modes, mode, widening, spread, focus, actions):
 
 
 def grow_trees(
-    method, key, sim, choices, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, threads, lanes, available, progress, callback
-):
+    method, key, sim, choices, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, threads, lanes, available, progress, callback,
+    heads=None, head_settings=None,
+):  # fmt: skip
     """A forest by its settings, all given: what `forest` and `mcts` call. ``choices``: mode, widening, spread and focus."""
     mode, widening, spread, focus = choices
     given = {name: value for name, value in dict(threads=threads, lanes=lanes).items() if value is not None}
@@ -57,10 +62,24 @@ def grow_trees(
     problem = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)))
     children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
     plan = Plan(prunes, simulations, children, "node" if memoize == "auto" else memoize)
+    school, at_once = None, trees
+    if heads is not None:
+        head_settings = checked(HEAD_MODES[mode] if head_settings is None else head_settings)
+        school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
+        problem = problem._replace(guide=guide(school.heads, head_settings))
+        plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.edges == "all" and school.value is not None)
+        at_once = min(trees, head_settings.round or max(1, min(trees // 5, 40))) if head_settings.train else trees
+        if settings is None and isinstance(heads, str):
+            raise ValueError(f"{method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot hold: pass jast.heads.Heads that were trained")
+        if plan.edges and memoize in ("root", "none"):
+            raise ValueError(f"{method}: heads that learn from all edges (head_settings.edges) need states at every node, received memoize={memoize!r}")
     if settings is None:
         return _traced(grow_traced(problem, tree_keys(key, trees), plan))
-    plan, threads, lanes = _fit(method, problem, plan, trees, threads, lanes, available, auto=memoize == "auto")
+    plan, threads, lanes = _fit(method, problem, plan, at_once, threads, lanes, available, auto=memoize == "auto")
     settings |= dict(prunes=prunes, memoize=plan.memoize)
+    if school is not None:
+        kind = heads if isinstance(heads, str) else "/".join(name for name in ("policy", "value") if getattr(heads, name) is not None)
+        settings |= dict(heads=kind, head_settings=head_settings._asdict() | dict(round=at_once))
     if progress:
         from tqdm import tqdm
     bar = tqdm(total=trees * total, unit="sim", unit_scale=True, desc=method) if progress else None
@@ -74,16 +93,25 @@ def grow_trees(
             callback(done[0], trees * total)
 
     chunk = max(1, min(simulations, 500))
-    harvests, interrupted = grow_all(
-        problem, tree_keys(key, trees), plan, threads=threads, lanes=lanes, chunk=chunk, candidates=max(256, 4 * top), on_chunk=on_chunk
-    )
+    keys, harvests, interrupted = tree_keys(key, trees), [], False
+    for first in range(0, trees, at_once):
+        new, interrupted = grow_all(
+            problem, keys[first : first + at_once], plan, threads=threads, lanes=lanes, chunk=chunk, candidates=max(256, 4 * top), on_chunk=on_chunk,
+            first=first,
+        )  # fmt: skip
+        harvests += new
+        if interrupted:
+            break
+        if school is not None and head_settings.train:
+            school = teach(jax.random.fold_in(key, trees + 1 + first), school, sim, actions, head_settings, new)
+            problem = problem._replace(guide=guide(school.heads, head_settings))
     if bar is not None:
         bar.close()
     if interrupted:
         settings["interrupted"] = f"after {done[0]} of {trees * total} simulations"
     if not harvests:
         raise KeyboardInterrupt
-    return _result(sim, reward, harvests, settings, top)
+    return _result(sim, reward, harvests, settings, top, school)
 
 
 def _fit(method, problem, plan, trees, threads, lanes, available, auto):
@@ -95,9 +123,9 @@ def _fit(method, problem, plan, trees, threads, lanes, available, auto):
     if lanes is None:
         rounds = -(-trees // (threads * LANES))
         lanes = -(-trees // (threads * rounds)) if jax.default_backend() == "cpu" else trees
-    lanes = min(lanes, trees, most_lanes(plan.prunes * plan.simulations))
+    lanes = min(lanes, trees, most_lanes(pages_of(problem, plan.prunes * plan.simulations)))
     threads = min(threads, -(-trees // lanes))
-    for memoize in ["node", "root"] if auto else [plan.memoize]:
+    for memoize in ["node", "root"] if auto and not plan.edges else [plan.memoize]:
         plan = plan._replace(memoize=memoize)
         one = bytes_per_tree(problem, plan)
         within = lanes if free is None else int(0.8 * free // (one * threads))
@@ -112,7 +140,7 @@ def _fit(method, problem, plan, trees, threads, lanes, available, auto):
     return plan, threads, max(1, min(lanes, within))
 
 
-def _result(sim, reward, harvests, settings, top):
+def _result(sim, reward, harvests, settings, top, school):
     log, outcome = (np.concatenate([getattr(h, field) for h in harvests], axis=1) for field in ("log", "outcome"))
     has = lambda bit: (outcome & bit) > 0
     ran, failed = has(RAN), has(FAILURE)
@@ -144,6 +172,8 @@ def _result(sim, reward, harvests, settings, top):
         invalid=int(has(INVALID).sum()),
         settings=settings,
         roots=roots,
+        heads=None if school is None else school.heads,
+        lessons=() if school is None else school.lessons,
     )
 
 

@@ -1,0 +1,8 @@
+"""Rollout-policy and value networks for tree searches, trained on the statistics of finished trees."""
+
+from jast.heads.heads import Heads, Moments
+from jast.heads.networks import Head, make_head
+from jast.heads.settings import MODES, HeadSettings, settings
+from jast.heads.training import Lesson
+
+__all__ = ["MODES", "Head", "HeadSettings", "Heads", "Lesson", "Moments", "make_head", "settings"]

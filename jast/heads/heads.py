@@ -1,0 +1,110 @@
+"""The two heads of a search and what they say: a histogram of the next disturbance, and the reward to come after one."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast.heads.networks import Head
+
+__all__ = ["Heads", "Moments", "flat", "histogram", "moments", "observed", "unflat", "value"]
+
+
+class Moments(NamedTuple):
+    """Running mean and deviation of n numbers; with ``count`` 0 they leave what they normalise as it is."""
+
+    count: Any
+    """scalar float32."""
+    mean: Any
+    """[n] float32."""
+    deviation: Any
+    """[n] float32: 1 where nothing varies."""
+
+    @classmethod
+    def empty(cls, *shape):
+        return cls(np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32))
+
+    def normalise(self, x):
+        return (x - self.mean) / self.deviation
+
+    def restore(self, x):
+        return self.mean + self.deviation * x
+
+    def first(self, n):
+        """Those of the first ``n`` numbers."""
+        return Moments(self.count, self.mean[:n], self.deviation[:n])
+
+
+def moments(before, x):
+    """``before`` and the rows of ``x`` [m, n] (or [m]), on the host (the pairwise update of Chan, Golub and LeVeque)."""
+    if not len(x):
+        return before
+    x, mean, count = np.asarray(x, np.float64), np.float64(before.mean), before.count + len(x)
+    squares = before.count * np.float64(before.deviation) ** 2 if before.count else 0.0
+    gap = x.mean(0) - mean
+    variance = (squares + len(x) * x.var(0) + gap**2 * before.count * len(x) / count) / count
+    deviation = np.where(variance > 1e-12, np.sqrt(variance), 1)
+    return Moments(*(np.asarray(a, np.float32) for a in (count, mean + gap * len(x) / count, deviation)))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Heads:
+    """A rollout-policy head and a value head (Lytskjold and Mengshoel, MCFS-AP): each a `Head`, or a pair (params, apply), or None; a pytree.
+
+    ``policy.apply(params, s)`` gives logits [d, bins] for the normalised observation s [n], ``value.apply(params, s and x [n + d])`` a scalar; n numbers are
+    observed, a disturbance has d. A search fills in the moments that normalise what goes in and out.
+    """
+
+    policy: Any = None
+    value: Any = None
+    inputs: Any = None
+    """`Moments` of the n + d inputs."""
+    returns: Any = None
+    """`Moments` of the value head's targets."""
+    levels: Any = 0
+    """int: the first levels of an episode that they have learned of; a default search is not guided by them deeper down. Give those that you trained yourself
+    the horizon."""
+
+    def __post_init__(self):
+        for name in ("policy", "value"):
+            head = getattr(self, name)
+            if isinstance(head, tuple) and len(head) == 2 and callable(head[1]):
+                apply = head[1] if isinstance(head[1], Partial) else Partial(head[1])
+                object.__setattr__(self, name, Head(head[0], apply))
+
+
+def observed(sim, state):
+    """[n] float32: what networks see of a state."""
+    return jnp.ravel(jnp.asarray(sim.observe(state))).astype(jnp.float32)
+
+
+def flat(x):
+    """[d] float32: a disturbance, or a point of its unit cube, as one row of numbers."""
+    return jnp.concatenate([jnp.ravel(a).astype(jnp.float32) for a in jax.tree.leaves(x)])
+
+
+def unflat(u, event):
+    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as floats."""
+    leaves, treedef = jax.tree.flatten(event)
+    out, at = [], 0
+    for s in leaves:
+        n = math.prod(s.shape)
+        out.append(u[at : at + n].reshape(s.shape).astype(D.float_dtype(s.dtype)))
+        at += n
+    return treedef.unflatten(out)
+
+
+def histogram(heads, seen):
+    """Logits [d, bins] of the policy head at an observation [n]."""
+    return heads.policy.apply(heads.policy.params, heads.inputs.first(seen.shape[0]).normalise(seen))
+
+
+def value(heads, seen, x):
+    """v(s, a), a scalar: the value head's word on the reward from the observation ``seen`` [n] on, with the disturbance ``x`` [d]."""
+    return heads.returns.restore(heads.value.apply(heads.value.params, heads.inputs.normalise(jnp.concatenate([seen, x]))))

@@ -1,0 +1,160 @@
+"""Between two rounds of trees: heads are made, and learn from the statistics of the trees that are finished."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import distributions as D
+from jast.episode import random_start
+from jast.heads.heads import Heads, Moments, flat, histogram, moments, observed, value
+from jast.heads.networks import make_head
+from jast.heads.samples import Samples, of_edges, of_episodes, of_roots
+from jast.heads.training import learn, learner
+
+__all__ = ["School", "enrol", "teach"]
+
+
+class School(NamedTuple):
+    """Heads in training."""
+
+    heads: Heads
+    policy: Any
+    """`Learner`, or None without such a head."""
+    value: Any
+    lessons: tuple = ()
+    """Of each round, name of the head -> `Lesson`."""
+
+
+def enrol(key, sim, actions, heads, settings):
+    """The `School` of ``heads``: "rollout", "value" or "both" to be made, or `Heads` to be taught on. ValueError where they do not fit the simulator."""
+    n, d = sizes(sim, actions, heads)
+    start = sim.init(D.sample(sim.start(), key))
+    if not isinstance(start_seen := observed(sim, start), jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(start_seen))):
+        raise ValueError(f"observe: expected finite numbers for heads, received {np.asarray(start_seen)} at the start")
+    if isinstance(heads, str):
+        keys = jax.random.split(key)
+        new = lambda i, inputs, outputs: make_head(
+            keys[i], inputs, outputs, hidden=settings.hidden, activation=settings.activation[i], first_activation=settings.first_activation
+        )
+        policy = new(0, n, (d, settings.bins)) if heads in ("rollout", "both") else None
+        heads = Heads(policy, new(1, n + d, ()) if heads in ("value", "both") else None)
+    heads = filled(heads, n, d)
+    _check_outputs(heads, n, d)
+    return School(heads, *(None if head is None else learner(head.params) for head in (heads.policy, heads.value)))
+
+
+def sizes(sim, actions, heads):
+    """The numbers that ``observe`` gives and that a disturbance has; ValueError where heads cannot serve."""
+    if isinstance(heads, str) and heads not in ("rollout", "value", "both"):
+        raise ValueError(f'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received {heads!r}')
+    if not isinstance(heads, (str, Heads)):
+        raise ValueError(f'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received {type(heads).__name__}')
+    if isinstance(heads, Heads) and heads.policy is None and heads.value is None:
+        raise ValueError("forest: heads must have a policy or a value head, received Heads(None, None)")
+
+    def start():
+        state = sim.init(D.sample(sim.start(), jax.random.key(0)))
+        dist = sim.disturbance(state)
+        return observed(sim, state), flat(D.sample(dist, jax.random.key(0)))
+
+    seen, x = jax.eval_shape(start)
+    wants = heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None
+
+    def locates():
+        dist = sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))
+        return actions.locate(D.sample(dist, jax.random.key(0)), dist)
+
+    if wants:
+        try:
+            jax.eval_shape(locates)
+        except ValueError as e:
+            raise ValueError(f'forest: a rollout head needs disturbances with a distribution function; use heads="value", or actions.uniform: {e}') from e
+    return seen.shape[0], x.shape[0]
+
+
+def filled(heads, n, d):
+    """``heads`` with moments that leave everything as it is, where there are none."""
+    inputs = Moments.empty(n + d) if heads.inputs is None else heads.inputs
+    if inputs.mean.shape != (n + d,):
+        raise ValueError(f"heads: expected those of {n} observed numbers and a disturbance of {d}, received heads of {inputs.mean.shape[0]} in all")
+    return Heads(heads.policy, heads.value, inputs, Moments.empty() if heads.returns is None else heads.returns, heads.levels)
+
+
+def _check_outputs(heads, n, d):
+    zeros = jnp.zeros((n,), jnp.float32), jnp.zeros((d,), jnp.float32)
+    for name, run in (("policy", lambda: histogram(heads, zeros[0])), ("value", lambda: value(heads, *zeros))):
+        if getattr(heads, name) is None:
+            continue
+        takes = n if name == "policy" else n + d
+        wanted = f"logits of shape ({d}, bins), bins at least 2" if name == "policy" else "a scalar"
+        try:
+            out = jax.eval_shape(run)
+        except (TypeError, ValueError) as e:
+            raise ValueError(f"heads: the {name} head's apply(params, x) failed on x of shape ({takes},) float32: {str(e).splitlines()[0]}") from e
+        shape = getattr(out, "shape", None)
+        fits = shape is not None and (len(shape) == 2 and shape[0] == d and shape[1] >= 2 if name == "policy" else shape == ())
+        if not fits or not jnp.issubdtype(out.dtype, jnp.floating):
+            raise ValueError(f"heads: the {name} head returned {jax.tree.map(lambda s: f'{s.dtype}{list(s.shape)}', out)}, expected {wanted}")
+
+
+def teach(key, school, sim, actions, settings, harvests):
+    """The `School` after the lesson of a round's ``harvests``: what has ``log``, ``roots`` and, for ``settings.edges="all"``, ``edges``.
+
+    A head whose loss or parameters come out NaN or infinite keeps those from before, and the `Lesson` says so.
+    """
+    heads = school.heads
+    bins = jax.eval_shape(lambda: histogram(heads, jnp.zeros((heads.inputs.mean.shape[0] - _d(sim),), jnp.float32))).shape[1] if heads.policy else 2
+    good = best_trees(harvests, settings.elite)
+    parts = [of_roots(sim, actions, h.roots, bins, g, first=int(random_start(sim))) for h, g in zip(harvests, good, strict=True)]
+    shares, of_root = (_joined(p) for p in zip(*parts, strict=True))
+    if heads.policy is not None and settings.episodes:
+        best = [jax.tree.map(lambda a, g=g: a[: len(g)], h.found) for h, g in zip(harvests, good, strict=True)]
+        told = [of_episodes(sim, actions, e, bins, g) for e, g in zip(best, good, strict=True)]
+        shares = _joined([shares, *told])
+    edges = _joined([of_edges(h.edges, settings.target) for h in harvests]) if settings.edges == "all" and heads.value else of_root
+    inputs, returns = heads.inputs, heads.returns
+    if settings.normalise:
+        inputs = moments(inputs, np.concatenate([of_root.seen, of_root.x], axis=1))
+        returns = moments(returns, edges.target)
+    keys, lesson, new = jax.random.split(key), {}, {}
+    plain = Moments.empty()
+    for i, (name, samples, of_in, of_out, loss) in enumerate(
+        (("policy", shares, inputs.first(shares.seen.shape[1]), plain, settings.loss), ("value", edges, inputs, returns, "squared"))
+    ):
+        head, pupil = getattr(heads, name), getattr(school, name)
+        new[name] = pupil
+        if head is None or (name == "value" and settings.untrained_alone and heads.policy is None):
+            continue
+        new[name], lesson[name] = learn(
+            keys[i], pupil, head.apply, (of_in, of_out), samples, loss=loss, rate=settings.learning_rate[i], batch=settings.batch[i], steps=settings.steps[i],
+            capacity=settings.replay[i],
+        )  # fmt: skip
+    levels = heads.levels
+    if settings.episodes and any(taught(r) for r in lesson.values()):
+        levels = sim.horizon + 1
+    elif any(taught(r) for r in lesson.values()):
+        levels = max(levels, 1 + max(int(np.where(h.roots.valid, h.roots.depth, 0).max()) for h in harvests))
+    heads = Heads(*(getattr(heads, name) and getattr(heads, name)._replace(params=new[name].params) for name in ("policy", "value")), inputs, returns, levels)
+    return School(heads, new["policy"], new["value"], (*school.lessons, lesson))
+
+
+def best_trees(harvests, share):
+    """Of each harvest, [B] bool: the trees among this ``share`` of all by the reward of their best episode."""
+    best = [np.where(np.isfinite(h.log), h.log, -np.inf).max(0) for h in harvests]
+    least = np.quantile(np.concatenate(best), 1 - share, method="lower")
+    return [b >= least for b in best]
+
+
+def taught(lesson):
+    return lesson.steps > 0 and not lesson.rejected
+
+
+def _d(sim):
+    like = jax.eval_shape(lambda: flat(D.sample(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))), jax.random.key(0))))
+    return like.shape[0]
+
+
+def _joined(parts):
+    return Samples(*(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)), sum(p.dropped for p in parts))

@@ -1,0 +1,97 @@
+"""What heads learn from: the statistics of roots, and of all edges, as rows of numbers."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import rewards
+from jast.episode import play_back
+from jast.heads.heads import flat, observed
+
+__all__ = ["Samples", "of_edges", "of_episodes", "of_roots"]
+
+
+class Samples(NamedTuple):
+    """Rows of numbers, float32 on the host; only finite ones."""
+
+    seen: Any
+    """[m, n] observations."""
+    x: Any
+    """[m, d] disturbances; [m, 0] for a policy head."""
+    target: Any
+    """[m, d, bins] shares of the visits, or [m] rewards to come."""
+    dropped: int = 0
+    """Rows left out because something in them was not finite."""
+
+
+def of_roots(sim, actions, roots, bins, good, first=0):
+    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from `Roots` with any leading axes.
+
+    Per root and number of the disturbance, the target of the policy head is the share of the visits in each of ``bins`` equal cells of the unit interval that
+    ``actions`` maps to it. Roots at levels above ``first`` choose x0 and teach nothing.
+    """
+    roots = jax.tree.map(lambda a: jnp.asarray(a).reshape(-1, *a.shape[2:]), roots._replace(starts=()))
+    seen, x, shares = _rows(sim, actions, roots, bins)
+    good = np.broadcast_to(good, (len(seen) // len(good), len(good))).reshape(-1)
+    use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
+    policy = _finite(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
+    edges = roots.visits > 0
+    each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
+    use = roots.valid & (roots.depth >= first)
+    merge = lambda a: a.reshape(-1, *a.shape[2:])
+    value = _finite(merge(use[:, None] & edges), merge(each), merge(x), merge(roots.q))
+    return policy, value
+
+
+def of_edges(edges, target="own"):
+    """`Samples` for a value head from `jast.search.edges.Edges`: Q(s, a), or the Q of the edge that leads to s, as published (``target="parent"``)."""
+    edges = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), edges)
+    return _finite(edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q)
+
+
+def of_episodes(sim, actions, episodes, bins, good):
+    """`Samples` for a policy head from whole episodes [B, ...], those of ``good`` [B]: at each state, all of the histogram in the cell of what came next."""
+    seen, shares, use = _steps(sim, actions, episodes._replace(states=None), bins)
+    merge = lambda a: a.reshape(-1, *a.shape[2:])
+    return _finite(merge(use & good[:, None]), merge(seen), np.zeros((use.size, 0)), merge(shares))
+
+
+@functools.partial(jax.jit, static_argnames="bins")
+def _steps(sim, actions, episodes, bins):
+    def one(episode):
+        states = play_back(sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length).states
+
+        def step(state, x):
+            u = flat(actions.locate(x, sim.disturbance(state)))
+            return observed(sim, state), jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+
+        rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), episode.disturbances)
+        return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < episode.length
+
+    return jax.vmap(one)(episodes)
+
+
+def cells(u, bins):
+    """The cell of each point of the unit interval."""
+    return jnp.clip(jnp.floor(u * bins).astype(jnp.int32), 0, bins - 1)
+
+
+@functools.partial(jax.jit, static_argnames="bins")
+def _rows(sim, actions, roots, bins):
+    def one(state, xs, visits):
+        dist = sim.disturbance(state)
+        u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
+        n = visits.astype(jnp.float32)
+        shares = jnp.einsum("k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)) / jnp.maximum(jnp.sum(n), 1)
+        return observed(sim, state), jax.vmap(flat)(xs), shares
+
+    return jax.vmap(one)(roots.state, roots.actions, roots.visits)
+
+
+def _finite(use, *columns):
+    use, columns = np.asarray(use), [np.asarray(c, np.float32) for c in columns]
+    good = use & np.all([np.isfinite(c.reshape(len(c), -1)).all(1) for c in columns], axis=0)
+    return Samples(*(c[good] for c in columns), int((use & ~good).sum()))

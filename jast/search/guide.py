@@ -1,0 +1,76 @@
+"""How a search uses its heads: rollout steps drawn from the policy head's histogram, and the value term of eq. 3."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast import distributions as D
+from jast.heads.heads import flat, histogram, observed, unflat, value
+
+__all__ = ["Guide", "child_value", "guide", "rolled"]
+
+
+_SHARE, _HEAD = jnp.uint32(1 << 31), jnp.uint32(1)  # addresses apart from those of levels, and of what is drawn without heads
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Guide:
+    """Heads in a search; the numbers are traced."""
+
+    heads: Any
+    """`jast.heads.Heads`."""
+    power: Any
+    """A bin is drawn with probability proportional to p^power."""
+    q_weight: Any
+    """Of Q(s, a) where there is a value head."""
+    v_weight: Any
+    """c2 of MCFS-AP eq. 3."""
+    share: Any
+    """Of the rollouts that the policy head draws."""
+    levels: Any
+    """The first levels of an episode, at which the policy head draws."""
+    eager: bool = field(default=False, metadata=dict(static=True))
+    """Whether a node's unvisited children are all that widening allows, or one at a time."""
+
+
+def guide(heads, settings):
+    """The `Guide` by ``heads`` (of `jast.heads`) and their settings; one without influence where they were never trained and may not guide so."""
+    levels = jnp.where(settings.from_start, 2**30, jnp.asarray(heads.levels, jnp.int32))
+    on = levels > 0
+    number = lambda value, neutral: jnp.where(on, jnp.float32(value), jnp.float32(neutral))
+    weights = dict(power=jnp.float32(settings.power), q_weight=number(settings.q_weight, 1), v_weight=number(settings.v_weight, 0))
+    return jax.tree.map(jnp.asarray, Guide(heads, share=jnp.float32(settings.share), levels=levels, eager=settings.candidates == "all", **weights))
+
+
+def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
+    """A rollout's disturbance by the policy head; ``otherwise`` at levels that it has learned nothing of, and in the simulations that are not its share."""
+    logits = guide.power * histogram(guide.heads, observed(sim, state))
+    own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
+    key = jax.random.fold_in(key, _HEAD)
+    u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
+    x = actions.at(unflat(in_bins(logits, u), D.event_like(dist)), dist)
+    return jax.tree.map(lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise)
+
+
+def in_bins(logits, u):
+    """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from uniform ``u`` [d]: the inverse of its distribution function."""
+    bins = logits.shape[1]
+    mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
+    mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
+    u = u * jnp.sum(mass, axis=1)
+    below = bin = beneath = jnp.zeros_like(u)
+    own = mass[:, 0]
+    for k in range(1, bins):  # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
+        below = below + mass[:, k - 1]
+        past = u >= below
+        bin, beneath, own = jnp.where(past, jnp.float32(k), bin), jnp.where(past, below, beneath), jnp.where(past, mass[:, k], own)
+    return (bin + jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - 2.0**-20)) / bins
+
+
+def child_value(guide, sim, state, x):
+    """v(s, a); 0 where it is not finite."""
+    v = value(guide.heads, observed(sim, state), flat(x))
+    return jnp.where(jnp.isfinite(v), v, 0)

@@ -1,0 +1,88 @@
+"""`at` and `locate` of the three kinds of action: a point of the unit cube, and the disturbance there."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jast import actions
+from jast import distributions as D
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """float32, and float64 inside its context, in every run of the suite."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+def kinds(dtype):
+    return dict(samples=actions.samples(), quantiles=actions.quantiles(), uniform=actions.uniform(jnp.asarray(0, dtype), 3.0))
+
+
+def models(dtype):
+    f = lambda v: jnp.asarray(v, dtype)
+    vector, integer = D.MultivariateNormalDiag(f([0, 1, 1.5]), f([1, 1, 2])), D.Categorical(probs=f([0.1, 0.4, 0.2, 0.3]))
+    return dict(vector=vector, integer=integer, joint=D.Joint({"v": vector, "n": integer, "t": D.tent(f(0.7))}), nothing=D.Fixed())
+
+
+@pytest.mark.parametrize("model", list(models("float32")))
+@pytest.mark.parametrize("kind", list(kinds("float32")))
+def test_locate_inverts_at(kind, model, dtype, key):
+    choice, dist = kinds(dtype)[kind], models(dtype)[model]
+
+    @jax.vmap
+    def there_and_back(key):
+        x = choice.draw(key, dist)
+        u = choice.locate(x, dist)
+        return x, u, choice.at(u, dist)
+
+    x, u, again = jax.jit(there_and_back)(jax.random.split(key, 300))
+    assert jax.tree.structure(u) == jax.tree.structure(x)
+    for a, v, b in zip(*map(jax.tree.leaves, (x, u, again)), strict=True):
+        assert v.shape == a.shape == b.shape and v.dtype == dtype and a.dtype == b.dtype
+        assert ((v >= 0) & (v <= 1)).all()
+        if jnp.issubdtype(a.dtype, jnp.floating):
+            np.testing.assert_allclose(b, a, rtol=2e-3 if dtype == "float32" else 1e-9, atol=1e-4 if dtype == "float32" else 1e-12)
+        else:
+            np.testing.assert_array_equal(a, b)
+            assert np.unique(a).size == 4
+
+
+def test_at_is_place_where_there_is_one():
+    u, dist = jnp.asarray(0.25), D.Normal(0.0, 1.0)
+    for choice in (actions.quantiles(), actions.uniform(0.0, 2.0)):
+        assert choice.at(u, dist) == choice.place(u, dist)
+    assert actions.samples().at(u, dist) == D.quantile(dist, u) and not hasattr(actions.samples(), "place")
+    assert actions.uniform(0.0, 2.0).locate(jnp.asarray(0.5), dist) == 0.25  # of the box, not of the model
+
+
+def test_locate_outside_of_a_box_and_in_one_of_no_width(dtype):
+    x, n = (D.MultivariateNormalDiag(jnp.zeros(3, dtype), jnp.ones(3, dtype)), D.Categorical(probs=jnp.ones(9, dtype)))
+    box = actions.uniform(jnp.asarray([0, 1, 2], dtype), jnp.asarray([2, 1, 4], dtype))
+    assert box.locate(jnp.asarray([-1, 1, 5], dtype), x).tolist() == [0, 0.5, 1]
+    assert box.locate(jnp.asarray([np.inf, 1, -np.inf], dtype), x).tolist() == [1, 0.5, 0]
+    assert box.at(box.locate(jnp.asarray([0.5, 1, 3], dtype), x), x).tolist() == [0.5, 1, 3]
+    ints = actions.uniform(2, 5)
+    u = [float(ints.locate(jnp.asarray(i), n)) for i in range(8)]
+    assert u == [0.125, 0.125, 0.125, 0.375, 0.625, 0.875, 0.875, 0.875]  # middles of four cells; a whole number outside has that of the nearest one
+    assert actions.uniform(4, 4).locate(jnp.asarray(4), n) == 0.5
+
+
+@settings(max_examples=60, deadline=None)
+@given(low=st.integers(-1000, 1000), width=st.integers(0, 1000), part=st.integers(0, 1000), double=st.booleans())
+def test_every_whole_number_of_a_box_is_at_its_point(low, width, part, double):
+    with jax.enable_x64(double):
+        box, dist = actions.uniform(low, low + width), D.Categorical(probs=jnp.ones(2))
+        x = jnp.asarray(low + min(part, width))
+        assert box.at(box.locate(x, dist), dist) == x
+
+
+def test_locate_names_the_distribution_that_cannot():
+    gamma = D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0))
+    for choice in (actions.samples(), actions.quantiles()):
+        with pytest.raises(ValueError, match="cdf: Gamma has no quantile function"):
+            choice.locate(jnp.asarray(1.0), gamma)
+    assert actions.uniform(0.0, 4.0).locate(jnp.asarray(1.0), gamma) == 0.25
