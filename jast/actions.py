@@ -25,6 +25,10 @@ class Samples:
 
     draw_start = draw
 
+    def log_prob(self, x, dist):
+        """Log density of `draw` at ``x``."""
+        return dist.log_prob(x)
+
     def near(self, x, dist, scale, start=False):
         """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
         return _towards_mode(x, dist, scale)
@@ -53,7 +57,7 @@ class Quantiles:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(dist, u)
 
-    draw_start, near, at, locate = draw, Samples.near, place, Samples.locate
+    draw_start, near, at, locate, log_prob = draw, Samples.near, place, Samples.locate, Samples.log_prob
 
 
 @jax.tree_util.register_dataclass
@@ -72,6 +76,18 @@ class UniformBox:
     def draw_start(self, key, dist):
         """The box is one of steps: a random start is drawn from its own distribution."""
         return D.sample(dist, key)
+
+    def log_prob(self, x, dist):
+        """Log density of `draw` at ``x``: uniform, -inf outside the box."""
+
+        def of(x):
+            dtype = D.float_dtype(x.dtype)
+            low, high = self._ends(dtype)
+            width = high - low if jnp.issubdtype(x.dtype, jnp.floating) else high - low + 1
+            x = x.astype(dtype)
+            return jnp.sum(jnp.where((x >= low) & (x <= high), -jnp.log(width), -jnp.inf))
+
+        return D.sum_parts(jax.tree.map(of, x))
 
     def near(self, x, dist, scale, start=False):
         """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""

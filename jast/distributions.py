@@ -36,7 +36,7 @@ with warnings.catch_warnings():  # tensorflow-probability, below distrax, touche
 __all__ = [
     "Bernoulli", "Beta", "Categorical", "Deterministic", "Distribution", "Fixed", "Gamma", "Independent", "Joint", "Laplace", "Logistic",
     "MultivariateNormalDiag", "MultivariateNormalTri", "Normal", "Seeds", "Tent", "Transformed", "Uniform", "Where", "cdf", "event_like", "float_dtype",
-    "fraction", "has_cdf", "has_mode", "has_quantile", "log_density", "log_mode", "mode", "quantile", "sample", "seeds", "tent", "where",
+    "fraction", "has_cdf", "has_mode", "has_quantile", "log_density", "log_mode", "mode", "quantile", "sample", "seeds", "sum_parts", "tent", "where",
 ]  # fmt: skip
 
 
@@ -258,7 +258,7 @@ def _defined(function):
 def log_mode(d):
     """The log density of ``d`` at its mode: scalar."""
     if isinstance(d, Joint):
-        return _sum_parts(jax.tree.map(log_mode, d.distributions, is_leaf=_is_distribution))
+        return sum_parts(jax.tree.map(log_mode, d.distributions, is_leaf=_is_distribution))
     return d.log_prob(mode(d))
 
 
@@ -270,7 +270,7 @@ def log_density(d, x, density="raw"):
         return d.log_prob(x)
     if isinstance(d, Joint):
         parts = jax.tree.map(lambda e, v: log_density(e, v, "mode"), d.distributions, x, is_leaf=_is_distribution)
-        return _sum_parts(parts)
+        return sum_parts(parts)
     if isinstance(d, Independent):
         inner = log_density(d.distribution, x, "mode")
         return inner.sum(range(inner.ndim - d.reinterpreted_batch_ndims, inner.ndim))
@@ -420,7 +420,8 @@ def _is_distribution(d):
     return isinstance(d, Distribution)
 
 
-def _sum_parts(parts):
+def sum_parts(parts):
+    """The sum of a pytree of scalars, in the widest of their dtypes."""
     leaves = jax.tree.leaves(parts)
     dtype = jnp.result_type(*leaves)
     return sum((lax.convert_element_type(v, dtype) for v in leaves[1:]), lax.convert_element_type(leaves[0], dtype))

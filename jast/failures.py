@@ -4,22 +4,18 @@ An archived episode went through `jast.replay` once and carries its numbers, so 
 All arrays are NumPy's: they keep their dtype whatever the precision that JAX is set to.
 """
 
-import hashlib
-import io
 import json
-import os
-import zipfile
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
 from jast.episode import Episode, _shapes, accumulator, replay
 
 __all__ = ["Failures", "collect", "empty", "identity", "load", "merge", "save"]
 
-FORMAT, VERSION = "jast failures", 1
+FORMAT, VERSION, KIND = "jast failures", 1, "a jast archive of failures"
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 
 
@@ -136,8 +132,6 @@ def save(path, failures, settings=None):
     An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON: format, version, settings, the structure of x0 and x, and a checksum.
     An older file of that name stays whole until the new one is. ValueError for settings that JSON cannot hold.
     """
-    from jast import __version__  # not at import: the package imports this module
-
     try:
         settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
     except (TypeError, ValueError) as error:
@@ -145,25 +139,9 @@ def save(path, failures, settings=None):
     e = failures.episodes
     parts = {"x0": e.x0, "disturbances": e.disturbances} | {name: getattr(e, name) for name in SCALARS}
     parts |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
-    arrays = {f"{name}.{i}": np.asarray(leaf) for name, part in parts.items() for i, leaf in enumerate(jax.tree.leaves(part))}
-    header = dict(format=FORMAT, version=VERSION, package=__version__, settings=settings, seen=int(failures.seen), dropped=int(failures.dropped))
-    header["structure"] = {name: _describe(getattr(e, name)) for name in ("x0", "disturbances")}
-    header["dtypes"] = {name: a.dtype.name for name, a in arrays.items()}
-    header["sha256"] = _checksum(header, arrays)
-
-    path = os.fspath(path)
-    # extended floats have no NumPy name in a file, so they are stored as bits
-    bits = {name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a for name, a in arrays.items()}
-    part = f"{path}.{os.getpid()}.part"
-    try:
-        with open(part, "wb") as file:
-            np.savez_compressed(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        if os.path.exists(part):
-            os.unlink(part)
+    header = dict(settings=settings, seen=int(failures.seen), dropped=int(failures.dropped))
+    header["structure"] = {name: describe(getattr(e, name)) for name in ("x0", "disturbances")}
+    write(path, FORMAT, VERSION, header, named(parts))
 
 
 def load(path, sim=None):
@@ -173,30 +151,8 @@ def load(path, sim=None):
     another structure than dicts, lists, tuples and None. ValueError says why a file is refused: no jast archive, a version unknown here, damaged, or no
     fit to ``sim``.
     """
-    with open(path, "rb") as file:
-        data = file.read()
-    if data[:2] != b"PK":
-        raise ValueError(f"load: {path} is not a jast archive of failures")
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as pack:
-            arrays = {name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(pack.read(name)), allow_pickle=False) for name in pack.namelist()}
-        header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
-    except Exception as error:  # a damaged zip fails in many ways
-        raise ValueError(f"load: {path} is damaged or truncated ({type(error).__name__}: {error})") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"load: {path} is not a jast archive of failures")
-    if header.get("version") != VERSION:
-        raise ValueError(
-            f"load: {path} has version {header.get('version')!r}; this jast reads version {VERSION}: use the jast that wrote it, {header.get('package')}"
-        )
-    dtypes = header.get("dtypes", {})
-    if set(dtypes) != set(arrays):
-        raise ValueError(f"load: {path} is damaged: the arrays {sorted(set(dtypes) ^ set(arrays))} are missing or too many")
-    arrays = {name: arrays[name].view(jnp.dtype(dtype)) if arrays[name].dtype.name != dtype else arrays[name] for name, dtype in dtypes.items()}
-    if header.pop("sha256", None) != _checksum(header, arrays):
-        raise ValueError(f"load: {path} is damaged: its checksum does not match")
-
-    x0, x = ([arrays[f"{name}.{i}"] for i in range(sum(key.startswith(f"{name}.") for key in arrays))] for name in ("x0", "disturbances"))
+    header, arrays = read(path, FORMAT, VERSION, KIND)
+    x0, x = (arrays_of(arrays, name) for name in ("x0", "disturbances"))
     structure = header["structure"]
     if sim is not None:
         like_x0, like_x = jax.eval_shape(_shapes, sim)
@@ -249,25 +205,6 @@ def _plain(value):
     raise TypeError(f"{type(value).__name__} {value!r} is not a number, text, list or dict")
 
 
-def _checksum(header, arrays):
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode() + np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
-
-
-def _describe(tree):
-    """A pytree's structure in JSON: its nodes as [kind, names, children], an array as "array"."""
-    if tree is None:
-        return ["None", [], []]
-    below, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda node: node is not tree)
-    if len(below) == 1 and below[0][1] is tree:
-        return "array"
-    plain = type(tree) in (tuple, list) or (type(tree) is dict and all(isinstance(key, str) for key in tree))
-    names = sorted(tree) if plain and isinstance(tree, dict) else [] if plain else [jax.tree_util.keystr(path) for path, _ in below]
-    return [type(tree).__name__ if plain else f"the class {type(tree).__name__}", names, [_describe(child) for _, child in below]]
-
-
 def _rebuild(path, structure, leaves):
     if structure == "array":
         return next(leaves)
@@ -279,10 +216,6 @@ def _rebuild(path, structure, leaves):
 
 
 def _fits(path, name, structure, arrays, like, rows):
-    expected = _describe(like)
-    if structure != expected:
-        raise ValueError(f"load: {path} does not fit sim: {name} has the structure {structure}, expected {expected}")
+    check_structure(path, "sim", name, structure, like)
     for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
-        kinds = [next((k for k in (jnp.floating, jnp.signedinteger, jnp.unsignedinteger) if jnp.issubdtype(d, k)), d) for d in (a.dtype, s.dtype)]
-        if a.shape[1:] != (*rows, *s.shape) or kinds[0] != kinds[1]:
-            raise ValueError(f"load: {path} does not fit sim: {name} has {a.dtype.name}{list(a.shape[1:])}, expected {s.dtype.name}{[*rows, *s.shape]}")
+        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes=1)

@@ -2,7 +2,9 @@
 
 from jast.heads.heads import Heads, Moments
 from jast.heads.networks import Head, make_head
+from jast.heads.policy import as_policy
 from jast.heads.settings import MODES, HeadSettings, settings
+from jast.heads.storage import load, save
 from jast.heads.training import Lesson
 
-__all__ = ["MODES", "Head", "HeadSettings", "Heads", "Lesson", "Moments", "make_head", "settings"]
+__all__ = ["MODES", "Head", "HeadSettings", "Heads", "Lesson", "Moments", "as_policy", "load", "make_head", "save", "settings"]

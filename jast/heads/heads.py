@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast.heads.networks import Head
 
-__all__ = ["Heads", "Moments", "flat", "histogram", "moments", "observed", "unflat", "value"]
+__all__ = ["Heads", "Moments", "flat", "histogram", "in_bins", "moments", "observed", "unflat", "value"]
 
 
 class Moments(NamedTuple):
@@ -103,6 +103,21 @@ def unflat(u, event):
 def histogram(heads, seen):
     """Logits [d, bins] of the policy head at an observation [n]."""
     return heads.policy.apply(heads.policy.params, heads.inputs.first(seen.shape[0]).normalise(seen))
+
+
+def in_bins(logits, u):
+    """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from uniform ``u`` [d]: the inverse of its distribution function."""
+    bins = logits.shape[1]
+    mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
+    mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
+    u = u * jnp.sum(mass, axis=1)
+    below = bin = beneath = jnp.zeros_like(u)
+    own = mass[:, 0]
+    for k in range(1, bins):  # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
+        below = below + mass[:, k - 1]
+        past = u >= below
+        bin, beneath, own = jnp.where(past, jnp.float32(k), bin), jnp.where(past, below, beneath), jnp.where(past, mass[:, k], own)
+    return (bin + jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - 2.0**-20)) / bins
 
 
 def value(heads, seen, x):

@@ -10,7 +10,7 @@ from jast import distributions as D
 from jast.episode import random_start
 from jast.heads.heads import Heads, Moments, flat, histogram, moments, observed, value
 from jast.heads.networks import make_head
-from jast.heads.samples import Samples, of_edges, of_episodes, of_roots
+from jast.heads.samples import joined, of_edges, of_episodes, of_roots
 from jast.heads.training import learn, learner
 
 __all__ = ["School", "enrol", "teach"]
@@ -47,10 +47,8 @@ def enrol(key, sim, actions, heads, settings):
 
 def sizes(sim, actions, heads):
     """The numbers that ``observe`` gives and that a disturbance has; ValueError where heads cannot serve."""
-    if isinstance(heads, str) and heads not in ("rollout", "value", "both"):
+    if not isinstance(heads, Heads) and heads not in ("rollout", "value", "both"):
         raise ValueError(f'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received {heads!r}')
-    if not isinstance(heads, (str, Heads)):
-        raise ValueError(f'forest: heads must be None, "rollout", "value", "both" or jast.heads.Heads, received {type(heads).__name__}')
     if isinstance(heads, Heads) and heads.policy is None and heads.value is None:
         raise ValueError("forest: heads must have a policy or a value head, received Heads(None, None)")
 
@@ -59,18 +57,16 @@ def sizes(sim, actions, heads):
         dist = sim.disturbance(state)
         return observed(sim, state), flat(D.sample(dist, jax.random.key(0)))
 
-    seen, x = jax.eval_shape(start)
-    wants = heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None
-
-    def locates():
+    def located():
         dist = sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))
         return actions.locate(D.sample(dist, jax.random.key(0)), dist)
 
-    if wants:
+    if heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None:
         try:
-            jax.eval_shape(locates)
+            jax.eval_shape(located)
         except ValueError as e:
             raise ValueError(f'forest: a rollout head needs disturbances with a distribution function; use heads="value", or actions.uniform: {e}') from e
+    seen, x = jax.eval_shape(start)
     return seen.shape[0], x.shape[0]
 
 
@@ -100,44 +96,49 @@ def _check_outputs(heads, n, d):
 
 
 def teach(key, school, sim, actions, settings, harvests):
-    """The `School` after the lesson of a round's ``harvests``: what has ``log``, ``roots`` and, for ``settings.edges="all"``, ``edges``.
+    """The `School` after the lesson of a round's ``harvests``: what has ``log``, ``roots``, ``found`` and, for ``settings.edges="all"``, ``edges``.
 
     A head whose loss or parameters come out NaN or infinite keeps those from before, and the `Lesson` says so.
     """
     heads = school.heads
-    bins = jax.eval_shape(lambda: histogram(heads, jnp.zeros((heads.inputs.mean.shape[0] - _d(sim),), jnp.float32))).shape[1] if heads.policy else 2
-    good = best_trees(harvests, settings.elite)
-    parts = [of_roots(sim, actions, h.roots, bins, g, first=int(random_start(sim))) for h, g in zip(harvests, good, strict=True)]
-    shares, of_root = (_joined(p) for p in zip(*parts, strict=True))
-    if heads.policy is not None and settings.episodes:
-        best = [jax.tree.map(lambda a, g=g: a[: len(g)], h.found) for h, g in zip(harvests, good, strict=True)]
-        told = [of_episodes(sim, actions, e, bins, g) for e, g in zip(best, good, strict=True)]
-        shares = _joined([shares, *told])
-    edges = _joined([of_edges(h.edges, settings.target) for h in harvests]) if settings.edges == "all" and heads.value else of_root
+    shares, edges = _samples(heads, sim, actions, settings, harvests)
     inputs, returns = heads.inputs, heads.returns
     if settings.normalise:
-        inputs = moments(inputs, np.concatenate([of_root.seen, of_root.x], axis=1))
-        returns = moments(returns, edges.target)
-    keys, lesson, new = jax.random.split(key), {}, {}
-    plain = Moments.empty()
-    for i, (name, samples, of_in, of_out, loss) in enumerate(
-        (("policy", shares, inputs.first(shares.seen.shape[1]), plain, settings.loss), ("value", edges, inputs, returns, "squared"))
-    ):
-        head, pupil = getattr(heads, name), getattr(school, name)
-        new[name] = pupil
-        if head is None or (name == "value" and settings.untrained_alone and heads.policy is None):
-            continue
-        new[name], lesson[name] = learn(
-            keys[i], pupil, head.apply, (of_in, of_out), samples, loss=loss, rate=settings.learning_rate[i], batch=settings.batch[i], steps=settings.steps[i],
-            capacity=settings.replay[i],
+        inputs, returns = moments(inputs, np.concatenate([edges.seen, edges.x], axis=1)), moments(returns, edges.target)
+    keys, lesson, pupils = jax.random.split(key), {}, dict(policy=school.policy, value=school.value)
+
+    def one(i, name, loss, samples, normalise):
+        pick = lambda pair: pair[i]
+        pupils[name], lesson[name] = learn(
+            keys[i], pupils[name], getattr(heads, name).apply, normalise, samples, loss=loss, rate=pick(settings.learning_rate), batch=pick(settings.batch),
+            steps=pick(settings.steps), capacity=pick(settings.replay),
         )  # fmt: skip
+
+    if heads.policy is not None:
+        one(0, "policy", settings.loss, shares, (inputs.first(edges.seen.shape[1]), Moments.empty()))
+    if heads.value is not None and not (settings.untrained_alone and heads.policy is None):
+        one(1, "value", "squared", edges, (inputs, returns))
     levels = heads.levels
-    if settings.episodes and any(taught(r) for r in lesson.values()):
-        levels = sim.horizon + 1
-    elif any(taught(r) for r in lesson.values()):
-        levels = max(levels, 1 + max(int(np.where(h.roots.valid, h.roots.depth, 0).max()) for h in harvests))
-    heads = Heads(*(getattr(heads, name) and getattr(heads, name)._replace(params=new[name].params) for name in ("policy", "value")), inputs, returns, levels)
-    return School(heads, new["policy"], new["value"], (*school.lessons, lesson))
+    if any(of.steps > 0 and not of.rejected for of in lesson.values()):
+        deepest = sim.horizon if settings.episodes else max(int(np.where(h.roots.valid, h.roots.depth, 0).max()) for h in harvests)
+        levels = max(levels, deepest + 1)
+    new = (None if pupil is None else getattr(heads, name)._replace(params=pupil.params) for name, pupil in pupils.items())
+    return School(Heads(*new, inputs, returns, levels), **pupils, lessons=(*school.lessons, lesson))
+
+
+def _samples(heads, sim, actions, settings, harvests):
+    """What the policy head (None without one) and the value head learn from."""
+    n, first = heads.inputs.mean.shape[0] - _numbers(sim), int(random_start(sim))
+    bins = None if heads.policy is None else jax.eval_shape(lambda: histogram(heads, jnp.zeros((n,), jnp.float32))).shape[1]
+    good = best_trees(harvests, settings.elite)
+    shares, edges = zip(*(of_roots(sim, actions, h.roots, bins, g, first) for h, g in zip(harvests, good, strict=True)), strict=True)
+    if heads.policy is not None and settings.episodes:
+        # the best episode of each tree stands first
+        best = [(jax.tree.map(lambda a, g=g: a[: len(g)], h.found), g) for h, g in zip(harvests, good, strict=True)]
+        shares = (*shares, *(of_episodes(sim, actions, episodes, bins, g) for episodes, g in best))
+    if heads.value is not None and settings.edges == "all":
+        edges = [of_edges(h.edges, settings.target) for h in harvests]
+    return None if heads.policy is None else joined(shares), joined(edges)
 
 
 def best_trees(harvests, share):
@@ -147,14 +148,7 @@ def best_trees(harvests, share):
     return [b >= least for b in best]
 
 
-def taught(lesson):
-    return lesson.steps > 0 and not lesson.rejected
-
-
-def _d(sim):
+def _numbers(sim):
+    """In a disturbance."""
     like = jax.eval_shape(lambda: flat(D.sample(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))), jax.random.key(0))))
     return like.shape[0]
-
-
-def _joined(parts):
-    return Samples(*(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)), sum(p.dropped for p in parts))

@@ -11,7 +11,7 @@ from jast import rewards
 from jast.episode import play_back
 from jast.heads.heads import flat, observed
 
-__all__ = ["Samples", "of_edges", "of_episodes", "of_roots"]
+__all__ = ["Samples", "joined", "of_edges", "of_episodes", "of_roots"]
 
 
 class Samples(NamedTuple):
@@ -31,19 +31,25 @@ def of_roots(sim, actions, roots, bins, good, first=0):
     """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from `Roots` with any leading axes.
 
     Per root and number of the disturbance, the target of the policy head is the share of the visits in each of ``bins`` equal cells of the unit interval that
-    ``actions`` maps to it. Roots at levels above ``first`` choose x0 and teach nothing.
+    ``actions`` maps to it; only trees that are ``good`` [B] count. Without ``bins`` there are none of the first kind. Roots at levels above ``first`` choose x0
+    and teach nothing.
     """
     roots = jax.tree.map(lambda a: jnp.asarray(a).reshape(-1, *a.shape[2:]), roots._replace(starts=()))
     seen, x, shares = _rows(sim, actions, roots, bins)
     good = np.broadcast_to(good, (len(seen) // len(good), len(good))).reshape(-1)
     use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
-    policy = _finite(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
+    policy = None if bins is None else _finite(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
     edges = roots.visits > 0
     each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
     use = roots.valid & (roots.depth >= first)
     merge = lambda a: a.reshape(-1, *a.shape[2:])
     value = _finite(merge(use[:, None] & edges), merge(each), merge(x), merge(roots.q))
     return policy, value
+
+
+def joined(parts):
+    """Several `Samples` as one."""
+    return Samples(*(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)), sum(p.dropped for p in parts))
 
 
 def of_edges(edges, target="own"):
@@ -82,6 +88,8 @@ def cells(u, bins):
 @functools.partial(jax.jit, static_argnames="bins")
 def _rows(sim, actions, roots, bins):
     def one(state, xs, visits):
+        if bins is None:
+            return observed(sim, state), jax.vmap(flat)(xs), ()
         dist = sim.disturbance(state)
         u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
         n = visits.astype(jnp.float32)

@@ -9,7 +9,7 @@ class HeadSettings(NamedTuple):
     """Settings of heads. A pair is (rollout-policy head, value head)."""
 
     round: Any
-    """Trees that grow between two trainings; None: a fifth of all, at most 40."""
+    """Trees that grow between two trainings; None: a fifth of all, at most 128."""
     bins: int
     """Cells of the histogram, per number of the disturbance."""
     hidden: Any
@@ -63,9 +63,9 @@ MODES = {
         untrained_alone=True, from_start=True, power=2.0, share=1.0, q_weight=0.6, v_weight=0.4, candidates="all", train=True,
     ),
     "default": HeadSettings(
-        round=None, bins=20, hidden=(32,), activation=("relu", "relu"), first_activation=True, normalise=True, loss="cross_entropy",
-        learning_rate=(0.003, 0.003), batch=(64, 256), steps=(1000, 1000), replay=(4096, 65536), elite=0.25, episodes=True, target="own", edges="roots",
-        untrained_alone=False, from_start=False, power=2.0, share=1.0, q_weight=0.5, v_weight=0.5, candidates="one", train=True,
+        round=None, bins=40, hidden=(32,), activation=("relu", "relu"), first_activation=True, normalise=True, loss="cross_entropy",
+        learning_rate=(0.01, 0.01), batch=(64, 128), steps=(500, 200), replay=(4096, 65536), elite=0.25, episodes=True, target="own", edges="roots",
+        untrained_alone=False, from_start=False, power=3.0, share=1.0, q_weight=0.5, v_weight=0.5, candidates="one", train=True,
     ),
 }  # fmt: skip
 

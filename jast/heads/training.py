@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import lax
 
 from jast.heads.samples import Samples
@@ -39,7 +38,13 @@ class Lesson(NamedTuple):
 
 def learner(params):
     """A `Learner` that has seen nothing."""
-    return Learner(params, optax.scale_by_adam().init(params), None)
+    return Learner(params, adam().init(params), None)
+
+
+def adam():
+    import optax  # here: it takes a while, and only searches with heads need it
+
+    return optax.scale_by_adam()
 
 
 def squared(out, target):
@@ -90,10 +95,9 @@ def _fit(key, params, optimiser, apply, normalise, data, size, steps, rate, loss
     seen, x, target = data
     inputs, targets = normalise
     rows = jnp.concatenate([seen, x], axis=1)
-    rows, target = inputs.normalise(rows), targets.normalise(target)
+    rows, target = jax.vmap(inputs.normalise)(rows), jax.vmap(targets.normalise)(target)
     number = jnp.arange(rows.shape[0], dtype=jnp.int32)
     order = jnp.argsort(jnp.where(number < size, jax.random.uniform(key, number.shape), 2.0)).astype(jnp.int32)
-    adam = optax.scale_by_adam()
 
     def mean_loss(params, rows, target):
         return jnp.mean(jax.vmap(lambda r, t: LOSSES[loss](apply(params, r), t))(rows, target))
@@ -103,10 +107,11 @@ def _fit(key, params, optimiser, apply, normalise, data, size, steps, rate, loss
         # a pass over all samples in their shuffled order, then the next; the size is a number, not a shape
         at = order[(i * batch + jnp.arange(batch, dtype=jnp.int32)) % size]
         value, gradient = jax.value_and_grad(mean_loss)(params, rows[at], target[at])
-        update, optimiser = adam.update(gradient, optimiser)
+        with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+            update, optimiser = adam().update(gradient, optimiser)
         params = jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, update)
         late = i >= steps - (steps + 9) // 10
-        return params, optimiser, total + jnp.where(late, value, 0)
+        return params, optimiser, total + jnp.where(late, value, 0).astype(total.dtype)
 
-    params, optimiser, total = lax.fori_loop(0, steps, step, (params, optimiser, jnp.zeros(())))
+    params, optimiser, total = lax.fori_loop(0, steps, step, (params, optimiser, jnp.zeros((), jnp.float32)))
     return params, optimiser, total / ((steps + 9) // 10)

@@ -33,7 +33,7 @@ class Edges(NamedTuple):
 def edges_of(problem, axes, tree, children):
     """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a node."""
     lanes = tree.key.shape[0]
-    lane = jnp.arange(lanes, dtype=jnp.int32)
+    lane = jnp.arange(lanes, dtype=jnp.int32)[None]
     like = node_shapes(tree, "node")
     node = jax.vmap(jax.vmap(lambda w: unpack(w, like)))(tree.nodes)  # [S + 1, B]
     parent, slot = node.parent[1:], node.slot[1:]
@@ -43,7 +43,7 @@ def edges_of(problem, axes, tree, children):
     at = row * ROW + slot % PAGE
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
-    valid = ((tree.outcome & FRESH) > 0) & ~tree.ended & (visits > 0)
+    valid = ((tree.outcome & FRESH) > 0) & ~tree.ended[None] & (visits > 0)
     q = jnp.where(valid, total / jnp.maximum(visits, 1) - own, 0)
     parent_q = jnp.take_along_axis(jnp.concatenate([jnp.zeros_like(q[:1]), q]), parent, axis=0)
 

@@ -23,19 +23,19 @@ def foresee(problem, axes, tree, walk, fresh, replay, memoize):
     like = node_shapes(tree, memoize)
     if problem.guide.eager:
         depth = jnp.broadcast_to(jnp.arange(walk.new.shape[0], dtype=jnp.int32)[:, None], walk.new.shape)
-        todo = (tree.alive & ~tree.ended) & (walk.new > 0) & (depth >= tree.depth) & (depth <= walk.depth)
+        todo = (tree.alive & ~tree.ended)[None] & (walk.new > 0) & (depth >= tree.depth[None]) & (depth <= walk.depth[None])
         new, last = walk.new, walk.last
     else:
         depth, todo, new, last = (a[None] for a in (walk.depth, fresh, walk.best.slot + 1, walk.best.edge // ROW))
 
     opens = todo & (new % PAGE == 0)  # a page of its own
     rank = jnp.cumsum(opens, axis=0, dtype=jnp.int32)
-    page = tree.pages + rank - 1
-    rows = jnp.where(opens, page * lanes + lane, last)
+    page = tree.pages[None] + rank - 1
+    rows = jnp.where(opens, page * lanes + lane[None], last)
 
     both = jnp.concatenate([todo, todo & (new == 1)])  # the new child, and the first one where the new one is its first sibling
     per_lane = jnp.sum(both, axis=0, dtype=jnp.int32)
-    place = jnp.cumsum(both, axis=0, dtype=jnp.int32) - 1 + (jnp.cumsum(per_lane, dtype=jnp.int32) - per_lane)
+    place = jnp.cumsum(both, axis=0, dtype=jnp.int32) - 1 + (jnp.cumsum(per_lane, dtype=jnp.int32) - per_lane)[None]
     place = jnp.where(both, place, -1).reshape(-1)
     number, room = jnp.arange(place.size, dtype=jnp.int32), 2 * lanes
     total = jnp.sum(per_lane, dtype=jnp.int32)

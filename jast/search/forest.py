@@ -33,9 +33,14 @@ def forest(
     flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.
     A KeyboardInterrupt ends the search with an honest result of what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
 
-    ``heads``: the place of the rollout-policy and value networks, which are not in this version: None.
+    ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw, "value": a v(s, a) that joins eq. 3, "both"; or
+    `jast.heads.Heads` of your own or of an earlier result (``result.heads``), also of another start of the same system. The trees then grow in rounds, and
+    between two rounds the heads learn from the statistics of the roots and, the policy, from the best episodes; no untrained head guides the first round. With
+    ``mode="paper"`` they are the published ones, a tree a round. ``head_settings``: `jast.heads.settings`, if not the mode's; ``settings(train=False)`` uses
+    heads as they are, which is what `jax.jit` and `jax.vmap` do. ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
 
-    Raises ValueError for counts below 1, a simulator that breaks its contract, and trees that do not fit into memory, with the numbers.
+    Raises ValueError for counts below 1, a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not finite at the start, and
+    trees that do not fit into memory, with the numbers.
     """
     return grow_trees(
         "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast.heads.heads import flat, histogram, observed, unflat, value
+from jast.heads.heads import flat, histogram, in_bins, observed, unflat, value
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
@@ -53,21 +53,6 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
     u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
     x = actions.at(unflat(in_bins(logits, u), D.event_like(dist)), dist)
     return jax.tree.map(lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise)
-
-
-def in_bins(logits, u):
-    """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from uniform ``u`` [d]: the inverse of its distribution function."""
-    bins = logits.shape[1]
-    mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
-    mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
-    u = u * jnp.sum(mass, axis=1)
-    below = bin = beneath = jnp.zeros_like(u)
-    own = mass[:, 0]
-    for k in range(1, bins):  # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
-        below = below + mass[:, k - 1]
-        past = u >= below
-        bin, beneath, own = jnp.where(past, jnp.float32(k), bin), jnp.where(past, below, beneath), jnp.where(past, mass[:, k], own)
-    return (bin + jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - 2.0**-20)) / bins
 
 
 def child_value(guide, sim, state, x):

@@ -68,7 +68,7 @@ def grow_trees(
         school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
         problem = problem._replace(guide=guide(school.heads, head_settings))
         plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.edges == "all" and school.value is not None)
-        at_once = min(trees, head_settings.round or max(1, min(trees // 5, 40))) if head_settings.train else trees
+        at_once = min(trees, head_settings.round or max(1, min(trees // 5, LANES))) if head_settings.train else trees
         if settings is None and isinstance(heads, str):
             raise ValueError(f"{method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot hold: pass jast.heads.Heads that were trained")
         if plan.edges and memoize in ("root", "none"):

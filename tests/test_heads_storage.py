@@ -1,0 +1,339 @@
+"""Files of heads: they give back what was saved to the bit, and the very functions of networks that jast made, or say why not."""
+
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import jast
+from jast.heads import Head, Heads, Moments, make_head, networks, storage
+from jast.heads.heads import histogram, value
+from jast.search import run
+
+WALK = jast.simulators.walk1d(threshold=4.0)  # one number observed, a disturbance of one
+SIZE = dict(trees=4, prunes=2, simulations=30)
+INPUTS = Moments(np.float32(7), np.array([0.5, -1.0], np.float32), np.array([2.0, 0.25], np.float32))
+RETURNS = Moments(np.float32(3), np.array(-4.0, np.float32), np.array(1.5, np.float32))
+
+
+@functools.cache
+def made(policy=True, value=True, moments=True, activation="tanh"):
+    keys = jax.random.split(jax.random.key(8))
+    new = functools.partial(make_head, hidden=(5, 4), activation=activation, first_activation=False)
+    heads = Heads(new(keys[0], 1, (1, 6)) if policy else None, new(keys[1], 2) if value else None, levels=31)
+    return Heads(heads.policy, heads.value, INPUTS, RETURNS, 31) if moments else heads
+
+
+def linear(params, x):
+    (a, b), c = params["a"], params["c"]
+    return jnp.dot(a, x) + b + 0 * c["sizes"].sum().astype(jnp.float32)
+
+
+def own(n=2, b=0.5):
+    return Head({"a": (np.arange(n, dtype=np.float32), np.float32(b)), "c": {"sizes": np.arange(3, dtype=np.int32)}, "none": None}, linear)
+
+
+def saved(path, heads, given=None):
+    jast.heads.save(path, heads)
+    return jast.heads.load(path, given)
+
+
+def searched(heads):
+    return jast.search.forest(jax.random.key(2), WALK, heads=heads, head_settings=jast.heads.settings(train=False), **SIZE)
+
+
+def outputs(heads, seen, x):
+    return (heads.policy and histogram(heads, seen)), (heads.value and value(heads, seen, x))
+
+
+# --- round trips ----------------------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy,value", [(True, False), (False, True), (True, True)])
+def test_file_gives_back_what_was_saved(tmp_path, equal, policy, value):
+    heads = made(policy, value)
+    back = saved(tmp_path / "h.jast", heads)
+    equal(back, heads)
+    assert isinstance(back.levels, int) and (back.policy is None, back.value is None) == (not policy, not value)
+    for name in ("policy", "value"):
+        if (head := getattr(heads, name)) is not None:
+            assert getattr(back, name).apply is head.apply
+            assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves(getattr(back, name).params))
+    equal(saved(tmp_path / "h.jast", heads, heads), heads)  # over the old one, and with heads that fit
+    equal(saved(tmp_path / "h.jast", back), heads)
+    assert [p.name for p in tmp_path.iterdir()] == ["h.jast"]
+    with np.load(tmp_path / "h.jast") as pack:  # no pickle inside
+        header = json.loads(pack["header"].tobytes())
+    assert header["format"] == "jast heads" and set(header["heads"]) == {n for n, there in (("policy", policy), ("value", value)) if there}
+    if value:
+        assert header["heads"]["value"]["network"] == dict(inputs=2, outputs=[], hidden=[5, 4], activation="tanh", first_activation=False)
+
+
+def test_untrained_heads_have_no_moments(tmp_path, equal):
+    heads = made(moments=False)
+    back = saved(tmp_path / "h", heads)
+    assert back.inputs is None and back.returns is None
+    equal(back, heads)
+    one = Heads(heads.policy, inputs=INPUTS, levels=np.int32(3))
+    back = saved(tmp_path / "h", one)
+    assert back.returns is None and type(back.levels) is int and back.levels == 3
+    equal(back.inputs, INPUTS)
+
+
+@pytest.mark.parametrize("hidden", [(3,), (2,) * 12])
+@pytest.mark.parametrize("activation", sorted(networks.ACTIVATIONS))
+def test_every_network_is_made_again(tmp_path, equal, hidden, activation):
+    policy = make_head(jax.random.key(0), 3, (2, 4), hidden=hidden, activation=activation)
+    back = saved(tmp_path / "h", Heads(policy))
+    assert back.policy.apply is policy.apply
+    equal(back.policy, policy)
+
+
+def test_functions_of_ones_own_come_from_heads(tmp_path, equal):
+    heads = Heads(value=own(), inputs=INPUTS, returns=RETURNS, levels=9)
+    other = Heads(value=own(b=7.0))
+    back = saved(tmp_path / "h", heads, other)
+    equal(back, heads)
+    assert back.value.apply is other.value.apply
+    abstract = Heads(value=(jax.eval_shape(lambda: own()._replace(apply=None)).params, linear))
+    equal(jast.heads.load(tmp_path / "h", abstract), heads)
+
+
+def test_networks_beside_functions_of_ones_own(tmp_path, equal):
+    heads = Heads(made().policy, own())
+    back = saved(tmp_path / "h", heads, Heads(value=own(b=1.0)))
+    equal(back, heads)
+    assert back.policy.apply is heads.policy.apply
+
+
+def test_functions_around_a_network_are_ones_own(tmp_path, equal):
+    policy = made().policy
+    doubled = lambda params, x: 2 * policy.apply(params, x)
+    stacked = jax.tree.map(lambda a: jnp.stack([a, a]), policy.params)
+    for head in (
+        (policy.params, doubled),
+        (policy.params, Partial(policy.apply.func, mutable=False)),
+        (policy.params, policy.apply.func.__self__.init),
+        (stacked, policy.apply),
+        (policy.params["params"], policy.apply),
+        ((), policy.apply),
+    ):
+        heads = Heads(head)
+        jast.heads.save(tmp_path / "h", heads)
+        with pytest.raises(ValueError, match=r"holds a policy head with a function that is not in the file: load\(path, heads\) with Heads that have it"):
+            jast.heads.load(tmp_path / "h")
+        equal(jast.heads.load(tmp_path / "h", heads), heads)
+    jast.heads.save(tmp_path / "h", Heads(policy))
+    assert jast.heads.load(tmp_path / "h", Heads((policy.params, doubled))).policy.apply.func is doubled  # whoever gives a function gets it
+
+
+def test_heads_that_passed_through_jit_are_still_networks(tmp_path, equal):
+    heads = jax.jit(lambda h: h)(made())
+    assert heads.policy.apply is not made().policy.apply
+    back = saved(tmp_path / "h", heads)
+    assert back.policy.apply is made().policy.apply and back.levels == 31
+    equal(back, made())
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16", "float64", "float8_e4m3fn", "int4", "uint8", "bool", "complex64"])
+def test_precision_is_kept(tmp_path, equal, dtype):
+    dtype = jnp.dtype(dtype)
+    numbers = np.arange(6).reshape(2, 3).T.astype(dtype)
+    head = ([numbers, numbers[0, 0]], linear)
+    equal(saved(tmp_path / "h", Heads(head), Heads(head)).policy.params, head[0])
+    if jnp.issubdtype(dtype, jnp.floating):
+        single = Heads(([numbers.astype(np.float32), np.float32(1)], linear))
+        equal(jast.heads.load(tmp_path / "h", single).policy.params, head[0])
+
+
+def test_networks_made_in_double_precision_keep_theirs(tmp_path, equal):
+    head = make_head(jax.random.key(0), 3, (2, 4))
+    double = Heads(head._replace(params=jax.tree.map(lambda a: np.asarray(a, np.float64) / 3, head.params)))
+    back = saved(tmp_path / "h", double)
+    equal(back, double)
+    assert back.policy.apply is head.apply
+
+
+# --- in use ---------------------------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy,value", [(True, False), (False, True), (True, True)])
+def test_loaded_heads_say_the_same_without_compiling(tmp_path, equal, policy, value):
+    heads = made(policy, value)
+    back = saved(tmp_path / "h", heads)
+    traces = []
+
+    @jax.jit
+    def out(heads, seen, x):
+        traces.append(1)
+        return outputs(heads, seen, x)
+
+    seen, x = jnp.ones((1,), jnp.float32), jnp.full((1,), 0.3, jnp.float32)
+    equal(out(back, seen, x), out(heads, seen, x))
+    assert len(traces) == 1
+    equal(outputs(back, seen, x), outputs(heads, seen, x))
+
+
+def test_a_search_goes_on_with_loaded_heads(tmp_path, equal):
+    heads = made()
+    first = searched(heads)
+    programs = lambda: (run._grow._cache_size(), run._prune._cache_size(), run._rebuild._cache_size())
+    before = programs()
+    again = searched(saved(tmp_path / "h", heads))
+    assert programs() == before
+    equal(again._replace(settings=None, heads=None), first._replace(settings=None, heads=None))
+    assert again.settings == first.settings
+    equal(saved(tmp_path / "h", again.heads), first.heads)
+
+
+def test_what_a_search_trained_can_be_saved(tmp_path, equal):
+    settings = jast.heads.settings(hidden=(4,), bins=4, steps=(2, 2), round=2)
+    found = jast.search.forest(jax.random.key(2), WALK, heads="both", head_settings=settings, **SIZE)
+    back = saved(tmp_path / "h", found.heads)
+    equal(back, found.heads)
+    assert back.policy.apply is found.heads.policy.apply and back.inputs.count > 0
+    equal(searched(back).best, searched(found.heads).best)
+
+
+# --- refused --------------------------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_save_refuses_what_no_file_can_hold(tmp_path):
+    head = made().policy
+    for heads, reason in (
+        (Heads(), r"save: heads must have a policy or a value head, received Heads\(None, None\)"),
+        (head, "save: heads must be jast.heads.Heads, received Head"),
+        (None, "save: heads must be jast.heads.Heads, received NoneType"),
+        (Heads("rollout"), r"save: the policy head must be a pair \(params, apply\), received str"),
+        (Heads(head, levels=2.5), "save: levels must be an integer, received 2.5"),
+        (Heads(head, inputs=(1, 2, 3)), "save: inputs must be jast.heads.Moments or None, received tuple"),
+        (Heads(head, returns=RETURNS._replace(mean=0.5)), r"save: returns\.mean must be an array of numbers, received float 0.5"),
+        (Heads(({"w": [1.5]}, linear)), r"save: policy\['w'\]\[0\] must be an array of numbers, received float 1.5"),
+        (Heads(({"w": "a"}, linear)), r"save: policy\['w'\] must be an array of numbers, received str 'a'"),
+        (Heads((np.array([None]), linear)), r"save: policy must be an array of numbers, received object\[1\]"),
+        (Heads((np.array(["a"]), linear)), r"save: policy must be an array of numbers, received <U1\[1\]"),
+        (Heads((jax.random.key(0), linear)), r"save: policy must be an array of numbers, received key<fry>\[\]"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            jast.heads.save(tmp_path / "h", heads)
+    with pytest.raises(ValueError, match=r"save: policy.* must be an array of numbers, received float32\[5\], traced"):
+        jax.jit(lambda p: jast.heads.save(tmp_path / "h", Heads((p, linear))))(head.params)
+    assert not list(tmp_path.iterdir())
+
+
+def test_load_refuses_heads_that_do_not_fit(tmp_path):
+    path = tmp_path / "h"
+    jast.heads.save(path, Heads(value=own()))
+    with pytest.raises(ValueError, match="load: .*h holds a value head with a function that is not in the file"):
+        jast.heads.load(path)
+    kept = own().params
+    for params, reason in (
+        (own(3).params, r"value\.params\['a'\]\[0\] has float32\[2\], expected float32\[3\]"),
+        (kept | {"c": {"sizes": np.zeros(3, np.float32)}}, r"value\.params\['c'\]\['sizes'\] has int32\[3\], expected float32\[3\]"),
+        (kept | {"c": [np.zeros(3, np.int32)]}, "value.params has the structure .*'sizes'.*, expected .*'list'"),
+        (kept | {"d": kept["a"][0]}, "value.params has the structure .*, expected .*'d'"),
+    ):
+        with pytest.raises(ValueError, match="load: .*h does not fit heads: " + reason):
+            jast.heads.load(path, Heads(value=(params, linear)))
+    with pytest.raises(ValueError, match=r"load: value\.params\['a'\]\[1\] of heads must be an array of numbers, received float 1.0"):
+        jast.heads.load(path, Heads(value=(kept | {"a": (np.zeros(2), 1.0)}, linear)))
+    with pytest.raises(ValueError, match="does not fit heads: it holds no policy head, expected one"):
+        jast.heads.load(path, Heads(made().policy, own()))
+    jast.heads.save(path, Heads(made().policy, own()))
+    with pytest.raises(ValueError, match="load: .*h holds a value head with a function that is not in the file"):
+        jast.heads.load(path, Heads(made().policy))
+    for heads, reason in ((Heads(), "must have a policy or a value head"), (own(), "must be jast.heads.Heads, received Head")):
+        with pytest.raises(ValueError, match="load: heads " + reason):
+            jast.heads.load(path, heads)
+
+
+def test_load_refuses_another_network(tmp_path):
+    jast.heads.save(tmp_path / "h", made())
+    with pytest.raises(ValueError, match="does not fit heads: policy is the network .*'activation': 'tanh'.*, expected .*'activation': 'relu'"):
+        jast.heads.load(tmp_path / "h", made(activation="relu"))
+
+
+def test_load_refuses_an_unknown_activation(tmp_path, monkeypatch):
+    monkeypatch.setitem(networks.ACTIVATIONS, "mish", jax.nn.mish)
+    jast.heads.save(tmp_path / "h", made(activation="mish"))
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=f"has the activation 'mish', unknown here: use the jast that wrote it, {jast.__version__}"):
+        jast.heads.load(tmp_path / "h")
+
+
+def test_load_refuses_other_files_and_versions(tmp_path, monkeypatch):
+    path = tmp_path / "h"
+    path.write_text("levels,3")
+    with pytest.raises(ValueError, match="load: .*h is not a file of jast heads"):
+        jast.heads.load(path)
+    jast.failures.save(path, jast.failures.empty(WALK))
+    with pytest.raises(ValueError, match="is not a file of jast heads"):
+        jast.heads.load(path)
+    with pytest.raises(FileNotFoundError):
+        jast.heads.load(tmp_path / "none")
+    for version in (0, 2):
+        with monkeypatch.context() as patch:
+            patch.setattr(storage, "VERSION", version)
+            jast.heads.save(path, made())
+        with pytest.raises(ValueError, match=f"has version {version}; this jast reads version 1: use the jast that wrote it, {jast.__version__}"):
+            jast.heads.load(path)
+    jast.heads.save(path, made())
+    with pytest.raises(ValueError, match="is not a jast archive of failures"):
+        jast.failures.load(path)
+
+
+def test_load_refuses_missing_and_changed_arrays(tmp_path):
+    path = tmp_path / "h"
+    jast.heads.save(path, made())
+    with np.load(path) as pack:
+        arrays = dict(pack)
+    other = arrays["header"].tobytes().replace(b'"levels": 31', b'"levels": 32')
+    for change in (
+        lambda a: a.pop("value.0"),
+        lambda a: a.update({"value.0": a["value.0"] + 1}),
+        lambda a: a.update(extra=np.zeros(1)),
+        lambda a: a.update(header=np.frombuffer(other, np.uint8)),
+    ):
+        changed = dict(arrays)
+        change(changed)
+        with open(path, "wb") as file:
+            np.savez(file, **changed)
+        with pytest.raises(ValueError, match="is damaged"):
+            jast.heads.load(path)
+
+
+def test_damaged_files_are_refused_or_harmless(tmp_path, equal):
+    path = tmp_path / "h"
+    jast.heads.save(path, made())
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for at in rng.choice(len(whole), 100, replace=False):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            back = jast.heads.load(path)
+        except ValueError as error:
+            assert "damaged" in str(error) or "not a file of jast heads" in str(error)
+            refused += 1
+        else:  # a date or another byte without meaning
+            equal(back, made())
+    assert refused > 50
+    for length in rng.choice(len(whole), 20, replace=False):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match="damaged|not a file of jast heads"):
+            jast.heads.load(path)
+
+
+def test_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch, equal):
+    jast.heads.save(tmp_path / "h", made())
+    monkeypatch.setattr(np, "savez_compressed", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        jast.heads.save(tmp_path / "h", made(policy=False))
+    monkeypatch.undo()
+    equal(jast.heads.load(tmp_path / "h"), made())
+    assert [p.name for p in tmp_path.iterdir()] == ["h"]
