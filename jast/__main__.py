@@ -33,6 +33,8 @@ def main(argv=None):
     options = parser.parse_args(argv)
     if options.prunes is not None and options.method != "forest":
         parser.error(f"argument --prunes: only of --method forest, not of {options.method}")
+    if options.heads and options.method != "forest":
+        parser.error(f"argument --heads: only of --method forest, not of {options.method}")
     if options.paper and options.method not in ("forest", "mcts"):
         parser.error(f"argument --paper: only with --method forest or mcts, not with {options.method}")
     try:
@@ -61,6 +63,7 @@ def _parser():
     add("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add("--output", type=Path, default=Path("jast-output"), metavar="FOLDER", help="folder for the archive and the pictures (default: jast-output)")
     add("--paper", action="store_true", help="forest and mcts: the published widening in place of the better-tuned one")
+    add("--heads", choices=["rollout", "value", "both"], help="forest: networks that learn from the trees before (default: none)")
     add("--quiet", action="store_true", help="no progress bars")
     return parser
 
@@ -100,7 +103,7 @@ def _search(key, sim, options, common):
     trees, each = options.trees, options.simulations or (500 if options.method == "forest" else 9000)
     mode = "paper" if options.paper else "default"
     if options.method == "forest":
-        return forest(key, sim, trees=trees, prunes=options.prunes or 18, simulations=each, mode=mode, **common)
+        return forest(key, sim, trees=trees, prunes=options.prunes or 18, simulations=each, mode=mode, heads=options.heads, **common)
     if options.method == "mcts":
         return mcts(key, sim, trees=trees, simulations=each, mode=mode, **common)
     if options.method == "monte-carlo":
@@ -115,7 +118,8 @@ def _shares(results):
     for name, r in results.items():
         k, n, what = (r.failures.seen, r.episodes, "episodes") if name == "monte-carlo" else (int(r.failing.sum()), len(r.failing), "trees")
         low, high = clopper_pearson(k, n)
-        lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, 95 % [{100 * low:.4g}, {100 * high:.4g}]")
+        interval = "no interval: they share heads" if r.heads is not None else f"95 % [{100 * low:.4g}, {100 * high:.4g}]"
+        lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, {interval}")
     return "\n".join(lines)
 
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 
 import jast
 from jast.distributions import Categorical, Independent, Joint, Normal
@@ -55,3 +56,31 @@ def walk(init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, fails=lambda s:
 def two_densities():
     """Breaks the contract: a disturbance of two numbers that has a density each."""
     return jast.Simulator(lambda x0: jnp.zeros(2), lambda s, x: s + x, lambda s: Normal(s, 1.0), lambda s: (s[0] > 1, s[0]), 3)
+
+
+def _plane_init(x0):
+    return jnp.zeros(2)
+
+
+def _plane_step(s, x):
+    return s + x
+
+
+def _plane_disturbance(s):
+    return Independent(Normal(jnp.zeros_like(s), 1.0), 1)
+
+
+def _plane_evaluate(threshold, s):
+    gone = (s[0] + s[1]) / jnp.sqrt(2.0).astype(s.dtype)
+    return gone > threshold, jnp.maximum(threshold - gone, 0)
+
+
+def _plane_observe(sight, s):
+    return jnp.where(jnp.abs(s[0]) <= sight, s, jnp.nan)
+
+
+def plane(threshold=3.0, sight=jnp.inf):
+    """Five normal steps in two dimensions that fail ``threshold`` up the diagonal; ``observe`` shows NaN where the first coordinate is out of ``sight``."""
+    threshold, sight = (jnp.asarray(v, jnp.zeros(()).dtype) for v in (threshold, sight))
+    evaluate, observe = Partial(_plane_evaluate, threshold), Partial(_plane_observe, sight)
+    return jast.Simulator(_plane_init, _plane_step, _plane_disturbance, evaluate, 5, observe=observe)

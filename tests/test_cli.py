@@ -49,6 +49,13 @@ def test_every_simulator(capsys, tmp_path, simulator):
         assert jast.replay(make(), held.best, reward=reward).reward == held.best.reward
 
 
+def test_heads_of_a_forest(capsys, tmp_path):
+    status, text, out = run(capsys, tmp_path, "--prunes", "2", "--heads", "both")
+    assert status == 0 and "no interval: they share heads" in text
+    settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())[1]
+    assert settings["heads"] == "both" and settings["head_settings"]["round"] == 1
+
+
 def test_a_seed_gives_the_same_report(capsys, tmp_path):
     one, two, other = (run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2", "--seed", seed)[1] for seed in "330")
     assert one == two != other
@@ -78,6 +85,7 @@ def test_help(capsys):
         (["--prunes", "1.5"], "argument --prunes: must be a whole number of at least 1, received '1.5'"),
         (["--seed", "x"], "argument --seed: invalid int value: 'x'"),
         (["--method", "mcts", "--prunes", "3"], "argument --prunes: only of --method forest, not of mcts"),
+        (["--method", "mcts", "--heads", "both"], "argument --heads: only of --method forest, not of mcts"),
         (["--method", "cem", "--paper"], "argument --paper: only with --method forest or mcts, not with cem"),
         (["--output", __file__], "argument --output: "),
         (["--trees", "1", "--simulations", "2000000000"], "prunes * simulations must be below 2**24"),

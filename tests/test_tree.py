@@ -2,6 +2,7 @@
 
 import functools
 import re
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +26,9 @@ SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
 SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
 
 
-def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0):
+def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0, guide=()):
     choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0)
-    parts = T.Problem(sim, reward, choice, T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)))
+    parts = T.Problem(sim, reward, choice, T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)), guide)
     return jax.tree.map(jnp.asarray, parts)
 
 
@@ -36,7 +37,7 @@ def grown(sim, keys, prunes=3, simulations=120, memoize="node", **choices):
     total = prunes * simulations
     p = problem(sim, total, **choices)
     children = int(p.settings.widths.max())
-    tree = run._make(p, keys, total, memoize)
+    tree = run._make(p, keys, total, memoize, T.pages_of(p, total))
     visits, roots = [], []
     for turn in range(prunes):
         tree = run._grow(p, tree, turn * simulations, (turn + 1) * simulations, memoize)
@@ -46,10 +47,11 @@ def grown(sim, keys, prunes=3, simulations=120, memoize="node", **choices):
     return tree, visits, roots
 
 
-def visited_children(tree, lane):
-    """What the edges of one tree hold: node -> [(visits, sum of returns, child's id, child's reward)] by slot; the only place here that knows the layout."""
+def slots_of(tree, lane):
+    """What one tree holds: node -> [(visits, sum of returns, child's id, child's reward, v)], the slots of its pages; the only place that knows the layout."""
     lanes = tree.key.shape[0]
     pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, T.ROW)[:, lane]
+    values = np.asarray(tree.values, np.float64).reshape(-1, lanes, T.PAGE + 1)[:, lane] if len(tree.values) else np.zeros((len(pages), T.PAGE + 1))
     made = np.flatnonzero((np.asarray(tree.outcome)[:, lane] & T.FRESH) > 0) + 1
     out = {}
     for node in [0, *made]:
@@ -57,7 +59,7 @@ def visited_children(tree, lane):
         while True:
             row = pages[page]
             columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
-            found += [(int(n), w, int(i), r) for n, w, i, r in zip(*columns, strict=True) if n > 0]
+            found += [(int(n), w, int(i), r, v) for n, w, i, r, v in zip(*columns, values[page, : T.PAGE], strict=True)]
             page = int(row[T.LINK])
             if page == 0:
                 break
@@ -65,11 +67,16 @@ def visited_children(tree, lane):
     return out
 
 
+def visited_children(tree, lane):
+    """Of the children that were visited, without v."""
+    return {node: [found[:4] for found in slots if found[0] > 0] for node, slots in slots_of(tree, lane).items()}
+
+
 # --- against an independent search ----------------------------------------------------------------------------------------------------------------------------
 
 
 def drawn_as_published(keys, simulations, slots):
-    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, last)``, uniform numbers addressed by the keys of the tree, drawn beforehand."""
+    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, state)``, uniform numbers addressed by the keys of the tree, drawn beforehand."""
     node_slot = jnp.stack(jnp.divmod(jnp.arange((simulations + 1) * slots), slots), axis=1).astype(jnp.int32)
 
     @jax.jit
@@ -79,7 +86,7 @@ def drawn_as_published(keys, simulations, slots):
         return children.reshape(-1, slots), rollouts(key, simulations)[0]
 
     def draw(of_child, of_level):
-        return lambda node, slot, last: of_child[node, slot], lambda i, level, last: of_level[i, level]
+        return lambda node, slot, last: of_child[node, slot], lambda i, level, state: of_level[i, level]
 
     return [draw(*(np.asarray(a, np.float64) for a in table(key))) for key in keys]
 
@@ -101,7 +108,7 @@ def drawn_by_default(keys, simulations, focus):
     def draw(shift, of_level, coin, of_tree):
         place = lambda node, slot: ((int(shift[node]) + step * (slot // 2)) % 2**32 >> 8) / 2**24
         child = lambda node, slot, last: near(slot % 2, place(node, slot), last)
-        return child, lambda i, level, last: near(coin[i, level] & of_tree, float(of_level[i, level]), last)
+        return child, lambda i, level, state: near(coin[i, level] & of_tree, float(of_level[i, level]), state[4])
 
     return [draw(*map(np.asarray, table(key))) for key in keys]
 
@@ -113,8 +120,21 @@ def rollouts(key, simulations):
     return jax.vmap(jax.vmap(lambda k: jax.random.uniform(k, ())))(keys), jax.random.key_data(keys)[..., 1] & 1
 
 
-def plain_search(child, rollout, prunes, simulations, k, alpha, c):
-    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation."""
+class Slot(NamedTuple):
+    """A place for a child."""
+
+    visits: int
+    q: float
+    id: int
+    v: float
+
+
+def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False):
+    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation.
+
+    With ``value(state, a)``, of ``weights`` (of Q, of v); ``one``: of a node's children that were not visited only the first is to be had. Third: of each node
+    the children to be had, (visits, Q, id, v), 0 where there is none; the v of an only child is never asked for.
+    """
 
     def step(state, a):
         ferry, x, y, heading, last, nearest = state
@@ -130,6 +150,18 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c):
 
     children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, 16.0, 0.0, 0.0, None, np.hypot(16, 50))}
     root, ancestors, log, at_prune = 0, [], [], []
+
+    @functools.cache
+    def v(node, slot):
+        return value(states[node], child(node, slot, states[node][4]))
+
+    def to_be_had(node):
+        ids = [n for n in children[node] if n is not None] + [None] if one else children[node]
+        lonely = value is None or len(children[node]) < 2
+        return [
+            Slot(*((0, 0.0, 0) if n is None else (visits[n], q[n], n)), 0.0 if lonely else v(node, slot)) for slot, n in enumerate(ids[: len(children[node])])
+        ]
+
     for turn in range(prunes):
         for i in range(turn * simulations, (turn + 1) * simulations):
             node, path = root, list(ancestors)
@@ -142,7 +174,7 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c):
                     count[node] += 1
                     children[node].append(None)
                 bonus = np.sqrt(np.log(visits[node]))
-                scores = [c * bonus if n is None else q[n] + c * bonus / np.sqrt(1 + visits[n]) for n in children[node]]
+                scores = [weights[0] * n.q + weights[1] * n.v + c * bonus / np.sqrt(1 + n.visits) for n in to_be_had(node)]
                 slot = int(np.argmax(scores))
                 if children[node][slot] is None:
                     new = i + 1
@@ -157,7 +189,7 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c):
             else:
                 state, end = states[node], ends[node]
                 while not end:
-                    state, gain, end = step(state, rollout(i, level, state[4]))
+                    state, gain, end = step(state, rollout(i, level, state))
                     total, level = total + gain, level + 1
             for n in reversed(path):
                 total += gains[n]
@@ -166,8 +198,8 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c):
             log.append(total)
         at_prune.append([visits[n] for n in children[root] if n is not None])
         ancestors.append(root)
-        root = children[root][int(np.argmax(at_prune[-1]))]
-    return at_prune, log
+        root = max((n for n in children[root] if n is not None), key=visits.get)
+    return at_prune, log, {node: to_be_had(node) for node in children}
 
 
 def agree(key, k, alpha, focus=1.0):
@@ -177,7 +209,7 @@ def agree(key, k, alpha, focus=1.0):
     tree, _, roots = grown(jast.simulators.ferry(), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices)
     draws = drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max())) if focus == 1 else drawn_by_default(keys, 360, focus)
     for lane, (child, rollout) in enumerate(draws):
-        at_prune, log = plain_search(child, rollout, 3, 120, k, alpha, 10.0)
+        at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0)
         for turn, expected in enumerate(at_prune):
             found = roots[turn].visits[lane]
             assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
@@ -200,15 +232,11 @@ def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
 # --- what holds in every tree ---------------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_counts_of_every_node_add_up(name, key):
-    sim, choices = SYSTEMS[name]
-    k, alpha = 4.0, 0.5
-    tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(k, alpha), **choices)
-    np.testing.assert_array_equal(root_visits[0], 121)  # the simulations, and the 1 that a root starts from
+def counts_add_up(tree, k, alpha):
+    """In every node; the greatest number of children of one."""
     log, outcome = np.asarray(tree.log), np.asarray(tree.outcome)
     widest = 0
-    for lane in range(3):
+    for lane in range(log.shape[1]):
         nodes = visited_children(tree, lane)
         ran = (outcome[:, lane] & T.RAN) > 0
         visits, ends = {0: 1 + int(ran.sum())}, set()
@@ -225,6 +253,15 @@ def test_counts_of_every_node_add_up(name, key):
             widest = max(widest, len(found))
         total = sum(w for _, w, _, _ in nodes[0])
         np.testing.assert_allclose(total / (visits[0] - 1), log[ran, lane].astype(np.float64).mean(), rtol=1e-5)
+    return widest
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_counts_of_every_node_add_up(name, key):
+    sim, choices = SYSTEMS[name]
+    tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(4.0, 0.5), **choices)
+    np.testing.assert_array_equal(root_visits[0], 121)  # the simulations, and the 1 that a root starts from
+    widest = counts_add_up(tree, 4.0, 0.5)
     assert name != "ferry" or widest > T.PAGE  # pages were linked
 
 

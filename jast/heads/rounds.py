@@ -87,8 +87,9 @@ def _check_outputs(heads, n, d):
         wanted = f"logits of shape ({d}, bins), bins at least 2" if name == "policy" else "a scalar"
         try:
             out = jax.eval_shape(run)
-        except (TypeError, ValueError) as e:
-            raise ValueError(f"heads: the {name} head's apply(params, x) failed on x of shape ({takes},) float32: {str(e).splitlines()[0]}") from e
+        except Exception as e:  # of whatever framework
+            why = (str(e) or type(e).__name__).splitlines()[0]
+            raise ValueError(f"heads: the {name} head's apply(params, x) failed on x of shape ({takes},) float32: {why}") from e
         shape = getattr(out, "shape", None)
         fits = shape is not None and (len(shape) == 2 and shape[0] == d and shape[1] >= 2 if name == "policy" else shape == ())
         if not fits or not jnp.issubdtype(out.dtype, jnp.floating):

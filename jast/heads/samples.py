@@ -28,15 +28,16 @@ class Samples(NamedTuple):
 
 
 def of_roots(sim, actions, roots, bins, good, first=0):
-    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from `Roots` with any leading axes.
+    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from `Roots` [turns, B].
 
-    Per root and number of the disturbance, the target of the policy head is the share of the visits in each of ``bins`` equal cells of the unit interval that
-    ``actions`` maps to it; only trees that are ``good`` [B] count. Without ``bins`` there are none of the first kind. Roots at levels above ``first`` choose x0
-    and teach nothing.
+    They come tree by tree, so that the groups in which trees grew do not show. Per root and number of the disturbance, the target of the policy head is the
+    share of the visits in each of ``bins`` equal cells of the unit interval that ``actions`` maps to it; only trees that are ``good`` [B] count. Without
+    ``bins`` there are none of the first kind. Roots at levels above ``first`` choose x0 and teach nothing.
     """
-    roots = jax.tree.map(lambda a: jnp.asarray(a).reshape(-1, *a.shape[2:]), roots._replace(starts=()))
+    turns = len(roots.depth)
+    roots = _tree_by_tree(roots._replace(starts=()))
     seen, x, shares = _rows(sim, actions, roots, bins)
-    good = np.broadcast_to(good, (len(seen) // len(good), len(good))).reshape(-1)
+    good = np.repeat(good, turns)
     use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
     policy = None if bins is None else _finite(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
     edges = roots.visits > 0
@@ -54,7 +55,7 @@ def joined(parts):
 
 def of_edges(edges, target="own"):
     """`Samples` for a value head from `jast.search.edges.Edges`: Q(s, a), or the Q of the edge that leads to s, as published (``target="parent"``)."""
-    edges = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), edges)
+    edges = _tree_by_tree(edges)
     return _finite(edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q)
 
 
@@ -97,6 +98,11 @@ def _rows(sim, actions, roots, bins):
         return observed(sim, state), jax.vmap(flat)(xs), shares
 
     return jax.vmap(one)(roots.state, roots.actions, roots.visits)
+
+
+def _tree_by_tree(rows):
+    """Rows [n, B, ...] as [B * n, ...]."""
+    return jax.tree.map(lambda a: np.swapaxes(a, 0, 1).reshape(-1, *a.shape[2:]), rows)
 
 
 def _finite(use, *columns):

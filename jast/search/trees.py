@@ -67,7 +67,7 @@ def grow_trees(
         head_settings = checked(HEAD_MODES[mode] if head_settings is None else head_settings)
         school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
         problem = problem._replace(guide=guide(school.heads, head_settings))
-        plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.edges == "all" and school.value is not None)
+        plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.train and head_settings.edges == "all" and school.value is not None)
         at_once = min(trees, head_settings.round or max(1, min(trees // 5, LANES))) if head_settings.train else trees
         if settings is None and isinstance(heads, str):
             raise ValueError(f"{method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot hold: pass jast.heads.Heads that were trained")
@@ -103,7 +103,11 @@ def grow_trees(
         if interrupted:
             break
         if school is not None and head_settings.train:
-            school = teach(jax.random.fold_in(key, trees + 1 + first), school, sim, actions, head_settings, new)
+            try:
+                school = teach(jax.random.fold_in(key, trees + 1 + first), school, sim, actions, head_settings, new)
+            except KeyboardInterrupt:
+                interrupted = True
+                break
             problem = problem._replace(guide=guide(school.heads, head_settings))
     if bar is not None:
         bar.close()
