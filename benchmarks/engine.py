@@ -17,6 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.tree_util import Partial
 
 import jast
 from benchmarks import reference
@@ -158,17 +159,18 @@ def compile_time():
 
 
 def slow_ferry(substeps):
-    """S0 with a step that takes ``substeps`` times the arithmetic and ends in the same place."""
+    """S0 with a step that takes ``substeps`` times the arithmetic and ends in the same place. One program serves every number of substeps."""
     sim = jast.simulators.ferry()
-
-    def step(state, a):
-        def burn(_, heading):
-            return jnp.arctan2(jnp.sin(heading), jnp.cos(heading))
-
-        after = sim.step(state, a)
-        return after._replace(heading=lax.fori_loop(0, substeps, burn, after.heading))
-
+    step = Partial(_slow_step, sim.step, jnp.int32(substeps))
     return Simulator(sim.init, step, sim.disturbance, sim.evaluate, sim.horizon, is_terminal=sim.is_terminal, observe=sim.observe)
+
+
+def _slow_step(step, substeps, state, a):
+    def burn(_, heading):
+        return jnp.arctan2(jnp.sin(heading), jnp.cos(heading))
+
+    after = step(state, a)
+    return after._replace(heading=lax.fori_loop(0, substeps, burn, after.heading))
 
 
 def memoization(lanes, prunes, simulations):

@@ -1,7 +1,8 @@
 """The ferry S0: golden episodes, the paper's Table 1 without networks, and what the default search makes of it.
 
 ``python -m benchmarks.ferry [--json] [--quick] [--trees N]``. Every tree has 9000 simulations. Rates have 95 % Clopper-Pearson intervals, means
-1.96 standard errors. Published rows: Lytskjold and Mengshoel, Table 1, 200 trees each.
+1.96 standard errors. Published rows: Lytskjold and Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--picture PATH]``: all of that table, networks
+included, and where they pay (`benchmarks.table1`).
 """
 
 import argparse
@@ -18,15 +19,27 @@ from jast.estimate.intervals import clopper_pearson
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
 BOX = jast.actions.uniform(0.0, 1.0)
+TABLE = {  # as printed in the paper: share of failing trees in %, mean best reward, best
+    "-/-": (29.5, 1.927, 28.061),
+    "MCTS-SA": (35.5, 2.304, 28.245),
+    "RP/-": (37.0, 4.776, 28.650),
+    "-/VN": (20.5, -1.426, 28.784),
+    "RP/VN": (39.0, 5.818, 29.092),
+}
+PUBLISHED = {"forest, paper": TABLE["-/-"], "mcts, paper": TABLE["MCTS-SA"]}
+
+
+def data(name):
+    """What a file of published results holds, or None where it is absent."""
+    path = DATA / name
+    return json.loads(path.read_text()) if path.exists() else None
 
 
 def golden():
     """Greatest error of the rewards of the published episodes, in float32 and float64; None where the data is absent."""
-    path = DATA / "golden_episodes.json"
-    if not path.exists():
+    if (found := data("golden_episodes.json")) is None:
         return None
-    episodes = json.loads(path.read_text())["episodes"]
-    errors = {}
+    episodes, errors = found["episodes"], {}
     for bits in (32, 64):
         with jax.enable_x64(bits == 64):
             sim = jast.simulators.ferry()
@@ -35,14 +48,16 @@ def golden():
     return {"episodes": len(episodes), "greatest_error": errors}
 
 
-def row(search, seed):
-    """One row: what a search of many trees found."""
+def timed(function):
+    """What a function returns, its CPU and its wall seconds."""
     start = time.process_time(), time.perf_counter()
-    result = search(jax.random.key(seed))
-    cpu, wall = time.process_time() - start[0], time.perf_counter() - start[1]
-    best = np.asarray(result.best_reward_per_tree, np.float64)
+    result = function()
+    return result, time.process_time() - start[0], time.perf_counter() - start[1]
+
+
+def outcome(best):
+    """What trees found, by the reward of each one's best episode."""
     n, failing = best.size, int(np.sum(best > 0))
-    runs = [best[i : i + 200].max() for i in range(0, n - 199, 200)]
     return {
         "trees": n,
         "rate": failing / n,
@@ -51,13 +66,22 @@ def row(search, seed):
         "mean_best_95": 1.96 * best.std() / np.sqrt(n),
         "mean_best_failing": best[best > 0].mean() if failing else None,
         "best": best.max(),
+    }
+
+
+def row(search, seed):
+    """One row: what a search of many trees found."""
+    result, cpu, wall = timed(lambda: search(jax.random.key(seed)))
+    best = np.asarray(result.best_reward_per_tree, np.float64)
+    runs = [best[i : i + 200].max() for i in range(0, best.size - 199, 200)]
+    return outcome(best) | {
         "best_of_200": [min(runs), float(np.median(runs)), max(runs)] if runs else None,
         "failing_episodes": result.failing_share,
         "episodes": result.episodes,
         "steps": result.simulator_steps,
         "cpu_s": cpu,
         "wall_s": wall,
-        "failing_trees_per_cpu_s": failing / cpu,
+        "failing_trees_per_cpu_s": int(np.sum(best > 0)) / cpu,
     }
 
 
@@ -89,16 +113,20 @@ def rows(trees, quick):
     return table
 
 
-PUBLISHED = {"forest, paper": (29.5, 1.927, 28.061), "mcts, paper": (35.5, 2.304, 28.245)}
-
-
 def main(argv=None):
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--quick", action="store_true", help="100 trees a row")
-    parser.add_argument("--trees", type=int, help="trees a row (default 1000)")
+    parser.add_argument("--quick", action="store_true", help="100 trees a row; of --table1 also fewer rows")
+    parser.add_argument("--trees", type=int, help="trees a row (default 1000; of --table1 200)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--table1", action="store_true", help="the paper's Table 1 with networks, and where they pay")
+    parser.add_argument("--seeds", type=int, help="of --table1: seeds a row, from --seed on (default 3)")
+    parser.add_argument("--picture", help="of --table1: also measure slower simulators, and draw to this file")
     args = parser.parse_args(argv)
+    if args.table1:
+        from benchmarks import table1
+
+        return table1.report(args)
     trees = args.trees or (100 if args.quick else 1000)
     report = {"golden": golden(), "seed": args.seed, "rows": {}}
     if not args.json:

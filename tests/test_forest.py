@@ -247,9 +247,9 @@ def test_a_system_that_always_fails_at_its_first_step():
 
 
 def test_trees_that_end_early_end_apart():
-    """A tree whose root is an episode's end stops; the others go on."""
+    """A tree whose root is an episode's end stops; the others go on, also those of other groups."""
     sim = walk(fails=lambda s: s > 2.0)
-    result = forest(jax.random.key(0), sim, trees=6, prunes=6, simulations=60, reward=BONUS)
+    result = forest(jax.random.key(0), sim, trees=6, prunes=6, simulations=60, reward=BONUS, lanes=2)
     turns = result.roots.valid.sum(0)
     assert turns.min() < turns.max()
     assert result.episodes == 60 * turns.sum()

@@ -23,17 +23,20 @@ class Moments(NamedTuple):
     mean: Any
     """[n] float32."""
     deviation: Any
-    """[n] float32: 1 where nothing varies."""
+    """[n] float32: 0 where nothing varies, which then is as good as 1."""
 
     @classmethod
     def empty(cls, *shape):
         return cls(np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32))
 
     def normalise(self, x):
-        return (x - self.mean) / self.deviation
+        return (x - self.mean) / self._scale()
 
     def restore(self, x):
-        return self.mean + self.deviation * x
+        return self.mean + self._scale() * x
+
+    def _scale(self):
+        return jnp.where(self.deviation > 0, self.deviation, 1)
 
     def first(self, n):
         """Those of the first ``n`` numbers."""
@@ -48,7 +51,7 @@ def moments(before, x):
     squares = before.count * np.float64(before.deviation) ** 2 if before.count else 0.0
     gap = x.mean(0) - mean
     variance = (squares + len(x) * x.var(0) + gap**2 * before.count * len(x) / count) / count
-    deviation = np.where(variance > 1e-12, np.sqrt(variance), 1)
+    deviation = np.where(variance > 1e-12, np.sqrt(variance), 0)
     return Moments(*(np.asarray(a, np.float32) for a in (count, mean + gap * len(x) / count, deviation)))
 
 

@@ -48,7 +48,7 @@ class Harvest(NamedTuple):
     steps: Any
     """[B] simulator steps."""
     roots: Any
-    """`Roots` with a leading axis [turns]."""
+    """`Roots` with a leading axis [prunes], zeros from where all trees of the group are at their end."""
     found: Episode
     """[n] the best failing episodes, or the best ones of trees without failure."""
     tree: Any
@@ -174,7 +174,7 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
     wanted = candidates + len(group)
     found = _rebuild(problem, tree, np.resize(lane, wanted).astype(np.int32), np.resize(i, wanted).astype(np.int32), plan.memoize)
     found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
-    roots = jax.tree.map(lambda *rows: np.stack(rows), *turns)
+    roots = jax.tree.map(lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]), *turns)
     edges = jax.device_get(jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))) if plan.edges else ()
     return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32), edges)
 

@@ -79,7 +79,8 @@ def grow_trees(
     settings |= dict(prunes=prunes, memoize=plan.memoize)
     if school is not None:
         kind = heads if isinstance(heads, str) else "/".join(name for name in ("policy", "value") if getattr(heads, name) is not None)
-        settings |= dict(heads=kind, head_settings=head_settings._asdict() | dict(round=at_once))
+        used = {name: list(value) if isinstance(value, tuple) else value for name, value in head_settings._asdict().items()}
+        settings |= dict(heads=kind, head_settings=used | dict(round=at_once))
     if progress:
         from tqdm import tqdm
     bar = tqdm(total=trees * total, unit="sim", unit_scale=True, desc=method) if progress else None
@@ -161,8 +162,7 @@ def _result(sim, reward, harvests, settings, top, school):
     best = archive.best
     if best is None:
         best = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
-    turns = min(h.roots.depth.shape[0] for h in harvests)
-    roots = jax.tree.map(lambda *parts: np.concatenate([p[:turns] for p in parts], axis=1), *(h.roots for h in harvests))
+    roots = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *(h.roots for h in harvests))
     return SearchResult(
         best=jax.device_get(replay(sim, best, reward=reward)),
         best_reward_per_tree=per_tree,
