@@ -16,7 +16,6 @@ from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
 from jast.counter import tree_keys
 from jast.estimate.intervals import clopper_pearson
-from jast.search.trees import LANES
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}
@@ -46,7 +45,7 @@ class Sizes(NamedTuple):
     """Of the slowed simulators."""
 
 
-QUICK = Sizes(100, 40, 1, 8, ("none", "both"), 50, (), 100, (15.0,), 100, (0, 30, 300))
+QUICK = Sizes(100, 24, 1, 8, ("none", "both"), 50, (), 100, (15.0,), 100, (0, 30, 300))
 
 COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "B": (3, lambda r: r["B"] or "-"),
@@ -73,7 +72,7 @@ compiles what no row above it did; failing/s: failing trees per CPU second, with
 
 def forest(sim, heads=None, mode="default", trees=200, simulations=500, **settings):
     """A search by its key. The round of its heads has the default length, but by number, so that `warm_up` can have the same with fewer trees."""
-    settings = dict(round=max(1, min(trees // 5, LANES))) | settings
+    settings = dict(round=max(1, min(trees // 5, 40))) | settings
     more = {} if heads is None else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
     return functools.partial(jast.search.forest, sim=sim, trees=trees, simulations=simulations, mode=mode, reward=REWARD, actions=BOX, **more)
 
