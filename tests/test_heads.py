@@ -183,6 +183,10 @@ def test_histograms_at_their_ends():
         np.testing.assert_allclose(x, (k + np.asarray(u)) / 4, atol=1e-6)
     for logits in ([jnp.nan] * 4, [-jnp.inf] * 4, [0.0, jnp.nan, 1.0, 2.0]):  # nothing is known
         np.testing.assert_allclose(in_bins(rows(logits), u), u, atol=2e-6)
+    some = np.random.default_rng(0).normal(size=(5000, 40)).astype(np.float32)
+    for last, bins in ((1.0, 40), (0.75, 30)):  # the greatest number that is drawn stays below the end of the last cell that has mass
+        logits = jnp.asarray(np.where(np.arange(40) < bins, some, -200), jnp.float32)
+        assert float(binned(logits, jnp.full(5000, 1 - 2.0**-23, jnp.float32)).max()) < last
     np.testing.assert_allclose(in_bins(rows([-jnp.inf, 0.0]), u), (1 + np.asarray(u)) / 2, atol=1e-6)
     np.testing.assert_allclose(in_bins(rows([0.0, jnp.inf]), u), (1 + np.asarray(u)) / 2, atol=1e-6)
 

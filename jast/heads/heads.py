@@ -113,14 +113,15 @@ def in_bins(logits, u):
     bins = logits.shape[1]
     mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
     mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
-    u = u * jnp.sum(mass, axis=1)
+    u = u * sum(mass[:, k] for k in range(bins))  # summed as below, so that no rounding leads past the last bin that has mass
     below = bin = beneath = jnp.zeros_like(u)
     own = mass[:, 0]
     for k in range(1, bins):  # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
         below = below + mass[:, k - 1]
         past = u >= below
         bin, beneath, own = jnp.where(past, jnp.float32(k), bin), jnp.where(past, below, beneath), jnp.where(past, mass[:, k], own)
-    return (bin + jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - 2.0**-20)) / bins
+    inside = jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - bins * 2.0**-22)  # of 1, so far that no rounding leads into the next bin
+    return (bin + inside) / bins
 
 
 def value(heads, seen, x):
