@@ -16,6 +16,7 @@ from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
 from jast.counter import tree_keys
 from jast.estimate.intervals import clopper_pearson
+from jast.search.trees import LANES
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}
@@ -72,7 +73,7 @@ compiles what no row above it did; failing/s: failing trees per CPU second, with
 
 def forest(sim, heads=None, mode="default", trees=200, simulations=500, **settings):
     """A search by its key. The round of its heads has the default length, but by number, so that `warm_up` can have the same with fewer trees."""
-    settings = dict(round=max(1, min(trees // 5, 40))) | settings
+    settings = dict(round=max(1, min(trees // 5, LANES))) | settings
     more = {} if heads is None else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
     return functools.partial(jast.search.forest, sim=sim, trees=trees, simulations=simulations, mode=mode, reward=REWARD, actions=BOX, **more)
 
