@@ -1,0 +1,88 @@
+"""The ferry's collision avoidance: safety zones around the tracked obstacle, and the speed along the path that keeps out of them.
+
+Path-velocity decomposition: the path is fixed, the planner chooses a speed. It predicts the obstacle at the tracker's velocity, and for each candidate speed
+adds up what the zones that the ferry would enter cost. Zones and weights are those published for S1 (Lytskjold and Mengshoel); how its planner combines them
+is not, so the sum below is ours.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+__all__ = ["DESIRED", "FIRST", "SPEEDS", "ZONES", "Zone", "costs", "inside", "plan", "speed_of", "zone_outline"]
+
+
+class Zone(NamedTuple):
+    """A zone that moves with an obstacle: how far it reaches (m), and what a second in it costs."""
+
+    name: str
+    forward: float
+    starboard: float
+    aft: float
+    port: float
+    weight: float
+
+
+ZONES = (
+    Zone("region of collision", 20.0, 10.0, 10.0, 10.0, 1000.0),
+    Zone("high penalty region", 25.0, 20.0, 15.0, 15.0, 100.0),
+    Zone("low penalty region", 40.0, 30.0, 25.0, 25.0, 10.0),
+)
+DESIRED = 0.75  # m/s
+SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])  # candidates, m/s: published range
+FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
+STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end
+SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
+KEEP = 0.8  # the speed in force stays unless another costs less than this share of it ...
+KEEP_LEAST = 20.0  # ... and this much less
+
+
+def inside(zone, ahead, right):
+    """Whether a point ``ahead`` and to the ``right`` of an obstacle (m) is in its zone: a quarter of an ellipse in each quadrant."""
+    x = ahead / jnp.where(ahead > 0, zone.forward, zone.aft)
+    y = right / jnp.where(right > 0, zone.starboard, zone.port)
+    return x**2 + y**2 < 1
+
+
+def zone_outline(zone, n, e, course, points=200):
+    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e, n), for pictures."""
+    angle = np.linspace(0, 2 * np.pi, points)
+    ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
+    right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
+    return np.stack([e + ahead * np.sin(course) + right * np.cos(course), n + ahead * np.cos(course) - right * np.sin(course)], -1)
+
+
+def costs(along, obstacle):
+    """[candidates] cost of each of `SPEEDS` for a ferry at ``along`` on the path and an obstacle with this `tracker.Track`."""
+    dtype = along.dtype
+    speeds, times = jnp.asarray(SPEEDS, dtype)[:, None], jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :]
+    n, e, v_n, v_e = obstacle
+    speed = jnp.sqrt(v_n**2 + v_e**2)
+    still = speed < 0.05  # published threshold of low velocity; a course of its own an obstacle at rest has not
+    north, east = (jnp.where(still, rest, v / jnp.where(still, 1, speed)) for v, rest in ((v_n, 1), (v_e, 0)))
+    d_n, d_e = along + speeds * times - n - v_n * times, -e - v_e * times
+    ahead, right = d_n * north + d_e * east, d_e * north - d_n * east
+    rate = jnp.zeros_like(ahead)
+    for zone in reversed(ZONES):  # the innermost counts
+        rate = jnp.where(inside(zone, ahead, right), jnp.asarray(zone.weight, dtype), rate)
+    sure = 1 - times / (2 * AHEAD)  # what is predicted for later is less certain
+    return STEP * jnp.sum(rate * sure, axis=1) + SLOWNESS * AHEAD * jnp.abs(speeds[:, 0] - DESIRED)
+
+
+def plan(along, current, obstacle):
+    """int32: which of `SPEEDS` to take now; ``current``: the one in force."""
+    cost = costs(along, obstacle)
+    now, least = _pick(cost, current), jnp.min(cost)
+    return jnp.where((least < KEEP * now) & (least < now - KEEP_LEAST), jnp.argmin(cost).astype(jnp.int32), current)
+
+
+def speed_of(choice, dtype):
+    """m/s."""
+    return _pick(jnp.asarray(SPEEDS, dtype), choice)
+
+
+def _pick(values, index):
+    """``values[index]`` without a gather, which costs more in a batch."""
+    return jnp.sum(jnp.where(jnp.arange(values.size, dtype=jnp.int32) == index, values, 0))
