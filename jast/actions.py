@@ -80,55 +80,57 @@ class UniformBox:
     def log_prob(self, x, dist):
         """Log density of `draw` at ``x``: uniform, -inf outside the box."""
 
-        def of(x):
+        def of(x, low, high):
             dtype = D.float_dtype(x.dtype)
-            low, high = self._ends(dtype)
+            low, high = _as(dtype, low, high)
             width = high - low if jnp.issubdtype(x.dtype, jnp.floating) else high - low + 1
             x = x.astype(dtype)
             return jnp.sum(jnp.where((x >= low) & (x <= high), -jnp.log(width), -jnp.inf))
 
-        return D.sum_parts(jax.tree.map(of, x))
+        return D.sum_parts(jax.tree.map(of, x, *self.ends(x)))
 
     def near(self, x, dist, scale, start=False):
         """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""
         if start:
             return _towards_mode(x, dist, scale)
 
-        def shrink(x, m):
+        def shrink(x, m, low, high):
             if not jnp.issubdtype(x.dtype, jnp.floating):
                 return x
-            low, high = self._ends(x.dtype)
+            low, high = _as(x.dtype, low, high)
             return jnp.clip(m + jnp.asarray(scale, x.dtype) * (x - (low + high) / 2), low, high)
 
-        return jax.tree.map(shrink, x, D.mode(dist))
+        return jax.tree.map(shrink, x, D.mode(dist), *self.ends(x))
 
     def place(self, u, dist):
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to ``high``, both included."""
 
-        def place(u, s):
-            low, high = self._ends(u.dtype)
+        def place(u, s, low, high):
+            low, high = _as(u.dtype, low, high)
             if jnp.issubdtype(s.dtype, jnp.floating):
                 return low + u * (high - low)
             return jnp.floor(low + u * (high - low + 1)).astype(s.dtype)
 
-        return jax.tree.map(place, u, D.event_like(dist))
+        return jax.tree.map(place, u, D.event_like(dist), *self.ends(u))
 
     at = place
 
     def locate(self, x, dist):
         """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box nearest to it. Integers: the middle of the cell."""
 
-        def locate(x):
+        def locate(x, low, high):
             dtype = D.float_dtype(x.dtype)
-            low, high = self._ends(dtype)
+            low, high = _as(dtype, low, high)
             if jnp.issubdtype(x.dtype, jnp.floating):
                 return D.fraction(x, low, high)
             return D.fraction(jnp.clip(x.astype(dtype), low, high) + 0.5, low, high + 1)
 
-        return jax.tree.map(locate, x)
+        return jax.tree.map(locate, x, *self.ends(x))
 
-    def _ends(self, dtype):
-        return (jnp.asarray(v).astype(dtype) for v in (self.low, self.high))
+    def ends(self, x):
+        """``low`` and ``high`` as pytrees like ``x``: each is one already, or serves every array of ``x``."""
+        like = jax.tree.structure(x)
+        return (end if jax.tree.structure(end) == like else jax.tree.map(lambda _, end=end: end, x) for end in (self.low, self.high))
 
 
 def samples():
@@ -142,8 +144,15 @@ def quantiles():
 
 
 def uniform(low, high):
-    """Disturbances uniform on the box ``[low, high]`` (scalars, or arrays that broadcast to x). The ferry's published actions are ``uniform(0., 1.)``."""
+    """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or pytrees of them where x is one.
+
+    The ferry's published actions are ``uniform(0., 1.)``.
+    """
     return UniformBox(low, high)
+
+
+def _as(dtype, *values):
+    return (jnp.asarray(v).astype(dtype) for v in values)
 
 
 def _uniform_like(key, dist):

@@ -145,9 +145,14 @@ def _same(what, new, old):
 
 
 def _box(box, x):
-    for leaf in jax.tree.leaves(x):
-        for side in ("low", "high"):
-            shape = jnp.shape(getattr(box, side))
+    like = jax.tree.structure(x)
+    for side in ("low", "high"):
+        end = getattr(box, side)
+        if jax.tree.structure(end) != like:
+            if isinstance(end, dict):
+                raise ValueError(f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or what the disturbance is, {like}")
+            end = jax.tree.map(lambda _, end=end: np.asarray(end), x)
+        for leaf, shape in zip(jax.tree.leaves(x), map(jnp.shape, jax.tree.leaves(end)), strict=True):
             try:
                 fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
             except ValueError:

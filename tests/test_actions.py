@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jast
 from jast import actions
 from jast import distributions as D
 
@@ -86,3 +87,29 @@ def test_locate_names_the_distribution_that_cannot():
         with pytest.raises(ValueError, match="cdf: Gamma has no quantile function"):
             choice.locate(jnp.asarray(1.0), gamma)
     assert actions.uniform(0.0, 4.0).locate(jnp.asarray(1.0), gamma) == 0.25
+
+
+def test_a_box_with_ends_for_each_part_is_the_boxes_of_its_parts(key):
+    a, b = D.Normal(0.0, 1.0), D.MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2))
+    dist = D.Joint({"a": a, "b": b})
+    low, high = {"a": -1.0, "b": jnp.array([0.0, 2.0])}, {"a": 1.0, "b": 4.0}
+    box, parts = actions.uniform(low, high), {name: actions.uniform(low[name], high[name]) for name in low}
+    u = {"a": jnp.asarray(0.75), "b": jnp.array([0.5, 0.25])}
+    x = box.place(u, dist)
+    assert x["a"] == 0.5 and x["b"].tolist() == [2.0, 2.5]
+    assert all((box.locate(x, dist)[name] == parts[name].locate(x[name], d)).all() for name, d in dict(a=a, b=b).items())
+    assert box.log_prob(x, dist) == parts["a"].log_prob(x["a"], a) + parts["b"].log_prob(x["b"], b) == -jnp.log(2.0 * 4.0 * 2.0)
+    near = box.near(x, dist, 0.5)
+    assert all((near[name] == parts[name].near(x[name], d, 0.5)).all() for name, d in dict(a=a, b=b).items())
+    draws = jax.vmap(lambda k: box.draw(k, dist))(jax.random.split(key, 500))
+    assert (jnp.abs(draws["a"]) < 1).all() and (draws["b"].min(0) > jnp.array([0.0, 2.0])).all() and (draws["b"].max(0) > 3.9).all()
+
+
+def test_check_says_what_is_wrong_with_the_ends_of_a_box():
+    joint = lambda s: D.Joint({"a": D.Normal(0.0, 1.0), "b": D.Normal(0.0, 1.0)})
+    sim = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x["a"] + x["b"], joint, lambda s: (s > 9, 9 - s), horizon=4)
+    jast.check(sim, actions.uniform({"a": -1.0, "b": -2.0}, 2.0))
+    with pytest.raises(ValueError, match=r"actions.uniform: low is PyTreeDef\({'a': \*}\), expected an array or what the disturbance is, PyTreeDef\({'a'"):
+        jast.check(sim, actions.uniform({"a": -1.0}, 2.0))
+    with pytest.raises(ValueError, match=r"actions.uniform: high has shape \(3,\), expected one that broadcasts to the disturbance's \(\)"):
+        jast.check(sim, actions.uniform(0.0, {"a": 1.0, "b": jnp.ones(3)}))

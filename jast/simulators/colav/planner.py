@@ -7,7 +7,6 @@ is not, so the sum below is ours.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 

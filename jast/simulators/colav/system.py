@@ -64,7 +64,8 @@ class Model:
 
 
 def colav(
-    scenario="sharp turn", disturbances="delay", *, substeps=30, longest_delay=BUFFER, delay_change=0.2, delay_easing=0.8, steering_change=0.5, noise=(0.3, 0.1),
+    scenario="sharp turn", disturbances="delay", *, substeps=30, longest_delay=BUFFER, delay_change=0.2, delay_easing=0.8, steering_change=0.5,
+    noise=(0.3, 0.1),
 ):  # fmt: skip
     """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s, with states of 93 numbers.
 

@@ -40,8 +40,8 @@ def push(past, now):
 def reader(past, step, delay):
     """What is read during a search step: a function of the time since its start, in periods, to a `Track`.
 
-    ``past``: up to the end of the step; ``step``: its number, from 0; ``delay``: in periods, at most `BUFFER`. Before the start of the episode there is nothing:
-    the first state is read.
+    ``past``: up to the end of the step; ``step``: its number, from 0; ``delay``: in periods, at most `BUFFER`. Before the start of the episode there is
+    nothing: the first state is read.
     """
     now = step.astype(delay.dtype)
     first = jnp.minimum(jnp.floor(jnp.maximum(now - delay, 0)), now - 1)  # a whole step is read from two intervals
