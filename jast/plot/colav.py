@@ -1,0 +1,246 @@
+"""The encounters of `jast.simulators.colav`: where both vessels are, where the ferry believes the other to be, and what it orders on that.
+
+Positions are in metres, times in seconds from the start; a step is 3 s. Ships are drawn 8 m long, to be seen: a collision is 1 m between the centres.
+"""
+
+import math
+from numbers import Real
+from operator import index
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jast.episode import replay
+from jast.plot import style
+from jast.simulators.colav.planner import SPEEDS, ZONES, zone_outline
+from jast.simulators.colav.system import COLLISION, ColavState
+from jast.simulators.colav.tracker import PERIOD
+
+__all__ = ["colav", "colav_animation", "colav_story"]
+
+HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])  # m ahead and to the right of the centre
+BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
+SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
+
+
+def colav(episode, sim=None, moments=3, axes=None):
+    """One colav `Episode` as the planner saw it, at some moments: a panel each, x east (m), y north (m). Returns the list of Axes.
+
+    In a panel: the paths so far, the track that the ferry believes (dashed, a thin line from it to the truth), the safety zones around the believed adversary,
+    and, in the title, the time and the speed that the ferry orders on that picture (at the episode's end: the last order). Ships are drawn 8 m long, not to
+    the scale of a collision (1 m).
+
+    ``moments``: step numbers, or how many: then the last is the closest approach (or the end, where that comes too soon for so many), the others are spread
+    evenly before it. The states are those of the episode, or of its replay on ``sim``. With ``axes``, the title is that of their figure.
+
+    Raises ValueError for many episodes, states that are missing or another system's, moments outside the episode and too few axes.
+    """
+    states = _states("colav", episode, sim)
+    log, moments = _log(states), _moments(moments, states)
+    low, high = _limits(log, moments)
+    height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
+    with style.axes(axes, (0.7 + 3.7 * len(moments) + 2.2, height + 1.45), 1, len(moments), sharey=True, layout="compressed") as axes:
+        axes = style.panels("colav", axes, len(moments), "moment")[: len(moments)]
+        for ax, t in zip(axes, moments, strict=True):
+            _Panel(ax, log, low, high).show(t)
+            ax.set_xlabel("east (m)")
+        axes[0].set_ylabel("north (m)")
+        axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+        axes[0].figure.suptitle(_headline(episode, states) + "\n", x=0.01, ha="left", fontsize=11)
+    return axes
+
+
+def colav_story(episode, sim=None, axes=None):
+    """One colav `Episode` over time (s): a panel for each kind of disturbance, then the distances (m), then the ferry's speed (m/s). Returns the list of Axes.
+
+    The delay is in seconds where ``sim`` is given, which knows the longest, else a share of it; steering is the turn (rad/s) on top of the route; noise is
+    the size of its errors in position (m) and velocity (m/s). States and errors as for `colav`.
+    """
+    states = _states("colav_story", episode, sim)
+    kinds, log, edges = _kinds(episode, states, sim), _log(states), PERIOD * np.arange(len(states.step))
+    count = len(kinds) + 2
+    with style.axes(axes, (7.4, 1.15 + 1.45 * count), count) as axes:
+        axes = style.panels("colav_story", axes, count, "kind of disturbance, the distances and the speed")[:count]
+        *first, apart, speed = axes
+        for ax, (label, rows) in zip(first, kinds.items(), strict=True):
+            for (name, values), colour, line in zip(rows.items(), (style.INK, style.PURPLE), ("-", (0, (3, 1))), strict=False):
+                ax.stairs(values, edges, baseline=None, color=colour, linestyle=line, linewidth=1.8, label=name, zorder=3, clip_on=False)
+            ax.axhline(0, color=style.GREY, linewidth=1, zorder=1)
+            ax.set(ylabel=label, ylim=(None if any((values < 0).any() for values in rows.values()) else 0, None))
+        gaps = [np.hypot(*(log.ferry - rows)[:, :2].T) for rows in (log.adversary, log.believed)]
+        apart.plot(edges, gaps[0], color=style.VERMILION, marker="o", markersize=3, label="to the adversary")
+        apart.plot(edges, gaps[1], color=BELIEF, linestyle=DASHED, label="to where it is believed")
+        apart.axhline(COLLISION, color=style.INK, linewidth=1, linestyle=":", label=f"collision: {COLLISION:g} m")
+        apart.set(ylabel="distance (m)", ylim=(0, None))
+        speed.stairs(log.order[:-1], edges, baseline=None, color=style.INK, linewidth=1.8, label="ordered")
+        speed.plot(edges, states.velocity.u, color=style.BLUE, linestyle=DASHED, label="actual (surge)")
+        speed.set(ylabel="speed (m/s)", xlabel="time (s)")
+        for ax in axes:
+            ax.set_xlim(0, max(edges[-1], PERIOD))
+            if ax.get_legend_handles_labels()[0]:
+                ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        axes[0].figure.align_ylabels(axes)
+        axes[0].set_title(_headline(episode, states))
+    return axes
+
+
+def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
+    """A panel of `colav` that moves: ``smooth`` frames a step, between states by straight lines. Returns the matplotlib FuncAnimation.
+
+    In a notebook: ``HTML(animation.to_jshtml())``. ``path``: save it too, as .html, .gif or .mp4, ``fps`` frames a second. States and errors as for `colav`;
+    ValueError too for a path that nothing here can write, and for ``fps`` and ``smooth`` that are not positive.
+    """
+    from matplotlib import rc_context
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    states, path = _states("colav_animation", episode, sim), style.writable("colav_animation", path)
+    if not isinstance(fps, Real) or not 0 < fps < math.inf:
+        raise ValueError(f"plot.colav_animation: fps must be a positive number, received {fps!r}")
+    if isinstance(smooth, bool) or not isinstance(smooth, int) or smooth < 1:
+        raise ValueError(f"plot.colav_animation: smooth must be an int of at least 1, received {smooth!r}")
+    log = _log(states)
+    steps = len(states.step) - 1
+    low, high = _limits(log, range(steps + 1))
+    with rc_context(style.STYLE):
+        height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40  # an even number of pixels, as films must have
+        figure = style.frugal()(figsize=(6.6, height), dpi=80, layout="compressed")  # not pyplot's: a notebook would show it a second time
+        FigureCanvasAgg(figure)
+        ax = figure.subplots()
+        panel = _Panel(ax, log, low, high)
+        panel.show(0)
+        ax.set(xlabel="east (m)", ylabel="north (m)")
+        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # the axes stand still from here on
+        animation = FuncAnimation(figure, panel.show, np.arange(steps * smooth + 1) / smooth, interval=1000 / fps, blit=False)
+        if path is not None and path.suffix.lower() == ".html":
+            path.write_text(animation.to_jshtml(fps=fps, default_mode="once"))
+        elif path is not None:
+            animation.save(path, writer=style.WRITERS[path.suffix.lower()], fps=fps)
+    return animation
+
+
+class _Log(NamedTuple):
+    """What the pictures need of an episode's states, row by row."""
+
+    ferry: np.ndarray
+    """[steps + 1, 3]: east (m), north (m), heading (radians, without jumps)."""
+    adversary: np.ndarray
+    believed: np.ndarray
+    order: np.ndarray
+    """[steps + 1]: the speed (m/s) ordered at that state, for the step after it; the last stays."""
+
+
+class _Panel:
+    """A panel of `colav`: its lines and shapes, which `show` puts where they are at a time."""
+
+    def __init__(self, ax, log, low, high):
+        self.log, self.title = log, ax.set_title(" ", loc="left")
+        ax.plot([0, 0], [0, 100], color=style.GREY, linewidth=1, label="the ferry's route", zorder=1)
+        self.ferry = ax.plot([], [], color=style.BLUE, linewidth=2.4, label="ferry", zorder=4)[0]
+        self.adversary = ax.plot([], [], color=style.VERMILION, marker="o", markersize=3, linewidth=1.2, label="adversary (a dot a step)", zorder=4)[0]
+        self.believed = ax.plot([], [], color=BELIEF, linestyle=DASHED, label="adversary as believed", zorder=5)[0]
+        self.error = ax.plot([], [], color=style.INK, linewidth=0.8, marker="o", markersize=2.5, label="from belief to truth", zorder=7)[0]
+        shape = lambda **how: ax.fill([], [], **how)[0]
+        looks = [dict(facecolor=(ZONE, opacity), linestyle=line, label=zone.name) for zone, (opacity, line) in zip(ZONES, SHADES, strict=True)]
+        self.zones = [shape(**look, edgecolor=style.INK, linewidth=0.9, zorder=2) for look in looks]
+        looks = ((style.BLUE, "-", style.INK, 1), (style.VERMILION, "-", style.INK, 1), ("none", DASHED, BELIEF, 1.8))
+        self.hulls = [shape(facecolor=face, linestyle=line, edgecolor=edge, linewidth=width, zorder=6) for face, line, edge, width in looks]
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+
+    def show(self, t):
+        """The panel ``t`` steps after the start, which need not be whole."""
+        now = [_at(rows, t) for rows in self.log[:3]]
+        for line, rows, here in zip((self.ferry, self.adversary, self.believed), self.log[:3], now, strict=True):
+            line.set_data(*np.concatenate([rows[: math.ceil(t)], here[None]])[:, :2].T)
+        self.error.set_data(*np.stack(now[1:])[:, :2].T)
+        for patch, zone in zip(self.zones, ZONES, strict=True):
+            east, north, course = now[2]
+            patch.set_xy(zone_outline(zone, north, east, course))
+        for patch, here in zip(self.hulls, now, strict=True):
+            patch.set_xy(_hull(*here))
+        self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s")
+
+
+def _states(caller, episode, sim):
+    """s_0 .. s_length as NumPy arrays."""
+    states = style.one(caller, episode).states
+    if states is None and sim is None:
+        raise ValueError(f"plot.{caller}: episode must have states, or sim be the simulator to replay it on, received neither")
+    states = replay(sim, episode).states if states is None else states
+    if not isinstance(states, ColavState):
+        raise ValueError(f"plot.{caller}: episode must be of jast.simulators.colav, received states of {type(states).__name__}")
+    return jax.tree.map(lambda a: np.asarray(a)[: int(episode.length) + 1], states)
+
+
+def _log(states):
+    track, adversary = states.track, states.adversary.pose
+    still = np.hypot(track.v_n, track.v_e) < 0.05  # as the planner has it
+    course = np.where(still, 0, np.arctan2(track.v_e, track.v_n))
+    rows = ((states.pose.e, states.pose.n, states.pose.psi), (adversary.e, adversary.n, adversary.psi), (track.e, track.n, course))
+    choice = np.concatenate([states.choice[1:], states.choice[-1:]])
+    return _Log(*(np.stack([e, n, np.unwrap(psi)], -1).astype(float) for e, n, psi in rows), SPEEDS[choice])
+
+
+def _at(rows, t):
+    """The row at ``t``, between two by a straight line; at a whole number the row itself."""
+    return np.array([np.interp(t, np.arange(len(rows)), column) for column in rows.T])
+
+
+def _hull(east, north, heading):
+    """[points, 2]: a ship's outline in (east, north)."""
+    ahead, right = HULL.T
+    return np.stack([east + ahead * np.sin(heading) + right * np.cos(heading), north + ahead * np.cos(heading) - right * np.sin(heading)], -1)
+
+
+def _limits(log, moments):
+    """Corners (east, north) that hold the paths up to the last moment, and the high penalty region at each: the low one would make the ships small."""
+    ships = [rows[: max(moments) + 1, :2] for rows in log[:3]]
+    zones = [zone_outline(ZONES[1], *log.believed[t][[1, 0, 2]]) for t in moments]
+    points = np.concatenate(ships + zones)
+    return points.min(0) - 5, points.max(0) + 5
+
+
+def _moments(moments, states):
+    last = len(states.step) - 1
+    wrong = ValueError(f"plot.colav: moments must be at least 1, or step numbers in 0 .. {last}, received {moments!r}")
+    try:
+        if np.ndim(moments) == 0:
+            count = index(moments)
+            nearest = int(np.argmin(states.near))
+            end = nearest if nearest >= count else last
+            chosen = np.unique(np.linspace(0, end, count + 1).round().astype(int)[-count:]) if count > 0 else ()
+        else:
+            chosen = [index(t) for t in moments]
+    except TypeError:
+        raise wrong from None
+    if not len(chosen) or not all(0 <= t <= last for t in chosen):
+        raise wrong
+    return [int(t) for t in chosen]
+
+
+def _headline(episode, states):
+    nearest = int(np.argmin(states.near))
+    return style.headline(
+        "Ferry and adversary", episode, f"\nclosest approach {states.near[nearest]:.2f} m by t = {nearest * PERIOD:g} s (collision: below {COLLISION:g} m)"
+    )
+
+
+def _kinds(episode, states, sim):
+    """``{label: {name: [steps] values}}``, a label for each kind of disturbance."""
+    n, x = int(episode.length), episode.disturbances
+    if not isinstance(x, dict):  # one kind: which, is told by what the states remember
+        steered = np.ndim(x) == 1 and np.allclose(x[:n], states.steering[1:]) and not states.delay.any()
+        x = {"noise" if np.ndim(x) == 2 else "steering" if steered else "delay": x}
+    x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
+    model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
+    longest = getattr(model, "longest", None)
+    size = lambda rows: np.hypot(*rows.T)
+    of = {
+        "delay": lambda a: ("delay (share)", {"": a}) if longest is None else ("delay (s)", {"": a * float(longest)}),
+        "steering": lambda a: ("steering (rad/s)", {"": a - 0.5}),
+        "noise": lambda a: ("size of noise", {"position (m)": size(a[:, :2]), "velocity (m/s)": size(a[:, 2:])}),
+    }
+    return dict(of[kind](x[kind]) for kind in of if kind in x)

@@ -1,0 +1,94 @@
+"""What the pictures share: colours, settings of matplotlib, and small helpers."""
+
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from jast.episode import Episode
+
+__all__ = [
+    "BLUE", "COLOURS", "GREEN", "GREY", "INK", "ORANGE", "PURPLE", "SKY", "STYLE", "VERMILION", "WRITERS",
+    "axes", "frugal", "halo", "headline", "one", "panels", "shade", "writable",
+]  # fmt: skip
+
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+INK, GREY = "#222222", "#8A8A8A"
+STYLE = {
+    "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left", "axes.titlepad": 10, "axes.labelcolor": INK, "text.color": INK, "axes.edgecolor": GREY,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#E6E6E6", "grid.linewidth": 0.8,
+    "xtick.color": GREY, "ytick.color": GREY, "xtick.labelcolor": INK, "ytick.labelcolor": INK, "legend.frameon": False, "lines.linewidth": 1.8,
+    "figure.dpi": 110,
+}  # fmt: skip
+WRITERS = {".mp4": "ffmpeg", ".gif": "pillow", ".html": "html"}  # an animation's suffix: what writes it
+
+
+@contextmanager
+def axes(given, size, rows=1, columns=1, sharey=False, layout="constrained"):
+    """The given axes, or those of a new figure; the style of these pictures while drawing."""
+    import matplotlib.pyplot as plt
+
+    with plt.rc_context(STYLE):
+        yield given if given is not None else plt.subplots(rows, columns, figsize=size, sharex=True, sharey=sharey, layout=layout)[1]
+
+
+def halo():
+    """A white rim, so that a word stays legible on a line."""
+    from matplotlib.patheffects import withStroke
+
+    return [withStroke(linewidth=3, foreground="white")]
+
+
+def headline(what, episode, more=""):
+    """What happened, and the numbers that identify the episode."""
+    outcome = f"{'failure at step' if episode.failure else 'no failure, steps:'} {int(episode.length)}"
+    return f"{what}: {outcome}\nreward {float(episode.reward):.3f},  log p {float(episode.log_prob):.3f}{more}"
+
+
+def one(caller, episode):
+    """``episode``, or a ValueError where it is not one `Episode`."""
+    if not isinstance(episode, Episode) or np.ndim(episode.length):
+        received = type(episode).__name__ + (f" with leading axes {np.shape(episode.length)}" if isinstance(episode, Episode) else "")
+        raise ValueError(f"plot.{caller}: episode must be one Episode, received {received}")
+    return episode
+
+
+def panels(caller, axes, least, each):
+    """The axes as a flat list, or a ValueError where they are fewer than ``least``, one for ``each``."""
+    axes = np.atleast_1d(np.asarray(axes, object)).ravel().tolist()
+    if len(axes) < least:
+        raise ValueError(f"plot.{caller}: axes must be at least {least}, one for each {each}, received {len(axes)}")
+    return axes
+
+
+def frugal():
+    """A `Figure` whose PNGs have 256 colours, which are all that one needs: a third of the bytes in an animation's HTML."""
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    class Frugal(Figure):
+        def savefig(self, fname, **settings):
+            if settings.get("format") != "png":
+                return super().savefig(fname, **settings)
+            super().savefig(whole := BytesIO(), **settings)
+            Image.open(whole).convert("RGB").quantize(256).save(fname, "png", optimize=True)
+
+    return Frugal
+
+
+def shade(u):
+    """A colour for u in [0, 1]."""
+    import matplotlib
+
+    return matplotlib.colormaps["cividis"](u)
+
+
+def writable(caller, path):
+    """``path`` as a `Path`, or a ValueError where nothing here can write it."""
+    from matplotlib.animation import writers
+
+    able = [suffix for suffix, writer in WRITERS.items() if writers.is_available(writer)]
+    if path is not None and Path(path).suffix.lower() not in able:
+        raise ValueError(f"plot.{caller}: path must end in one of {able}, which can be written here, received {str(path)!r}")
+    return None if path is None else Path(path)
