@@ -8,11 +8,16 @@ __all__ = ["positive"]
 
 
 def positive(function, **values):
-    """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless positive (not looked at while traced)."""
-    arrays = {name: jnp.asarray(value) for name, value in values.items()}
-    floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
+    """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless positive and finite (not looked at while traced)."""
+    for name, value in values.items():
+        if not (isinstance(value, jax.core.Tracer) and value.shape == () or _is_positive(value)):
+            raise ValueError(f"{function}: {name} must be a positive number, received {value!r}")
+    arrays = [jnp.asarray(value) for value in values.values()]
+    floats = [a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.zeros(()).dtype
-    for name, a in arrays.items():
-        if a.shape != () or not (isinstance(a, jax.core.Tracer) or np.asarray(a) > 0):
-            raise ValueError(f"{function}: {name} must be a positive number, received {values[name]!r}")
-    return [a.astype(dtype) for a in arrays.values()]
+    return [a.astype(dtype) for a in arrays]
+
+
+def _is_positive(value):
+    a = np.asarray(value)
+    return a.shape == () and a.dtype.kind in "iuf" and bool(np.isfinite(a) and a > 0)

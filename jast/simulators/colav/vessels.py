@@ -90,7 +90,7 @@ def forces(control, pose, velocity):
 def ferry_substep(pose, velocity, control, command, dt):
     """Pose, velocity and control ``dt`` seconds on, with the planner's speed ``command`` (m/s).
 
-    M nu' + C(nu) nu + D(nu) nu = tau; damping implicit, the pose with the new velocity: first order, and stable up to a step of 3 s.
+    M nu' + C(nu) nu + D(nu) nu = tau; damping implicit, the pose with the new velocity: first order, stable up to a step of 1.5 s.
     """
     thrust = forces(control, pose, velocity)
     u, v, r = velocity

@@ -1,0 +1,200 @@
+"""The ferry with collision avoidance: how often it fails by itself, what the searches find, and what keeping its states is worth.
+
+``python -m benchmarks.colav [--json] [--quick]``. The searches have 22 roots of 50 simulations, as published for S1. Rates have 95 % Clopper-Pearson intervals.
+CPU times are those of one core, compilation excluded, the best of several alternated runs, measured in a process whose XLA has one thread.
+"""
+
+import argparse
+import functools
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jast
+from benchmarks.engine import cpu
+from benchmarks.ferry import timed
+from jast import actions
+from jast.counter import tree_keys
+from jast.estimate.intervals import clopper_pearson
+from jast.search import run
+from jast.search.choice import Choice
+from jast.search.forest import MODES
+from jast.search.tree import Problem, Settings, widths
+from jast.simulators.colav import SCENARIOS, colav
+
+REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")  # the published bonus
+PRUNES, SIMULATIONS = 22, 50  # published
+ALL = ("delay", "steering", "noise")
+SUBSTEPS = (1, 3, 10, 30, 100, 300)
+
+
+def nominal(scenario, kind, episodes):
+    """How often the system fails when disturbances are drawn from their densities."""
+    found = jast.nominal(jax.random.key(0), colav(scenario, kind), episodes=episodes)
+    quiet = found.undisturbed
+    return {
+        "undisturbed_distance_m": float(quiet.distance),
+        "undisturbed_fails": bool(quiet.failure),
+        "episodes": found.episodes,
+        "failures": found.failures,
+        "rate": found.rate,
+        "rate_95": list(found.interval),
+        "mean_distance_m": found.mean_distance,
+    }
+
+
+def search(scenario, kind, trees, heads=None, seed=0):
+    """Trees of the default search that find a collision, beside random searches of as many episodes each."""
+    sim, each = colav(scenario, kind), PRUNES * SIMULATIONS
+    result, seconds, _ = timed(
+        lambda: jast.search.forest(jax.random.key(seed), sim, trees=trees, prunes=PRUNES, simulations=SIMULATIONS, reward=REWARD, heads=heads)
+    )
+    found = int(result.failing.sum())
+    return {
+        "trees": trees,
+        "failing_trees": found,
+        "share": found / trees,
+        "share_95": list(clopper_pearson(found, trees)),
+        "best": float(result.best.reward),
+        "best_distance_m": float(result.best.distance),
+        "episodes": result.episodes,
+        "steps": result.simulator_steps,
+        "cpu_s": seconds,
+        "episodes_each": each,
+    }
+
+
+def random_search(scenario, kind, runs, seed=1):
+    """Random searches of as many episodes as a tree has simulations: how many find a collision. One program of many runs."""
+    sim, each = colav(scenario, kind), PRUNES * SIMULATIONS
+    failing = _random(sim, jax.random.split(jax.random.key(seed), runs), each)
+    found = int(np.sum(failing > 0))
+    return {"runs": runs, "failing_runs": found, "share": found / runs, "share_95": list(clopper_pearson(found, runs)), "failures": int(np.sum(failing))}
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _random(sim, keys, episodes):
+    def one(key):
+        def chunk(key):
+            return jnp.sum(jax.vmap(lambda k: jast.rollout(k, sim).failure)(jax.random.split(key, 110)), dtype=jnp.int32)
+
+        return jnp.sum(jax.lax.map(chunk, jax.random.split(key, episodes // 110)))
+
+    return jax.lax.map(one, keys)
+
+
+def problem(sim, mode, total):
+    """What the forest grows, with draws of the model for actions."""
+    settings = MODES[mode]
+    choice = Choice(actions.samples(), jnp.float32(1.0), spread=settings["spread"], focused=False)
+    return jax.tree.map(jnp.asarray, Problem(sim, REWARD, choice, Settings(jnp.float32(10.0), widths(total, *settings["widening"]))))
+
+
+def grown(p, keys, prunes, simulations, children, memoize):
+    """A forest in one thread, without its result: simulator steps by tree."""
+    tree = run._make(p, keys, prunes * simulations, memoize)
+    for turn in range(prunes):
+        tree = run._grow(p, tree, turn * simulations, (turn + 1) * simulations, memoize)
+        tree, _ = run._prune(p, tree, children, memoize)
+    return tree.steps
+
+
+def memoization(substeps, mode, simulations, trees, repeats):
+    """CPU microseconds and simulator steps of a simulation, by where states are kept; and of MCTS-SA, one root, whose simulations all begin at the start."""
+    total = PRUNES * simulations
+    p, keys = problem(colav("sharp turn", substeps=substeps), mode, total), tree_keys(jax.random.key(0), trees)
+    children = int(p.settings.widths.max())
+    runs = {name: functools.partial(grown, p, keys, PRUNES, simulations, children, name) for name in ("node", "root", "none")}
+    runs["MCTS-SA"] = functools.partial(grown, p, keys, 1, total, children, "none")
+    steps = {name: float(np.mean(jax.device_get(function()))) / total for name, function in runs.items()}
+    seconds = {name: float("inf") for name in runs}
+    for _ in range(repeats):
+        for name, function in runs.items():
+            seconds[name] = min(seconds[name], cpu(function)[0])
+    us = {name: s / total / trees * 1e6 for name, s in seconds.items()}
+    ratios = {f"{a}/{b}": us[a] / us[b] for a, b in (("node", "none"), ("root", "none"), ("node", "MCTS-SA"), ("root", "MCTS-SA"))}
+    return {"mode": mode, "simulations": simulations, "trees": trees, "substeps": substeps, "us": us, "steps": steps, "ratios": ratios}
+
+
+def alone(calls):
+    """`memoization` of each of these arguments, in a process whose XLA has one thread."""
+    code = f"import json; from benchmarks import colav; [print(json.dumps(colav.memoization(*c)), flush=True) for c in {calls!r}]"
+    env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
+    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout.splitlines()
+    return [json.loads(line) for line in lines if line.startswith("{")]
+
+
+def picture(rows, path):
+    """Figure 5 of the paper, measured: the CPU time of a simulation by the substeps of a step."""
+    from jast.plot import style
+
+    with style.axes(None, (6.8, 4.2)) as ax:
+        for (name, label), colour, marker in zip(
+            {"MCTS-SA": "MCTS-SA, full simulations", "none": "forest, no states", "root": "states at roots", "node": "states at every node"}.items(),
+            style.COLOURS,
+            "osD^",
+            strict=False,
+        ):
+            ax.loglog([r["substeps"] for r in rows], [r["us"][name] for r in rows], color=colour, marker=marker, label=label)
+        ax.set(xlabel="substeps of a search step", ylabel="CPU time of a simulation (µs)")
+        ax.legend(loc="upper left")
+        ax.figure.savefig(path, dpi=120)
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.colav", description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quick", action="store_true", help="fewer episodes, trees and rows: under two minutes")
+    parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
+    args = parser.parse_args(argv)
+    say = (lambda *a: None) if args.json else functools.partial(print, flush=True)
+    percent = lambda r, name: f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
+    report = {"nominal": {}, "searches": {}, "memoization": []}
+
+    say("nominal: least distance undisturbed, and failures when disturbances are drawn from their densities")
+    for scenario in SCENARIOS:
+        for kind in ("delay", "steering") if args.quick else (*ALL, ALL):
+            name = f"{scenario}, {kind if isinstance(kind, str) else 'all three'}"
+            r = report["nominal"][name] = nominal(scenario, kind, 20_000 if args.quick else 1_000_000)
+            say(
+                f"  {name:26} {r['undisturbed_distance_m']:6.2f} m   {r['failures']:6d} of {r['episodes']}, {r['rate']:.2e} [{r['rate_95'][0]:.1e}, {r['rate_95'][1]:.1e}]"
+            )
+
+    say(f"\ntrees of {PRUNES} x {SIMULATIONS} that find a collision, and random searches of as many episodes")
+    rows = [(s, k) for k in ("delay", "steering") for s in SCENARIOS]
+    if args.quick:
+        rows = [("sharp turn", "delay"), ("head-on", "steering")]
+    for scenario, kind in rows:
+        trees = 64 if args.quick else 200
+        r = {"random": random_search(scenario, kind, trees), "forest": search(scenario, kind, trees)}
+        if not args.quick:
+            r["forest, heads"] = search(scenario, kind, trees, heads="both")
+        report["searches"][f"{scenario}, {kind}"] = r
+        for name, row in r.items():
+            more = f"best {row['best']:8.2f}, {row['best_distance_m']:.2f} m, {row['cpu_s']:.0f} CPU s" if "best" in row else ""
+            say(f"  {scenario + ', ' + kind:26} {name:14} {percent(row, 'share'):24} {more}")
+
+    say("\nCPU time of a simulation (us) and its steps, by where states are kept")
+    if args.quick:
+        calls = [(30, "default", 20, 64, 1)]
+    else:
+        calls = [(30, mode, n, 128, 3) for mode in ("default", "paper") for n in (20, 50)] + [(30, "paper", 500, 32, 1)]
+        calls += [(n, "default", 20, 64, 2) for n in SUBSTEPS]
+    for r in alone(calls):
+        report["memoization"].append(r)
+        cells = ", ".join(f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"])
+        ratios = ", ".join(f"{name} {value:.2f}" for name, value in r["ratios"].items())
+        say(f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']}, {r['trees']} trees: {cells}; {ratios}")
+    if args.picture:
+        picture(report["memoization"][-len(SUBSTEPS) :], args.picture)
+    if args.json:
+        print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()
