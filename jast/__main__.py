@@ -22,6 +22,7 @@ SYSTEMS = {  # name: the simulator, the reward and the actions of a search
     "ferry": (simulators.ferry, STANDARD, actions.uniform(0.0, 1.0)),
     "ferry-b": (lambda: simulators.ferry(adversary=(17.0, 0.0)), STANDARD, actions.uniform(0.0, 1.0)),
     "walk1d": (simulators.walk1d, STANDARD, actions.uniform(-1.0, 1.0)),
+    "colav": (simulators.colav, rewards.standard(event_bonus=200.0, density="mode"), actions.samples()),
     "landing": (simulators.landing, rewards.shaped(100.0, event_bonus=30.0, density="mode"), actions.uniform(-0.15, 0.15)),
 }
 ITERATIONS = 10  # of the cross-entropy method, which keeps a tenth of the samples of each
@@ -55,7 +56,12 @@ def main(argv=None):
 def _parser():
     parser = argparse.ArgumentParser("python -m jast", description="Find the likeliest failure of a built-in system, with Monte Carlo as the baseline.")
     add = parser.add_argument
-    add("--simulator", choices=SYSTEMS, default="ferry", help="system under test (default: ferry; ferry-b is its easier variant S0b)")
+    add(
+        "--simulator",
+        choices=SYSTEMS,
+        default="ferry",
+        help="system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids collisions with late sensors)",
+    )
     add("--method", choices=["forest", "mcts", "cem", "monte-carlo"], default="forest", help="search (default: forest)")
     add("--trees", type=_count, default=200, metavar="N", help="independent searches (default: 200)")
     add("--simulations", type=_count, metavar="N", help="simulations per root (forest, default: 500) or per tree (the others, default: 9000)")
@@ -145,7 +151,8 @@ def _draw(options, sim, results):
     from matplotlib import pyplot as plt
 
     best = results[options.method].best
-    first = plot.ferry(best, sim) if options.simulator.startswith("ferry") else plot.disturbances(best)[0]
+    draw = {"ferry": plot.ferry, "ferry-b": plot.ferry, "colav": lambda *of: plot.colav(*of)[0]}.get(options.simulator)
+    first = plot.disturbances(best)[0] if draw is None else draw(best, sim)
     for name, ax in dict(episode=first, history=plot.history(results, total=True)).items():
         path = options.output / f"{name}.png"
         ax.figure.savefig(path, dpi=120)

@@ -91,7 +91,6 @@ def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
     In a notebook: ``HTML(animation.to_jshtml())``. ``path``: save it too, as .html, .gif or .mp4, ``fps`` frames a second. States and errors as for `colav`;
     ValueError too for a path that nothing here can write, and for ``fps`` and ``smooth`` that are not positive.
     """
-    from matplotlib import rc_context
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -103,7 +102,7 @@ def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
     log = _log(states)
     steps = len(states.step) - 1
     low, high = _limits(log, range(steps + 1))
-    with rc_context(style.STYLE):
+    with style.styled():
         height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40  # an even number of pixels, as films must have
         figure = style.frugal()(figsize=(6.6, height), dpi=80, layout="compressed")  # not pyplot's: a notebook would show it a second time
         FigureCanvasAgg(figure)

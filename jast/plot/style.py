@@ -10,7 +10,7 @@ from jast.episode import Episode
 
 __all__ = [
     "BLUE", "COLOURS", "GREEN", "GREY", "INK", "ORANGE", "PURPLE", "SKY", "STYLE", "VERMILION", "WRITERS",
-    "axes", "frugal", "halo", "headline", "one", "panels", "shade", "writable",
+    "axes", "frugal", "halo", "headline", "one", "panels", "shade", "styled", "writable",
 ]  # fmt: skip
 
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -29,8 +29,21 @@ def axes(given, size, rows=1, columns=1, sharey=False, layout="constrained"):
     """The given axes, or those of a new figure; the style of these pictures while drawing."""
     import matplotlib.pyplot as plt
 
-    with plt.rc_context(STYLE):
+    with styled():
         yield given if given is not None else plt.subplots(rows, columns, figsize=size, sharex=True, sharey=sharey, layout=layout)[1]
+
+
+@contextmanager
+def styled():
+    """The style of these pictures. Only what it sets is put back: `rc_context` would also undo what a notebook sets when it makes its first figure."""
+    from matplotlib import rcParams
+
+    before = {name: rcParams[name] for name in STYLE}
+    rcParams.update(STYLE)
+    try:
+        yield
+    finally:
+        rcParams.update(before)
 
 
 def halo():
