@@ -21,16 +21,25 @@ from benchmarks.ferry import timed
 from jast import actions
 from jast.counter import tree_keys
 from jast.estimate.intervals import clopper_pearson
+from jast.rewards import as_pytree
 from jast.search import run
 from jast.search.choice import Choice
 from jast.search.forest import MODES
 from jast.search.tree import Problem, Settings, widths
 from jast.simulators.colav import SCENARIOS, colav
 
-REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")  # the published bonus
+REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
 PRUNES, SIMULATIONS = 22, 50  # published
 ALL = ("delay", "steering", "noise")
 SUBSTEPS = (1, 3, 10, 30, 100, 300)
+
+
+def published(log_p, event, distance, terminal, approach):
+    """The reward of S1: ten times the log densities, and 200 for a collision or less 50 times the miss distance."""
+    return 10 * log_p + jnp.where(terminal, jnp.where(event, 200.0, -50 * distance), 0)
+
+
+published.density = "mode"
 
 
 def nominal(scenario, kind, episodes):
@@ -89,10 +98,10 @@ def _random(sim, keys, episodes):
 
 
 def problem(sim, mode, total):
-    """What the forest grows, with draws of the model for actions."""
-    settings = MODES[mode]
+    """What the forest grows, with draws of the model for actions; in paper mode with the published reward."""
+    settings, reward = MODES[mode], as_pytree(published if mode == "paper" else REWARD)
     choice = Choice(actions.samples(), jnp.float32(1.0), spread=settings["spread"], focused=False)
-    return jax.tree.map(jnp.asarray, Problem(sim, REWARD, choice, Settings(jnp.float32(10.0), widths(total, *settings["widening"]))))
+    return jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.float32(10.0), widths(total, *settings["widening"]))))
 
 
 def grown(p, keys, prunes, simulations, children, memoize):
@@ -122,11 +131,14 @@ def memoization(substeps, mode, simulations, trees, repeats):
 
 
 def alone(calls):
-    """`memoization` of each of these arguments, in a process whose XLA has one thread."""
+    """`memoization` of each of these arguments, one after the other, in a process whose XLA has one thread."""
     code = f"import json; from benchmarks import colav; [print(json.dumps(colav.memoization(*c)), flush=True) for c in {calls!r}]"
     env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
-    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout.splitlines()
-    return [json.loads(line) for line in lines if line.startswith("{")]
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=env) as process:
+        for line in process.stdout:
+            yield json.loads(line)
+    if process.returncode:
+        raise RuntimeError(f"the measuring process ended with status {process.returncode}")
 
 
 def picture(rows, path):
@@ -150,6 +162,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(prog="python -m benchmarks.colav", description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="fewer episodes, trees and rows: under two minutes")
+    parser.add_argument("--memoization", action="store_true", help="only what keeping states is worth")
     parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
     args = parser.parse_args(argv)
     say = (lambda *a: None) if args.json else functools.partial(print, flush=True)
@@ -157,7 +170,7 @@ def main(argv=None):
     report = {"nominal": {}, "searches": {}, "memoization": []}
 
     say("nominal: least distance undisturbed, and failures when disturbances are drawn from their densities")
-    for scenario in SCENARIOS:
+    for scenario in () if args.memoization else SCENARIOS:
         for kind in ("delay", "steering") if args.quick else (*ALL, ALL):
             name = f"{scenario}, {kind if isinstance(kind, str) else 'all three'}"
             r = report["nominal"][name] = nominal(scenario, kind, 20_000 if args.quick else 300_000)
@@ -168,7 +181,7 @@ def main(argv=None):
     rows = [(s, k) for k in ("delay", "steering") for s in SCENARIOS]
     if args.quick:
         rows = [("sharp turn", "delay"), ("head-on", "steering")]
-    for scenario, kind in rows:
+    for scenario, kind in () if args.memoization else rows:
         trees = 64 if args.quick else 200
         r = {"random": random_search(scenario, kind, trees), "forest": search(scenario, kind, trees)}
         if not args.quick:
@@ -180,10 +193,9 @@ def main(argv=None):
 
     say("\nCPU time of a simulation (us) and its steps, by where states are kept")
     if args.quick:
-        calls = [(30, "default", 20, 64, 1)]
+        calls = [(30, "paper", 20, 64, 1)]
     else:
-        calls = [(30, mode, n, 128, 3) for mode in ("default", "paper") for n in (20, 50)] + [(30, "paper", 500, 32, 1)]
-        calls += [(n, "default", 20, 64, 2) for n in SUBSTEPS]
+        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [(n, "paper", 20, 64, 2) for n in SUBSTEPS]
     for r in alone(calls):
         report["memoization"].append(r)
         cells = ", ".join(f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"])
