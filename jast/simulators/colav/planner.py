@@ -1,8 +1,8 @@
 """The ferry's collision avoidance: safety zones around the tracked obstacle, and the speed along the path that keeps out of them.
 
 Path-velocity decomposition: the path is fixed, the planner chooses a speed. It predicts the obstacle at the tracker's velocity, and for each candidate speed
-adds up what the zones that the ferry would enter cost. Zones and weights are those published for S1 (Lytskjold and Mengshoel); how its planner combines them
-is not, so the sum below is ours.
+adds up what the zones that the ferry would enter cost. The zones, the weights of the two penalty regions and of slowness, and the rule for keeping a speed are
+those published for S1 (Lytskjold and Mengshoel); the weight of the region of collision, the prediction and the sum of it all are ours.
 """
 
 from typing import NamedTuple

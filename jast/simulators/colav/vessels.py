@@ -18,10 +18,11 @@ __all__ = ["Adversary", "Control", "Pose", "Velocity", "adversary_substep", "ene
 MASS = (2389.657, 2533.911, 5068.910)  # kg, kg, kg m^2
 LINEAR, QUADRATIC, CUBIC = (27.632, 52.948, 122.861), (110.064, 116.487, 874.428), (13.965, 24.313, 0.0)  # damping X, Y, N
 KP, KI, KD = (200.0, 200.0, 800.0), (10.0, 10.0, 15.0), (700.0, 700.0, 1600.0)
-THRUST = (1000.0, 1000.0, 2000.0)  # greatest force (N) and moment (N m), each way
+THRUST = (1000.0, 1000.0, 2000.0)  # greatest force (N) and moment (N m), each way: ours
 REACH = 5.0  # greatest position error that the controller sees, m (published: initial and along-path error 5)
-LAGS = (3.0, 5.0, 3.0)  # time constants of the adversary's surge, sway and yaw rate, s
-ACCELERATION = 0.15  # greatest change of the reference speed, m/s^2
+LAGS = (3.0, 5.0, 3.0)  # time constants of the adversary's surge, sway and yaw rate, s: published
+ACCELERATION = 0.15  # greatest change of the reference speed, m/s^2: ours
+WINDUP = 20.0  # greatest integral of an error (m s, rad s): ours
 
 
 class Pose(NamedTuple):
@@ -104,7 +105,7 @@ def ferry_substep(pose, velocity, control, command, dt):
     along = jnp.clip(control.along + dt * speed, pose.n - REACH, pose.n + REACH)  # the reference waits for the ferry
     clipped = lambda x, most: jnp.clip(x, -most, most)
     sums = (control.sum_n + dt * clipped(control.along - pose.n, REACH), control.sum_e - dt * clipped(pose.e, REACH), control.sum_psi - dt * _wrapped(pose.psi))
-    return pose, velocity, Control(along, speed, *(clipped(x, 20.0) for x in sums))
+    return pose, velocity, Control(along, speed, *(clipped(x, WINDUP) for x in sums))
 
 
 def adversary_substep(adversary, command, dt):
