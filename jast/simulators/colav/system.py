@@ -18,7 +18,7 @@ from jast.simulators.colav.scenarios import SCENARIOS, Scenario
 from jast.simulators.colav.tracker import BUFFER, PERIOD, Track
 from jast.simulators.colav.vessels import Adversary, Control, Pose, Velocity, adversary_substep, ferry_substep, world_velocity
 
-__all__ = ["COLLISION", "DOCK", "ColavState", "colav", "kinds_of"]
+__all__ = ["COLLISION", "ColavState", "colav"]
 
 KINDS = ("delay", "steering", "noise")
 COLLISION = 1.0  # m between the centres: published
@@ -89,7 +89,7 @@ def colav(
     Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has other shapes, a delay beyond the buffer, substeps below 1,
     scales that are not positive and finite, and an easing above 1.
     """
-    kinds = kinds_of(disturbances)
+    kinds = _kinds(disturbances)
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
         raise ValueError(f"colav: substeps must be an int of at least 1, received {substeps!r}")
     if not isinstance(noise, tuple | list) or len(noise) != 2:
@@ -110,7 +110,7 @@ def colav(
     )  # fmt: skip
 
 
-def kinds_of(disturbances):
+def _kinds(disturbances):
     """The kinds of disturbance as a tuple; ValueError for what is none."""
     kinds = tuple(disturbances) if isinstance(disturbances, tuple | list) else (disturbances,)
     if not kinds or not all(kind in KINDS for kind in kinds) or len(set(kinds)) != len(kinds):
