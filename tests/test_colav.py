@@ -1157,3 +1157,23 @@ def test_bad_input(bad, match):
 def test_infinite_scales_are_refused(argument):
     with pytest.raises(ValueError, match=f"colav: {argument}"):
         colav(**{argument: (np.inf, 1.0) if argument == "noise" else np.inf})
+
+
+def test_a_traced_delay_beyond_the_buffer_is_that_of_the_buffer():
+    """As far as the past is kept; while it is traced nothing can be refused."""
+
+    @jax.jit
+    def tracks(longest):
+        sim = colav(longest_delay=longest)
+        return lax.scan(lambda s, a: (sim.step(s, a),) * 2, sim.init(()), jnp.ones(STEPS))[1].track
+
+    for far, most in zip(tracks(80.0), tracks(40.0), strict=True):
+        np.testing.assert_array_equal(far, most)
+
+
+def test_scales_may_be_arrays_and_are_refused_by_name():
+    assert jast.check(colav(disturbances="noise", noise=np.array([0.3, 0.1]))).horizon == STEPS
+    with pytest.raises(ValueError, match="colav: delay_change must be a positive number"):
+        jax.jit(lambda width: colav(delay_change=width).horizon)(jnp.ones(2))
+    with pytest.raises(ValueError, match=r"colav: delay_change must be a positive number, received \[1.0, \[2.0\]\]"):
+        colav(delay_change=[1.0, [2.0]])

@@ -230,11 +230,11 @@ def _headline(episode, states):
 def _kinds(episode, states, sim):
     """``{label: {name: [steps] values}}``, a label for each kind of disturbance."""
     n, x = int(episode.length), episode.disturbances
-    if not isinstance(x, dict):  # one kind: which, is told by what the states remember
-        steered = np.ndim(x) == 1 and np.allclose(x[:n], states.steering[1:]) and not states.delay.any()
-        x = {"noise" if np.ndim(x) == 2 else "steering" if steered else "delay": x}
-    x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
     model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
+    if not isinstance(x, dict):  # one kind: which, the simulator says, or what the states remember
+        steered = np.ndim(x) == 1 and np.allclose(np.clip(x[:n], 0, 1), states.steering[1:]) and not states.delay.any()
+        x = {model.kinds[0] if hasattr(model, "kinds") else "noise" if np.ndim(x) == 2 else "steering" if steered else "delay": x}
+    x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
     longest = getattr(model, "longest", None)
     size = lambda rows: np.hypot(*rows.T)
     of = {

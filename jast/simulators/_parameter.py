@@ -10,7 +10,7 @@ __all__ = ["positive"]
 def positive(function, **values):
     """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless positive and finite (not looked at while traced)."""
     for name, value in values.items():
-        if not (isinstance(value, jax.core.Tracer) and value.shape == () or _is_positive(value)):
+        if not (value.shape == () if isinstance(value, jax.core.Tracer) else _is_positive(value)):
             raise ValueError(f"{function}: {name} must be a positive number, received {value!r}")
     arrays = [jnp.asarray(value) for value in values.values()]
     floats = [a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
@@ -19,5 +19,8 @@ def positive(function, **values):
 
 
 def _is_positive(value):
-    a = np.asarray(value)
-    return a.shape == () and a.dtype.kind in "iuf" and bool(np.isfinite(a) and a > 0)
+    try:
+        a = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return False
+    return a.shape == () and (jnp.issubdtype(a.dtype, jnp.floating) or jnp.issubdtype(a.dtype, jnp.integer)) and bool(0 < a < np.inf)

@@ -2,7 +2,8 @@
 
 Path-velocity decomposition: the path is fixed, the planner chooses a speed. It predicts the obstacle at the tracker's velocity, and for each candidate speed
 adds up what the zones that the ferry would enter cost. The zones, the weights of the two penalty regions and of slowness, and the rule for keeping a speed are
-those published for S1 (Lytskjold and Mengshoel); the weight of the region of collision, the prediction and the sum of it all are ours.
+those published for S1 (Lytskjold and Mengshoel); the weight of the region of collision, the prediction, the sum of it all, and planning
+every 3 s (published: 5 s) are ours.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,7 @@ ZONES = (
 DESIRED = 0.75  # m/s
 SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])  # candidates, m/s: published range
 FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
-STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end
+STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end: ours (published horizon: up to 600)
 SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
 KEEP = 0.8  # the speed in force stays unless another costs less than this share of it ...
 KEEP_LEAST = 20.0  # ... and this much less

@@ -69,7 +69,8 @@ def colav(
 ):  # fmt: skip
     """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s, with states of 90 numbers.
 
-    ``scenario``: "head-on", "crossing", "overtaking", "sharp turn", or a `Scenario` of your own. ``disturbances``, one or several of:
+    ``scenario``: "head-on", "crossing", "overtaking", "sharp turn", or a `Scenario` of your own (``from
+    jast.simulators.colav import Scenario``). ``disturbances``, one or several of:
 
     - "delay": the ferry's sensors show the adversary as it was a x ``longest_delay`` seconds ago (at most 40, and nothing before the start), a in [0, 1] drawn
       each step: tent-shaped around ``delay_easing`` times the last a, of half width ``delay_change``. Undisturbed: 0.
@@ -78,13 +79,15 @@ def colav(
     - "noise": errors of the sensed position (two, in m) and velocity (two, in m/s), normal of standard deviations ``noise``, one draw a step. Undisturbed: 0.
 
     With one kind x is its array (scalar, scalar, [4]), with several a dict of them by name. The published step rewards of delay and steering are
-    ln(1 - |a - a'|) up to a factor, with -0.5 a for a delay (for which the easing stands here), and the mean absolute error for noise.
+    ln(1 - |a - a'|) up to a factor, with -0.5 a for a delay (for which the easing stands here); the published steering stands in place of a route, the
+    published noise is within 0.5 and costs its mean absolute value. The past is kept at the ends of steps and read in between (`tracker`), not as a buffer
+    of samples.
 
     In a step the planner looks at the track and commands a speed (`planner`); then, ``substeps`` times (static), the adversary moves, the tracker takes in
     what the sensors show, and the ferry follows its path (`vessels`). Miss distance: least distance between the centres at substeps; failure below 1 m. Ends
     when the ferry is at the dock (99 m). Distances are in metres; the dtype is JAX's default float. At the default 30 substeps the ferry's path is right to
-    10 cm; one substep of 3 s is not stable and serves measurements of time only. The planner's choice is among speeds, so the miss distance has no useful
-    gradient in delays and noise.
+    10 cm; one substep of 3 s is unstable but for small motions and serves measurements of time. The planner's choice is among speeds, so the miss distance
+    has no useful gradient in delays and noise.
 
     Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has other shapes, a delay beyond the buffer, substeps below 1,
     scales that are not positive and finite, and an easing above 1.
@@ -92,11 +95,13 @@ def colav(
     kinds = _kinds(disturbances)
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
         raise ValueError(f"colav: substeps must be an int of at least 1, received {substeps!r}")
-    if not isinstance(noise, tuple | list) or len(noise) != 2:
-        raise ValueError(f"colav: noise must be a pair, of position (m) and velocity (m/s), received {noise!r}")
+    try:
+        noise_of_position, noise_of_velocity = noise
+    except (TypeError, ValueError):
+        raise ValueError(f"colav: noise must be a pair, of position (m) and velocity (m/s), received {noise!r}") from None
     scales = positive(
         "colav", longest_delay=longest_delay, delay_change=delay_change, delay_easing=delay_easing, steering_change=steering_change,
-        noise_of_position=noise[0], noise_of_velocity=noise[1],
+        noise_of_position=noise_of_position, noise_of_velocity=noise_of_velocity,
     )  # fmt: skip
     for name, value, most, why in (("longest_delay", longest_delay, BUFFER, " s, the past that is kept"), ("delay_easing", delay_easing, 1, "")):
         if not isinstance(value, jax.core.Tracer) and float(value) > most:
@@ -181,7 +186,7 @@ def _step(model, s, x):
 
     adversary, poses = lax.scan(sail, s.adversary, None, length=n)  # it minds nobody, so it may go first
     past = tracker.push(s.past, _seen(adversary))
-    read = tracker.reader(past, s.step, delay * (model.longest / PERIOD))
+    read = tracker.reader(past, s.step, delay * (jnp.minimum(model.longest, BUFFER) / PERIOD))
     choice = planner.plan(s.control.along, s.choice, s.track)
     speed = planner.speed_of(choice, dtype)
 

@@ -16,7 +16,7 @@ __all__ = ["BUFFER", "PERIOD", "Track", "begin", "push", "reader", "track"]
 PERIOD = 3.0  # s: a search step
 BUFFER = 40.0  # s: the published buffer's 400 samples of 0.1 s
 KNOTS = 16  # both ends of the 40 s, of the search step in progress and of the one in which the buffer begins
-LAG = 1.0  # s: the tracker's time constants, published as T_p = T_v = 1, with gains of 1
+LAG = 1.0  # s: our reading of the published T_p = k_p = T_v = k_v = 1
 
 
 class Track(NamedTuple):
