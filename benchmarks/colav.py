@@ -8,30 +8,20 @@ runs (of one with ``--quick``), in a process whose XLA has one thread.
 import argparse
 import functools
 import json
-import os
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.engine import cpu
+from benchmarks.engine import alone, cpu, problem, whole
 from benchmarks.ferry import timed
-from jast import actions
 from jast.counter import tree_keys
 from jast.estimate.intervals import clopper_pearson
-from jast.rewards import as_pytree
-from jast.search import run
-from jast.search.choice import Choice
-from jast.search.forest import MODES
-from jast.search.tree import Problem, Settings, widths
 from jast.simulators.colav import SCENARIOS, colav
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
 PRUNES, SIMULATIONS = 22, 50  # published
-CHUNK = 110  # episodes of a random search at once: a part of 22 x 50
 ALL = ("delay", "steering", "noise")
 SUBSTEPS = (1, 3, 10, 30, 100, 300)
 
@@ -59,70 +49,37 @@ def nominal(scenario, kind, episodes):
     }
 
 
-def search(scenario, kind, trees, heads=None, seed=0):
-    """Trees of the default search that find a collision, beside random searches of as many episodes each."""
-    sim, each = colav(scenario, kind), PRUNES * SIMULATIONS
-    result, seconds, _ = timed(
-        lambda: jast.search.forest(jax.random.key(seed), sim, trees=trees, prunes=PRUNES, simulations=SIMULATIONS, reward=REWARD, heads=heads)
-    )
-    found = int(result.failing.sum())
-    return {
-        "trees": trees,
-        "failing_trees": found,
-        "share": found / trees,
-        "share_95": list(clopper_pearson(found, trees)),
-        "best": float(result.best.reward),
-        "best_distance_m": float(result.best.distance),
-        "episodes": result.episodes,
-        "steps": result.simulator_steps,
-        "cpu_s": seconds,
-        "episodes_each": each,
-    }
+def share(failing):
+    """How many of several runs found a collision."""
+    found, n = int(np.sum(failing)), len(failing)
+    return {"runs": n, "failing": found, "share": found / n, "share_95": list(clopper_pearson(found, n))}
 
 
-def random_search(scenario, kind, runs, seed=1):
-    """Random searches of as many episodes as a tree has simulations: how many find a collision. One program of many runs."""
-    sim, each = colav(scenario, kind), PRUNES * SIMULATIONS
-    failing = _random(sim, jax.random.split(jax.random.key(seed), runs), each)
-    found = int(np.sum(failing > 0))
-    return {"runs": runs, "failing_runs": found, "share": found / runs, "share_95": list(clopper_pearson(found, runs)), "failures": int(np.sum(failing))}
+def search(scenario, kind, trees, heads=None):
+    """Trees of the default search that find a collision."""
+    sim = colav(scenario, kind)
+    grow = lambda: jast.search.forest(jax.random.key(0), sim, trees=trees, prunes=PRUNES, simulations=SIMULATIONS, reward=REWARD, heads=heads)
+    result, seconds, _ = timed(grow)
+    best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
+    return share(result.failing) | best | {"episodes": result.episodes, "steps": result.simulator_steps, "cpu_s": seconds}
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _random(sim, keys, episodes):
-    def one(key):
-        def chunk(key):
-            return jnp.sum(jax.vmap(lambda k: jast.rollout(k, sim).failure)(jax.random.split(key, CHUNK)), dtype=jnp.int32)
-
-        return jnp.sum(jax.lax.map(chunk, jax.random.split(key, episodes // CHUNK)))
-
-    return jax.lax.map(one, keys)
-
-
-def problem(sim, mode, total):
-    """What the forest grows, with draws of the model for actions; in paper mode with the published reward."""
-    settings, reward = MODES[mode], as_pytree(published if mode == "paper" else REWARD)
-    choice = Choice(actions.samples(), jnp.float32(1.0), spread=settings["spread"], focused=False)
-    return jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.float32(10.0), widths(total, *settings["widening"]))))
-
-
-def grown(p, keys, prunes, simulations, children, memoize):
-    """A forest in one thread, without its result: simulator steps by tree."""
-    tree = run._make(p, keys, prunes * simulations, memoize)
-    for turn in range(prunes):
-        tree = run._grow(p, tree, turn * simulations, (turn + 1) * simulations, memoize)
-        tree, _ = run._prune(p, tree, children, memoize)
-    return tree.steps
+def random_search(scenario, kind, runs):
+    """Random searches of as many episodes as a tree has simulations that find a collision."""
+    sim = colav(scenario, kind)
+    one = lambda key: jast.search.monte_carlo(key, sim, episodes=PRUNES * SIMULATIONS, reward=REWARD).failing[0]
+    return share(jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs)))
 
 
 def memoization(substeps, mode, simulations, trees, repeats):
     """CPU microseconds and simulator steps of a simulation, by where states are kept; and of MCTS-SA, one root, whose simulations all begin at the start."""
     total = PRUNES * simulations
-    p, keys = problem(colav("sharp turn", substeps=substeps), mode, total), tree_keys(jax.random.key(0), trees)
+    sim, reward = colav("sharp turn", substeps=substeps), published if mode == "paper" else REWARD
+    p, keys = problem(total, mode, sim, reward, jast.actions.samples()), tree_keys(jax.random.key(0), trees)
     children = int(p.settings.widths.max())
-    runs = {name: functools.partial(grown, p, keys, PRUNES, simulations, children, name) for name in ("node", "root", "none")}
-    runs["MCTS-SA"] = functools.partial(grown, p, keys, 1, total, children, "none")
-    steps = {name: float(np.mean(jax.device_get(function()))) / total for name, function in runs.items()}
+    runs = {name: functools.partial(whole, p, keys, PRUNES, simulations, children, name) for name in ("node", "root", "none")}
+    runs["MCTS-SA"] = functools.partial(whole, p, keys, 1, total, children, "none")
+    steps = {name: float(np.mean(jax.device_get(function().steps))) / total for name, function in runs.items()}
     seconds = {name: float("inf") for name in runs}
     for _ in range(repeats):
         for name, function in runs.items():
@@ -132,28 +89,13 @@ def memoization(substeps, mode, simulations, trees, repeats):
     return {"mode": mode, "simulations": simulations, "trees": trees, "substeps": substeps, "us": us, "steps": steps, "ratios": ratios}
 
 
-def alone(calls):
-    """`memoization` of each of these arguments, one after the other, in a process whose XLA has one thread."""
-    code = f"import json; from benchmarks import colav; [print(json.dumps(colav.memoization(*c)), flush=True) for c in {calls!r}]"
-    env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=env) as process:
-        for line in process.stdout:
-            yield json.loads(line)
-    if process.returncode:
-        raise RuntimeError(f"the measuring process ended with status {process.returncode}")
-
-
 def picture(rows, path):
     """Figure 5 of the paper, measured: the CPU time of a simulation by the substeps of a step."""
     from jast.plot import style
 
+    labels = {"MCTS-SA": "MCTS-SA, full simulations", "none": "forest, no states", "root": "states at roots", "node": "states at every node"}
     with style.axes(None, (6.8, 4.2)) as ax:
-        for (name, label), colour, marker in zip(
-            {"MCTS-SA": "MCTS-SA, full simulations", "none": "forest, no states", "root": "states at roots", "node": "states at every node"}.items(),
-            style.COLOURS,
-            "osD^",
-            strict=False,
-        ):
+        for (name, label), colour, marker in zip(labels.items(), style.COLOURS, "osD^", strict=False):
             ax.loglog([r["substeps"] for r in rows], [r["us"][name] for r in rows], color=colour, marker=marker, label=label)
         ax.set(xlabel="substeps of a search step", ylabel="CPU time of a simulation (µs)")
         ax.legend(loc="upper left")
@@ -198,8 +140,8 @@ def main(argv=None):
         calls = [(30, "paper", 20, 64, 1)]
     else:
         calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [(n, "paper", 20, 64, 2) for n in SUBSTEPS]
-    for r in alone(calls):
-        report["memoization"].append(r)
+    for call in calls:
+        report["memoization"].append(r := alone("memoization", *call, module="colav"))
         cells = ", ".join(f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"])
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in r["ratios"].items())
         say(f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']}, {r['trees']} trees: {cells}; {ratios}")

@@ -23,21 +23,24 @@ import jast
 from benchmarks import reference
 from jast.counter import tree_keys
 from jast.episode import Progress, begin
+from jast.rewards import as_pytree
 from jast.search import run
 from jast.search.choice import Choice
+from jast.search.forest import MODES
 from jast.search.tree import Problem, Settings, choose_rollout, take, widths
+from jast.search.trees import settled
 from jast.simulator import Simulator
 
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
 BOX = jast.actions.uniform(0.0, 1.0)
-MODES = {"paper": dict(widening=(0.5, 0.6), spread=False, focus=1.0), "default": dict(widening=(2.0, 0.5), spread=True, focus=0.2)}
 
 
-def problem(total, mode="paper", sim=None):
-    settings = MODES[mode]
-    choice = Choice(BOX, jnp.float32(settings["focus"]), spread=settings["spread"], focused=settings["focus"] != 1)
+def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
+    """What `jast.search.forest` grows in this mode."""
+    mode, widening, spread, focus = settled("forest", MODES, mode, None, None, None, actions)
+    choice = Choice(actions, jnp.float32(focus), spread=spread, focused=focus != 1)
     sim = jast.simulators.ferry() if sim is None else sim
-    return jax.tree.map(jnp.asarray, Problem(sim, REWARD, choice, Settings(jnp.float32(10.0), widths(total, *settings["widening"]))))
+    return jax.tree.map(jnp.asarray, Problem(sim, as_pytree(reward), choice, Settings(jnp.float32(10.0), widths(total, *widening))))
 
 
 def cpu(function):
@@ -69,12 +72,12 @@ def rollouts(problem, keys, simulations):
 
 
 def whole(problem, keys, prunes, simulations, children, memoize="node"):
-    """A forest in one thread, without its result."""
+    """The trees of a forest in one thread, without its result."""
     tree = run._make(problem, keys, prunes * simulations, memoize)
     for turn in range(prunes):
         tree = run._grow(problem, tree, turn * simulations, (turn + 1) * simulations, memoize)
         tree, _ = run._prune(problem, tree, children, memoize)
-    return tree.log
+    return tree
 
 
 def first_turn(problem, keys, capacity, simulations=500):
@@ -131,11 +134,11 @@ def cores(repeats, trees=200):
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
 
 
-def alone(name, *arguments):
-    """A measurement of this module in a process whose XLA has one thread."""
-    code = f"import json; from benchmarks import engine; print(json.dumps(engine.{name}(*{arguments!r})))"
+def alone(name, *arguments, module="engine"):
+    """A measurement of this module, or of another benchmark, in a process whose XLA has one thread."""
+    code = f"import json; from benchmarks import {module}; print(json.dumps({module}.{name}(*{arguments!r})))"
     env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
-    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout.splitlines()[-1])
+    return json.loads(subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env).stdout.splitlines()[-1])
 
 
 def compile_time():

@@ -219,9 +219,9 @@ def draw(out, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from jast.plot import COLOURS, STYLE
+    from jast.plot.style import COLOURS, styled
 
-    with plt.rc_context(STYLE):
+    with styled():
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")
         for colour, marker, name in zip(COLOURS, "os^", ("none", "rollout", "both"), strict=False):
             style = dict(color=colour, marker=marker, markersize=5, capsize=2.5, label={"none": "no heads", "both": "both heads"}.get(name, "rollout head"))

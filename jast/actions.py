@@ -128,9 +128,18 @@ class UniformBox:
         return jax.tree.map(locate, x, *self.ends(x))
 
     def ends(self, x):
-        """``low`` and ``high`` as pytrees like ``x``: each is one already, or serves every array of ``x``."""
-        like = jax.tree.structure(x)
-        return (end if jax.tree.structure(end) == like else jax.tree.map(lambda _, end=end: end, x) for end in (self.low, self.high))
+        """``low`` and ``high`` as pytrees like ``x``: each is one already, or an array that serves every one of ``x``. ValueError where it is neither."""
+        return [self._like(x, side) for side in ("low", "high")]
+
+    def _like(self, x, side):
+        end, like = getattr(self, side), jax.tree.structure(x)
+        if jax.tree.structure(end) == like:
+            return end
+        try:
+            array = jnp.asarray(end)
+        except (TypeError, ValueError):
+            raise ValueError(f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or what the disturbance is, {like}") from None
+        return jax.tree.map(lambda _: array, x)
 
 
 def samples():

@@ -21,10 +21,11 @@ from jax import lax
 import jast
 from jast import distributions as D
 from jast.episode import _rollout, play_back
+from jast.plot.colav import zone_outline
 from jast.rewards import STANDARD, as_pytree
 from jast.simulators import colav
 from jast.simulators.colav import SCENARIOS, Scenario, planner, tracker, vessels
-from jast.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside, zone_outline
+from jast.simulators.colav.planner import DESIRED, SPEEDS, ZONES, inside
 from jast.simulators.colav.tracker import Track
 from jast.simulators.colav.vessels import Adversary, Control, Pose, Velocity, adversary_substep, ferry_substep
 

@@ -13,6 +13,7 @@ from matplotlib import animation as mpl_animation  # noqa: E402
 
 import jast  # noqa: E402
 from jast import plot  # noqa: E402
+from jast.plot.colav import zone_outline  # noqa: E402
 from jast.simulators.colav import SCENARIOS, colav, planner  # noqa: E402
 from jast.simulators.colav.tracker import PERIOD  # noqa: E402
 
@@ -77,7 +78,7 @@ def test_the_zones_are_those_of_the_believed_adversary():
     course = np.arctan2(track.v_e, track.v_n)
     for zone in planner.ZONES:
         edge = labelled(ax)[zone.name].get_xy()
-        np.testing.assert_allclose(edge[:200], planner.zone_outline(zone, track.n, track.e, course), atol=1e-4)
+        np.testing.assert_allclose(edge[:200], zone_outline(zone, track.n, track.e, course), atol=1e-4)
         ahead = (edge - [track.e, track.n]) @ [np.sin(course), np.cos(course)]
         right = (edge - [track.e, track.n]) @ [np.cos(course), -np.sin(course)]
         np.testing.assert_allclose([ahead.max(), right.max(), -ahead.min(), -right.min()], [zone.forward, zone.starboard, zone.aft, zone.port], rtol=1e-3)

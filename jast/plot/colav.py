@@ -13,7 +13,7 @@ import numpy as np
 
 from jast.episode import replay
 from jast.plot import style
-from jast.simulators.colav.planner import SPEEDS, ZONES, zone_outline
+from jast.simulators.colav.planner import SPEEDS, STILL, ZONES
 from jast.simulators.colav.system import COLLISION, ColavState
 from jast.simulators.colav.tracker import PERIOD
 
@@ -159,7 +159,7 @@ class _Panel:
             east, north, course = now[2]
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
-            patch.set_xy(_hull(*here))
+            patch.set_xy(_placed(*HULL.T, *here))
         self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s")
 
 
@@ -176,7 +176,7 @@ def _states(caller, episode, sim):
 
 def _log(states):
     track, adversary = states.track, states.adversary.pose
-    still = np.hypot(track.v_n, track.v_e) < 0.05  # as the planner has it
+    still = np.hypot(track.v_n, track.v_e) < STILL  # as the planner has it
     course = np.where(still, 0, np.arctan2(track.v_e, track.v_n))
     rows = ((states.pose.e, states.pose.n, states.pose.psi), (adversary.e, adversary.n, adversary.psi), (track.e, track.n, course))
     choice = np.concatenate([states.choice[1:], states.choice[-1:]])
@@ -188,9 +188,16 @@ def _at(rows, t):
     return np.array([np.interp(t, np.arange(len(rows)), column) for column in rows.T])
 
 
-def _hull(east, north, heading):
-    """[points, 2]: a ship's outline in (east, north)."""
-    ahead, right = HULL.T
+def zone_outline(zone, n, e, course, points=200):
+    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e, n)."""
+    angle = np.linspace(0, 2 * np.pi, points)
+    ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
+    right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
+    return _placed(ahead, right, e, n, course)
+
+
+def _placed(ahead, right, east, north, heading):
+    """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
     return np.stack([east + ahead * np.sin(heading) + right * np.cos(heading), north + ahead * np.cos(heading) - right * np.sin(heading)], -1)
 
 

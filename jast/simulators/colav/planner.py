@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["DESIRED", "FIRST", "SPEEDS", "ZONES", "Zone", "costs", "inside", "plan", "speed_of", "zone_outline"]
+__all__ = ["DESIRED", "FIRST", "SPEEDS", "STILL", "ZONES", "Zone", "costs", "inside", "plan", "speed_of"]
 
 
 class Zone(NamedTuple):
@@ -31,6 +31,7 @@ ZONES = (
     Zone("low penalty region", 40.0, 30.0, 25.0, 25.0, 10.0),
 )
 DESIRED = 0.75  # m/s
+STILL = 0.05  # m/s: published threshold of low velocity
 SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])  # candidates, m/s: published range
 FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
 STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end: ours (published horizon: up to 600)
@@ -46,21 +47,13 @@ def inside(zone, ahead, right):
     return x**2 + y**2 < 1
 
 
-def zone_outline(zone, n, e, course, points=200):
-    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e, n), for pictures."""
-    angle = np.linspace(0, 2 * np.pi, points)
-    ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
-    right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
-    return np.stack([e + ahead * np.sin(course) + right * np.cos(course), n + ahead * np.cos(course) - right * np.sin(course)], -1)
-
-
 def costs(along, obstacle):
     """[candidates] cost of each of `SPEEDS` for a ferry at ``along`` on the path and an obstacle with this `tracker.Track`."""
     dtype = along.dtype
     speeds, times = jnp.asarray(SPEEDS, dtype)[:, None], jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :]
     n, e, v_n, v_e = obstacle
     speed = jnp.sqrt(v_n**2 + v_e**2)
-    still = speed < 0.05  # published threshold of low velocity; a course of its own an obstacle at rest has not
+    still = speed < STILL  # a course of its own an obstacle at rest has not
     north, east = (jnp.where(still, rest, v / jnp.where(still, 1, speed)) for v, rest in ((v_n, 1), (v_e, 0)))
     d_n, d_e = along + speeds * times - n - v_n * times, -e - v_e * times
     ahead, right = d_n * north + d_e * east, d_e * north - d_n * east

@@ -79,11 +79,11 @@ def energy(velocity):
 def forces(control, pose, velocity):
     """Thrust of the controller: PID on position and heading in the body's axes, cut to what the thrusters can."""
     c, s = jnp.cos(pose.psi), jnp.sin(pose.psi)
-    error_n, error_e = (jnp.clip(x, -REACH, REACH) for x in (control.along - pose.n, -pose.e))
+    error_n, error_e, error_psi = _errors(control.along, pose)
     body = lambda n, e: (c * n + s * e, c * e - s * n)
     (p_u, p_v), (i_u, i_v) = body(error_n, error_e), body(control.sum_n, control.sum_e)
     want_u, want_v = body(control.speed, jnp.zeros_like(control.speed))
-    errors = zip((p_u, p_v, -_wrapped(pose.psi)), (i_u, i_v, control.sum_psi), (want_u - velocity.u, want_v - velocity.v, -velocity.r), strict=True)
+    errors = zip((p_u, p_v, error_psi), (i_u, i_v, control.sum_psi), (want_u - velocity.u, want_v - velocity.v, -velocity.r), strict=True)
     wanted = (kp * p + ki * i + kd * d for kp, ki, kd, (p, i, d) in zip(KP, KI, KD, errors, strict=True))
     return Velocity(*(jnp.clip(f, -most, most) for f, most in zip(wanted, THRUST, strict=True)))
 
@@ -103,9 +103,8 @@ def ferry_substep(pose, velocity, control, command, dt):
     pose = Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True)))
     speed = control.speed + jnp.clip(command - control.speed, -ACCELERATION * dt, ACCELERATION * dt)
     along = jnp.clip(control.along + dt * speed, pose.n - REACH, pose.n + REACH)  # the reference waits for the ferry
-    clipped = lambda x, most: jnp.clip(x, -most, most)
-    sums = (control.sum_n + dt * clipped(control.along - pose.n, REACH), control.sum_e - dt * clipped(pose.e, REACH), control.sum_psi - dt * _wrapped(pose.psi))
-    return pose, velocity, Control(along, speed, *(clipped(x, WINDUP) for x in sums))
+    sums = zip((control.sum_n, control.sum_e, control.sum_psi), _errors(control.along, pose), strict=True)
+    return pose, velocity, Control(along, speed, *(jnp.clip(x + dt * error, -WINDUP, WINDUP) for x, error in sums))
 
 
 def adversary_substep(adversary, command, dt):
@@ -117,6 +116,7 @@ def adversary_substep(adversary, command, dt):
     return Adversary(Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True))), after)
 
 
-def _wrapped(angle):
-    """In [-pi, pi]."""
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+def _errors(along, pose):
+    """What is missing to the reference: north and east (m, as far as the controller sees), heading (radians, the short way round)."""
+    turn = pose.psi - 2 * jnp.pi * jnp.round(pose.psi / (2 * jnp.pi))
+    return Pose(jnp.clip(along - pose.n, -REACH, REACH), jnp.clip(-pose.e, -REACH, REACH), -turn)
