@@ -1,0 +1,137 @@
+"""The multivariate normal distribution as a cross-entropy method needs it: drawn from, scored, and refitted to weighted samples."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import Precision
+from jax.scipy.linalg import solve_triangular
+
+__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "normal", "sample"]
+
+
+class Gaussian(NamedTuple):
+    """N(mean, covariance), floats; the covariance is positive definite."""
+
+    mean: Any
+    """[d]"""
+    covariance: Any
+    """[d, d]"""
+
+
+def normal(mean, covariance):
+    """The `Gaussian` of a ``mean`` [d] and a ``covariance``: a number (times the identity), the variances [d], or a matrix [d, d].
+
+    The dtype is that of the float arrays given, the wider one, else the default. Raises ValueError unless both are finite and the matrix symmetric and
+    positive definite; of traced values only the shapes are looked at.
+    """
+    return _normal("normal", mean, covariance)
+
+
+def as_gaussian(proposal):
+    """The `Gaussian` that is meant by one, by a pair (mean, covariance), or by a distribution with ``mean()`` and ``covariance()``, as distrax's are.
+
+    Raises ValueError, naming ``proposal``, for anything else and for what `normal` refuses.
+    """
+    if isinstance(proposal, tuple | list) and len(proposal) == 2:
+        return _normal("proposal", *proposal)
+    if callable(getattr(proposal, "mean", None)) and callable(getattr(proposal, "covariance", None)):
+        return _normal("proposal", proposal.mean(), proposal.covariance())
+    raise ValueError(f"proposal: expected a Gaussian, a pair (mean, covariance), or a distribution with mean() and covariance(), received {proposal!r}")
+
+
+def _normal(name, mean, covariance):
+    traced = [any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in (mean, covariance)]
+    parts = []
+    for part, value, skip in zip(("mean", "covariance"), (mean, covariance), traced, strict=True):
+        try:
+            parts.append(jnp.asarray(value) if skip else np.asarray(value, np.float64))
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}: {part} must be numbers, received {value!r}") from None
+        if not skip and not np.isfinite(parts[-1]).all():
+            raise ValueError(f"{name}: {part} must be finite, received {value}")
+    m, c = parts
+    if m.ndim != 1 or m.size == 0:
+        raise ValueError(f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}")
+    d = m.size
+    if c.shape not in ((), (d,), (d, d)):
+        raise ValueError(f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received shape {c.shape}")
+    floats = [v.dtype for v in (mean, covariance) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
+    dtype = max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
+    if not traced[1]:
+        _check_covariance(name, c, float(jnp.finfo(dtype).eps))
+    m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
+    return Gaussian(m, c if c.ndim == 2 else jnp.diag(jnp.broadcast_to(c, (d,))))
+
+
+def _check_covariance(name, c, eps):
+    """ValueError unless the number, variances or matrix ``c`` is a covariance, on the host."""
+    if c.ndim < 2:
+        if not (c > 0).all():
+            raise ValueError(f"{name}: covariance must be positive, received {c}")
+        return
+    spread = np.sqrt(np.abs(np.diagonal(c)))
+    if not (np.abs(c - c.T) <= 16 * eps * np.outer(spread, spread)).all():
+        raise ValueError(f"{name}: covariance must be symmetric, received\n{c}")
+    if not ((np.diagonal(c) > 0).all() and np.linalg.eigvalsh(c / np.outer(spread, spread))[0] > 4 * len(c) * eps):
+        raise ValueError(f"{name}: covariance must be positive definite, received\n{c}")
+
+
+def sample(key, g, n):
+    """``n`` draws [n, d]: mean + L z, L the Cholesky factor of the covariance."""
+    z = jax.random.normal(key, (n, *g.mean.shape), g.mean.dtype)
+    return g.mean[None] + jnp.matmul(z, jnp.linalg.cholesky(g.covariance).T, precision=Precision.HIGHEST)
+
+
+def log_prob(g, x):
+    """Log density [...] at ``x`` [..., d]."""
+    factor = jnp.linalg.cholesky(g.covariance)
+    rows = x.reshape(-1, x.shape[-1]) - g.mean[None]
+    z = solve_triangular(factor, rows.T, lower=True)
+    constant = 0.5 * x.shape[-1] * math.log(2 * math.pi) + jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return (-0.5 * jnp.sum(z**2, axis=0) - constant).reshape(x.shape[:-1])
+
+
+def fit(g, x, weights):
+    """The `Gaussian` of greatest likelihood for ``x`` [n, d] with ``weights`` [n], at least 0: the covariance is divided by their sum.
+
+    The old ``g`` stays where that has no answer: total weight 0, at most d rows of positive weight, a covariance that `is_definite` refuses, a number that
+    is not finite. Rows of weight 0 may hold anything, NaN too. Only the weights' ratios matter. ValueError for shapes that do not fit.
+    """
+    if x.ndim != 2 or x.shape[1:] != g.mean.shape or weights.shape != x.shape[:1]:
+        raise ValueError(f"gaussian.fit: x must be [n, {g.mean.size}] and weights [n], received {x.shape} and {weights.shape}")
+    n, d = x.shape
+    if n == 0:
+        return g
+    weights = weights.astype(x.dtype)
+    counted = weights > 0
+    w = jnp.where(counted, weights, 0)
+    w = w / jnp.max(w)  # neither overflows nor underflows; NaN if all are 0
+    w = w / jnp.sum(w)
+    c = jnp.where(counted[:, None], x, 0)
+    average = lambda a: jnp.matmul(w, a, precision=Precision.HIGHEST)
+    mean = average(c)
+    # The mean is rounded relative to its own size, which may be far above the spread: the second pass takes the remainder out
+    c = jnp.where(counted[:, None], c - mean[None], 0)
+    rest = average(c)
+    mean, c = mean + rest, c - rest[None]
+    covariance = jnp.einsum("n,nd,ne->de", w, c, c, precision=Precision.HIGHEST)
+    covariance = 0.5 * (covariance + covariance.T)
+    good = jnp.all(jnp.isfinite(mean)) & is_definite(covariance, n) & (jnp.sum(counted) > d)
+    return jax.tree.map(lambda new, old: jnp.where(good, new, old), Gaussian(mean, covariance), g)
+
+
+def is_definite(covariance, rows=1):
+    """Whether a symmetric matrix [d, d], an average over ``rows`` samples, is positive definite beyond its rounding errors; False if it is not finite.
+
+    Its correlation matrix R = L L^T is what is judged, so units do not matter. A singular R comes out with a least eigenvalue of the size of rounding errors,
+    and often with a Cholesky factor whose pivots look sound when it is ill-conditioned before the last one. So the trace of R^-1, the sum of the inverse
+    eigenvalues and of the squares of L^-1, is asked to be below 1 / (4 (d + sqrt(rows)) eps).
+    """
+    d = covariance.shape[-1]
+    spread = jnp.sqrt(jnp.diagonal(covariance))
+    correlation = covariance / spread[:, None] / spread[None, :]
+    inverse = solve_triangular(jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True)
+    return jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * float(jnp.finfo(covariance.dtype).eps)) < 1  # NaN is not below 1

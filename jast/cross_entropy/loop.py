@@ -1,0 +1,178 @@
+"""One iteration of a cross-entropy method as two pure functions, ask and tell, and their loop in one program for objectives in JAX.
+
+Every evaluation is kept in one log, in order; an iteration reads the rows that it may remember from there. Batches are padded to the largest one, with masks.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast.cross_entropy import refit
+from jast.cross_entropy.refit import Points
+from jast.cross_entropy.result import CEResult, History
+
+__all__ = ["Plan", "Settings", "State", "ask", "begin", "finish", "run", "tell"]
+
+
+class Plan(NamedTuple):
+    """The static part of a method: what is compiled."""
+
+    method: str
+    """"ce_method", "ce_surrogate" or "ce_mixture\""""
+    counts: tuple
+    """True evaluations of each iteration"""
+    elites: tuple
+    """Of each iteration"""
+    elitism: bool
+    """Elites of all iterations, not only of the last batch"""
+    memory: int = 0
+    """The surrogate sees the evaluations of so many iterations ..."""
+    best: int = 0
+    """... and so many of the best before"""
+    evaluated: int = 0
+    """Points of the last iteration's searches on the surrogate that are truly evaluated, of at most half a batch"""
+    current: bool = False
+    """Those searches have the current covariance, not the initial one"""
+    surrogate: str = ""
+    kernel: str = ""
+    warp: str = ""
+    frame: str = ""
+    """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the initial proposal"""
+    factor: int = 10
+    """Samples judged by the surrogate, as a multiple of those evaluated"""
+    sub: tuple = (100, 10, 2)
+    """Samples, elites and iterations of a search on the surrogate"""
+    components: int = 0
+    start: str = ""
+    """Where a mixture's fit begins: "elites" with the searches' first covariance, or "searches", as these ended"""
+    em_iterations: int = 10
+
+
+class Settings(NamedTuple):
+    """The traced part."""
+
+    alpha: Any
+    regularisation: Any
+
+
+class State(NamedTuple):
+    """Between two iterations. [n] true evaluations in all, K iterations."""
+
+    key: Any
+    k: Any
+    """int32: the iteration to come"""
+    x: Any
+    """[n, d]: the log"""
+    value: Any
+    """[n]: inf where there is none yet"""
+    first: Any
+    """The initial proposal"""
+    proposal: Any
+    pending: Any
+    """[evaluated, d]: points to be evaluated"""
+    proposals: Any
+    """[K + 1, ...]"""
+    model_x: Any
+    """[K, m, d]"""
+
+
+def begin(key, plan, proposal):
+    """The `State` before the first iteration."""
+    d, dtype = refit.moments(proposal).mean.shape[0], jax.tree.leaves(proposal)[0].dtype
+    n, steps = sum(plan.counts), len(plan.counts)
+    judged = plan.factor * max(plan.counts) if plan.method != "ce_method" else 0
+    full = lambda value, *shape: jnp.full(shape, value, dtype)
+    stacked = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal)
+    return State(
+        key, jnp.int32(0), full(jnp.nan, n, d), full(jnp.inf, n), proposal, proposal, full(0, plan.evaluated, d), stacked, full(jnp.nan, steps, judged, d)
+    )
+
+
+def ask(plan, state):
+    """The points of the next iteration, [max(m), d], of which the first ``plan.counts[k]`` count."""
+    x = refit.draw(_key(state, 0), state.proposal, max(plan.counts))
+    known = (state.k > 0) & (jnp.arange(plan.evaluated) < _of(plan.counts, state.k) // 2)
+    return x.at[: plan.evaluated].set(jnp.where(known[:, None], state.pending, x[: plan.evaluated]))
+
+
+def tell(plan, settings, state, x, value):
+    """The `State` after the values [max(m)] at ``x`` [max(m), d]."""
+    k, rows = state.k, jnp.arange(max(plan.counts))
+    begins = np.cumsum((0, *plan.counts))
+    at, count, kept = _of(begins, k), _of(plan.counts, k), _of(plan.elites, k)
+    live = rows < count
+    value = jnp.where(live, value, jnp.inf)
+    places = jnp.where(live, at + rows, len(state.value))
+    state = state._replace(x=state.x.at[places].set(x, mode="drop"), value=state.value.at[places].set(value, mode="drop"))
+    elites = _best(*((state.x, state.value) if plan.elitism else (x, value)), kept, max(plan.elites))
+    proposal, pending = state.proposal, state.pending
+    if plan.method == "ce_method":
+        proposal = refit.to_elites(proposal, elites)
+    else:
+        since = _of([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
+        seen = _remembered(plan, state, since, at + count)
+        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, count, kept)
+        pending = better[: plan.evaluated]
+        state = state._replace(model_x=state.model_x.at[k].set(judged))
+    proposals = jax.tree.map(lambda a, b: a.at[k + 1].set(b), state.proposals, proposal)
+    return state._replace(k=k + 1, proposal=proposal, pending=pending, proposals=proposals)
+
+
+def _key(state, part):
+    return jax.random.fold_in(jax.random.fold_in(state.key, state.k), part)
+
+
+def _of(sizes, k):
+    return jnp.asarray(sizes, jnp.int32)[k]
+
+
+def _best(x, value, count, most):
+    """`Points`: the ``count`` best of finite value, of at most ``most``, best first; the others have weight 0."""
+    finite = jnp.isfinite(value)
+    _, i = lax.top_k(-jnp.where(finite, value, jnp.inf), min(most, len(value)))
+    weights = finite[i] & (jnp.arange(len(i)) < count)
+    return Points(jnp.where(weights[:, None], x[i], x[i[0]]), weights.astype(x.dtype))
+
+
+def _remembered(plan, state, since, until):
+    """What the surrogate is fitted to, (x, values, mask): rows ``since`` to ``until`` of the log, and the best before."""
+    n, begins = len(state.value), np.cumsum((0, *plan.counts))
+    width = max(begins[i + 1] - begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts)))
+    rows = since + jnp.arange(width)
+    mask = rows < until
+    if older := min(plan.best, n - width):
+        before = (jnp.arange(n) < since) & jnp.isfinite(state.value)
+        _, i = lax.top_k(-jnp.where(before, state.value, jnp.inf), older)
+        rows, mask = jnp.concatenate([rows, i]), jnp.concatenate([mask, before[i]])
+    take = lambda a: a.at[rows].get(mode="clip")
+    return take(state.x), take(state.value), mask
+
+
+def finish(plan, state):
+    """The `CEResult` of what has been evaluated."""
+    last = np.cumsum(plan.counts) - 1
+    finite = jnp.isfinite(state.value)
+    value = jnp.where(finite, state.value, jnp.inf)
+    order = jnp.arange(len(value))
+    # the place of the best so far: the running minimum by value, then by place
+    best, place = lax.associative_scan(lambda a, b: jax.tree.map(lambda u, v: jnp.where(b[0] < a[0], v, u), a, b), (value, order))
+    x = jnp.where(jnp.isfinite(best)[:, None], state.x[place], jnp.nan)
+    evaluated = order < _of(np.cumsum((0, *plan.counts)), state.k)
+    iteration = jnp.asarray(np.repeat(np.arange(len(plan.counts), dtype=np.int32), plan.counts))
+    history = History(state.x, state.value, iteration, x[last], best[last], state.proposals, state.model_x)
+    return CEResult(state.proposal, x[-1], best[-1], history, jnp.sum(evaluated & ~finite, dtype=jnp.int32))
+
+
+@partial(jax.jit, static_argnums=1)
+def run(key, plan, settings, objective, proposal):
+    """All iterations in one program: `CEResult`. ``objective`` is a pytree that is called, [d] -> scalar."""
+
+    def iterate(state, _):
+        x = ask(plan, state)
+        return tell(plan, settings, state, x, jax.vmap(objective)(x).astype(x.dtype)), None
+
+    return finish(plan, lax.scan(iterate, begin(key, plan, proposal), length=len(plan.counts))[0])

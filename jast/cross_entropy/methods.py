@@ -1,0 +1,145 @@
+"""The cross-entropy method and its variants with a surrogate (R. J. Moss's thesis, chapter 2), for objectives in JAX, and as ask and tell for any other."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast.cross_entropy import loop
+from jast.cross_entropy.settle import MODES, checked, settled
+
+__all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish", "start", "tell"]
+
+
+def ce_method(key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", ratchet=False, elitism=None):
+    """Minimise ``objective`` (x [d] -> scalar) by the cross-entropy method: `CEResult`. Algorithm 1 of the thesis.
+
+    Each of ``iterations`` draws ``samples`` points from the proposal, evaluates them, and refits the proposal by maximum likelihood to the best of them, the
+    ``elites``. ``proposal``: a `Gaussian` (`jast.cross_entropy.normal`), a pair (mean [d], covariance), or a distribution with ``mean()`` and ``covariance()``.
+    Where the elites have no covariance that is positive definite (as when they are at most d), the proposal stays.
+
+    ``schedule``: None, the same number in each iteration; of `jast.cross_entropy.schedules`; or the numbers. ``mode="thesis"`` takes the elites from the last
+    batch only, ``"default"`` from all that were evaluated (``elitism``). ``ratchet``: once a batch is smaller than the elites, they stay as few, as in the
+    published code. Counts and names are static, the key, the proposal and what a `jax.tree_util.Partial` binds to the objective are traced: `jax.vmap` runs
+    hundreds of seeds and proposals in one program. With an uneven schedule the objective is also called on rows that pad a batch; they are neither kept nor
+    counted. An evaluation that is NaN or infinite is kept in the history, counted in ``invalid``, and never an elite.
+
+    Raises ValueError for a proposal that is no proper distribution, elites above the samples, counts below 1, and an objective that is not written in JAX (see
+    `start`) or not a number.
+    """
+    more = dict(ratchet=ratchet, elitism=elitism)
+    return _run("ce_method", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
+
+
+def ce_surrogate(
+    key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", ratchet=False, elitism=None, surrogate=None,
+    kernel=None, warp=None, memory=None, best=None, evaluated=None, current=None, frame=None, alpha=1.0,
+):  # fmt: skip
+    """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2 to 4 of the thesis; see `ce_method` for what is common.
+
+    A cheap model of the objective is fitted in every iteration. The proposal is refitted to the elites that were evaluated, to the best half or so of ten times
+    as many samples that only the model judged, and to the best points of short cross-entropy searches on the model around each true elite.
+
+    ``surrogate``: "gaussian process" (with a ``kernel``: "squared exponential", "matern12", "matern32", "matern52"), "linear", "polynomial" (of degree 2) or
+    "radial basis". It is fitted to the evaluations of the last ``memory`` iterations and the ``best`` of those before, with values ``warp``: "raw", "standard"
+    (mean 0, variance 1), or "rank" (normal scores, which no monotone change of the objective alters). ``evaluated``: the share of each batch, rounded up, that
+    is spent on the best points of the last iteration's searches. These start with the covariance of the ``current`` proposal, or else of the initial one, over
+    ``alpha``. ``frame``: the model's coordinates are whitened by the points it is fitted to ("window"), or have the scale of the initial proposal ("initial").
+
+    ``mode="thesis"`` is the published code: raw values, three iterations, elites of the last batch, no search result evaluated, initial covariance; its
+    likelihood is maximised on a grid here. ``mode="default"`` is `MODES` ["ce_surrogate"]["default"], tuned on sierra, checked on others (docs/figures.md).
+    """
+    more = dict(
+        ratchet=ratchet, elitism=elitism, surrogate=surrogate, kernel=kernel, warp=warp, memory=memory, best=best, evaluated=evaluated, current=current,
+        frame=frame, alpha=alpha,
+    )  # fmt: skip
+    return _run("ce_surrogate", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
+
+
+def ce_mixture(
+    key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", ratchet=False, elitism=None, surrogate=None,
+    kernel=None, warp=None, memory=None, best=None, evaluated=None, current=None, frame=None, alpha=1.0, components=None, start=None, regularisation=None,
+):  # fmt: skip
+    """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its proposal: `CEResult`. Algorithm 5; see `ce_surrogate`.
+
+    The `Mixture` of ``components`` (default: as many as elites) is fitted by ten iterations of expectation maximisation, which ``start`` at Gaussians around
+    the true elites ("elites"), or at the proposals with which the searches around them ended ("searches", as in the thesis). ``regularisation`` is added to
+    the diagonals. ``proposal`` may also be a `Mixture`, of as many components.
+    """
+    more = dict(
+        ratchet=ratchet, elitism=elitism, surrogate=surrogate, kernel=kernel, warp=warp, memory=memory, best=best, evaluated=evaluated, current=current,
+        frame=frame, alpha=alpha, components=components, start=start, regularisation=regularisation,
+    )  # fmt: skip
+    return _run("ce_mixture", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
+
+
+def _run(method, key, objective, proposal, samples, elites, iterations, schedule, mode, more):
+    plan, settings, proposal = settled(method, proposal, samples=samples, elites=elites, iterations=iterations, schedule=schedule, mode=mode, **more)
+    leaf = jax.tree.leaves(proposal)[1]
+    return loop.run(key, plan, settings, checked(method, objective, leaf.shape[-1], leaf.dtype), proposal)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Search:
+    """A cross-entropy method between two batches, for an objective that is evaluated outside; see `start`."""
+
+    state: loop.State
+    settings: Any
+    plan: Any = field(metadata=dict(static=True))
+
+    @property
+    def done(self):
+        """Whether the budget is spent."""
+        return int(self.state.k) >= len(self.plan.counts)
+
+
+def start(key, proposal, method="ce_surrogate", *, samples=10, elites=5, iterations=10, schedule=None, mode="default", **settings):
+    """A `Search` with the settings of `ce_method`, `ce_surrogate` or `ce_mixture`, for an objective that need not be written in JAX:
+
+        search = start(key, proposal, samples=10, iterations=10)
+        while not search.done:
+            x = ask(search)                                   # [m, d], exactly as many as are to be evaluated
+            search = tell(search, x, [program(row) for row in x])
+        result = finish(search)
+
+    It takes exactly the budget of evaluations, and the same steps as those functions with the same key. A search is a pytree: keep it to go on later.
+    """
+    if method not in MODES:
+        raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
+    plan, real, proposal = settled(method, proposal, samples=samples, elites=elites, iterations=iterations, schedule=schedule, mode=mode, **settings)
+    return Search(_begin(key, plan, proposal), real, plan)
+
+
+def ask(search):
+    """The next points to evaluate, [m, d]; the same until they are told. ValueError where the search is done."""
+    if search.done:
+        raise ValueError(f"ask: the search is done, all {sum(search.plan.counts)} evaluations are spent")
+    return _ask(search.plan, search.state)[: search.plan.counts[int(search.state.k)]]
+
+
+def tell(search, x, values):
+    """The `Search` after the objective's ``values`` [m] at ``x`` [m, d]: those that `ask` gave, or what was evaluated in their place (clipped to bounds, say).
+
+    A value may be NaN or infinite where an evaluation failed. ValueError for other shapes, and where the search is done.
+    """
+    expected = ask(search)
+    x, values = np.asarray(x), np.asarray(values)
+    if x.shape != expected.shape or values.shape != x.shape[:1]:
+        raise ValueError(f"tell: expected x of shape {expected.shape} and values of shape {expected.shape[:1]}, received {x.shape} and {values.shape}")
+    if not np.isfinite(x).all():
+        raise ValueError("tell: x must be finite")
+    pad = max(search.plan.counts) - len(x)
+    x, values = (jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1)), expected.dtype) for a in (x, values))
+    return Search(_tell(search.plan, search.settings, search.state, x, values), search.settings, search.plan)
+
+
+def finish(search):
+    """The `CEResult` of what was told so far; what was not has value inf in its history."""
+    return _finish(search.plan, search.state)
+
+
+_begin, _ask, _tell, _finish = (partial(jax.jit, static_argnums=i)(f) for f, i in ((loop.begin, 1), (loop.ask, 0), (loop.tell, 0), (loop.finish, 0)))

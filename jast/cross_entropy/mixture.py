@@ -1,0 +1,123 @@
+"""Mixtures of multivariate normal distributions and their fit to weighted samples by expectation maximisation (Bishop 2006, section 9.2)."""
+
+import operator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.lax import Precision
+from jax.scipy.special import logsumexp
+
+from jast.cross_entropy import gaussian
+from jast.cross_entropy.gaussian import Gaussian
+
+__all__ = ["Mixture", "em", "log_likelihood", "log_prob", "responsibilities", "sample"]
+
+
+class Mixture(NamedTuple):
+    """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is positive definite."""
+
+    weights: Any
+    """[k]"""
+    means: Any
+    """[k, d]"""
+    covariances: Any
+    """[k, d, d]"""
+
+
+def sample(key, m, n):
+    """``n`` draws [n, d], each of a component of its own."""
+    which, where = jax.random.split(key)
+    i = jax.random.categorical(which, jnp.log(m.weights), shape=(n,))
+    z = jax.random.normal(where, (n, m.means.shape[1]), m.means.dtype)
+    factors = jnp.linalg.cholesky(m.covariances)
+    return m.means[i] + jnp.einsum("nde,ne->nd", factors[i], z, precision=Precision.HIGHEST)
+
+
+def log_prob(m, x):
+    """Log density [...] at ``x`` [..., d]."""
+    return logsumexp(_log_joint(m, x), axis=-1)
+
+
+def responsibilities(m, x):
+    """[..., k]: with what probability each component made ``x`` [..., d] (Bishop eq. 9.23). Where no density is a number above 0, the weights."""
+    joint = _log_joint(m, x)
+    total = logsumexp(joint, axis=-1, keepdims=True)
+    known = jnp.isfinite(total)
+    weights = (m.weights / jnp.sum(m.weights)).reshape((1,) * (joint.ndim - 1) + (-1,))
+    return jnp.where(known, jnp.exp(joint - jnp.where(known, total, 0)), weights)
+
+
+def log_likelihood(m, x, weights):
+    """The sum of weights [n] times the log densities at ``x`` [n, d]; a row of weight 0 may hold anything, NaN too. ValueError for shapes that do not fit."""
+    _check("log_likelihood", m, x, weights)
+    weights = weights.astype(x.dtype)
+    counted = weights > 0
+    values = log_prob(m, jnp.where(counted[:, None], x, 0))
+    return jnp.sum(jnp.where(counted, weights * values, 0))
+
+
+def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
+    """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted ``weights[i]`` times: a `Mixture` without NaN.
+
+    ``iterations``: static. ``regularisation`` is added to the diagonals of the new covariances. A component with a soft count, the sum of its weighted
+    responsibilities, below ``least`` (default d, the rule of R. J. Moss's thesis) keeps its covariance, as does one whose new covariance
+    `gaussian.is_definite` refuses; with a count of 0, or data that are not finite, its mean as well. So weights are multiplicities, not only ratios. With no
+    regularisation no iteration lowers the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
+
+    Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0, and a negative regularisation or least (unless traced).
+    """
+    _check("em", m, x, weights)
+    try:
+        steps = -1 if isinstance(iterations, bool) else operator.index(iterations)
+    except TypeError:
+        steps = -1
+    if steps < 0:
+        raise ValueError(f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}")
+    least = x.shape[1] if least is None else least
+    for name, value in dict(regularisation=regularisation, least=least).items():
+        if jnp.shape(value) != () or not (isinstance(value, jax.core.Tracer) or value >= 0):
+            raise ValueError(f"mixture.em: {name} must be a number of at least 0, received {value!r}")
+    weights = weights.astype(x.dtype)
+    counted = weights > 0
+    x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
+    regularisation, least = jnp.asarray(regularisation).astype(x.dtype), jnp.asarray(least).astype(x.dtype)
+    return lax.fori_loop(0, steps, lambda _, m: _iterate(m, x, w, counted, regularisation, least), m)
+
+
+def _iterate(m, x, w, counted, regularisation, least):
+    """One E and one M step, Bishop eq. 9.23 to 9.27."""
+    n, d = x.shape
+    tiny, eps = (float(getattr(jnp.finfo(x.dtype), name)) for name in ("tiny", "eps"))
+    r = jnp.where(counted[:, None], w[:, None] * responsibilities(m, x), 0)
+    count = jnp.sum(r, axis=0)  # eq. 9.27
+    r = r / jnp.where(count > 0, count, 1)[None]
+    means = jnp.einsum("nk,nd->kd", r, x, precision=Precision.HIGHEST)  # eq. 9.24
+    moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)  # below, the sums of underflowing numbers are no longer averages
+    c = x[:, None] - means[None]
+    covariances = jnp.einsum("nk,nkd,nke->kde", r, c, c, precision=Precision.HIGHEST)  # eq. 9.25
+    covariances = 0.5 * (covariances + covariances.mT) + regularisation * jnp.eye(d, dtype=x.dtype)[None]
+    spread = moved & (count >= least) & jax.vmap(lambda a: gaussian.is_definite(a, n))(covariances)
+    total = jnp.sum(count)
+    share = jnp.maximum(count / jnp.where(total > 0, total, 1), tiny)  # eq. 9.26; its log stays finite
+    return Mixture(
+        jnp.where(jnp.isfinite(total) & (total > 0), share / jnp.sum(share), m.weights),
+        jnp.where(moved[:, None], means, m.means),
+        jnp.where(spread[:, None, None], covariances, m.covariances),
+    )
+
+
+def _log_joint(m, x):
+    """[..., k]: log of weight times density."""
+    values = jax.vmap(lambda mean, covariance: gaussian.log_prob(Gaussian(mean, covariance), x), out_axes=-1)(m.means, m.covariances)
+    return values + jnp.log(m.weights).reshape((1,) * (values.ndim - 1) + (-1,))
+
+
+def _check(function, m, x, weights):
+    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
+    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
+        received = [a.shape for a in m]
+        raise ValueError(f"mixture.{function}: weights must be [k], means [k, d] and covariances [k, d, d], received {received}")
+    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
+        raise ValueError(f"mixture.{function}: x must be [n, {d}] and its weights [n], received {x.shape} and {weights.shape}")

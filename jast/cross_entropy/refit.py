@@ -1,0 +1,120 @@
+"""How a proposal moves to the elites: those that were truly evaluated, those of the surrogate, and those of short searches on it."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast.cross_entropy import gaussian, mixture, surrogates
+from jast.cross_entropy.gaussian import Gaussian
+from jast.cross_entropy.mixture import Mixture
+
+__all__ = ["Points", "draw", "moments", "search_around", "to_elites", "to_model"]
+
+
+class Points(NamedTuple):
+    """Weighted points; one of weight 0 is not there."""
+
+    x: Any
+    """[n, d]"""
+    weights: Any
+    """[n]"""
+
+
+def draw(key, proposal, n):
+    """``n`` draws [n, d]."""
+    return (mixture if isinstance(proposal, Mixture) else gaussian).sample(key, proposal, n)
+
+
+def moments(proposal):
+    """The `Gaussian` of the proposal's mean and covariance."""
+    if isinstance(proposal, Gaussian):
+        return proposal
+    w = proposal.weights / jnp.sum(proposal.weights)
+    mean = w @ proposal.means
+    z = proposal.means - mean[None]
+    return Gaussian(mean, jnp.einsum("k,kde->de", w, proposal.covariances) + jnp.einsum("k,kd,ke->de", w, z, z))
+
+
+def to_elites(proposal, elites):
+    """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are too few for a covariance."""
+    return gaussian.fit(proposal, elites.x, elites.weights)
+
+
+class Sub(NamedTuple):
+    """The outcome of short searches on the surrogate, one an elite."""
+
+    x: Any
+    """[n, d]: the best point of each"""
+    value: Any
+    """[n]: what the surrogate says there"""
+    fitted: Gaussian
+    """[n, ...]: their last proposals"""
+
+
+def search_around(key, model, centres, covariance, samples, elites, iterations):
+    """`Sub`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from N(centre, covariance), for each of ``centres`` [n, d] (Algorithm 4)."""
+
+    def search(key, centre):
+        def iterate(carry, key):
+            g, best, value = carry
+            x = gaussian.sample(key, g, samples)
+            v = model(x)
+            least, i = lax.top_k(-v, elites)
+            better = -least[0] < value
+            g = gaussian.fit(g, x[i], jnp.ones((elites,), x.dtype))
+            return (g, jnp.where(better, x[i[0]], best), jnp.where(better, -least[0], value)), None
+
+        start = Gaussian(centre, covariance), centre, jnp.asarray(jnp.inf, centre.dtype)
+        (g, best, value), _ = lax.scan(iterate, start, jax.random.split(key, iterations))
+        return Sub(best, value, g)
+
+    return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
+
+
+def to_model(key, plan, settings, proposal, first, elites, seen, count, kept):
+    """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that the surrogate judged [m, d]).
+
+    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``count``, ``kept``:
+    samples and elites of this iteration, both traced.
+    """
+    for_samples, for_searches = jax.random.split(key)
+    x, y, mask = seen
+    y, mask = surrogates.warped(plan.warp, y, mask)
+    at = surrogates.frame(x, mask) if plan.frame == "window" else _round(moments(first))
+    model = partial(surrogates.predict, plan.surrogate, surrogates.fit(plan.surrogate, x, y, mask, at, plan.kernel))
+
+    judged = draw(for_samples, proposal, plan.factor * max(plan.counts))  # Algorithm 3
+    there = jnp.arange(len(judged)) < plan.factor * count
+    _, i = lax.top_k(-jnp.where(there, model(judged), jnp.inf), plan.factor * max(plan.elites))
+    chosen = Points(judged[i], (jnp.arange(len(i)) < plan.factor * kept).astype(x.dtype))
+
+    spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
+    sub = search_around(for_searches, model, elites.x, spread, *plan.sub)
+    everything = (jnp.concatenate(part) for part in zip(elites, chosen, (sub.x, elites.weights), strict=True))
+    together = Points(*everything)  # Algorithm 2: true, model and sub-elites
+    best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
+    judged = jnp.where(there[:, None], judged, jnp.nan)
+    if isinstance(proposal, Gaussian):
+        return to_elites(proposal, together), sub.x[best], judged
+    return _to_components(plan, settings, proposal, elites, sub, spread, together), sub.x[best], judged
+
+
+def _to_components(plan, settings, proposal, elites, sub, spread, together):
+    """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of them."""
+    k = plan.components
+    there = elites.weights[:k]
+    weights = there / jnp.maximum(jnp.sum(there), 1)
+    means, covariances = (
+        (sub.fitted.mean[:k], sub.fitted.covariance[:k]) if plan.start == "searches" else (elites.x[:k], jnp.broadcast_to(spread[None], (k, *spread.shape)))
+    )
+    new = mixture.em(Mixture(weights, means, covariances), *together, iterations=plan.em_iterations, regularisation=settings.regularisation)
+    return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
+
+
+def _round(proposal):
+    """The frame of one scale for all coordinates: the root of the mean variance."""
+    d = proposal.mean.size
+    return surrogates.Frame(proposal.mean, jnp.sqrt(jnp.trace(proposal.covariance) / d) * jnp.eye(d, dtype=proposal.mean.dtype))

@@ -1,0 +1,89 @@
+"""What the cross-entropy methods return, and how runs are judged that know the optimum."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["CEResult", "History", "Scores", "scores"]
+
+
+class History(NamedTuple):
+    """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand together, in order."""
+
+    x: Any
+    """[n, d]: every point that was truly evaluated, in order"""
+    value: Any
+    """[n]: the objective there, NaN or infinite where it was"""
+    iteration: Any
+    """[n] int: from 0"""
+    best_x: Any
+    """[K, d]: the best point so far, after each iteration; NaN while there is none"""
+    best_value: Any
+    """[K]; inf while no value was finite"""
+    proposals: Any
+    """A `Gaussian` or a `Mixture` with a leading axis [K + 1]: that of each iteration, and the last"""
+    model_x: Any
+    """[K, 10 max(m), d]: the points that the surrogate judged in each iteration, NaN where there were fewer; [K, 0, d] without a surrogate"""
+
+
+class CEResult(NamedTuple):
+    """The outcome. With a leading axis everywhere after `jax.vmap`."""
+
+    proposal: Any
+    """The last one, a `Gaussian` or a `Mixture`"""
+    best_x: Any
+    """[d]: the point of the least finite value"""
+    best_value: Any
+    """That value: b_v"""
+    history: History
+    invalid: Any
+    """int: evaluations that gave NaN or infinity; none of them was an elite"""
+
+    def __str__(self):
+        value = np.asarray(self.best_value)
+        n = np.asarray(self.history.value).shape[-1]
+        bad = int(np.sum(self.invalid))
+        note = f"\n{bad} evaluations gave NaN or infinity and count as no elite" if bad else ""
+        if value.ndim == 0:
+            rows = zip(np.cumsum(np.bincount(self.history.iteration)), np.asarray(self.history.best_value), np.asarray(self.history.best_x), strict=True)
+            table = "\n".join(f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}" for i, (evaluations, b, x) in enumerate(rows, 1))
+            return f"iteration evaluations  best value   at\n{table}{note}"
+        spread = f" +- {value.std(ddof=1) / np.sqrt(value.size):.2g}" if value.size > 1 else ""
+        return f"{value.size} runs of {n} evaluations: best value {value.mean():.6g}{spread} (mean and its standard error), the best of them {value.min():.6g}{note}"
+
+
+def _point(x):
+    shown = ", ".join(f"{v:.4g}" for v in x[:6])
+    return f"({shown}{', ...' if x.size > 6 else ''})"
+
+
+class Scores(NamedTuple):
+    """Of several runs, the means over them; distances are Euclidean, from the best point to the optimum."""
+
+    best_value: Any
+    """b_v"""
+    standard_error: Any
+    """Of ``best_value``"""
+    mean_distance: Any
+    rms_distance: Any
+    """Root of the mean squared distance"""
+    frobenius: Any
+    """sqrt(50) times ``rms_distance``: the size of the 2 x 50 matrix of errors of 50 runs, which the thesis's b_d most likely is"""
+
+
+def scores(result, optimum):
+    """The `Scores` of a batch of runs, a `CEResult` with a leading axis [runs], after each iteration: arrays [K], the last of which is the outcome.
+
+    ``optimum`` [d]: where the objective is least. On the host. ValueError for a result of one run, and an optimum of another dimension.
+    """
+    x, value = np.asarray(result.history.best_x, float), np.asarray(result.history.best_value, float)
+    if x.ndim != 3:
+        raise ValueError(f"scores: result must be a batch of runs, its history.best_x [runs, iterations, d], received {x.shape}")
+    optimum = np.asarray(optimum, float)
+    if optimum.shape != x.shape[2:]:
+        raise ValueError(f"scores: optimum must be [{x.shape[2]}], received shape {optimum.shape}")
+    runs = len(x)
+    distance = np.sqrt(np.sum((x - optimum) ** 2, axis=2))
+    error = value.std(axis=0, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(value.shape[1], np.nan)
+    rms = np.sqrt(np.mean(distance**2, axis=0))
+    return Scores(value.mean(axis=0), error, distance.mean(axis=0), rms, np.sqrt(50) * rms)

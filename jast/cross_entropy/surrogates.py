@@ -1,0 +1,133 @@
+"""Cheap models of an objective, fitted to the masked points that were truly evaluated: a Gaussian process, or least squares on a few basis functions.
+
+Points are centred and scaled first, and values may be warped. What is predicted is only good for ranking points, which is all that a cross-entropy method does.
+"""
+
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+from jax.scipy.special import ndtri
+
+from jast.cross_entropy import gaussian_process
+
+__all__ = ["SURROGATES", "WARPS", "Surrogate", "frame", "fit", "predict", "warped"]
+
+
+class Frame(NamedTuple):
+    """Coordinates in which points are compared: z = L^-1 (x - centre)."""
+
+    centre: Any
+    """[d]"""
+    factor: Any
+    """[d, d], lower triangular"""
+
+
+class Surrogate(NamedTuple):
+    """A fitted model."""
+
+    frame: Frame
+    model: Any
+    """A `GaussianProcess`, or a `Basis`."""
+
+
+class Basis(NamedTuple):
+    """Least squares on basis functions, which `predict` finds by the kind of the model."""
+
+    x: Any
+    """[n, d]: the points, which are the centres of radial basis functions"""
+    mask: Any
+    """[n] bool"""
+    weights: Any
+    """[features]"""
+
+
+def _linear(x, centres, mask):
+    return jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
+
+
+def _quadratic(x, centres, mask):
+    pairs = [x[:, i : i + 1] * x[:, j : j + 1] for i, j in combinations_with_replacement(range(x.shape[1]), 2)]
+    return jnp.concatenate([_linear(x, centres, mask), *pairs], axis=1)
+
+
+def _radial(x, centres, mask):
+    return jnp.where(mask[None, :], jnp.exp(-0.5 * gaussian_process.squared_distances(x, centres) / x.shape[1]), 0)
+
+
+BASES = {"linear": _linear, "polynomial": _quadratic, "radial basis": _radial}
+SURROGATES = ("gaussian process", *BASES)
+RIDGE = 1e-4
+"""Of the least squares, as a share of the features' mean square."""
+
+
+def _raw(y, mask):
+    """The values as they are, but for their size."""
+    return y / jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
+
+
+def _standard(y, mask):
+    n = jnp.maximum(jnp.sum(mask, dtype=y.dtype), 1)
+    centred = jnp.where(mask, y - jnp.sum(y) / n, 0)
+    return centred / jnp.maximum(jnp.sqrt(jnp.sum(centred**2) / n), jnp.finfo(y.dtype).tiny)
+
+
+def _rank(y, mask):
+    """Normal scores: Phi^-1((r + 1/2) / n) of the rank r from 0; equal values share the mean of their ranks."""
+    n = jnp.maximum(jnp.sum(mask, dtype=y.dtype), 1)
+    less = jnp.sum((y[None, :] < y[:, None]) & mask[None, :], axis=1, dtype=y.dtype)
+    equal = jnp.sum((y[None, :] == y[:, None]) & mask[None, :], axis=1, dtype=y.dtype)
+    return jnp.where(mask, ndtri(jnp.clip((less + 0.5 * equal) / n, 1e-4, 1 - 1e-4)), 0)
+
+
+WARPS = {"raw": _raw, "standard": _standard, "rank": _rank}
+
+
+def warped(warp, y, mask):
+    """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where they are the worst."""
+    finite = mask & jnp.isfinite(y)
+    if warp == "rank":
+        return _rank(jnp.where(finite, y, jnp.inf), mask), mask
+    return WARPS[warp](jnp.where(finite, y, 0), finite), finite
+
+
+def frame(x, mask):
+    """The `Frame` in which masked points ``x`` [n, d] have mean 0 and about the identity for covariance; a tenth of it is kept round, so that few points do."""
+    d = x.shape[1]
+    n = jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
+    x = jnp.where(mask[:, None], x, 0)
+    centre = jnp.sum(x, axis=0) / n
+    z = jnp.where(mask[:, None], x - centre[None], 0)
+    variances = jnp.sum(z**2, axis=0) / n
+    largest = jnp.maximum(jnp.max(variances), jnp.finfo(x.dtype).tiny ** 0.5)
+    variances = jnp.where(variances > largest * jnp.finfo(x.dtype).eps, variances, largest)  # a coordinate without spread
+    u = z / jnp.sqrt(variances)[None]
+    correlation = 0.9 * u.T @ u / n + 0.1 * jnp.eye(d, dtype=x.dtype)
+    return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))
+
+
+def fit(kind, x, y, mask, frame, kernel="squared exponential"):
+    """The `Surrogate` of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values ``y`` [n], where ``mask`` [n]."""
+    z = jnp.where(mask[:, None], _framed(frame, jnp.where(mask[:, None], x, 0)), 0)
+    if kind == "gaussian process":
+        return Surrogate(frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=kernel))
+    features = jnp.where(mask[:, None], BASES[kind](z, z, mask), 0)
+    normal = features.T @ features
+    size = jnp.maximum(jnp.trace(normal) / len(normal), jnp.finfo(x.dtype).tiny)
+    ridge = RIDGE * size * jnp.eye(len(normal), dtype=x.dtype)
+    return Surrogate(frame, Basis(z, mask, cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))))
+
+
+def predict(kind, surrogate, x):
+    """What the model expects at ``x`` [m, d]: [m], on the scale of the warped values."""
+    z = _framed(surrogate.frame, x)
+    if kind == "gaussian process":
+        return gaussian_process.predict(surrogate.model, z)
+    model = surrogate.model
+    return BASES[kind](z, model.x, model.mask) @ model.weights
+
+
+def _framed(frame, x):
+    return solve_triangular(frame.factor, (x - frame.centre[None]).T, lower=True).T
