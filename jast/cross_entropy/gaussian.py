@@ -9,7 +9,7 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
-__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "normal", "sample"]
+__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "moments", "normal", "sample"]
 
 
 class Gaussian(NamedTuple):
@@ -111,27 +111,33 @@ def fit(g, x, weights):
     w = w / jnp.max(w)  # neither overflows nor underflows; NaN if all are 0
     w = w / jnp.sum(w)
     c = jnp.where(counted[:, None], x, 0)
-    average = lambda a: jnp.matmul(w, a, precision=Precision.HIGHEST)
-    mean = average(c)
-    # The mean is rounded relative to its own size, which may be far above the spread: the second pass takes the remainder out
-    c = jnp.where(counted[:, None], c - mean[None], 0)
-    rest = average(c)
-    mean, c = mean + rest, c - rest[None]
-    covariance = jnp.einsum("n,nd,ne->de", w, c, c, precision=Precision.HIGHEST)
-    covariance = 0.5 * (covariance + covariance.T)
-    good = jnp.all(jnp.isfinite(mean)) & is_definite(covariance, n) & (jnp.sum(counted) > d)
+    mean, covariance = moments(jnp.where(counted[:, None], x, 0), w)
+    good = jnp.all(jnp.isfinite(mean)) & is_definite(covariance, mean, n) & (jnp.sum(counted) > d)
     return jax.tree.map(lambda new, old: jnp.where(good, new, old), Gaussian(mean, covariance), g)
 
 
-def is_definite(covariance, rows=1):
-    """Whether a symmetric matrix [d, d], an average over ``rows`` samples, is positive definite beyond its rounding errors; False if it is not finite.
+def moments(x, w):
+    """Mean [d] and covariance [d, d] of ``x`` [n, d] with weights ``w`` [n] that sum to 1."""
+    average = lambda a: jnp.matmul(w, a, precision=Precision.HIGHEST)
+    mean = average(x)
+    # The mean is rounded relative to its own size, which may be far above the spread: the second pass takes the remainder out
+    c = x - mean[None]
+    rest = average(c)
+    c = c - rest[None]
+    covariance = jnp.einsum("n,nd,ne->de", w, c, c, precision=Precision.HIGHEST)
+    return mean + rest, 0.5 * (covariance + covariance.T)
 
-    Its correlation matrix R = L L^T is what is judged, so units do not matter. A singular R comes out with a least eigenvalue of the size of rounding errors,
-    and often with a Cholesky factor whose pivots look sound when it is ill-conditioned before the last one. So the trace of R^-1, the sum of the inverse
-    eigenvalues and of the squares of L^-1, is asked to be below 1 / (4 (d + sqrt(rows)) eps).
+
+def is_definite(covariance, mean, rows):
+    """Whether the covariance [d, d] of ``rows`` samples about ``mean`` [d] is positive definite beyond its rounding errors; False if it is not finite.
+
+    No standard deviation may be below 4 eps times the mean, about which samples are stored no finer. For the rest the correlation matrix R = L L^T is judged,
+    so units do not matter. A singular R comes out with a least eigenvalue of the size of rounding errors, and often with a Cholesky factor whose pivots look
+    sound, when it is ill-conditioned before the last one. So the trace of R^-1, the sum of the inverse eigenvalues and of the squares of L^-1, is asked to be
+    below 1 / (4 (d + sqrt(rows)) eps).
     """
-    d = covariance.shape[-1]
+    d, eps = covariance.shape[-1], float(jnp.finfo(covariance.dtype).eps)
     spread = jnp.sqrt(jnp.diagonal(covariance))
     correlation = covariance / spread[:, None] / spread[None, :]
     inverse = solve_triangular(jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True)
-    return jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * float(jnp.finfo(covariance.dtype).eps)) < 1  # NaN is not below 1
+    return (jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1) & jnp.all(spread > 4 * eps * jnp.abs(mean))  # False for NaN

@@ -93,12 +93,10 @@ def _iterate(m, x, w, counted, regularisation, least):
     r = jnp.where(counted[:, None], w[:, None] * responsibilities(m, x), 0)
     count = jnp.sum(r, axis=0)  # eq. 9.27
     r = r / jnp.where(count > 0, count, 1)[None]
-    means = jnp.einsum("nk,nd->kd", r, x, precision=Precision.HIGHEST)  # eq. 9.24
+    means, covariances = jax.vmap(gaussian.moments, (None, 1))(x, r)  # eq. 9.24, 9.25
+    covariances = covariances + regularisation * jnp.eye(d, dtype=x.dtype)[None]
     moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)  # below, the sums of underflowing numbers are no longer averages
-    c = x[:, None] - means[None]
-    covariances = jnp.einsum("nk,nkd,nke->kde", r, c, c, precision=Precision.HIGHEST)  # eq. 9.25
-    covariances = 0.5 * (covariances + covariances.mT) + regularisation * jnp.eye(d, dtype=x.dtype)[None]
-    spread = moved & (count >= least) & jax.vmap(lambda a: gaussian.is_definite(a, n))(covariances)
+    spread = moved & (count >= least) & jax.vmap(lambda c, mean: gaussian.is_definite(c, mean, n))(covariances, means)
     total = jnp.sum(count)
     share = jnp.maximum(count / jnp.where(total > 0, total, 1), tiny)  # eq. 9.26; its log stays finite
     return Mixture(

@@ -48,8 +48,8 @@ class CEResult(NamedTuple):
             rows = zip(np.cumsum(np.bincount(self.history.iteration)), np.asarray(self.history.best_value), np.asarray(self.history.best_x), strict=True)
             table = "\n".join(f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}" for i, (evaluations, b, x) in enumerate(rows, 1))
             return f"iteration evaluations  best value   at\n{table}{note}"
-        spread = f" +- {value.std(ddof=1) / np.sqrt(value.size):.2g}" if value.size > 1 else ""
-        return f"{value.size} runs of {n} evaluations: best value {value.mean():.6g}{spread} (mean and its standard error), the best of them {value.min():.6g}{note}"
+        mean = f"{value.mean():.6g}" + (f" +- {value.std(ddof=1) / np.sqrt(value.size):.2g}" if value.size > 1 else "")
+        return f"{value.size} runs of {n} evaluations: best value {mean} (mean and its standard error), the best of them {value.min():.6g}{note}"
 
 
 def _point(x):

@@ -6,7 +6,6 @@ Points are centred and scaled first, and values may be warped. What is predicted
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jax.scipy.special import ndtri
