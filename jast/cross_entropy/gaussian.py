@@ -59,7 +59,7 @@ def _normal(name, mean, covariance):
     if c.shape not in ((), (d,), (d, d)):
         raise ValueError(f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received shape {c.shape}")
     floats = [v.dtype for v in (mean, covariance) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    dtype = max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
+    dtype = jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))  # float64 is float32 where that is all there is
     if not traced[1]:
         _check_covariance(name, c, float(jnp.finfo(dtype).eps))
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
@@ -110,7 +110,6 @@ def fit(g, x, weights):
     w = jnp.where(counted, weights, 0)
     w = w / jnp.max(w)  # neither overflows nor underflows; NaN if all are 0
     w = w / jnp.sum(w)
-    c = jnp.where(counted[:, None], x, 0)
     mean, covariance = moments(jnp.where(counted[:, None], x, 0), w)
     good = jnp.all(jnp.isfinite(mean)) & is_definite(covariance, mean, n) & (jnp.sum(counted) > d)
     return jax.tree.map(lambda new, old: jnp.where(good, new, old), Gaussian(mean, covariance), g)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast.counter import tree_keys
 from jast.cross_entropy import refit
 from jast.cross_entropy.refit import Points
 from jast.cross_entropy.result import CEResult, History
@@ -42,8 +43,12 @@ class Plan(NamedTuple):
     warp: str = ""
     frame: str = ""
     """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the initial proposal"""
+    optimistic: bool = False
+    """Those searches minimise the model's mean less ``Settings.optimism`` of its standard deviations"""
     factor: int = 10
     """Samples judged by the surrogate, as a multiple of those evaluated"""
+    chosen: tuple = ()
+    """How many of them are elites, in each iteration"""
     sub: tuple = (100, 10, 2)
     """Samples, elites and iterations of a search on the surrogate"""
     components: int = 0
@@ -56,6 +61,7 @@ class Settings(NamedTuple):
     """The traced part."""
 
     alpha: Any
+    optimism: Any
     regularisation: Any
 
 
@@ -88,20 +94,20 @@ def begin(key, plan, proposal):
     full = lambda value, *shape: jnp.full(shape, value, dtype)
     stacked = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal)
     return State(
-        key, jnp.int32(0), full(jnp.nan, n, d), full(jnp.inf, n), proposal, proposal, full(0, plan.evaluated, d), stacked, full(jnp.nan, steps, judged, d)
+        tree_keys(key, 1)[0], jnp.int32(0), full(jnp.nan, n, d), full(jnp.inf, n), proposal, proposal, full(0, plan.evaluated, d), stacked, full(jnp.nan, steps, judged, d)
     )
 
 
 def ask(plan, state):
     """The points of the next iteration, [max(m), d], of which the first ``plan.counts[k]`` count."""
     x = refit.draw(_key(state, 0), state.proposal, max(plan.counts))
-    known = (state.k > 0) & (jnp.arange(plan.evaluated) < _of(plan.counts, state.k) // 2)
+    known = (state.k > 0) & (jnp.arange(plan.evaluated, dtype=jnp.int32) < _of(plan.counts, state.k) // 2)
     return x.at[: plan.evaluated].set(jnp.where(known[:, None], state.pending, x[: plan.evaluated]))
 
 
 def tell(plan, settings, state, x, value):
     """The `State` after the values [max(m)] at ``x`` [max(m), d]."""
-    k, rows = state.k, jnp.arange(max(plan.counts))
+    k, rows = state.k, jnp.arange(max(plan.counts), dtype=jnp.int32)
     begins = np.cumsum((0, *plan.counts))
     at, count, kept = _of(begins, k), _of(plan.counts, k), _of(plan.elites, k)
     live = rows < count
@@ -115,7 +121,7 @@ def tell(plan, settings, state, x, value):
     else:
         since = _of([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
         seen = _remembered(plan, state, since, at + count)
-        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, count, kept)
+        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, count, _of(plan.chosen, k))
         pending = better[: plan.evaluated]
         state = state._replace(model_x=state.model_x.at[k].set(judged))
     proposals = jax.tree.map(lambda a, b: a.at[k + 1].set(b), state.proposals, proposal)
@@ -134,7 +140,7 @@ def _best(x, value, count, most):
     """`Points`: the ``count`` best of finite value, of at most ``most``, best first; the others have weight 0."""
     finite = jnp.isfinite(value)
     _, i = lax.top_k(-jnp.where(finite, value, jnp.inf), min(most, len(value)))
-    weights = finite[i] & (jnp.arange(len(i)) < count)
+    weights = finite[i] & (jnp.arange(len(i), dtype=jnp.int32) < count)
     return Points(jnp.where(weights[:, None], x[i], x[i[0]]), weights.astype(x.dtype))
 
 
@@ -142,10 +148,10 @@ def _remembered(plan, state, since, until):
     """What the surrogate is fitted to, (x, values, mask): rows ``since`` to ``until`` of the log, and the best before."""
     n, begins = len(state.value), np.cumsum((0, *plan.counts))
     width = max(begins[i + 1] - begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts)))
-    rows = since + jnp.arange(width)
+    rows = since + jnp.arange(width, dtype=jnp.int32)
     mask = rows < until
     if older := min(plan.best, n - width):
-        before = (jnp.arange(n) < since) & jnp.isfinite(state.value)
+        before = (jnp.arange(n, dtype=jnp.int32) < since) & jnp.isfinite(state.value)
         _, i = lax.top_k(-jnp.where(before, state.value, jnp.inf), older)
         rows, mask = jnp.concatenate([rows, i]), jnp.concatenate([mask, before[i]])
     take = lambda a: a.at[rows].get(mode="clip")
@@ -157,13 +163,13 @@ def finish(plan, state):
     last = np.cumsum(plan.counts) - 1
     finite = jnp.isfinite(state.value)
     value = jnp.where(finite, state.value, jnp.inf)
-    order = jnp.arange(len(value))
-    # the place of the best so far: the running minimum by value, then by place
-    best, place = lax.associative_scan(lambda a, b: jax.tree.map(lambda u, v: jnp.where(b[0] < a[0], v, u), a, b), (value, order))
+    order = jnp.arange(len(value), dtype=jnp.int32)
+    place = jnp.argmin(jnp.where(order[None, :] <= jnp.asarray(last, jnp.int32)[:, None], value[None, :], jnp.inf), axis=1)
+    best = value[place]
     x = jnp.where(jnp.isfinite(best)[:, None], state.x[place], jnp.nan)
     evaluated = order < _of(np.cumsum((0, *plan.counts)), state.k)
     iteration = jnp.asarray(np.repeat(np.arange(len(plan.counts), dtype=np.int32), plan.counts))
-    history = History(state.x, state.value, iteration, x[last], best[last], state.proposals, state.model_x)
+    history = History(state.x, state.value, iteration, x, best, state.proposals, state.model_x)
     return CEResult(state.proposal, x[-1], best[-1], history, jnp.sum(evaluated & ~finite, dtype=jnp.int32))
 
 

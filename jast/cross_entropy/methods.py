@@ -34,46 +34,40 @@ def ce_method(key, objective, proposal, *, samples=10, elites=5, iterations=10, 
     return _run("ce_method", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
 
 
-def ce_surrogate(
-    key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", ratchet=False, elitism=None, surrogate=None,
-    kernel=None, warp=None, memory=None, best=None, evaluated=None, current=None, frame=None, alpha=1.0,
-):  # fmt: skip
+def ce_surrogate(key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", **settings):
     """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2 to 4 of the thesis; see `ce_method` for what is common.
 
-    A cheap model of the objective is fitted in every iteration. The proposal is refitted to the elites that were evaluated, to the best half or so of ten times
-    as many samples that only the model judged, and to the best points of short cross-entropy searches on the model around each true elite.
+    A cheap model of the objective is fitted in every iteration. The proposal is refitted to the elites that were evaluated, to the best part of ten times as
+    many samples that only the model judged, and to the best points of short cross-entropy searches on the model, one around each true elite.
 
-    ``surrogate``: "gaussian process" (with a ``kernel``: "squared exponential", "matern12", "matern32", "matern52"), "linear", "polynomial" (of degree 2) or
-    "radial basis". It is fitted to the evaluations of the last ``memory`` iterations and the ``best`` of those before, with values ``warp``: "raw", "standard"
-    (mean 0, variance 1), or "rank" (normal scores, which no monotone change of the objective alters). ``evaluated``: the share of each batch, rounded up, that
-    is spent on the best points of the last iteration's searches. These start with the covariance of the ``current`` proposal, or else of the initial one, over
-    ``alpha``. ``frame``: the model's coordinates are whitened by the points it is fitted to ("window"), or have the scale of the initial proposal ("initial").
+    ``settings``, beside ``ratchet`` and ``elitism`` (each with the value of `MODES` [method][mode] where it is not given):
+
+    - ``surrogate``: "gaussian process" (with a ``kernel``: "squared exponential", "matern12", "matern32", "matern52"), "linear", "polynomial" (of degree 2) or
+      "radial basis".
+    - ``memory``, ``best``: it is fitted to the evaluations of so many of the last iterations, and so many of the best before them.
+    - ``warp``: to values "raw", "standard" (mean 0, variance 1), or "rank" (normal scores, which no increasing function of the objective alters).
+    - ``frame``: in coordinates whitened by those points ("window"), or in the scale of the initial proposal ("initial").
+    - ``selection``: the share of the judged samples that are elites; "elites": as among the evaluated ones, "dimension": but at most one in d.
+    - ``optimism``: the searches minimise the mean less so many standard deviations of the model; traced.
+    - ``current``, ``alpha``: they start with the covariance of the current proposal, or else of the initial one, over alpha, which is traced.
+    - ``evaluated``: the share of each batch, rounded up, that is spent on their best points in the iteration after; at most a half.
 
     ``mode="thesis"`` is the published code: raw values, three iterations, elites of the last batch, no search result evaluated, initial covariance; its
-    likelihood is maximised on a grid here. ``mode="default"`` is `MODES` ["ce_surrogate"]["default"], tuned on sierra, checked on others (docs/figures.md).
+    likelihood is maximised on a grid here. ``mode="default"`` is tuned on sierra and checked on others (docs/figures.md).
     """
-    more = dict(
-        ratchet=ratchet, elitism=elitism, surrogate=surrogate, kernel=kernel, warp=warp, memory=memory, best=best, evaluated=evaluated, current=current,
-        frame=frame, alpha=alpha,
-    )  # fmt: skip
-    return _run("ce_surrogate", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
+    return _run("ce_surrogate", key, objective, proposal, samples, elites, iterations, schedule, mode, settings)
 
 
-def ce_mixture(
-    key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", ratchet=False, elitism=None, surrogate=None,
-    kernel=None, warp=None, memory=None, best=None, evaluated=None, current=None, frame=None, alpha=1.0, components=None, start=None, regularisation=None,
-):  # fmt: skip
+def ce_mixture(key, objective, proposal, *, samples=10, elites=5, iterations=10, schedule=None, mode="default", **settings):
     """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its proposal: `CEResult`. Algorithm 5; see `ce_surrogate`.
 
-    The `Mixture` of ``components`` (default: as many as elites) is fitted by ten iterations of expectation maximisation, which ``start`` at Gaussians around
-    the true elites ("elites"), or at the proposals with which the searches around them ended ("searches", as in the thesis). ``regularisation`` is added to
-    the diagonals. ``proposal`` may also be a `Mixture`, of as many components.
+    The `Mixture` is fitted by ten iterations of expectation maximisation. ``proposal`` may also be one. ``settings``, beside those of `ce_surrogate`:
+
+    - ``components``: how many; default: as many as elites.
+    - ``start``: each begins as a Gaussian around a true elite ("elites"), or as the proposal with which the search around it ended ("searches", the thesis).
+    - ``regularisation``: added to the diagonals of their covariances; traced.
     """
-    more = dict(
-        ratchet=ratchet, elitism=elitism, surrogate=surrogate, kernel=kernel, warp=warp, memory=memory, best=best, evaluated=evaluated, current=current,
-        frame=frame, alpha=alpha, components=components, start=start, regularisation=regularisation,
-    )  # fmt: skip
-    return _run("ce_mixture", key, objective, proposal, samples, elites, iterations, schedule, mode, more)
+    return _run("ce_mixture", key, objective, proposal, samples, elites, iterations, schedule, mode, settings)
 
 
 def _run(method, key, objective, proposal, samples, elites, iterations, schedule, mode, more):

@@ -47,7 +47,7 @@ def sierra(mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0,
         _finite(name, value, (), positive=name in ("variance", "sharpness"))
     given = (mean, variance, spacing, sharpness, decay)
     floats = [v.dtype for v in given if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    dtype = max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
+    dtype = jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))  # float64 is float32 where that is all there is
     mean, variance, spacing, sharpness, decay = (jnp.asarray(v).astype(dtype) for v in given)
 
     corners = jnp.asarray(_CORNERS[:, None, None], dtype)  # [corner, path, way, coordinate]

@@ -74,26 +74,28 @@ def search_around(key, model, centres, covariance, samples, elites, iterations):
     return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
 
 
-def to_model(key, plan, settings, proposal, first, elites, seen, count, kept):
+def to_model(key, plan, settings, proposal, first, elites, seen, count, chosen):
     """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that the surrogate judged [m, d]).
 
-    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``count``, ``kept``:
-    samples and elites of this iteration, both traced.
+    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``count``, ``chosen``:
+    this iteration's samples, and its elites among those judged by the model; both traced.
     """
     for_samples, for_searches = jax.random.split(key)
     x, y, mask = seen
     y, mask = surrogates.warped(plan.warp, y, mask)
     at = surrogates.frame(x, mask) if plan.frame == "window" else _round(moments(first))
-    model = partial(surrogates.predict, plan.surrogate, surrogates.fit(plan.surrogate, x, y, mask, at, plan.kernel))
+    model = surrogates.fit(plan.surrogate, x, y, mask, at, plan.kernel)
+    mean = partial(surrogates.predict, plan.surrogate, model)
+    aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism) if plan.optimistic else mean
 
     judged = draw(for_samples, proposal, plan.factor * max(plan.counts))  # Algorithm 3
-    there = jnp.arange(len(judged)) < plan.factor * count
-    _, i = lax.top_k(-jnp.where(there, model(judged), jnp.inf), plan.factor * max(plan.elites))
-    chosen = Points(judged[i], (jnp.arange(len(i)) < plan.factor * kept).astype(x.dtype))
+    there = jnp.arange(len(judged), dtype=jnp.int32) < plan.factor * count
+    _, i = lax.top_k(-jnp.where(there, mean(judged), jnp.inf), max(plan.chosen))
+    model_elites = Points(judged[i], (jnp.arange(len(i), dtype=jnp.int32) < chosen).astype(x.dtype))
 
     spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
-    sub = search_around(for_searches, model, elites.x, spread, *plan.sub)
-    everything = (jnp.concatenate(part) for part in zip(elites, chosen, (sub.x, elites.weights), strict=True))
+    sub = search_around(for_searches, aim, elites.x, spread, *plan.sub)
+    everything = (jnp.concatenate(part) for part in zip(elites, model_elites, (sub.x, elites.weights), strict=True))
     together = Points(*everything)  # Algorithm 2: true, model and sub-elites
     best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
     judged = jnp.where(there[:, None], judged, jnp.nan)

@@ -12,7 +12,7 @@ from jax.scipy.special import ndtri
 
 from jast.cross_entropy import gaussian_process
 
-__all__ = ["SURROGATES", "WARPS", "Surrogate", "frame", "fit", "predict", "warped"]
+__all__ = ["SURROGATES", "WARPS", "Surrogate", "frame", "fit", "lower_bound", "predict", "warped"]
 
 
 class Frame(NamedTuple):
@@ -114,8 +114,8 @@ def fit(kind, x, y, mask, frame, kernel="squared exponential"):
         return Surrogate(frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=kernel))
     features = jnp.where(mask[:, None], BASES[kind](z, z, mask), 0)
     normal = features.T @ features
-    size = jnp.maximum(jnp.trace(normal) / len(normal), jnp.finfo(x.dtype).tiny)
-    ridge = RIDGE * size * jnp.eye(len(normal), dtype=x.dtype)
+    live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)  # a masked centre is no feature
+    ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny) * jnp.eye(len(normal), dtype=x.dtype)
     return Surrogate(frame, Basis(z, mask, cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))))
 
 
@@ -126,6 +126,14 @@ def predict(kind, surrogate, x):
         return gaussian_process.predict(surrogate.model, z)
     model = surrogate.model
     return BASES[kind](z, model.x, model.mask) @ model.weights
+
+
+def lower_bound(kind, surrogate, optimism, x):
+    """[m]: the mean less ``optimism`` standard deviations; only a Gaussian process knows any."""
+    if kind != "gaussian process":
+        return predict(kind, surrogate, x)
+    mean, variance = gaussian_process.predict(surrogate.model, _framed(surrogate.frame, x), variance=True)
+    return mean - optimism * jnp.sqrt(variance)
 
 
 def _framed(frame, x):
