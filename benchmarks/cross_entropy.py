@@ -131,9 +131,8 @@ def main(argv=None):
     report = {"seeds": seeds, "speed": speed(seeds), "sierra": {}, "peers": {}, "others": {}}
     say("speed: CPU seconds to compile, CPU ms of a run")
     for method, s in report["speed"].items():
-        say(
-            f"  {method:14} compile {s['compile_cpu_s']:.1f} s, 1A {s['cpu_ms_a_seed']['sierra 1A']:.2f} ms, 1B by the same program {s['cpu_ms_a_seed']['sierra 1B']:.2f} ms"
-        )
+        each = s["cpu_ms_a_seed"]
+        say(f"  {method:14} compile {s['compile_cpu_s']:.1f} s, 1A {each['sierra 1A']:.2f} ms, 1B by the same program {each['sierra 1B']:.2f} ms")
 
     for i, case in enumerate(SIERRA):
         say(f"\n{case}")

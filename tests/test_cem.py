@@ -10,7 +10,6 @@ from systems import S0, ring, two_densities, walk
 import jast
 from jast import actions, rewards
 from jast.distributions import seeds
-from jast.search import proposals as P
 from jast.search.cem import cem
 from jast.search.monte_carlo import monte_carlo
 
@@ -155,17 +154,6 @@ def test_interruption(key, equal):
     r = cem(key, walk(), trees=2, callback=callback, **SMALL)
     assert r.episodes == 600 and r.settings["interrupted"] == "after 600 of 2000 episodes" and len(r.history.failures) == 3
     equal(r.failures, cem(key, walk(), trees=2, samples=100, elites=10, iterations=3).failures)
-
-
-def test_fit(key):
-    """Mean and deviation of the episodes that reached a step; smoothed; not below the floor; kept where fewer than two did."""
-    z = jnp.array([[1.0, 5.0, 9.0], [3.0, 5.0, 0.0], [100.0, 0.0, 0.0]])
-    counts = jnp.array([[1, 1, 1], [1, 1, 0], [0, 0, 0]], bool)
-    old = P.standard(jax.ShapeDtypeStruct((), z.dtype), 3)
-    for smoothing, mean, deviation in ((0.0, [2, 5, 0], [1, 0.2, 1]), (0.5, [1, 2.5, 0], [1, 0.5, 1])):
-        new = P.fit(old, z, counts, jnp.asarray(smoothing), jnp.asarray(0.2))
-        np.testing.assert_allclose(new.mean, mean)
-        np.testing.assert_allclose(new.deviation, deviation, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -229,12 +229,12 @@ def test_mixtures_stay_proper(key):
     result = ce.ce_mixture(key, ce.sierra(), (np.zeros(2), 200.0), samples=10, elites=5, iterations=6)
     weights, means, covariances = result.history.proposals
     np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-5)
-    assert weights.shape == (7, 5) and np.isfinite(means).all() and (np.linalg.eigvalsh(covariances) > 0).all()
+    assert weights.shape == (7, 2) and np.isfinite(means).all() and (np.linalg.eigvalsh(covariances) > 0).all()
     start = ce.Mixture(*jax.tree.map(lambda a: a[-1], (weights, means, covariances)))
     again = ce.ce_mixture(key, ce.sierra(), start, samples=10, elites=5, iterations=2)
     np.testing.assert_array_equal(again.history.proposals.means[0], start.means)
-    few = settled("ce_mixture", START, samples=10, elites=5, iterations=1, schedule=None, mode="default", components=2)
-    assert few[0].components == 2 and few[2].weights.tolist() == [0.5, 0.5]
+    few = settled("ce_mixture", START, samples=10, elites=5, iterations=1, schedule=None, mode="thesis")
+    assert few[0].components == 5 and few[2].weights.tolist() == pytest.approx([0.2] * 5)
 
 
 # ---- bad input, and evaluations that fail
@@ -294,7 +294,7 @@ BAD = {
     'selection must be "elites", "dimension", or a share above 0, at most 1, received 2': dict(selection=2),
     "alpha must be a number above 0, received 0": dict(alpha=0),
     "optimism must be a number of at least 0, received -1.0": dict(optimism=-1.0),
-    "no setting keep; there are [": dict(keep=3),
+    "no setting components, keep; there are [": dict(keep=3, components=2),
     "schedule: counts must be whole numbers": dict(schedule=(3, -1)),
 }
 

@@ -94,7 +94,15 @@ def begin(key, plan, proposal):
     full = lambda value, *shape: jnp.full(shape, value, dtype)
     stacked = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal)
     return State(
-        tree_keys(key, 1)[0], jnp.int32(0), full(jnp.nan, n, d), full(jnp.inf, n), proposal, proposal, full(0, plan.evaluated, d), stacked, full(jnp.nan, steps, judged, d)
+        tree_keys(key, 1)[0],
+        jnp.int32(0),
+        full(jnp.nan, n, d),
+        full(jnp.inf, n),
+        proposal,
+        proposal,
+        full(0, plan.evaluated, d),
+        stacked,
+        full(jnp.nan, steps, judged, d),
     )
 
 

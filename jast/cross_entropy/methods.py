@@ -63,7 +63,7 @@ def ce_mixture(key, objective, proposal, *, samples=10, elites=5, iterations=10,
 
     The `Mixture` is fitted by ten iterations of expectation maximisation. ``proposal`` may also be one. ``settings``, beside those of `ce_surrogate`:
 
-    - ``components``: how many; default: as many as elites.
+    - ``components``: how many; 2, and in mode "thesis" as many as elites.
     - ``start``: each begins as a Gaussian around a true elite ("elites"), or as the proposal with which the search around it ended ("searches", the thesis).
     - ``regularisation``: added to the diagonals of their covariances; traced.
     """

@@ -1,5 +1,7 @@
 """From what a user gives to a `Plan`: modes, checks, and errors that name what is wrong."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -13,30 +15,27 @@ from jast.rewards import as_pytree
 
 __all__ = ["MODES", "checked", "settled"]
 
-_MODEL = dict(surrogate="gaussian process", kernel="squared exponential")
-_THESIS = (
-    dict(elitism=False, memory=3, best=0, evaluated=0.0, current=False, warp="raw", frame="initial", optimism=0.0, selection="elites", regularisation=0.0)
-    | _MODEL
-)
-_DEFAULT = (
-    dict(elitism=True, memory=3, best=10, evaluated=0.1, current=True, warp="rank", frame="window", optimism=1.0, selection="dimension", regularisation=1e-6)
-    | _MODEL
-)
+_MODEL = dict(surrogate="gaussian process", kernel="squared exponential", alpha=1.0)
+_THESIS = dict(elitism=False, memory=3, best=0, evaluated=0.0, current=False, warp="raw", frame="initial", optimism=0.0, selection="elites", **_MODEL)
+_DEFAULT = dict(elitism=True, memory=3, best=10, evaluated=0.1, current=True, warp="rank", frame="window", optimism=1.0, selection="dimension", **_MODEL)
 MODES = {
     "ce_method": {"thesis": dict(elitism=False), "default": dict(elitism=True)},
     "ce_surrogate": {"thesis": _THESIS, "default": _DEFAULT},
-    "ce_mixture": {"thesis": _THESIS | dict(start="searches"), "default": _DEFAULT | dict(start="elites")},
+    "ce_mixture": {
+        "thesis": dict(components=None, start="searches", regularisation=0.0, **_THESIS),
+        "default": dict(components=2, start="elites", regularisation=0.0, **_DEFAULT),
+    },
 }
-"""What each method does where the user does not say."""
+"""What each method does where the user does not say; no ``components``: as many as elites."""
 
 
-def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, components=None, alpha=1.0, **chosen):
-    """``(Plan, Settings, proposal)`` of ``method``; ``chosen``: the settings of `MODES`, None where the mode's serves."""
+def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, **given):
+    """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the mode's serves. Raises ValueError, as the methods say."""
     if mode not in MODES[method]:
         raise ValueError(f"{method}: mode must be one of {sorted(MODES[method])}, received {mode!r}")
-    if unknown := sorted(set(chosen) - set(MODES[method][mode])):
+    if unknown := sorted(set(given) - set(MODES[method][mode])):
         raise ValueError(f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}")
-    chosen = {name: value if chosen.get(name) is None else chosen[name] for name, value in MODES[method][mode].items()}
+    chosen = {name: value if given.get(name) is None else given[name] for name, value in MODES[method][mode].items()}
     sizes = tuple(n for n in counts(schedule, samples, iterations) if n)  # an iteration without evaluations teaches nothing
     elites = _whole(method, "elites", elites, 1)
     if elites > max(sizes):
@@ -44,29 +43,36 @@ def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ra
     kept = [min(elites, n) for n in sizes]
     if ratchet:
         kept = [min(kept[: i + 1]) for i in range(len(kept))]
-    real = dict(alpha=alpha) | {name: chosen.pop(name, 0.0) for name in ("optimism", "regularisation")}
-    settings = Settings(**{name: _number(method, name, value) for name, value in real.items()})
     for name, allowed in dict(surrogate=SURROGATES, kernel=KERNELS, warp=WARPS, frame=("initial", "window"), start=("elites", "searches")).items():
         if name in chosen and chosen[name] not in allowed:
             raise ValueError(f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}")
-    proposal = _start(method, proposal, max(kept), components)
-    d = jax.tree.leaves(proposal)[1].shape[-1]
-    if method != "ce_method":
-        share = chosen["evaluated"]
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 0.5:
-            raise ValueError(f"{method}: evaluated must be a share from 0 to 0.5, received {share!r}")
-        chosen["evaluated"] = min(-int(-share * max(sizes) // 1), max(kept), max(sizes) // 2)  # rounded up
-        chosen["memory"], chosen["best"] = _whole(method, "memory", chosen["memory"], 1), _whole(method, "best", chosen["best"], 0)
-        chosen["optimistic"] = isinstance(settings.optimism, jax.core.Tracer) or bool(settings.optimism != 0)
-        shares = _selection(method, chosen.pop("selection"), sizes, kept, d)
-        chosen["chosen"] = tuple(max(1, round(share * Plan._field_defaults["factor"] * n)) for share, n in zip(shares, sizes, strict=True))
-        if chosen["surrogate"] != "gaussian process":
-            chosen["kernel"] = ""
+    real = {name: _number(method, name, chosen.pop(name, default)) for name, default in dict(alpha=1.0, optimism=0.0, regularisation=0.0).items()}
     if method == "ce_mixture":
+        proposal = _mixture(method, proposal, max(kept), chosen["components"], given.get("components"))
         chosen["components"] = len(proposal.weights)
-    plan = Plan(method, sizes, tuple(kept), **chosen)
-    dtype = jax.tree.leaves(proposal)[0].dtype
-    return plan, jax.tree.map(lambda v: jnp.asarray(v).astype(dtype), settings), proposal
+    else:
+        proposal = as_gaussian(proposal)
+    mean = jax.tree.leaves(proposal)[-2]
+    if method != "ce_method":
+        chosen |= _model(method, chosen, real["optimism"], sizes, kept, mean.shape[-1])
+    settings = Settings(**{name: jnp.asarray(value).astype(mean.dtype) for name, value in real.items()})
+    return Plan(method, sizes, tuple(kept), **{name: value for name, value in chosen.items() if name != "selection"}), settings, proposal
+
+
+def _model(method, chosen, optimism, sizes, kept, d):
+    """The static settings of a surrogate, as `Plan` has them."""
+    share = chosen["evaluated"]
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 0.5:
+        raise ValueError(f"{method}: evaluated must be a share from 0 to 0.5, received {share!r}")
+    judged = Plan._field_defaults["factor"]
+    return dict(
+        evaluated=min(math.ceil(share * max(sizes)), max(kept), max(sizes) // 2),
+        memory=_whole(method, "memory", chosen["memory"], 1),
+        best=_whole(method, "best", chosen["best"], 0),
+        optimistic=isinstance(optimism, jax.core.Tracer) or bool(optimism != 0),
+        chosen=tuple(max(1, round(s * judged * n)) for s, n in zip(_selection(method, chosen["selection"], sizes, kept, d), sizes, strict=True)),
+        kernel=chosen["kernel"] if chosen["surrogate"] == "gaussian process" else "",
+    )
 
 
 def checked(method, objective, d, dtype):
@@ -87,7 +93,7 @@ def checked(method, objective, d, dtype):
 def _selection(method, given, sizes, kept, d):
     """The share of judged samples that are elites, in each iteration: a number, that of the evaluated ones, or at most one in d.
 
-    One in d, as a share of s shrinks a Gaussian of d dimensions by about s^(1/d) a side: by half the samples, ten dimensions would take ten iterations to halve.
+    One in d, as a share s shrinks a Gaussian of d dimensions by about s^(1/d) a side: with half of the samples, ten dimensions would halve in ten iterations.
     """
     if given in ("elites", "dimension"):
         return [min(e / n, 1.0 if given == "elites" else 1 / d) for n, e in zip(sizes, kept, strict=True)]
@@ -96,16 +102,15 @@ def _selection(method, given, sizes, kept, d):
     return [given] * len(sizes)
 
 
-def _start(method, proposal, elites, components):
-    """The first proposal; of a mixture, ``components`` equal ones where one is given."""
-    if method != "ce_mixture":
-        return as_gaussian(proposal)
+def _mixture(method, proposal, elites, components, asked):
+    """The first `Mixture`: that given, or of ``components`` equal ones."""
     if isinstance(proposal, Mixture):
         k = len(proposal.weights)
-        if components not in (None, k):
-            raise ValueError(f"{method}: components must be those of the proposal, {k}, received {components!r}")
+        if asked not in (None, k):
+            raise ValueError(f"{method}: components must be those of the proposal, {k}, received {asked!r}")
     else:
-        g, k = as_gaussian(proposal), elites if components is None else _whole(method, "components", components, 1)
+        g = as_gaussian(proposal)
+        k = _whole(method, "components", asked, 1) if asked is not None else min(components or elites, elites)
         d = g.mean.size
         proposal = Mixture(jnp.full((k,), 1 / k, g.mean.dtype), jnp.broadcast_to(g.mean[None], (k, d)), jnp.broadcast_to(g.covariance[None], (k, d, d)))
     if k > elites:

@@ -3,12 +3,17 @@
 Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns the axes. The colours are Okabe and Ito's, told apart by
 colour-blind readers; what matters is told by shape or words as well.
 
-Of any system: `history`, `disturbances`, `distances`. Of one simulator: `ferry`; `colav`, `colav_story`, `colav_animation`.
+Of any system: `history`, `disturbances`, `distances`. Of one simulator: `ferry`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
+`convergence`, `proposal_contours`, `surrogate_samples`.
 """
 
 from jast.plot.colav import colav, colav_animation, colav_story
+from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.ferry import ferry
 from jast.plot.general import distances, disturbances, history
 from jast.plot.style import COLOURS, STYLE
 
-__all__ = ["COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "disturbances", "distances", "ferry", "history"]
+__all__ = [
+    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "ferry", "history", "proposal_contours",
+    "surrogate_samples",
+]  # fmt: skip

@@ -1,7 +1,7 @@
 """The cross-entropy method over disturbance sequences: draw episodes, keep the elites, draw the next ones like them.
 
 The cross-entropy method for optimisation with smoothed updating (de Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy method), for
-proposals that are independent over time, each step with its own (`jast.search.proposals`). Unlike there, elites are the best of all iterations.
+proposals that are independent over time, each step with its own (`jast.cross_entropy.sequences`). Unlike there, elites are the best of all iterations.
 """
 
 from functools import partial
@@ -17,6 +17,7 @@ from jast import distributions as D
 from jast import rewards
 from jast.check import contract
 from jast.counter import tree_keys
+from jast.cross_entropy import sequences
 from jast.episode import Episode, _shapes, accumulator, random_start
 from jast.search import episodes as E
 from jast.search import proposals as P
@@ -137,7 +138,7 @@ def _propose(keys, sim, real, plan, pool, proposals):
 
     def rows(part):
         if plan.kinds[part] == "latent":
-            return jax.vmap(lambda k: P.noise(k, proposals[part], int(start) * part))(keys)
+            return jax.vmap(lambda k: sequences.noise(k, proposals[part], int(start) * part))(keys)
         return jax.vmap(lambda k: P.copies(k, *parents[part], real.fresh, part))(keys)
 
     return rows(0) if start else (), rows(1)
@@ -149,7 +150,7 @@ def _fit(proposals, pool, real, plan):
     known = reward[:, None] > -jnp.inf
     horizon = jax.tree.leaves(pool.episode.disturbances)[0].shape[1]
     counts = known, known & (jnp.arange(horizon, dtype=jnp.int32)[None] < length[:, None])
-    return tuple(P.fit(g, v, n, real.smoothing, real.floor) if g != () else () for g, v, n in zip(proposals, z, counts, strict=True))
+    return tuple(sequences.fit(g, v, n, real.smoothing, real.floor) if g != () else () for g, v, n in zip(proposals, z, counts, strict=True))
 
 
 def _merge(pool, new):
@@ -166,7 +167,7 @@ def _nothing(sim, plan, trees, k):
     """An empty `Pool` and the first proposals, of every tree."""
     likes = jax.eval_shape(_shapes, sim)
     latent = [kind == "latent" and bool(jax.tree.leaves(like)) for kind, like in zip(plan.kinds, likes, strict=True)]
-    proposals = tuple(P.standard(like, steps) if use else () for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True))
+    proposals = tuple(sequences.standard(like, steps) if use else () for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True))
     zero = lambda dtype: jnp.zeros((k,), dtype)
     x0 = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), likes[0])
     x = jax.tree.map(lambda s: jnp.zeros((k, sim.horizon, *s.shape), s.dtype), likes[1])

@@ -1,0 +1,106 @@
+"""Latent sequences: exact where the disturbance is normal, the model itself at N(0, 1), and fitted to those that count."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from systems import ring, walk
+
+import jast
+from jast import actions
+from jast import distributions as D
+from jast.cross_entropy import sequences as S
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+def scalar(dtype):
+    return jax.ShapeDtypeStruct((), jnp.dtype(dtype))
+
+
+def test_fit(dtype):
+    """Mean and deviation of the episodes that reached a step; smoothed; not below the floor; kept where fewer than two did."""
+    z = jnp.array([[1.0, 5.0, 9.0], [3.0, 5.0, 0.0], [100.0, 0.0, 0.0]], dtype)
+    counts = jnp.array([[1, 1, 1], [1, 1, 0], [0, 0, 0]], bool)
+    old = S.standard(scalar(dtype), 3)
+    for smoothing, mean, deviation in ((0.0, [2, 5, 0], [1, 0.2, 1]), (0.5, [1, 2.5, 0], [1, 0.5, 1])):
+        new = S.fit(old, z, counts, jnp.asarray(smoothing), jnp.asarray(0.2))
+        np.testing.assert_allclose(new.mean, mean)
+        np.testing.assert_allclose(new.deviation, deviation, rtol=1e-6)
+        assert new.mean.dtype == new.deviation.dtype == dtype
+
+
+def test_fit_of_shares(dtype):
+    """An episode that counts for 1.5 of 2.5: weighted moments; one of 1.9 effective episodes in all moves nothing."""
+    z = jnp.array([[1.0, 1.0], [3.0, 3.0], [9.0, 9.0]], dtype)
+    new = S.fit(S.standard(scalar(dtype), 2), z, jnp.array([[1.5, 1.5], [1.0, 0.4], [0.0, 0.0]], dtype), jnp.asarray(0.0), jnp.asarray(0.1))
+    np.testing.assert_allclose(new.mean, [1.8, 0], rtol=1e-6)
+    np.testing.assert_allclose(new.deviation, [np.sqrt(0.96), 1], rtol=1e-6)
+
+
+def test_quantile_is_exact_for_normals_far_out(dtype):
+    """At z = 8, where Phi(z) is 1 in float32, as anywhere."""
+    loc, scale = jnp.asarray([1.0, -2.0], dtype), jnp.asarray([0.5, 3.0], dtype)
+    factor = jnp.asarray([[2.0, 0.0], [1.0, 0.5]], dtype)
+    z = jnp.asarray([8.0, -7.0], dtype)
+    expected = [5, -23]
+    np.testing.assert_allclose(S.quantile(D.MultivariateNormalDiag(loc, scale), z), expected)
+    np.testing.assert_allclose(S.quantile(D.Independent(D.Normal(loc, scale), 1), z), expected)
+    np.testing.assert_allclose(S.quantile(D.MultivariateNormalTri(loc, factor), z), [17, 2.5])
+    joint = S.quantile(D.Joint({"a": D.Normal(loc[0], scale[0]), "b": D.Normal(loc[1], scale[1])}), {"a": z[0], "b": z[1]})
+    assert (float(joint["a"]), float(joint["b"])) == (5, -23)
+    one, other = D.Normal(loc[0], scale[0]), D.Normal(loc[1], scale[1])
+    assert [float(S.quantile(D.where(jnp.asarray(p), one, other), z[0])) for p in (True, False)] == [5, 22]
+
+
+def test_other_disturbances_by_their_quantile_function(dtype):
+    z = jnp.asarray([-9.0, -1.0, 0.0, 2.0, 9.0], dtype)
+    x = S.quantile(D.Uniform(jnp.full(5, 2.0, dtype), jnp.full(5, 4.0, dtype)), z)
+    np.testing.assert_allclose(x, 2 + 2 * scipy.stats.norm.cdf(np.asarray(z, float)), rtol=1e-6)
+    coin = D.Bernoulli(probs=jnp.asarray(0.1, dtype))
+    assert [int(S.quantile(coin, v)) for v in z] == [0, 0, 0, 1, 1]
+    box = S.place(actions.uniform(-1.0, 1.0), D.Normal(jnp.zeros((), dtype), jnp.ones((), dtype)), z[4])
+    assert box.dtype == dtype and 0.999 < box <= 1
+
+
+def test_log_ratio(dtype):
+    """Against scipy, and where the two densities differ by little at large z."""
+    m, s = jnp.asarray([[0.0, 3.0], [1e-3, -2.0]], dtype), jnp.asarray([[1.0, 0.5], [1.0, 2.0]], dtype)
+    z = jnp.asarray([[20.0, 2.5], [20.0, -7.0]], dtype)
+    norm = scipy.stats.norm
+    expected = (norm.logpdf(np.asarray(z, float)) - norm.logpdf(np.asarray(z, float), np.asarray(m, float), np.asarray(s, float))).sum(axis=1)
+    np.testing.assert_allclose(S.log_ratio(S.Steps(m, s), z), expected, rtol=1e-5)
+    assert S.log_ratio(S.standard(scalar(dtype), 3), jnp.arange(3, dtype=dtype)).tolist() == [0, 0, 0]
+
+
+def test_noise_is_addressed(key):
+    """z_t does not depend on the horizon, and levels are those of the offset."""
+    short, long = (S.noise(key, S.standard(scalar("float32"), n), 1) for n in (3, 7))
+    assert short.tolist() == long[:3].tolist()
+    assert S.noise(key, S.standard(scalar("float32"), 2), 2).tolist() == long[1:3].tolist()
+
+
+@pytest.mark.parametrize("make", [walk, ring], ids=["walk", "ring"])
+def test_player_at_standard_noise_is_the_model(key, make):
+    """The share of failures is the nominal one within 4 standard errors of the two binomial shares; structures and a random start included."""
+    sim, n = make(), 4000
+    like0, like = jax.eval_shape(jast.episode._shapes, sim)
+
+    @jax.jit
+    def shares(key):
+        def one(key):
+            a, b, c, d = jax.random.split(key, 4)
+            z0 = jax.tree.map(lambda v: v[0], S.noise(a, S.standard(like0, 1), 0)) if jax.tree.leaves(like0) else ()
+            player = S.player(sim, actions.quantiles(), z0, S.noise(b, S.standard(like, sim.horizon), 0))
+            return jast.rollout(c, sim, player).failure, jast.rollout(d, sim).failure
+
+        return jnp.stack(jax.vmap(one)(jax.random.split(key, n))).mean(axis=1)
+
+    latent, nominal = shares(key)
+    p = (latent + nominal) / 2
+    assert 0.01 < p < 0.5 and abs(latent - nominal) < 4 * np.sqrt(2 * p * (1 - p) / n)
