@@ -175,24 +175,29 @@ def main(argv=None):
         report["others"][case] = rows
         say(f"  {case:13} " + ", ".join(f"{name} {r['median']:.4g} ({r['best']:.4g})" for name, r in rows.items()))
     if args.picture:
-        picture(args.picture, seeds)
+        picture(args.picture, report)
     if args.json:
         print(json.dumps(report))
 
 
-def picture(path, seeds):
-    """Mean best value by evaluations, three methods in both modes."""
+def picture(path, report):
+    """Mean best value by evaluations with its 95 % band; where two peers of the same budget end, by a line."""
     import matplotlib
 
     matplotlib.use("Agg")
     from jast import plot
     from jast.plot import style
 
-    with style.axes(None, (10.0, 3.6), columns=3, sharey=True) as axes:
+    shown = {"CE-method": ("ce_method", "thesis"), "CE-surrogate, thesis": ("ce_surrogate", "thesis"), "CE-surrogate, default": ("ce_surrogate", "default")}
+    with style.axes(None, (10.0, 3.7), columns=3, sharey=True) as axes:
         for ax, case in zip(axes, SIERRA, strict=True):
-            found = {f"{method}, {mode}": runs(method, case, seeds, mode=mode) for mode in ("thesis", "default") for method in METHODS[:2]}
-            plot.convergence(found, axes=ax)
+            plot.convergence({name: runs(method, case, report["seeds"], mode=mode) for name, (method, mode) in shown.items()}, axes=ax)
+            for peer, name, line in (("cma_es", "CMA-ES", "--"), ("direct", "DIRECT", ":")):
+                ax.axhline(report["peers"][f"{case}, {peer}"]["best"], color=style.INK, linestyle=line, linewidth=1.2, label=name)
             ax.set_title(case)
+            ax.get_legend().remove()
+        axes[0].set_ylabel("mean best value")
+        axes[2].legend(loc="upper right", bbox_to_anchor=(1.05, 1.05))
         axes[0].figure.savefig(path)
 
 

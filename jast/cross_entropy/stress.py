@@ -83,8 +83,8 @@ def over(sim, *, reward=None, actions=None):
 
     A point z [D] holds normal numbers: first those of x0, where the start is random, then those of x_1 .. x_horizon; D is ``stress.proposal.mean.size``.
     Each x_t is the quantile of p(x | s) at Phi(z_t) (``actions.quantiles()``, the default), or that point of a box (``actions.uniform(low, high)``; a start
-    is never of the box). A Gaussian needs more elites than D for its covariance; with tens of dimensions and few
-    evaluations that of `ce_method` collapses before a failure is found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
+    is never of the box). A Gaussian needs more elites than D for its covariance; with tens of dimensions and few evaluations that of `ce_method` collapses
+    before a failure is found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
 
     Without a ``reward`` the order is lexicographic, whatever the units. An episode that does not fail has its miss distance, at least 0. One that fails has
     -1 / (1 + c), where c >= 0 is how far its log density is below that of the mode at each of its steps: any failure is below all else, a likelier one below
