@@ -77,15 +77,17 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
             np.testing.assert_array_equal([got[tuple(x[i])] for i in rows], value[rows])
 
 
-def test_true_model_and_sub_elites_make_the_next_proposal(key, x64):
-    """One iteration of Algorithms 2 to 4 put together again from its parts, with NumPy's least squares for the surrogate."""
-    searches, ((x, value),) = asked("ce_surrogate", np_bowl, key, samples=20, elites=4, iterations=1, mode="thesis", surrogate="polynomial")
-    before, after = searches
+@pytest.mark.parametrize("k", [0, 3])
+def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
+    """An iteration of Algorithms 2 to 4 put together again from its parts, with NumPy's least squares for the surrogate."""
+    searches, batches = asked("ce_surrogate", np_bowl, key, samples=20, elites=4, iterations=4, mode="thesis", surrogate="polynomial")
+    before, after = searches[k], searches[k + 1]
     plan = before.plan
     proposal, first = before.state.proposal, before.state.first
-    for_samples, for_searches = jax.random.split(jax.random.fold_in(jax.random.fold_in(before.state.key, 0), 1))
+    for_samples, for_searches = jax.random.split(jax.random.fold_in(jax.random.fold_in(before.state.key, k), 1))
     judged = np.asarray(refit.draw(for_samples, proposal, 200))
-    np.testing.assert_array_equal(after.state.model_x[0], judged)
+    np.testing.assert_array_equal(after.state.model_x[k], judged)
+    (last, last_value), (x, value) = batches[k], (np.concatenate(parts) for parts in zip(*batches[max(0, k - 2) : k + 1], strict=True))  # three iterations
 
     scale = np.sqrt(np.trace(first.covariance) / 2)  # the frame of mode "thesis"
     features = lambda p: np.stack([p[:, 0] ** 0, p[:, 0], p[:, 1], p[:, 0] ** 2, p[:, 0] * p[:, 1], p[:, 1] ** 2], 1)
@@ -95,11 +97,11 @@ def test_true_model_and_sub_elites_make_the_next_proposal(key, x64):
     model = lambda p: z(p) @ weights
     chosen = judged[np.argsort(model(judged))[:40]]  # the share of the true elites
 
-    elites = x[np.argsort(value)[:4]]
+    elites = last[np.argsort(last_value)[:4]]  # of the last batch
     sub = []
-    for k, centre in zip(jax.random.split(for_searches, 4), elites, strict=True):
+    for i, centre in zip(jax.random.split(for_searches, 4), elites, strict=True):
         mean, covariance, tried = centre, np.asarray(first.covariance), []
-        for step in jax.random.split(k, 2):
+        for step in jax.random.split(i, 2):
             points = mean + np.asarray(jax.random.normal(step, (100, 2))) @ np.linalg.cholesky(covariance).T
             best = points[np.argsort(model(points))[:10]]
             tried.append(best[0])
@@ -108,7 +110,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(key, x64):
     together = np.concatenate([elites, chosen, sub])
     np.testing.assert_allclose(after.state.proposal.mean, together.mean(0), rtol=1e-6)
     np.testing.assert_allclose(after.state.proposal.covariance, np.cov(together.T, bias=True), rtol=1e-6)
-    assert plan.chosen == (40,) and plan.evaluated == 0
+    assert plan.chosen == (40,) * 4 and plan.evaluated == 0
 
 
 def test_points_of_the_searches_are_evaluated_next(key):
@@ -204,7 +206,7 @@ def test_ratchet_and_empty_iterations():
 def test_selection():
     plan = lambda d, **more: settled("ce_surrogate", (np.zeros(d), 1.0), samples=20, elites=10, iterations=2, schedule=None, **more)[0]
     assert plan(2, mode="thesis").chosen == plan(8, mode="thesis").chosen == (100, 100)
-    assert [plan(d, mode="default").chosen[0] for d in (1, 2, 5, 10)] == [100, 100, 40, 20]
+    assert [plan(d, mode="default").chosen[0] for d in (1, 2, 5, 10, 20)] == [100, 100, 40, 20, 40]
     assert plan(2, mode="default", selection=0.25).chosen == (50, 50)
 
 
@@ -233,6 +235,8 @@ def test_mixtures_stay_proper(key):
     start = ce.Mixture(*jax.tree.map(lambda a: a[-1], (weights, means, covariances)))
     again = ce.ce_mixture(key, ce.sierra(), start, samples=10, elites=5, iterations=2)
     np.testing.assert_array_equal(again.history.proposals.means[0], start.means)
+    twice = ce.ce_mixture(key, ce.sierra(), ce.Mixture(2 * np.asarray(start.weights), *start[1:]), samples=10, elites=5, iterations=2)
+    np.testing.assert_allclose(twice.history.x, again.history.x, rtol=1e-4, atol=1e-4)  # weights are shares
     few = settled("ce_mixture", START, samples=10, elites=5, iterations=1, schedule=None, mode="thesis")
     assert few[0].components == 5 and few[2].weights.tolist() == pytest.approx([0.2] * 5)
 
@@ -282,7 +286,7 @@ def test_singular_elites_leave_the_proposal(key):
 BAD = {
     "elites must be at most the samples of an iteration, 10, received 11": dict(elites=11),
     "elites must be a whole number of at least 1, received 0": dict(elites=0),
-    "samples: expected a whole number of at least 1, received 0": dict(samples=0),
+    "schedule: samples must be a whole number of at least 1, received 0": dict(samples=0),
     "mode must be one of ['default', 'thesis'], received 'paper'": dict(mode="paper"),
     "surrogate must be one of ['gaussian process', 'linear', 'polynomial', 'radial basis'], received 'forest'": dict(surrogate="forest"),
     "kernel must be one of ": dict(kernel="cubic"),
@@ -317,6 +321,19 @@ def test_bad_proposals_and_objectives_are_named(key):
     raises(r"ce_method: objective must return one real number for x of shape \(2,\)", lambda x: x, START)
     raises("ce_method: objective must be written in JAX; for any other program use start, ask and tell", lambda x: float(x[0]), START)
     raises("ce_method: objective must be written in JAX", lambda x: np.sum(np.asarray(x)), START)
+    raises(r"objective must return one real number for x of shape \(2,\)", lambda x: (x[0],), START)
+    raises("proposal: mean must be finite in float32", bowl, ([1e300, 0.0], 1.0))
+    raises("proposal: covariance must be positive, received 0.0", bowl, ([0.0, 0.0], 1e-50))
+    raises("ce_method: elitism must be True or False, received 'no'", bowl, START, elitism="no")
+    raises(r"schedule: expected a function \(budget, iterations\) -> counts, received", bowl, START, schedule=lambda budget: (budget,))
+    unit = np.broadcast_to(np.eye(2), (2, 2, 2))
+    for message, mixture in {
+        r"proposal: weights must be at least 0 and not all 0, received \[-1": ([-1, 2], np.zeros((2, 2)), unit),
+        "proposal: means must be finite": ([0.5, 0.5], np.full((2, 2), np.nan), unit),
+        "proposal: covariance must be positive definite": ([0.5, 0.5], np.zeros((2, 2)), np.zeros((2, 2, 2)) + 1),
+        r"proposal: weights must be \[k\], means \[k, d\] and covariances \[k, d, d\], received": ([1.0], np.zeros((2, 2)), unit),
+    }.items():
+        raises(message, bowl, ce.Mixture(*mixture), method=ce.ce_mixture)
     raises("ce_mixture: components must be at most the elites, 5", bowl, START, method=ce.ce_mixture, components=6)
     raises("ce_method: no setting warp", bowl, START, warp="rank", method=lambda *a, **s: ce.start(a[0], a[2], "ce_method", **s))
     raises("start: method must be one of", START, "annealing", method=ce.start)
@@ -327,8 +344,12 @@ def test_bad_answers_are_named(key):
     x = np.asarray(ce.ask(search))
     with pytest.raises(ValueError, match=r"tell: expected x of shape \(4, 2\) and values of shape \(4,\), received \(3, 2\) and \(3,\)"):
         ce.tell(search, x[:3], np.zeros(3))
-    with pytest.raises(ValueError, match="tell: x must be finite"):
-        ce.tell(search, x * np.nan, np.zeros(4))
+    for beyond in (np.nan, 1e300):
+        with pytest.raises(ValueError, match="tell: x must be finite"):
+            ce.tell(search, np.full(x.shape, beyond), np.zeros(4))
+    for words in (["a"] * 4, np.full(4, 1j), [1.0, [2.0], 3.0, 4.0]):
+        with pytest.raises(ValueError, match="tell: x and values must be arrays of real numbers"):
+            ce.tell(search, x, words)
     search = ce.tell(search, x, np.zeros(4))
     for call in (lambda: ce.ask(search), lambda: ce.tell(search, x, np.zeros(4))):
         with pytest.raises(ValueError, match="the search is done, all 4 evaluations are spent"):
@@ -343,6 +364,10 @@ def test_a_result_prints_as_a_table(key):
     lines = str(result).splitlines()
     assert lines[0].split() == ["iteration", "evaluations", "best", "value", "at"] and [line.split()[1] for line in lines[1:]] == ["4", "8", "12"]
     assert float(lines[-1].split()[2]) == pytest.approx(float(result.best_value), rel=1e-5)
+    search = ce.start(key, START, "ce_method", samples=4, elites=3, iterations=3)
+    assert str(ce.finish(search)).splitlines() == lines[:1]  # nothing done, nothing told
+    search = ce.tell(search, x := np.asarray(ce.ask(search)), [np_bowl(row) for row in x])
+    assert len(str(ce.finish(search)).splitlines()) == 2
     several = batch("ce_method", bowl, jax.random.split(key, 5), *START, samples=4, elites=3, iterations=3)
     value = np.asarray(several.best_value, float)
     assert str(several) == (
@@ -369,20 +394,21 @@ def test_scores(key):
 
 # ---- what they reach (thesis, Table 2.1; standard errors of the published means of 50 runs are 0.0004 to 0.0007)
 
-REACHED = {  # method, mode: mean best value that each case must reach on 256 fresh seeds
-    ("ce_surrogate", "thesis"): (-0.0172, -0.0100, -0.0143),
-    ("ce_surrogate", "default"): (-0.0187, -0.0165, -0.0150),
+REACHED = {  # means of 256 runs that `python -m benchmarks.cross_entropy` found on 1A, 1B and 1C, with standard errors of 0.0002 to 0.0004
+    ("ce_surrogate", "thesis"): (-0.0178, -0.0114, -0.0144),
+    ("ce_mixture", "thesis"): (-0.0165, -0.0082),
+    ("ce_surrogate", "default"): (-0.0200, -0.0185, -0.0165),
 }
 
 
 @pytest.mark.parametrize("method, mode", REACHED)
 def test_sierra(method, mode, x64):
-    for (case, (mean, variance, samples, elites)), bound in zip(CASES.items(), REACHED[method, mode], strict=True):
-        keys = jax.random.split(jax.random.key(2024), 256)
+    for (case, (mean, variance, samples, elites)), expected in zip(CASES.items(), REACHED[method, mode], strict=False):
+        keys = jax.random.split(jax.random.key(2024), 128)
         runs = batch(method, ce.sierra(), keys, np.full(2, mean), variance * np.eye(2), samples=samples, elites=elites, mode=mode)
         s = ce.scores(runs, [0.0, 0.0])
-        # three standard errors are the leeway; what is measured is 2 to 9 of them below each bound
-        assert s.best_value[-1] < bound + 3 * s.standard_error[-1], (case, s.best_value[-1])
+        # the difference of the two means within four of its standard errors, those of 128 and of 256 runs
+        assert abs(s.best_value[-1] - expected) < 4 * np.sqrt(1.5) * s.standard_error[-1], (case, s.best_value[-1])
         if (case, mode) == ("1B", "default"):
             assert s.frobenius[-1] < 16
 
@@ -405,6 +431,31 @@ def test_the_default_is_not_for_the_plane_alone(key):
     assert (batch("ce_surrogate", f, keys, np.zeros(d), 9.0, **settings).best_value < 0.5 * plain.mean()).all()
 
 
-def test_every_setting_of_a_mode_is_one():
-    for method, modes in MODES.items():
-        assert set(modes["thesis"]) == set(modes["default"]), method
+def test_mode_thesis_is_the_published_code():
+    """The silent choices of the published code, each of which changes little enough on sierra to go unseen in a mean."""
+    published = dict(
+        elitism=False, memory=3, best=0, evaluated=0.0, current=False, warp="raw", frame="initial", optimism=0.0, selection="elites", alpha=1.0,
+        surrogate="gaussian process", kernel="squared exponential",
+    )  # fmt: skip
+    assert MODES["ce_method"]["thesis"] == dict(elitism=False)
+    assert MODES["ce_surrogate"]["thesis"] == published
+    assert MODES["ce_mixture"]["thesis"] == published | dict(components=None, start="searches", regularisation=0.0)
+    plan = settled("ce_mixture", START, samples=10, elites=5, iterations=10, schedule=None, mode="thesis")[0]
+    assert (plan.judged, plan.chosen[0], plan.sub, plan.components, plan.em_iterations) == (100, 50, (100, 10, 2), 5, 10)
+    assert all(set(modes["thesis"]) == set(modes["default"]) for modes in MODES.values())
+
+
+@pytest.mark.parametrize("d", [10, 20])
+def test_proposals_move_in_many_dimensions(d, key):
+    """Ten samples an iteration are fewer than a covariance needs; the judged ones must make up for it."""
+    result = ce.ce_surrogate(key, lambda x: jnp.sum(x**2), (np.ones(d), 1.0), iterations=5)
+    steps = np.linalg.norm(np.diff(result.history.proposals.mean, axis=0), axis=1)
+    assert (steps > 0).all() and result.best_value < result.history.best_value[0]
+
+
+def test_coordinates_of_very_different_size(key):
+    """In float32, the units of one coordinate a million times those of the other: as good as with equal ones."""
+    f = lambda scale, x: jnp.sum((x / scale - 1) ** 2 * jnp.array([1.0, 3.0]))
+    keys = jax.random.split(key, 16)
+    median = lambda scale: np.median(batch("ce_surrogate", Partial(f, scale), keys, np.zeros(2), np.diag(9 * np.asarray(scale) ** 2)).best_value)
+    assert median(jnp.array([1e6, 1.0])) < 10 * median(jnp.ones(2))

@@ -63,11 +63,11 @@ def test_a_sweep_over_starts(dtype):
     [
         (0.0, 1.0, r"mean must be a vector of one or more numbers, received shape \(\)"),
         ([], 1.0, r"mean must be a vector of one or more numbers, received shape \(0,\)"),
-        ([0.0, np.nan], 1.0, "mean must be finite, received"),
+        ([0.0, np.nan], 1.0, "mean must be finite in float"),
         ("here", 1.0, "mean must be numbers, received 'here'"),
         ([0.0, 0.0], [1.0, 1.0, 1.0], r"covariance must be a number, 2 variances or a 2 x 2 matrix, received shape \(3,\)"),
         ([0.0, 0.0], np.ones((1, 2)), "covariance must be a number, 2 variances or a 2 x 2 matrix"),
-        ([0.0, 0.0], [1.0, np.inf], "covariance must be finite"),
+        ([0.0, 0.0], [1.0, np.inf], "covariance must be finite in float"),
         ([0.0, 0.0], 0.0, "covariance must be positive, received 0.0"),
         ([0.0, 0.0], [1.0, -1.0], "covariance must be positive, received"),
         ([0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]], "covariance must be symmetric, received"),

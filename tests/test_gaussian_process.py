@@ -116,7 +116,6 @@ def test_bad_input_is_named():
         gp.fit(x, y[:3], y == 0, (1.0,))
 
 
-
 @pytest.mark.parametrize("kind", ["linear", "polynomial", "radial basis"])
 def test_least_squares_are_those_of_numpy(kind, x64):
     x, y = data(40, 2)

@@ -98,9 +98,9 @@ def test_bad_settings():
     with pytest.raises(ValueError, match="schedule: expected None, \"uniform\", a function .*, received 'geometric'"):
         schedules.counts("geometric", 10, 10)
     for samples in (0, -1, 2.0, True, None):
-        with pytest.raises(ValueError, match=f"samples: expected a whole number of at least 1, received {samples}"):
+        with pytest.raises(ValueError, match=f"samples must be a whole number of at least 1, received {samples}"):
             schedules.counts(None, samples, 10)
-        with pytest.raises(ValueError, match=f"iterations: expected a whole number of at least 1, received {samples}"):
+        with pytest.raises(ValueError, match=f"iterations must be a whole number of at least 1, received {samples}"):
             schedules.counts(None, 10, samples)
     for p in (0, 1, -0.1, np.nan, "half", True):
         with pytest.raises(ValueError, match="geometric: p must be a number between 0 and 1, received"):

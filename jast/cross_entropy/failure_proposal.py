@@ -14,6 +14,7 @@ from jax.tree_util import Partial
 
 from jast import actions as choices
 from jast import distributions as D
+from jast._checks import real, whole
 from jast.check import contract
 from jast.cross_entropy import sequences
 from jast.cross_entropy.tilted import tilted
@@ -78,32 +79,30 @@ def failure_proposal(key, sim, *, samples=1000, iterations=10, quantile=0.1, smo
     under `jax.jit` and `jax.vmap`. The key is consumed. An invalid episode is counted and never an elite. Raises ValueError for a count below 1, a setting
     outside its range, and a disturbance that cannot be tilted.
     """
-    for name, value, least in (("samples", samples, 2), ("iterations", iterations, 1)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"failure_proposal: {name} must be a whole number of at least {least}, received {value!r}")
-    real = Settings(
-        _between("quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"),
-        _between("smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"),
-        _between("floor", floor, lambda v: 0 < v < np.inf, "above 0"),
+    samples, iterations = whole("failure_proposal", "samples", samples, 2), whole("failure_proposal", "iterations", iterations)
+    settings = Settings(
+        real("failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"),
+        real("failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"),
+        real("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
     )
     contract(sim, observed=False)
-    return _search(key, sim, real, _tilts_start(sim), int(samples), int(iterations))
+    return _search(key, sim, settings, _tilts_start(sim), samples, iterations)
 
 
 @partial(jax.jit, static_argnums=(3, 4, 5))
-def _search(key, sim, real, tilt_start, samples, iterations):
+def _search(key, sim, settings, tilt_start, samples, iterations):
     like0, like = jax.eval_shape(_shapes, sim)
     first = sequences.standard(like0, 1) if tilt_start else (), sequences.standard(like, sim.horizon)
 
     def iterate(proposal, key):
         z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(jax.random.split(key, samples))
         valid = jnp.isfinite(e.distance)
-        level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), real.quantile)
+        level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), settings.quantile)
         ess = jnp.sum(counts)
         reached = jnp.arange(sim.horizon, dtype=jnp.int32)[None, :] < e.length[:, None]
         fitted = (
-            sequences.fit(proposal[0], z0, counts[:, None], real.smoothing, real.floor) if tilt_start else (),
-            sequences.fit(proposal[1], z, jnp.where(reached, counts[:, None], 0), real.smoothing, real.floor),
+            sequences.fit(proposal[0], z0, counts[:, None], settings.smoothing, settings.floor) if tilt_start else (),
+            sequences.fit(proposal[1], z, jnp.where(reached, counts[:, None], 0), settings.smoothing, settings.floor),
         )
         return fitted, (level, jnp.sum(e.failure, dtype=jnp.int32), ess, jnp.sum(~valid, dtype=jnp.int32), fails)
 
@@ -176,10 +175,3 @@ def _tilts_start(sim):
     except ValueError:
         return False
     return True
-
-
-def _between(name, value, holds, expected):
-    if not isinstance(value, jax.core.Tracer) and (isinstance(value, str | bool) or np.shape(value) != () or not holds(float(value))):
-        raise ValueError(f"failure_proposal: {name} must be a number {expected}, received {value!r}")
-    value = jnp.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.zeros(()).dtype)

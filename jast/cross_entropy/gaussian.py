@@ -9,7 +9,7 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
-__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "moments", "normal", "sample"]
+__all__ = ["Gaussian", "as_gaussian", "check_covariance", "fit", "float_of", "is_definite", "log_prob", "moments", "normal", "numbers", "sample"]
 
 
 class Gaussian(NamedTuple):
@@ -43,31 +43,42 @@ def as_gaussian(proposal):
 
 
 def _normal(name, mean, covariance):
-    traced = [any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in (mean, covariance)]
-    parts = []
-    for part, value, skip in zip(("mean", "covariance"), (mean, covariance), traced, strict=True):
-        try:
-            parts.append(jnp.asarray(value) if skip else np.asarray(value, np.float64))
-        except (TypeError, ValueError):
-            raise ValueError(f"{name}: {part} must be numbers, received {value!r}") from None
-        if not skip and not np.isfinite(parts[-1]).all():
-            raise ValueError(f"{name}: {part} must be finite, received {value}")
+    given, dtype = (mean, covariance), float_of(mean, covariance)
+    traced = [any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in given]
+    parts = [jnp.asarray(value) if skip else numbers(name, part, value, dtype) for part, value, skip in zip(("mean", "covariance"), given, traced, strict=True)]
     m, c = parts
     if m.ndim != 1 or m.size == 0:
         raise ValueError(f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}")
     d = m.size
     if c.shape not in ((), (d,), (d, d)):
         raise ValueError(f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received shape {c.shape}")
-    floats = [v.dtype for v in (mean, covariance) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    dtype = jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))  # float64 is float32 where that is all there is
     if not traced[1]:
-        _check_covariance(name, c, float(jnp.finfo(dtype).eps))
+        check_covariance(name, c)
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
     return Gaussian(m, c if c.ndim == 2 else jnp.diag(jnp.broadcast_to(c, (d,))))
 
 
-def _check_covariance(name, c, eps):
+def float_of(*values):
+    """The float dtype of these arrays, the widest, as far as JAX has it; the default where none is of floats."""
+    floats = [v.dtype for v in values if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
+    return jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))
+
+
+def numbers(name, part, value, dtype):
+    """``value`` on the host, in the dtype in which it will be used; ValueError unless it is finite there."""
+    try:
+        with np.errstate(over="ignore", under="ignore"):
+            array = np.asarray(value, np.float64).astype(dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {part} must be numbers, received {value!r}") from None
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: {part} must be finite in {np.dtype(dtype).name}, received {value}")
+    return array
+
+
+def check_covariance(name, c):
     """ValueError unless the number, variances or matrix ``c`` is a covariance, on the host."""
+    eps, c = float(jnp.finfo(c.dtype).eps), c.astype(np.float64)
     if c.ndim < 2:
         if not (c > 0).all():
             raise ValueError(f"{name}: covariance must be positive, received {c}")

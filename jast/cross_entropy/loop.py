@@ -45,11 +45,11 @@ class Plan(NamedTuple):
     """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the initial proposal"""
     optimistic: bool = False
     """Those searches minimise the model's mean less ``Settings.optimism`` of its standard deviations"""
-    factor: int = 10
-    """Samples judged by the surrogate, as a multiple of those evaluated"""
+    judged: int = 0
+    """Samples that only the surrogate judges, in each iteration"""
     chosen: tuple = ()
     """How many of them are elites, in each iteration"""
-    sub: tuple = (100, 10, 2)
+    sub: tuple = ()
     """Samples, elites and iterations of a search on the surrogate"""
     components: int = 0
     start: str = ""
@@ -90,7 +90,6 @@ def begin(key, plan, proposal):
     """The `State` before the first iteration."""
     d, dtype = refit.moments(proposal).mean.shape[0], jax.tree.leaves(proposal)[0].dtype
     n, steps = sum(plan.counts), len(plan.counts)
-    judged = plan.factor * max(plan.counts) if plan.method != "ce_method" else 0
     full = lambda value, *shape: jnp.full(shape, value, dtype)
     stacked = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (steps + 1, *a.shape)), proposal)
     return State(
@@ -102,7 +101,7 @@ def begin(key, plan, proposal):
         proposal,
         full(0, plan.evaluated, d),
         stacked,
-        full(jnp.nan, steps, judged, d),
+        full(jnp.nan, steps, plan.judged, d),
     )
 
 
@@ -129,7 +128,7 @@ def tell(plan, settings, state, x, value):
     else:
         since = _of([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
         seen = _remembered(plan, state, since, at + count)
-        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, count, _of(plan.chosen, k))
+        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, _of(plan.chosen, k))
         pending = better[: plan.evaluated]
         state = state._replace(model_x=state.model_x.at[k].set(judged))
     proposals = jax.tree.map(lambda a, b: a.at[k + 1].set(b), state.proposals, proposal)

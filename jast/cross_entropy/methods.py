@@ -21,11 +21,11 @@ def ce_method(key, objective, proposal, *, samples=10, elites=5, iterations=10, 
     ``elites``. ``proposal``: a `Gaussian` (`jast.cross_entropy.normal`), a pair (mean [d], covariance), or a distribution with ``mean()`` and ``covariance()``.
     Where the elites have no covariance that is positive definite (as when they are at most d), the proposal stays.
 
-    ``schedule``: None, the same number in each iteration; of `jast.cross_entropy.schedules`; or the numbers. ``mode="thesis"`` takes the elites from the last
-    batch only, ``"default"`` from all that were evaluated (``elitism``). ``ratchet``: once a batch is smaller than the elites, they stay as few, as in the
-    published code. Counts and names are static, the key, the proposal and what a `jax.tree_util.Partial` binds to the objective are traced: `jax.vmap` runs
-    hundreds of seeds and proposals in one program. With an uneven schedule the objective is also called on rows that pad a batch; they are neither kept nor
-    counted. An evaluation that is NaN or infinite is kept in the history, counted in ``invalid``, and never an elite.
+    ``schedule``: None, the same number in each iteration; of `jast.cross_entropy.schedules`; or the numbers, of which zeros are left out.
+    ``mode="thesis"`` takes the elites from the last batch only, ``"default"`` from all that were evaluated (``elitism``). ``ratchet``: once a batch is smaller
+    than the elites, they stay as few, as in the published code. Counts and names are static, the key, the proposal and what a `jax.tree_util.Partial` binds to
+    the objective are traced: `jax.vmap` runs hundreds of seeds and proposals in one program. With an uneven schedule the objective is also called on rows that
+    pad a batch; they are neither kept nor counted. An evaluation that is NaN or infinite is kept in the history, counted in ``invalid``, never an elite.
 
     Raises ValueError for a proposal that is no proper distribution, elites above the samples, counts below 1, and an objective that is not written in JAX (see
     `start`) or not a number.
@@ -48,7 +48,7 @@ def ce_surrogate(key, objective, proposal, *, samples=10, elites=5, iterations=1
     - ``warp``: to values "raw", "standard" (mean 0, variance 1), or "rank" (normal scores, which no increasing function of the objective alters).
     - ``frame``: in coordinates whitened by those points ("window"), or in the scale of the initial proposal ("initial").
     - ``selection``: the share of the judged samples that are elites; "elites": as among the evaluated ones, "dimension": but at most one in d.
-    - ``optimism``: the searches minimise the mean less so many standard deviations of the model; traced.
+    - ``optimism``: the searches minimise the mean less so many standard deviations of the model; traced. Only a Gaussian process has any.
     - ``current``, ``alpha``: they start with the covariance of the current proposal, or else of the initial one, over alpha, which is traced.
     - ``evaluated``: the share of each batch, rounded up, that is spent on their best points in the iteration after; at most a half.
 
@@ -100,7 +100,8 @@ def start(key, proposal, method="ce_surrogate", *, samples=10, elites=5, iterati
             search = tell(search, x, [program(row) for row in x])
         result = finish(search)
 
-    It takes exactly the budget of evaluations, and the same steps as those functions with the same key. A search is a pytree: keep it to go on later.
+    It takes exactly the budget of evaluations, and the same steps as those functions with the same key. A search is a pytree that can be pickled: keep it to
+    go on later.
     """
     if method not in MODES:
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
@@ -121,13 +122,17 @@ def tell(search, x, values):
     A value may be NaN or infinite where an evaluation failed. ValueError for other shapes, and where the search is done.
     """
     expected = ask(search)
-    x, values = np.asarray(x), np.asarray(values)
+    try:
+        with np.errstate(over="ignore"):
+            x, values = np.asarray(x).astype(expected.dtype, casting="same_kind"), np.asarray(values).astype(expected.dtype, casting="same_kind")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"tell: x and values must be arrays of real numbers: {error}") from None
     if x.shape != expected.shape or values.shape != x.shape[:1]:
         raise ValueError(f"tell: expected x of shape {expected.shape} and values of shape {expected.shape[:1]}, received {x.shape} and {values.shape}")
     if not np.isfinite(x).all():
         raise ValueError("tell: x must be finite")
     pad = max(search.plan.counts) - len(x)
-    x, values = (jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1)), expected.dtype) for a in (x, values))
+    x, values = (jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1))) for a in (x, values))
     return Search(_tell(search.plan, search.settings, search.state, x, values), search.settings, search.plan)
 
 

@@ -12,7 +12,7 @@ from jax.scipy.special import logsumexp
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
 
-__all__ = ["Mixture", "em", "log_likelihood", "log_prob", "responsibilities", "sample"]
+__all__ = ["Mixture", "as_mixture", "em", "log_likelihood", "log_prob", "responsibilities", "sample"]
 
 
 class Mixture(NamedTuple):
@@ -24,6 +24,26 @@ class Mixture(NamedTuple):
     """[k, d]"""
     covariances: Any
     """[k, d, d]"""
+
+
+def as_mixture(proposal):
+    """The `Mixture` with float arrays of one dtype and weights of sum 1. ValueError, naming ``proposal``, for one that is none; of traced parts only shapes."""
+    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(proposal)):
+        weights, means, covariances = (jnp.asarray(v) for v in proposal)
+    else:
+        dtype = gaussian.float_of(*proposal)
+        weights, means, covariances = (gaussian.numbers("proposal", part, value, dtype) for part, value in zip(Mixture._fields, proposal, strict=True))
+    (k, d) = means.shape if means.ndim == 2 else (0, 0)
+    if not k or not d or weights.shape != (k,) or covariances.shape != (k, d, d):
+        received = weights.shape, means.shape, covariances.shape
+        raise ValueError(f"proposal: weights must be [k], means [k, d] and covariances [k, d, d], received shapes {received}")
+    if isinstance(means, jax.Array):
+        return Mixture(weights, means, covariances)
+    if not ((weights >= 0).all() and weights.sum() > 0):
+        raise ValueError(f"proposal: weights must be at least 0 and not all 0, received {weights}")
+    for c in covariances:
+        gaussian.check_covariance("proposal", c)
+    return Mixture(*(jnp.asarray(a) for a in (weights / weights.sum(), means, covariances)))
 
 
 def sample(key, m, n):

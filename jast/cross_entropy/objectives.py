@@ -11,6 +11,8 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jax.tree_util import Partial
 
+from jast.cross_entropy.gaussian import float_of
+
 __all__ = ["ackley", "branin", "paraboloid", "sierra"]
 
 _CORNERS = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])  # g of the source, in spacings
@@ -46,8 +48,7 @@ def sierra(mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0,
     for name, value in dict(variance=variance, spacing=spacing, sharpness=sharpness, decay=decay).items():
         _finite(name, value, (), positive=name in ("variance", "sharpness"))
     given = (mean, variance, spacing, sharpness, decay)
-    floats = [v.dtype for v in given if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    dtype = jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))  # float64 is float32 where that is all there is
+    dtype = float_of(*given)
     mean, variance, spacing, sharpness, decay = (jnp.asarray(v).astype(dtype) for v in given)
 
     corners = jnp.asarray(_CORNERS[:, None, None], dtype)  # [corner, path, way, coordinate]

@@ -74,11 +74,11 @@ def search_around(key, model, centres, covariance, samples, elites, iterations):
     return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
 
 
-def to_model(key, plan, settings, proposal, first, elites, seen, count, chosen):
+def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
     """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that the surrogate judged [m, d]).
 
-    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``count``, ``chosen``:
-    this iteration's samples, and its elites among those judged by the model; both traced.
+    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``chosen``: how
+    many of the judged samples are elites, traced.
     """
     for_samples, for_searches = jax.random.split(key)
     x, y, mask = seen
@@ -88,9 +88,8 @@ def to_model(key, plan, settings, proposal, first, elites, seen, count, chosen):
     mean = partial(surrogates.predict, plan.surrogate, model)
     aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism) if plan.optimistic else mean
 
-    judged = draw(for_samples, proposal, plan.factor * max(plan.counts))  # Algorithm 3
-    there = jnp.arange(len(judged), dtype=jnp.int32) < plan.factor * count
-    _, i = lax.top_k(-jnp.where(there, mean(judged), jnp.inf), max(plan.chosen))
+    judged = draw(for_samples, proposal, plan.judged)  # Algorithm 3
+    _, i = lax.top_k(-mean(judged), max(plan.chosen))
     model_elites = Points(judged[i], (jnp.arange(len(i), dtype=jnp.int32) < chosen).astype(x.dtype))
 
     spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
@@ -98,7 +97,6 @@ def to_model(key, plan, settings, proposal, first, elites, seen, count, chosen):
     everything = (jnp.concatenate(part) for part in zip(elites, model_elites, (sub.x, elites.weights), strict=True))
     together = Points(*everything)  # Algorithm 2: true, model and sub-elites
     best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
-    judged = jnp.where(there[:, None], judged, jnp.nan)
     if isinstance(proposal, Gaussian):
         return to_elites(proposal, together), sub.x[best], judged
     return _to_components(plan, settings, proposal, elites, sub, spread, together), sub.x[best], judged

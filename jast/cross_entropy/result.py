@@ -23,7 +23,7 @@ class History(NamedTuple):
     proposals: Any
     """A `Gaussian` or a `Mixture` with a leading axis [K + 1]: that of each iteration, and the last"""
     model_x: Any
-    """[K, 10 max(m), d]: the points that the surrogate judged in each iteration, NaN where there were fewer; [K, 0, d] without a surrogate"""
+    """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
 
 class CEResult(NamedTuple):
@@ -45,10 +45,15 @@ class CEResult(NamedTuple):
         bad = int(np.sum(self.invalid))
         note = f"\n{bad} evaluations gave NaN or infinity and count as no elite" if bad else ""
         if value.ndim == 0:
-            rows = zip(np.cumsum(np.bincount(self.history.iteration)), np.asarray(self.history.best_value), np.asarray(self.history.best_x), strict=True)
+            done = ~np.isnan(self.history.x).any(axis=1)  # of a search that is not at its end
+            evaluations = np.cumsum(np.bincount(self.history.iteration[done]))
+            rows = zip(evaluations, np.asarray(self.history.best_value), np.asarray(self.history.best_x), strict=False)
             table = "\n".join(f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}" for i, (evaluations, b, x) in enumerate(rows, 1))
             return f"iteration evaluations  best value   at\n{table}{note}"
-        mean = f"{value.mean():.6g}" + (f" +- {value.std(ddof=1) / np.sqrt(value.size):.2g}" if value.size > 1 else "")
+        found = value[np.isfinite(value)]
+        if found.size < value.size:
+            note += f"\n{value.size - found.size} runs have no finite value, and are left out of the mean"
+        mean = f"{found.mean() if found.size else np.inf:.6g}" + (f" +- {found.std(ddof=1) / np.sqrt(found.size):.2g}" if found.size > 1 else "")
         return f"{value.size} runs of {n} evaluations: best value {mean} (mean and its standard error), the best of them {value.min():.6g}{note}"
 
 

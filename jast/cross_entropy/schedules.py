@@ -7,6 +7,8 @@ Sizes are static: they are worked out on the host.
 import math
 import operator
 
+from jast._checks import whole
+
 __all__ = ["counts", "geometric", "manual", "uniform"]
 
 
@@ -64,13 +66,17 @@ def counts(schedule, samples, iterations):
     """
     if not callable(schedule) and not isinstance(schedule, str) and schedule is not None:
         return _whole(schedule)
-    samples, iterations = _positive("samples", samples), _positive("iterations", iterations)
+    samples, iterations = whole("schedule", "samples", samples), whole("schedule", "iterations", iterations)
     if schedule is None or (isinstance(schedule, str) and schedule == "uniform"):
         return (samples,) * iterations
     if isinstance(schedule, str):
         raise ValueError(f'schedule: expected None, "uniform", a function (budget, iterations) -> counts, or a sequence of counts, received {schedule!r}')
     budget = samples * iterations
-    sizes = _whole(schedule(budget, iterations))
+    try:
+        sizes = schedule(budget, iterations)
+    except TypeError as error:
+        raise ValueError(f"schedule: expected a function (budget, iterations) -> counts, received {schedule!r}, which raised: {error}") from error
+    sizes = _whole(sizes)
     if (len(sizes), sum(sizes)) != (iterations, budget):
         raise ValueError(f"schedule: expected {iterations} counts that sum to the budget {budget}, received {len(sizes)} that sum to {sum(sizes)}: {sizes}")
     return sizes
@@ -87,13 +93,3 @@ def _whole(values):
     if not good:
         raise ValueError(f"schedule: counts must be whole numbers of at least 0, and not all 0, received {values!r}")
     return sizes
-
-
-def _positive(name, value):
-    try:
-        whole = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        whole = -1
-    if whole < 1:
-        raise ValueError(f"{name}: expected a whole number of at least 1, received {value!r}")
-    return whole

@@ -1,14 +1,16 @@
 """From what a user gives to a `Plan`: modes, checks, and errors that name what is wrong."""
 
 import math
+from numbers import Real
 
 import jax
 import jax.numpy as jnp
 
+from jast._checks import real, whole
 from jast.cross_entropy.gaussian import as_gaussian
 from jast.cross_entropy.gaussian_process import KERNELS
 from jast.cross_entropy.loop import Plan, Settings
-from jast.cross_entropy.mixture import Mixture
+from jast.cross_entropy.mixture import Mixture, as_mixture
 from jast.cross_entropy.schedules import counts
 from jast.cross_entropy.surrogates import SURROGATES, WARPS
 from jast.rewards import as_pytree
@@ -36,8 +38,10 @@ def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ra
     if unknown := sorted(set(given) - set(MODES[method][mode])):
         raise ValueError(f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}")
     chosen = {name: value if given.get(name) is None else given[name] for name, value in MODES[method][mode].items()}
-    sizes = tuple(n for n in counts(schedule, samples, iterations) if n)  # an iteration without evaluations teaches nothing
-    elites = _whole(method, "elites", elites, 1)
+    sizes = counts(schedule, samples, iterations)
+    mean_size = max(1, round(sum(sizes) / len(sizes)))
+    sizes = tuple(n for n in sizes if n)  # an iteration without evaluations teaches nothing
+    elites = whole(method, "elites", elites, 1)
     if elites > max(sizes):
         raise ValueError(f"{method}: elites must be at most the samples of an iteration, {max(sizes)}, received {elites}")
     kept = [min(elites, n) for n in sizes]
@@ -46,7 +50,15 @@ def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ra
     for name, allowed in dict(surrogate=SURROGATES, kernel=KERNELS, warp=WARPS, frame=("initial", "window"), start=("elites", "searches")).items():
         if name in chosen and chosen[name] not in allowed:
             raise ValueError(f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}")
-    real = {name: _number(method, name, chosen.pop(name, default)) for name, default in dict(alpha=1.0, optimism=0.0, regularisation=0.0).items()}
+    for name, value in dict(elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet).items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
+    given_optimism = chosen.get("optimism", 0.0)
+    positive, other = (lambda v: 0 < v < math.inf, "above 0"), (lambda v: 0 <= v < math.inf, "of at least 0")
+    numbers = [
+        real(method, name, chosen.pop(name, default), *check)
+        for name, default, check in (("alpha", 1.0, positive), ("optimism", 0.0, other), ("regularisation", 0.0, other))
+    ]
     if method == "ce_mixture":
         proposal = _mixture(method, proposal, max(kept), chosen["components"], given.get("components"))
         chosen["components"] = len(proposal.weights)
@@ -54,23 +66,27 @@ def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ra
         proposal = as_gaussian(proposal)
     mean = jax.tree.leaves(proposal)[-2]
     if method != "ce_method":
-        chosen |= _model(method, chosen, real["optimism"], sizes, kept, mean.shape[-1])
-    settings = Settings(**{name: jnp.asarray(value).astype(mean.dtype) for name, value in real.items()})
+        chosen |= _model(method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1])
+    settings = Settings(*(value.astype(mean.dtype) for value in numbers))
     return Plan(method, sizes, tuple(kept), **{name: value for name, value in chosen.items() if name != "selection"}), settings, proposal
 
 
-def _model(method, chosen, optimism, sizes, kept, d):
-    """The static settings of a surrogate, as `Plan` has them."""
+def _model(method, chosen, optimism, most, each, kept, d):
+    """The static settings of a surrogate, as `Plan` has them; ``most``, ``each``: the evaluations of the largest and of the mean iteration."""
     share = chosen["evaluated"]
-    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 0.5:
+    if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= share <= 0.5:
         raise ValueError(f"{method}: evaluated must be a share from 0 to 0.5, received {share!r}")
-    judged = Plan._field_defaults["factor"]
+    judged = 10 * each
+    fewest = min(2 * d, judged)  # a covariance needs more than d points
+    elites = max(10, 2 * d)
     return dict(
-        evaluated=min(math.ceil(share * max(sizes)), max(kept), max(sizes) // 2),
-        memory=_whole(method, "memory", chosen["memory"], 1),
-        best=_whole(method, "best", chosen["best"], 0),
+        evaluated=min(math.ceil(float(share) * most), max(kept), most // 2),
+        memory=whole(method, "memory", chosen["memory"], 1),
+        best=whole(method, "best", chosen["best"], 0),
         optimistic=isinstance(optimism, jax.core.Tracer) or bool(optimism != 0),
-        chosen=tuple(max(1, round(s * judged * n)) for s, n in zip(_selection(method, chosen["selection"], sizes, kept, d), sizes, strict=True)),
+        judged=judged,
+        sub=(10 * elites, elites, 2),
+        chosen=tuple(max(fewest, round(s * judged)) for s in _selection(method, chosen["selection"], each, kept, d)),
         kernel=chosen["kernel"] if chosen["surrogate"] == "gaussian process" else "",
     )
 
@@ -84,51 +100,35 @@ def checked(method, objective, d, dtype):
         out = jax.eval_shape(objective, jax.ShapeDtypeStruct((d,), dtype))
     except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
         raise ValueError(f"{method}: objective must be written in JAX; for any other program use start, ask and tell. It raised: {error}") from error
-    leaves = jax.tree.leaves(out)
-    if len(leaves) != 1 or leaves[0].shape != () or leaves[0].dtype == bool or jnp.issubdtype(leaves[0].dtype, jnp.complexfloating):
+    if not isinstance(out, jax.ShapeDtypeStruct) or out.shape != () or out.dtype == bool or jnp.issubdtype(out.dtype, jnp.complexfloating):
         raise ValueError(f"{method}: objective must return one real number for x of shape ({d},), it returns {out}")
     return objective
 
 
-def _selection(method, given, sizes, kept, d):
-    """The share of judged samples that are elites, in each iteration: a number, that of the evaluated ones, or at most one in d.
+def _selection(method, given, each, kept, d):
+    """The share of judged samples that are elites, in each iteration: a number, that of the evaluated ones, or at most one in d (`_model` takes 2 d at least).
 
     One in d, as a share s shrinks a Gaussian of d dimensions by about s^(1/d) a side: with half of the samples, ten dimensions would halve in ten iterations.
     """
     if given in ("elites", "dimension"):
-        return [min(e / n, 1.0 if given == "elites" else 1 / d) for n, e in zip(sizes, kept, strict=True)]
-    if isinstance(given, bool) or not isinstance(given, int | float) or not 0 < given <= 1:
+        return [min(e / each, 1.0 if given == "elites" else 1 / d) for e in kept]
+    if isinstance(given, bool) or not isinstance(given, Real) or not 0 < given <= 1:
         raise ValueError(f'{method}: selection must be "elites", "dimension", or a share above 0, at most 1, received {given!r}')
-    return [given] * len(sizes)
+    return [given] * len(kept)
 
 
 def _mixture(method, proposal, elites, components, asked):
     """The first `Mixture`: that given, or of ``components`` equal ones."""
     if isinstance(proposal, Mixture):
+        proposal = as_mixture(proposal)
         k = len(proposal.weights)
         if asked not in (None, k):
             raise ValueError(f"{method}: components must be those of the proposal, {k}, received {asked!r}")
     else:
         g = as_gaussian(proposal)
-        k = _whole(method, "components", asked, 1) if asked is not None else min(components or elites, elites)
+        k = whole(method, "components", asked, 1) if asked is not None else min(components or elites, elites)
         d = g.mean.size
         proposal = Mixture(jnp.full((k,), 1 / k, g.mean.dtype), jnp.broadcast_to(g.mean[None], (k, d)), jnp.broadcast_to(g.covariance[None], (k, d, d)))
     if k > elites:
         raise ValueError(f"{method}: components must be at most the elites, {elites}, as each begins at one, received {k}")
     return proposal
-
-
-def _whole(method, name, value, least):
-    if isinstance(value, bool) or not hasattr(value, "__index__") or int(value) < least:
-        raise ValueError(f"{method}: {name} must be a whole number of at least {least}, received {value!r}")
-    return int(value)
-
-
-def _number(method, name, value):
-    """``value``, if it is traced or a number: above 0 (alpha), or of at least 0."""
-    good = isinstance(value, jax.core.Tracer) or (
-        not isinstance(value, str | bool) and jnp.shape(value) == () and (value > 0 if name == "alpha" else value >= 0) and value < jnp.inf
-    )
-    if not good:
-        raise ValueError(f"{method}: {name} must be a number {'above' if name == 'alpha' else 'of at least'} 0, received {value!r}")
-    return value

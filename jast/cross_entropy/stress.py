@@ -94,6 +94,8 @@ def over(sim, *, reward=None, actions=None):
     Pure JAX, for `jax.jit`, `jax.vmap` (over simulators too) and ask and tell. Raises ValueError for actions that are neither of the two, a distribution
     without quantile function where one is needed, and what `jast.check` finds in the simulator's functions by tracing them.
     """
+    if reward is not None and not callable(reward):
+        raise ValueError(f"over: reward must be a function, one of jast.rewards or yours, received {reward!r}")
     actions = choices.quantiles() if actions is None else actions
     if not isinstance(actions, choices.Quantiles | choices.UniformBox):
         raise ValueError(f"over: actions must be jast.actions.quantiles() or uniform(low, high), received {actions!r}")

@@ -101,7 +101,8 @@ def frame(x, mask):
     z = jnp.where(mask[:, None], x - centre[None], 0)
     variances = jnp.sum(z**2, axis=0) / n
     largest = jnp.maximum(jnp.max(variances), jnp.finfo(x.dtype).tiny ** 0.5)
-    variances = jnp.where(variances > largest * jnp.finfo(x.dtype).eps, variances, largest)  # a coordinate without spread
+    spread = variances > (4 * jnp.finfo(x.dtype).eps * centre) ** 2  # else a coordinate whose points differ by their rounding, or not at all
+    variances = jnp.where(spread, variances, largest)
     u = z / jnp.sqrt(variances)[None]
     correlation = 0.9 * u.T @ u / n + 0.1 * jnp.eye(d, dtype=x.dtype)
     return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
+from jast import _checks, rewards
 from jast import actions as choices
 from jast import distributions as D
-from jast import rewards
 from jast.check import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
@@ -80,7 +79,8 @@ def cem(
         raise ValueError(f"cem: elites must be at most samples, {samples}, received {elites}")
     if samples * iterations * trees >= 2**31:
         raise ValueError(f"cem: samples x iterations x trees must be below 2^31, received {samples} x {iterations} x {trees}")
-    real = Settings(*(_share(name, value) for name, value in dict(smoothing=smoothing, floor=floor, fresh=fresh).items()))
+    share = lambda name, value: _checks.real("cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1")
+    real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
     actions = _chosen(contract(sim, observed=False)) if actions is None else actions
     counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
     reward, settings = E.prepare("cem", key, sim, reward, actions, **counts, **real._asdict())
@@ -211,10 +211,3 @@ def _chosen(sim):
 
     jax.eval_shape(look)
     return choices.quantiles() if found[0] else choices.samples()
-
-
-def _share(name, value):
-    if not isinstance(value, jax.core.Tracer) and (np.shape(value) != () or not 0 <= float(value) <= 1):
-        raise ValueError(f"cem: {name} must be a number from 0 to 1, received {value!r}")
-    value = jnp.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.zeros(()).dtype)

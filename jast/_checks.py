@@ -1,0 +1,33 @@
+"""Checks of settings, each with a ValueError that names the function and the setting, what was expected and what came."""
+
+import operator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+__all__ = ["real", "whole"]
+
+
+def whole(function, name, value, least=1):
+    """``value`` as an int of at least ``least``."""
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except (TypeError, jax.errors.JAXTypeError):
+        number = least - 1
+    if number < least:
+        raise ValueError(f"{function}: {name} must be a whole number of at least {least}, received {value!r}")
+    return number
+
+
+def real(function, name, value, holds, expected):
+    """``value`` as a float array []; one that is not traced must be a number for which ``holds``."""
+    if not isinstance(value, jax.core.Tracer):
+        try:
+            good = not isinstance(value, str | bool) and np.shape(value) == () and bool(holds(float(value)))
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise ValueError(f"{function}: {name} must be a number {expected}, received {value!r}")
+    value = jnp.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.zeros(()).dtype)
