@@ -208,6 +208,7 @@ def test_selection():
     assert plan(2, mode="thesis").chosen == plan(8, mode="thesis").chosen == (100, 100)
     assert [plan(d, mode="default").chosen[0] for d in (1, 2, 5, 10, 20)] == [100, 100, 40, 20, 40]
     assert plan(2, mode="default", selection=0.25).chosen == (50, 50)
+    assert [plan(2, mode="default", evaluated=share).evaluated for share in (0, 0.05, 0.1, 0.35, 0.5)] == [0, 1, 2, 7, 10]
 
 
 def test_float32_and_float64(key, x64):

@@ -103,7 +103,7 @@ def start(key, proposal, method="ce_surrogate", *, samples=10, elites=5, iterati
     It takes exactly the budget of evaluations, and the same steps as those functions with the same key. A search is a pytree that can be pickled: keep it to
     go on later.
     """
-    if method not in MODES:
+    if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
     plan, real, proposal = settled(method, proposal, samples=samples, elites=elites, iterations=iterations, schedule=schedule, mode=mode, **settings)
     return Search(_begin(key, plan, proposal), real, plan)

@@ -33,7 +33,7 @@ MODES = {
 
 def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, **given):
     """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the mode's serves. Raises ValueError, as the methods say."""
-    if mode not in MODES[method]:
+    if mode not in list(MODES[method]):
         raise ValueError(f"{method}: mode must be one of {sorted(MODES[method])}, received {mode!r}")
     if unknown := sorted(set(given) - set(MODES[method][mode])):
         raise ValueError(f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}")
@@ -77,10 +77,9 @@ def _model(method, chosen, optimism, most, each, kept, d):
     if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= share <= 0.5:
         raise ValueError(f"{method}: evaluated must be a share from 0 to 0.5, received {share!r}")
     judged = 10 * each
-    fewest = min(2 * d, judged)  # a covariance needs more than d points
-    elites = max(10, 2 * d)
+    fewest, elites = min(2 * d, judged), max(10, 2 * d)  # a covariance needs more than d points; up to five dimensions the published numbers
     return dict(
-        evaluated=min(math.ceil(float(share) * most), max(kept), most // 2),
+        evaluated=min(math.ceil(round(float(share) * most, 9)), max(kept), most // 2),
         memory=whole(method, "memory", chosen["memory"], 1),
         best=whole(method, "best", chosen["best"], 0),
         optimistic=isinstance(optimism, jax.core.Tracer) or bool(optimism != 0),
