@@ -9,7 +9,6 @@ import argparse
 import functools
 import json
 import os
-import time
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -19,6 +18,8 @@ import numpy as np  # noqa: E402
 
 from benchmarks import peers  # noqa: E402
 from benchmarks.cases import CASES  # noqa: E402
+from benchmarks.engine import cpu  # noqa: E402
+from benchmarks.ferry import timed  # noqa: E402
 from jast import cross_entropy as ce  # noqa: E402
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
@@ -54,15 +55,8 @@ def runs(method, case, seeds, seed=0, dtype=np.float64, **settings):
 
 def row(values, distances=None, sierra=True):
     """The report of several runs."""
-    n = len(values)
-    values = np.asarray(values, float)
-    out = {"seeds": n, "best": values.mean(), "best_se": values.std(ddof=1) / n**0.5, "median": np.median(values)}
-    if sierra:
-        out["hit"] = np.mean(values < BASIN)
-    if distances is not None:
-        d = np.asarray(distances, float)
-        out |= {"distance": d.mean(), "rms": np.sqrt(np.mean(d**2)), "F": np.sqrt(50 * np.mean(d**2))}
-    return {k: float(v) if k != "seeds" else v for k, v in out.items()}
+    out = peers.summary(values, distances)
+    return out | {"hit": float(np.mean(np.asarray(values, float) < BASIN))} if sierra else out
 
 
 def ours(method, case, seeds, **settings):
@@ -77,6 +71,11 @@ def theirs(peer, case, seeds):
     return row(found["values"], found["distances"], case in SIERRA) | {"cpu_s": float(found["cpu_s"].mean())}
 
 
+def compiled_for(run, *arguments):
+    """The program of a jitted function for such arguments, traced and compiled."""
+    return run.lower(*arguments).compile()
+
+
 def speed(seeds):
     """CPU time to compile each method on sierra, and of a seed of 1A; 1B has the same program."""
     out = {}
@@ -84,18 +83,9 @@ def speed(seeds):
         run = program(method, ce.sierra(), 10, 10, ())
         c = {case: (CASES[case].mean, np.diag(CASES[case].sd ** 2)) for case in SIERRA[:2]}
         keys = jax.random.split(jax.random.key(1), seeds)
-        cpu, wall = time.process_time(), time.perf_counter()
-        compiled = run.lower(keys, *c["sierra 1A"]).compile()
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-        each = {}
-        for case in c:
-            times = []
-            for _ in range(3):
-                start = time.process_time()
-                jax.block_until_ready(compiled(keys, *c[case]))
-                times.append(time.process_time() - start)
-            each[case] = min(times) / seeds
-        out[method] = {"compile_cpu_s": cpu, "compile_wall_s": wall, "cpu_ms_a_seed": {k: 1e3 * v for k, v in each.items()}, "seeds": seeds}
+        compiled, compile_cpu, compile_wall = timed(functools.partial(compiled_for, run, keys, *c["sierra 1A"]))
+        each = {case: min(cpu(functools.partial(compiled, keys, *start))[0] for _ in range(3)) / seeds for case, start in c.items()}
+        out[method] = {"compile_cpu_s": compile_cpu, "compile_wall_s": compile_wall, "cpu_ms_a_seed": {k: 1e3 * v for k, v in each.items()}, "seeds": seeds}
     return out
 
 

@@ -1,8 +1,8 @@
 """Peers of jast's cross-entropy optimisers on the same budgets, in NumPy and float64: ``python -m benchmarks.peers --seeds 64 [--cases ...] [--peers ...]``.
 
-A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every
-true evaluation in order, ``(x [n, d], value [n])`` with ``n <= budget``. Methods that start from a distribution get N(mean, diag sd^2), methods on a box
-mean +- 2 sd. Needs scipy 1.15 and, for their peers, cma and bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
+A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every true evaluation in order, ``(x [n, d], value [n])`` with ``n <= budget``. Methods that
+start from a distribution get N(mean, diag sd^2), methods on a box mean +- 2 sd. Needs scipy 1.15 and,
+for their peers, cma and bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.cases import CASES
 
-__all__ = ["PEERS", "run"]
+__all__ = ["PEERS", "run", "summary"]
 
 
 class Spent(Exception):
@@ -157,13 +157,15 @@ def run(peer, case, seeds):
     return {"values": np.array(values), "distances": distances, "cpu_s": np.array(seconds)}
 
 
-def summary(result):
-    """Means and standard errors of a `run`; ``F`` is sqrt(50) times the root of the mean square distance."""
-    n, values, distances = len(result["values"]), result["values"], result["distances"]
+def summary(values, distances=None):
+    """Means and standard errors of several runs; ``F`` is sqrt(50) times the root of the mean square distance, ``rms``."""
+    values, n = np.asarray(values, float), len(values)
     se = lambda sample: float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
-    report = {"seeds": n, "best": float(values.mean()), "best_se": se(values), "median": float(np.median(values)), "cpu_s": float(result["cpu_s"].mean())}
+    report = {"seeds": n, "best": float(values.mean()), "best_se": se(values), "median": float(np.median(values))}
     if distances is not None:
-        report |= {"distance": float(distances.mean()), "distance_se": se(distances), "F": float((50 * np.mean(distances**2)) ** 0.5)}
+        d = np.asarray(distances, float)
+        rms = float(np.mean(d**2) ** 0.5)
+        report |= {"distance": float(d.mean()), "distance_se": se(d), "rms": rms, "F": 50**0.5 * rms}
     return report
 
 
@@ -188,7 +190,7 @@ def main(argv=None):
     for name in args.cases:
         for peer in args.peers:
             result = run(peer, name, range(args.first, args.first + args.seeds))
-            s = summary(result)
+            s = summary(result["values"], result["distances"]) | {"cpu_s": float(result["cpu_s"].mean())}
             where = f"{s['distance']:10.3f}{s['distance_se']:8.3f}{s['F']:8.1f}" if "F" in s else f"{'-':>10}{'-':>8}{'-':>8}"
             print(f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}{s['cpu_s']:9.4f}", flush=True)
             raw = {k: None if v is None else v.tolist() for k, v in result.items()}

@@ -111,9 +111,7 @@ def start(key, proposal, method="ce_surrogate", *, samples=10, elites=5, iterati
 
 def ask(search):
     """The next points to evaluate, [m, d]; the same until they are told. ValueError where the search is done."""
-    if search.done:
-        raise ValueError(f"ask: the search is done, all {sum(search.plan.counts)} evaluations are spent")
-    return _ask(search.plan, search.state)[: search.plan.counts[int(search.state.k)]]
+    return _ask(search.plan, search.state)[: _count("ask", search)]
 
 
 def tell(search, x, values):
@@ -121,14 +119,14 @@ def tell(search, x, values):
 
     A value may be NaN or infinite where an evaluation failed. ValueError for other shapes, and where the search is done.
     """
-    expected = ask(search)
+    shape, dtype = (_count("tell", search), search.state.x.shape[1]), search.state.x.dtype
     try:
         with np.errstate(over="ignore"):
-            x, values = np.asarray(x).astype(expected.dtype, casting="same_kind"), np.asarray(values).astype(expected.dtype, casting="same_kind")
+            x, values = (np.asarray(a).astype(dtype, casting="same_kind") for a in (x, values))
     except (TypeError, ValueError) as error:
         raise ValueError(f"tell: x and values must be arrays of real numbers: {error}") from None
-    if x.shape != expected.shape or values.shape != x.shape[:1]:
-        raise ValueError(f"tell: expected x of shape {expected.shape} and values of shape {expected.shape[:1]}, received {x.shape} and {values.shape}")
+    if x.shape != shape or values.shape != shape[:1]:
+        raise ValueError(f"tell: expected x of shape {shape} and values of shape {shape[:1]}, received {x.shape} and {values.shape}")
     if not np.isfinite(x).all():
         raise ValueError("tell: x must be finite")
     pad = max(search.plan.counts) - len(x)
@@ -139,6 +137,13 @@ def tell(search, x, values):
 def finish(search):
     """The `CEResult` of what was told so far; what was not has value inf in its history."""
     return _finish(search.plan, search.state)
+
+
+def _count(caller, search):
+    """How many points the next batch has."""
+    if search.done:
+        raise ValueError(f"{caller}: the search is done, all {sum(search.plan.counts)} evaluations are spent")
+    return search.plan.counts[int(search.state.k)]
 
 
 _begin, _ask, _tell, _finish = (partial(jax.jit, static_argnums=i)(f) for f, i in ((loop.begin, 1), (loop.ask, 0), (loop.tell, 0), (loop.finish, 0)))
