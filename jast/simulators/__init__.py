@@ -1,9 +1,14 @@
 """Simulated systems with a source and a known truth, one file (or folder) each."""
 
+from jast.simulators.autoregression import autoregression
 from jast.simulators.colav import colav
 from jast.simulators.ferry import ferry
 from jast.simulators.landing import landing, landing_probability
 from jast.simulators.limit_state import limit_state
+from jast.simulators.pendulum import pendulum
+from jast.simulators.ruin import ruin, ruin_probability
 from jast.simulators.walk import walk1d
 
-__all__ = ["colav", "ferry", "landing", "landing_probability", "limit_state", "walk1d"]
+__all__ = [
+    "autoregression", "colav", "ferry", "landing", "landing_probability", "limit_state", "pendulum", "ruin", "ruin_probability", "walk1d",
+]  # fmt: skip
