@@ -7,14 +7,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtr
+from jax.scipy.linalg import solve_triangular
+from jax.scipy.special import ndtr, ndtri
 from jax.tree_util import Partial
 
 from jast import actions as choices
 from jast import distributions as D
 from jast.policy import Policy
 
-__all__ = ["Steps", "fit", "log_ratio", "noise", "phi", "place", "player", "quantile", "standard"]
+__all__ = ["Steps", "fit", "latent", "log_ratio", "noise", "normal_score", "phi", "place", "player", "quantile", "standard"]
 
 
 class Steps(NamedTuple):
@@ -98,6 +99,29 @@ def quantile(dist, z):
     if isinstance(dist, D.Joint):
         return jax.tree.map(quantile, dist.distributions, z, is_leaf=lambda d: isinstance(d, D.Distribution))
     return D.quantile(dist, jax.tree.map(phi, z))
+
+
+def latent(dist, x):
+    """The inverse of `quantile`: z with ``quantile(dist, z) == x``, for a whole number the middle (in probability) of those; ValueError where none is known."""
+    if isinstance(dist, D.Normal):
+        return (x - dist.loc) / dist.scale
+    if isinstance(dist, D.MultivariateNormalDiag):
+        return (x - dist.loc) / dist.scale_diag
+    if isinstance(dist, D.MultivariateNormalTri):
+        return solve_triangular(dist.scale_tri, x - dist.loc, lower=dist.is_lower)
+    if isinstance(dist, D.Independent):
+        return latent(dist.distribution, x)
+    if isinstance(dist, D.Where):
+        return dist._select(latent(dist._a, x), latent(dist._b, x))
+    if isinstance(dist, D.Joint):
+        return jax.tree.map(latent, dist.distributions, x, is_leaf=lambda d: isinstance(d, D.Distribution))
+    return jax.tree.map(normal_score, D.cdf(dist, x))
+
+
+def normal_score(u):
+    """Phi^-1(u), finite: what rounds to 0 or 1 counts as half a unit of rounding from there."""
+    eps = jnp.finfo(u.dtype).eps
+    return ndtri(jnp.where(u > 0, jnp.minimum(u, 1 - eps / 2), eps / 2))
 
 
 def phi(z):

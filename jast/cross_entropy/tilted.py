@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr, ndtri
 
 from jast import distributions as D
-from jast.cross_entropy.sequences import quantile
+from jast.cross_entropy.sequences import normal_score, quantile
 
 __all__ = ["Tilted", "tilted"]
 
@@ -32,7 +32,7 @@ class Tilted(D.Distribution):
     def log_prob(self, value):
         """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is the same in both."""
         log_p = self._distribution.log_prob(value)
-        z = _normal_score(D.cdf(self._distribution, value))
+        z = normal_score(D.cdf(self._distribution, value))
         e = (z - self._mean) / self._deviation
         gain = 0.5 * (z - e) * (z + e) - jnp.log(self._deviation)
         return log_p + jnp.sum(gain, axis=tuple(range(log_p.ndim, gain.ndim)))
@@ -66,12 +66,6 @@ def tilted(dist, mean, deviation):
     if not D.has_cdf(dist) or not (hasattr(like, "dtype") and jnp.issubdtype(like.dtype, jnp.floating)):
         raise ValueError(f"{type(dist).__name__} cannot be tilted: expected floats with a quantile function and a distribution function that inverts it")
     return Tilted(dist, mean, deviation)
-
-
-def _normal_score(u):
-    """Phi^-1(u), finite: what rounds to 0 or 1 counts as half a unit of rounding from there."""
-    eps = jnp.finfo(u.dtype).eps
-    return ndtri(jnp.where(u > 0, jnp.minimum(u, 1 - eps / 2), eps / 2))
 
 
 def _above(edge, mean, deviation):

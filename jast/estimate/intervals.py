@@ -1,8 +1,9 @@
 """Intervals for a probability. On the host, in double precision whatever the arrays' dtype."""
 
 import math
+from statistics import NormalDist
 
-__all__ = ["clopper_pearson"]
+__all__ = ["chernoff", "clopper_pearson", "jeffreys", "log_normal"]
 
 
 def clopper_pearson(k, n, level=0.95):
@@ -11,17 +12,21 @@ def clopper_pearson(k, n, level=0.95):
     low is the alpha/2 quantile of Beta(k, n - k + 1), high the 1 - alpha/2 quantile of Beta(k + 1, n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n.
     Raises ValueError unless 0 <= k <= n, n >= 1 and 0 < level < 1.
     """
-    if not (n == int(n) and n >= 1):
-        raise ValueError(f"clopper_pearson: n must be a whole number of at least 1, received {n!r}")
-    if not (k == int(k) and 0 <= k <= n):
-        raise ValueError(f"clopper_pearson: k must be a whole number from 0 to n = {n}, received {k!r}")
-    if not 0 < level < 1:
-        raise ValueError(f"clopper_pearson: level must lie between 0 and 1, received {level!r}")
+    _counts("clopper_pearson", k, n, level)
     k, n, tail = int(k), int(n), (1 - level) / 2
     # P(X >= k; p) = I_p(k, n - k + 1) and P(X <= k; p) = I_(1-p)(n - k, k + 1): each tail is solved as itself, none as 1 less the other
     low = 0.0 if k == 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
     high = 1.0 if k == n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
     return low, high
+
+
+def _counts(function, k, n, level):
+    if not (n == int(n) and n >= 1):
+        raise ValueError(f"{function}: n must be a whole number of at least 1, received {n!r}")
+    if not (k == int(k) and 0 <= k <= n):
+        raise ValueError(f"{function}: k must be a whole number from 0 to n = {n}, received {k!r}")
+    if not 0 < level < 1:
+        raise ValueError(f"{function}: level must lie between 0 and 1, received {level!r}")
 
 
 def _solve(rising):
@@ -55,3 +60,33 @@ def _betainc(a, b, x):
         if abs(c * d - 1) < 1e-15:
             break
     return math.exp(log_front) * value if log_front > -745 else 0.0
+
+
+def chernoff(k, n, level=0.95):
+    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u above k/n with n KL(k/n || u) = log(1 / (1 - level)).
+
+    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of the time and is above Clopper and Pearson's. Raises ValueError as
+    `clopper_pearson`.
+    """
+    _counts("chernoff", k, n, level)
+    k, n = int(k), int(n)
+    if k == n:
+        return 1.0
+    m, bound = k / n, -math.log1p(-level) / n
+    kl = lambda u: (m * math.log(m / u) if m else 0.0) + (1 - m) * (math.log1p(-m) - math.log1p(-u))
+    return _solve(lambda u: 1.0 if u >= 1 else (kl(u) - bound if u > m else -1.0))
+
+
+def jeffreys(k, n, level=0.95):
+    """Upper end of the one-sided interval of ``level`` under Jeffreys' prior (Lipkis and Agogino, eq. 18): that quantile of Beta(k + 1/2, n - k + 1/2).
+
+    A Bayesian bound: below the exact one, and not promised to cover in each case. Raises ValueError as `clopper_pearson`.
+    """
+    _counts("jeffreys", k, n, level)
+    return _solve(lambda p: _betainc(int(k) + 0.5, int(n) - int(k) + 0.5, p) - level)
+
+
+def log_normal(log_mean, relative_error, level=0.95):
+    """(low, high) above 0, as skewed as a mean of weights is: exp(log_mean -+ z s), s^2 = log(1 + relative_error^2)."""
+    half = NormalDist().inv_cdf((1 + level) / 2) * math.sqrt(math.log1p(relative_error**2))
+    return tuple(math.exp(min(log_mean + sign * half, 0.0)) for sign in (-1, 1))

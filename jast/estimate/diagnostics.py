@@ -1,0 +1,53 @@
+"""When a weighted estimate must not be believed: effective sample size, the Pareto shape of the greatest weights, and the rules made of them."""
+
+import numpy as np
+
+__all__ = ["pareto_k", "reasons"]
+
+K_HAT, ESS, SHARE, PER_FAILURE = 0.7, 100, 0.05, 0.01
+
+
+def pareto_k(log_weights, samples):
+    """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those above 0, of ``samples`` in all): a float.
+
+    Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The tail is
+    min(n / 5, 3 sqrt(n)) weights, and at most a fifth of those above 0. NaN below 5 of them; -inf where the greatest are all equal.
+    """
+    log_w = np.sort(np.asarray(log_weights, np.float64))
+    log_w = log_w[log_w > -np.inf]
+    m = int(np.ceil(min(samples / 5, 3 * np.sqrt(samples))))
+    m = min(m, len(log_w) - 1)
+    if m < 5:
+        return float("nan")
+    w = np.exp(log_w[-m - 1 :] - log_w[-1])
+    excess = w[1:] - w[0]
+    return _shape(excess) if excess[-1] > 1e-9 and excess[m // 4] > 0 else float("-inf")
+
+
+def _shape(x):
+    """The estimate of Zhang and Stephens (2009) from rising excesses ``x`` above 0, with the weak prior of PSIS (10 observations at 0.5)."""
+    n = len(x)
+    m = 30 + int(np.sqrt(n))
+    quartile = x[int(n / 4 + 0.5) - 1]
+    theta = 1 / x[-1] + (1 - np.sqrt(m / (np.arange(1, m + 1) - 0.5))) / (3 * quartile)
+    k = np.log1p(-theta[:, None] * x).mean(axis=1)
+    log_likelihood = n * (np.log(-theta / k) - k - 1)
+    weights = np.exp(log_likelihood - log_likelihood.max())
+    best = (theta * weights).sum() / weights.sum()
+    return float((n * np.log1p(-best * x).mean() + 5) / (n + 10))
+
+
+def reasons(failures, ess, k_hat, max_share):
+    """Why weights must not be trusted: a list of texts, empty where nothing speaks against them."""
+    found = []
+    if ess < ESS:
+        found.append(f"effective sample size {ess:.3g}, below {ESS}")
+    if np.isnan(k_hat):
+        found.append(f"{failures} failures are too few to look at the tail of the weights")
+    elif k_hat > K_HAT:
+        found.append(f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the greatest weights have no variance to speak of")
+    if max_share > SHARE:
+        found.append(f"one episode carries {max_share:.0%} of the estimate, above {SHARE:.0%}")
+    if ess < PER_FAILURE * failures:
+        found.append(f"effective sample size {ess:.3g} of {failures} failures, below {PER_FAILURE:.0%}")
+    return found

@@ -1,0 +1,150 @@
+"""The answer of every estimator: a probability, how sure it is, and whether to believe it."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast._checks import real
+from jast.estimate import diagnostics
+from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys, log_normal
+
+__all__ = ["Estimate", "estimate", "of_counts"]
+
+
+class Estimate(NamedTuple):
+    """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why before any number where it must not be believed.
+
+    Good diagnostics are necessary, not sufficient: a proposal that never reaches a failure mode gives weights that look perfect.
+    """
+
+    method: str
+    log_mean: float
+    """Natural logarithm of the estimate; NaN where no failure was seen, as 0 is not known to be the answer"""
+    mean: float
+    """The estimate; NaN likewise, 0 where it is below the least double"""
+    standard_error: float
+    """Of the mean"""
+    relative_error: float
+    """standard_error / mean, also where both are below the least double"""
+    interval: tuple
+    """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is); of plain counts Clopper and Pearson's"""
+    level: float
+    ess: float
+    """Effective sample size of the failing episodes, (sum w)^2 / sum w^2"""
+    k_hat: float
+    """Pareto shape of the greatest weights: `jast.estimate.pareto_k`"""
+    max_share: float
+    """Greatest weight over the sum of all"""
+    failures_seen: int
+    """Failing episodes among ``samples``"""
+    samples: int
+    """Episodes that the estimate is the mean of"""
+    evaluations: int
+    """Episodes simulated in all, the search for a proposal included"""
+    steps: int
+    """Simulator steps of ``samples``"""
+    invalid: int
+    """Episodes in which the simulator returned a number that is not finite; they count as not failing"""
+    modes: Any
+    """[K] the part of the estimate that each component or failure mode carries, of sum 1"""
+    reliable: bool
+    """No known reason against it"""
+    warnings: tuple
+    """Texts: the reasons why not, then remarks"""
+    chernoff: float | None = None
+    """Of plain counts: upper bound at one-sided ``level`` (the paper's eq. 17)"""
+    jeffreys: float | None = None
+    """Of plain counts: upper bound at one-sided ``level`` by Jeffreys' prior (eq. 18)"""
+    proposal: Any = None
+    """What it was drawn from, where the method found it itself: for `jast.estimate.failures`"""
+    history: Any = None
+    """How that was found, a text a line"""
+
+    @property
+    def log10_mean(self):
+        """Decimal logarithm of the estimate."""
+        return self.log_mean / math.log(10)
+
+    def __str__(self):
+        rows, low, high = [], *self.interval
+        if self.failures_seen:
+            value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
+            rows.append(("probability", f"{value}   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"))
+            rows.append(("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}"))
+        else:
+            known = f"below {high:.4g} at {self.level:.4g}" if high < 1 else "nothing is known"
+            rows.append(("probability", f"no failure seen: {known}"))
+        if self.chernoff is not None:
+            rows.append(("upper bounds", f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)   one-sided {self.level:.4g}"))
+        rows.append(("failures", f"{self.failures_seen} of {self.samples} episodes   {self.evaluations} evaluations"))
+        if self.chernoff is None and self.failures_seen:
+            rows.append(("weights", f"ESS {self.ess:.4g}   k-hat {self.k_hat:.2f}   greatest share {100 * self.max_share:.2g} %"))
+        if self.modes is not None and len(self.modes) > 1 and self.failures_seen:
+            rows.append(("modes", "  ".join(f"{100 * v:.1f} %" for v in self.modes[:12]) + (" ..." if len(self.modes) > 12 else "")))
+        if self.invalid:
+            rows.append(("invalid", f"{self.invalid}"))
+        head = [] if self.reliable else ["UNRELIABLE: " + "; ".join(self.warnings)]
+        tail = [f"{'remark':<14} {text}" for text in self.warnings] if self.reliable else []
+        return "\n".join([*head, f"{'method':<14} {self.method}", *(f"{name:<14} {text}" for name, text in rows), *tail])
+
+
+def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, modes=None, proposal=None, history=None):
+    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside, ``notes`` are remarks."""
+    level = float(real(method, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    n, seen = sums.samples, sums.first > 0
+    found = list(reasons)
+    if sums.undefined:
+        found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
+    log_mean = sums.top + math.log(sums.first / n) if seen else math.nan
+    # eq. 14 over the square of the mean; n - 1 for an unbiased variance
+    relative = math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1)) if seen and n > 1 else math.nan
+    ess = sums.first**2 / sums.second if seen else 0.0
+    k_hat = diagnostics.pareto_k(sums.tail, n)
+    share = 1 / sums.first if seen else math.nan
+    found += diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
+    if modes is None and seen:
+        modes = sums.by_component / sums.first
+    mean = math.exp(log_mean) if seen else math.nan
+    return Estimate(
+        method=method,
+        log_mean=log_mean,
+        mean=mean,
+        standard_error=mean * relative,
+        relative_error=relative,
+        interval=log_normal(log_mean, relative, level) if seen else (0.0, 1.0),
+        level=level,
+        ess=ess,
+        k_hat=k_hat,
+        max_share=share,
+        failures_seen=sums.failures,
+        samples=n,
+        evaluations=n if evaluations is None else evaluations,
+        steps=sums.steps,
+        invalid=sums.invalid,
+        modes=modes,
+        reliable=not found,
+        warnings=(*found, *_remarks(sums), *notes),
+        proposal=proposal,
+        history=history,
+    )
+
+
+def of_counts(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, proposal=None, history=None):
+    """The `Estimate` of episodes of the model itself: exact interval and upper bounds."""
+    level = float(real(method, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    n, k = sums.samples, sums.failures
+    mean = k / n if k else math.nan
+    found = [*reasons, *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",))]
+    relative = math.sqrt((1 - mean) / k) if k else math.nan
+    return Estimate(
+        method, math.log(mean) if k else math.nan, mean, mean * relative, relative, clopper_pearson(k, n, level), level, float(k), math.nan,
+        1 / k if k else math.nan, k, n, n if evaluations is None else evaluations, sums.steps, sums.invalid, np.ones(1) if k else None, not found,
+        (*found, *_remarks(sums), *notes), chernoff(k, n, level), jeffreys(k, n, level), proposal, history,
+    )  # fmt: skip
+
+
+def _remarks(sums):
+    if not sums.invalid:
+        return ()
+    return (f"{sums.invalid} of {sums.samples} episodes are invalid (a number that is not finite) and count as not failing",)

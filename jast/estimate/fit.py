@@ -1,0 +1,148 @@
+"""Mixtures of Gaussians fitted to weighted failures, for proposals: expectation maximisation with covariances that only say what the sample can know.
+
+On the host, in double precision. The cross-entropy optimum among mixtures is the maximum of the weighted likelihood (de Boer, Kroese, Mannor and Rubinstein
+2005); the number of components is the one that the other half of the sample likes best.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jast.estimate.latent import Latent
+
+__all__ = ["Gaussians", "as_latent", "fit", "shrunk"]
+
+COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16)
+ITERATIONS = 12
+MOST = 4000
+
+
+class Gaussians(NamedTuple):
+    """K Gaussians by the eigensystems of their covariances: vectors[k] diag(values[k]) vectors[k]^T."""
+
+    weights: np.ndarray
+    """[K]"""
+    means: np.ndarray
+    """[K, D]"""
+    values: np.ndarray
+    """[K, D]"""
+    vectors: np.ndarray
+    """[K, D, D]"""
+
+
+def fit(rng, points, weights, effective, known=None, limit=16):
+    """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``effective`` independent ones; of at most ``limit`` components.
+
+    ``known``: how many they count for as to covariances, where that is less. Of many points ``MOST`` are looked at.
+    """
+    known = effective if known is None else known
+    if len(points) > MOST:
+        chosen = rng.choice(len(points), MOST, replace=False)
+        points, weights, part = points[chosen], weights[chosen], weights[chosen].sum()
+        weights, effective, known = weights / part, *(min(v, MOST, v * max(part, 0.1)) for v in (effective, known))
+    n = len(points)
+    half = rng.permutation(n) < n // 2
+    best, score = 1, -np.inf
+    for k in COMPONENTS:
+        if k > limit or effective / 2 < 10 * k or np.count_nonzero(weights) < 4 * k:
+            break
+        value = 0.0
+        for part in (half, ~half):
+            w, v = (np.where(side, weights, 0) for side in (part, ~part))
+            if not (w.sum() > 0 and v.sum() > 0):
+                value = -np.inf
+                break
+            g = _em(rng, points[part], w[part] / w.sum(), known / 2, k)
+            value += v[~part] @ _log_sum(_log_joint(g, points[~part])) / v.sum()
+        if value > score + 0.02 or k == 1:
+            best, score = k, value
+        elif value < score - 0.5:
+            break
+    return _em(rng, points, weights, known, best)
+
+
+def as_latent(parts, dtype, size):
+    """The `Latent` of [(share, Gaussians), ...], padded to ``size`` components with ones of weight 0, so that programs are compiled once."""
+    weights = np.concatenate([share * g.weights for share, g in parts])
+    means = np.concatenate([g.means for _, g in parts])
+    values, vectors = (np.concatenate([getattr(g, name) for _, g in parts]) for name in ("values", "vectors"))
+    keep = np.argsort(-weights, kind="stable")[:size]
+    weights, means, values, vectors = weights[keep], means[keep], values[keep], vectors[keep]
+    factors = np.linalg.cholesky(np.einsum("kij,kj,klj->kil", vectors, values, vectors))
+    inverses = np.linalg.inv(factors)
+    k, d = means.shape
+    pad = lambda a, fill: np.concatenate([a, np.broadcast_to(fill, (size - k, *a.shape[1:]))])
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(pad(weights / weights.sum(), 0.0))
+    return Latent(*(jnp.asarray(a, dtype) for a in (log_weights, pad(means, 0.0), pad(factors, np.eye(d)), pad(np.tril(inverses), np.eye(d)))))
+
+
+def shrunk(values, count):
+    """Eigenvalues [D] of a sample covariance with what is noise of ``count`` independent points taken out.
+
+    Those within the band that a covariance s I would show (Marchenko and Pastur 1967) are set to their mean s, found by repetition; the others are kept.
+    """
+    d = len(values)
+    ratio = np.sqrt(min(d / max(count, 1.0), 1.0))
+    inside = np.ones(d, bool)
+    for _ in range(20):
+        s = values[inside].mean()
+        now = (values > s * (1 - ratio) ** 2 * 0.9) & (values < s * (1 + ratio) ** 2 * 1.1)
+        if not now.any() or (now == inside).all():
+            break
+        inside = now
+    return np.where(inside, values[inside].mean(), values)
+
+
+def _em(rng, z, w, effective, k):
+    """Expectation maximisation from far-apart points on; components that almost nothing belongs to end."""
+    n, d = z.shape
+    live = w > 0
+    z, w = z[live], w[live]
+    g = _start(rng, z, w, k)
+    for _ in range(ITERATIONS if k > 1 else 1):
+        joint = _log_joint(g, z) if k > 1 else np.zeros((len(z), 1))
+        r = np.exp(joint - _log_sum(joint)[:, None]) * w[:, None]
+        g = _maximise(z, r, effective)
+    return g
+
+
+def _start(rng, z, w, k):
+    """Centres by the rule of k-means++ (Arthur and Vassilvitskii 2007), unit covariances."""
+    d = z.shape[1]
+    centres = z[rng.choice(len(z), 1, p=w)]
+    for _ in range(1, k):
+        gap = ((z[:, None] - centres[None]) ** 2).sum(-1).min(axis=1) * w
+        centres = np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]]) if gap.sum() > 0 else centres
+    k = len(centres)
+    return Gaussians(np.full(k, 1 / k), centres, np.ones((k, d)), np.broadcast_to(np.eye(d), (k, d, d)))
+
+
+def _maximise(z, r, effective):
+    d = z.shape[1]
+    total = r.sum(axis=0)
+    kept = total * effective > 2
+    if not kept.any():
+        kept = total == total.max()
+    parts = []
+    for i in np.flatnonzero(kept):
+        mean = r[:, i] @ z / total[i]
+        e = z - mean
+        values, vectors = np.linalg.eigh((e * r[:, i : i + 1]).T @ e / total[i])
+        parts.append((total[i], mean, np.maximum(shrunk(values, effective * total[i]), 1e-4), vectors))
+    weights, means, values, vectors = (np.stack(a) for a in zip(*parts, strict=True))
+    return Gaussians(weights / weights.sum(), means, values, vectors)
+
+
+def _log_joint(g, z):
+    out = []
+    for weight, mean, values, vectors in zip(*g, strict=True):
+        e = (z - mean) @ vectors
+        out.append(np.log(weight) - 0.5 * (e**2 / values).sum(axis=1) - 0.5 * np.log(2 * np.pi * values).sum())
+    return np.stack(out, axis=1)
+
+
+def _log_sum(a):
+    top = a.max(axis=1)
+    return top + np.log(np.exp(a - top[:, None]).sum(axis=1))

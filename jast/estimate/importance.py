@@ -1,0 +1,169 @@
+"""Importance resampling: episodes drawn from a proposal, each weighted by how much likelier the model makes it (the paper's eq. 6-8).
+
+Weights are kept as logarithms and summed step by step as log p - log q, so that neither density overflows. Episodes are simulated in chunks of constant size;
+a chunk's log weights go to the host, where they are summed in double precision.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import logsumexp
+
+from jast import distributions as D
+from jast._checks import whole
+from jast.check import contract
+from jast.episode import accumulator, advance, begin
+from jast.estimate import sums
+from jast.estimate.estimate import estimate
+from jast.estimate.proposals import as_proposal
+from jast.policy import nominal_policy
+
+__all__ = ["Traces", "chunks", "importance", "log_weights"]
+
+LANES = 16384
+PROBES = 256
+
+
+class Traces(NamedTuple):
+    """Simulated episodes of a proposal, one a row of the leading axis [n]."""
+
+    log_weight: Any
+    """log p - log q to the end of the episode, also of those that do not fail"""
+    shares: Any
+    """[n, K] log of the probability that component k made the trace"""
+    failure: Any
+    """bool"""
+    invalid: Any
+    """bool: the simulator or a density returned NaN; no failure then"""
+    length: Any
+    """int32: steps taken"""
+
+
+def log_weights(key, sim, proposal, samples, *, mode="default"):
+    """``samples`` episodes drawn from ``proposal`` (a `Proposal` or a `Policy` with densities): `Traces`, for estimates of your own.
+
+    A trace's component is drawn once, and it is weighted by the full mixture (eq. 20): w = p(x) / sum_k a_k q_k(x). Pure, for `jax.jit` and `jax.vmap`; all in
+    memory. ``mode="default"`` weighs x0 and the steps to the end of the episode, as what comes after decides nothing; ``"paper"`` goes on to the horizon, as
+    the paper does. Both are unbiased. ValueError for another mode or proposal.
+    """
+    if mode not in ("default", "paper"):
+        raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
+    return _traces(key, sim, as_proposal("log_weights", sim, proposal), whole("log_weights", "samples", samples), mode == "paper")
+
+
+def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.95, progress=False, callback=None):
+    """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal: `Estimate`.
+
+    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities. Unbiased where the proposal can draw all that the model can: one
+    that holds no share of the model is tried on a few of the model's own episodes. It says nothing of failures that it hardly draws: `Estimate` on how to know.
+    ``mode`` as in `log_weights`; ``level`` of the interval. Memory does not grow with ``samples``. The key is consumed; chunk i is drawn with
+    ``jax.random.fold_in(key, i)``. ``progress=True`` shows a bar, ``callback(done, total)`` is called after each chunk; a KeyboardInterrupt ends it with the
+    estimate of the whole chunks, and a word in ``warnings``. Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
+
+    Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal without a density, and where the simulator's functions do not
+    fit together.
+    """
+    samples = whole("importance", "samples", samples, 2)
+    if mode not in ("default", "paper"):
+        raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
+    contract(sim, observed=False)
+    proposal = as_proposal("importance", sim, proposal)
+    key, for_probes = jax.random.split(key)
+    reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
+    lanes = min(LANES, 1 << (samples - 1).bit_length())
+    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
+    total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
+    return estimate("importance", total, level=level, reasons=reasons, notes=stopped)
+
+
+def chunks(simulate, lanes, samples, progress=False, callback=None, name="importance"):
+    """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces`` [lanes]; of the last chunk the first ones count."""
+    bar = None
+    if progress:
+        from tqdm import tqdm  # slow to import
+
+        bar = tqdm(total=samples, unit="episode", unit_scale=True, desc=name)
+    total, done, notes = sums.nothing(samples), 0, ()
+    try:
+        ahead = simulate(0)
+        while done < samples:
+            n, traces = min(lanes, samples - done), ahead
+            if done + n < samples:
+                ahead = simulate(done // lanes + 1)  # the device goes on while the host sums
+            total = sums.add(total, jax.tree.map(lambda a: a[:n], jax.device_get(traces)))
+            done += n
+            if bar is not None:
+                bar.update(n)
+            if callback is not None:
+                callback(done, samples)
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        notes = (f"interrupted after {done} of {samples} episodes",)
+    finally:
+        if bar is not None:
+            bar.close()
+    return total, notes
+
+
+@partial(jax.jit, static_argnums=(3, 4))
+def _traces(key, sim, proposal, n, to_horizon):
+    return jax.vmap(lambda k: _trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
+
+
+def raw(log_p, event, distance, terminal, approach=0.0):
+    """A reward that costs nothing: the log density."""
+    return log_p
+
+
+def _trace(key, sim, proposal, to_horizon, drawn=None):
+    """One `Traces` row; ``drawn``: another policy that draws it."""
+    for_component, for_start, for_steps = jax.random.split(key, 3)
+    own = drawn
+    if drawn is None:
+        k = jax.random.categorical(for_component, proposal.log_weights) if len(proposal.log_weights) > 1 else 0
+        own = jax.tree.map(lambda a: a[k], proposal.policies)
+    dtype, (components,) = accumulator(sim), proposal.log_weights.shape
+
+    def weigh(ratio, p, make, x):  # of log q_k - log p [K], and whether p is 0
+        ratios, impossible = ratio
+        log_q, log_p = jax.vmap(lambda policy: make(policy).log_prob(x), axis_size=components)(proposal.policies), p.log_prob(x)
+        return ratios + (log_q.astype(dtype) - log_p.astype(dtype)), impossible | (log_p == -jnp.inf)
+
+    x0 = D.sample(own.start(), for_start)
+    first = begin(sim, raw, x0)
+    none = jnp.zeros(proposal.log_weights.shape, dtype), jnp.zeros((), bool)
+    ratio = weigh(none, sim.start(), lambda policy: policy.start(), x0)
+
+    def body(carry):
+        progress, ratio, t, length = carry
+        x = D.sample(own.disturbance(progress.state, t), jax.random.fold_in(for_steps, t))
+        ratio = weigh(ratio, sim.disturbance(progress.state), lambda policy: policy.disturbance(progress.state, t), x)
+        after = advance(sim, raw, progress, x, t + 1 >= sim.horizon)
+        if to_horizon:  # the state of an ended episode stays, while drawing and weighing go on
+            after = jax.tree.map(lambda a, b: jnp.where(progress.done, a, b), progress, after)
+        return after, ratio, t + 1, length + jnp.where(progress.done, 0, 1)
+
+    goes_on = (lambda c: c[2] < sim.horizon) if to_horizon else (lambda c: ~c[0].done)
+    zero = jnp.zeros((), jnp.int32)
+    last, (ratios, impossible), _, length = lax.while_loop(goes_on, body, (first, ratio, zero, zero))
+    prior = proposal.log_weights.astype(dtype)
+    log_q = logsumexp(prior + ratios)
+    return Traces(jnp.where(impossible, -jnp.inf, -log_q), jnp.where(impossible, prior, prior + ratios - log_q), last.failure, last.invalid, length)
+
+
+@partial(jax.jit, static_argnums=3)
+def _probe(key, sim, proposal, n):
+    drawn = nominal_policy(sim)
+    return jax.vmap(lambda k: _trace(k, sim, proposal, False, drawn))(jax.random.split(key, n))
+
+
+def _uncovered(key, sim, proposal):
+    """Why the proposal cannot be right, tried on episodes of the model."""
+    traces = jax.device_get(_probe(key, sim, proposal, PROBES))
+    missing = int((~traces.invalid & ~(traces.log_weight < np.inf)).sum())
+    return [f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: what it cannot draw is missing"] if missing else []

@@ -1,0 +1,164 @@
+"""A simulator as a limit state of normal numbers: an episode is a point z [D], under the model z ~ N(0, I), and proposals are mixtures of Gaussians there.
+
+z holds the latents of x0 first, then those of x_1, x_2 ..: x_t is the quantile of p(x | s) at Phi(z_t). An episode that ends after n steps has used the first
+``used`` numbers; the others decide nothing, so densities are taken over the used ones. With Cholesky factors, lower triangular, these are a cumulative sum.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import actions as choices
+from jast import distributions as D
+from jast.check import contract
+from jast.cross_entropy.sequences import player
+from jast.episode import _shapes, advance, begin, random_start, rollout
+
+__all__ = ["Latent", "Outcomes", "check_latent", "dimension", "draw", "episodes", "log_ratios", "normal_numbers", "outcome", "outcomes"]
+
+
+class Outcomes(NamedTuple):
+    """What episodes [n] came to."""
+
+    failure: Any
+    """bool"""
+    distance: Any
+    """Miss distance; inf where invalid"""
+    used: Any
+    """int32: how many of the numbers of z decided it"""
+    length: Any
+    """int32: steps"""
+    invalid: Any
+    """bool"""
+
+    @property
+    def score(self):
+        """What a search minimises: the miss distance, -inf for a failure, inf for an invalid episode."""
+        return jnp.where(self.failure, -jnp.inf, jnp.where(self.invalid, jnp.inf, self.distance))
+
+
+class Latent(NamedTuple):
+    """A mixture of K Gaussians over z [D], one drawn a trace."""
+
+    log_weights: Any
+    """[K], of sum 1 as probabilities; -inf for a component that is not used"""
+    means: Any
+    """[K, D]"""
+    factors: Any
+    """[K, D, D] lower Cholesky factors of the covariances"""
+    inverses: Any
+    """[K, D, D] their inverses"""
+
+
+def check_latent(function, sim):
+    """ValueError unless the simulator fits the contract and its disturbances have a quantile function."""
+    contract(sim, observed=False)
+    missing = []
+
+    def look():
+        start = sim.start()
+        dists = [("disturbance", sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))] + ([("start", start)] if random_start(sim) else [])
+        missing.extend(f"{name}: {type(d).__name__}" for name, d in dists if not D.has_quantile(d))
+
+    jax.eval_shape(look)
+    if missing:
+        raise ValueError(f"{function}: {missing[0]} has no quantile function; jast.estimate.monte_carlo needs none")
+
+
+def dimension(sim):
+    """D, a Python int."""
+    first, row = _sizes(sim)
+    return first + sim.horizon * row
+
+
+def normal_numbers(sim):
+    """The float dtype of z."""
+    like = jax.eval_shape(_shapes, sim)
+    return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves(like)))
+
+
+def outcome(sim, z):
+    """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
+    policy, last = _policy(sim, z), jnp.asarray(sim.horizon, jnp.int32)
+    first = begin(sim, raw, D.mode(policy.start()))
+
+    def body(carry):
+        progress, t = carry
+        return advance(sim, raw, progress, D.mode(policy.disturbance(progress.state, t)), t + 1 >= last), t + 1
+
+    end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
+    size0, row = _sizes(sim)
+    return Outcomes(end.failure, end.distance, size0 + length * row, length, end.invalid)
+
+
+@jax.jit
+def outcomes(sim, z):
+    """`Outcomes` [n] of ``z`` [n, D]."""
+    return jax.vmap(lambda z: outcome(sim, z))(z)
+
+
+def episodes(sim, z):
+    """The `jast.Episode` of each of ``z`` [n, D], without states."""
+    return _episodes(sim, z)
+
+
+@jax.jit
+def _episodes(sim, z):
+    return jax.vmap(lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None))(z)
+
+
+def draw(key, q, n):
+    """``n`` points [n, D] of the mixture ``q``."""
+    for_component, for_noise = jax.random.split(key)
+    k = jax.random.categorical(for_component, q.log_weights, shape=(n,))
+    e = jax.random.normal(for_noise, (n, q.means.shape[1]), q.means.dtype)
+
+    def component(i, z):
+        return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)
+
+    return lax.fori_loop(0, len(q.means), component, e)
+
+
+def log_ratios(q, z, used):
+    """log q_k - log p [n, K] over the first ``used`` [n] numbers of each of ``z`` [n, D]."""
+
+    def component(mean, inverse):
+        e = (z - mean[None]) @ inverse.T
+        each = 0.5 * (z - e) * (z + e) + jnp.log(jnp.diagonal(inverse))[None]
+        kept = jnp.arange(z.shape[1], dtype=jnp.int32)[None] < used[:, None]
+        return jnp.sum(jnp.where(kept, each, 0), axis=1)
+
+    return lax.map(lambda c: component(*c), (q.means, q.inverses)).T
+
+
+def raw(log_p, event, distance, terminal, approach=0.0):
+    """A reward that costs nothing: the log density."""
+    return log_p
+
+
+def _policy(sim, z):
+    like0, like = jax.eval_shape(_shapes, sim)
+    size0, _ = _sizes(sim)
+    return player(sim, choices.quantiles(), _unflat(like0, z[:size0]), jax.vmap(partial(_unflat, like))(z[size0:].reshape(sim.horizon, -1)))
+
+
+def _sizes(sim):
+    """How many numbers x0 and x are."""
+    like0, like = jax.eval_shape(_shapes, sim)
+    count = lambda like: sum(int(np.prod(s.shape)) for s in jax.tree.leaves(like))
+    return count(like0) if random_start(sim) else 0, count(like)
+
+
+def _unflat(like, z):
+    """A pytree of floats like a disturbance, from its numbers."""
+    leaves, treedef = jax.tree.flatten(like)
+    parts, at = [], 0
+    for s in leaves:
+        size = int(np.prod(s.shape))
+        parts.append(z[at : at + size].reshape(s.shape).astype(D.float_dtype(s.dtype)))
+        at += size
+    return treedef.unflatten(parts)

@@ -1,0 +1,216 @@
+"""Proposals of importance resampling: recorded failure traces and failure policies, mixed with the model so that nothing is left uncovered.
+
+Lipkis and Agogino, Discovery and Analysis of Rare High-Impact Failure Modes Using Adversarial RL-Informed Sampling ("the paper").
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast._checks import real
+from jast.check import contract
+from jast.cross_entropy.sequences import latent
+from jast.cross_entropy.tilted import tilted
+from jast.episode import Episode, _fitted, _shapes, random_start, replay
+from jast.estimate.blend import blend
+from jast.policy import Policy
+
+__all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
+
+MIXING = ("step", "trace")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Proposal:
+    """A mixture of K policies, one of which is drawn for a whole trace: q(trace) = sum of exp(log_weights[k]) q_k(trace). A pytree."""
+
+    log_weights: Any
+    """[K], of sum 1 as probabilities"""
+    policies: Policy
+    """Stacked: a leading axis [K] on every leaf"""
+    covers: bool = field(default=False, metadata=dict(static=True))
+    """Known to have a density above 0 wherever the model has one, as it holds a share of the model; static."""
+
+
+def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=True):
+    """The proposal of recorded failures, the paper's Algorithm 1 (one trace) and eq. 19-20 (several): `Proposal` of one component a trace.
+
+    ``episodes``: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a list of either. Each is replayed; its disturbance x*_t
+    moves p(x | s) so that its middle is where x*_t lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq. 10-11), in general
+    `jast.cross_entropy.tilted`, which keeps within bounds and suits whole numbers too. Steps after the end of a trace are the model's own.
+
+    ``epsilon``: the share of the model, above 0 and at most 1 (traced). With ``mixing="step"`` it is mixed in at each step, as in the paper (eq. 12; of T steps
+    all are moved with probability (1 - epsilon)^T only); ``"trace"``: one more component is the model itself, for long horizons. ``tilt_start=False`` draws
+    x0 from the model.
+
+    Raises ValueError for another epsilon or mixing, episodes that do not fit the simulator, and a disturbance that cannot be tilted (named).
+    """
+    epsilon = _epsilon("trace_proposal", epsilon, mixing)
+    contract(sim, observed=False)
+    start, steps = _latents(sim, _stacked(sim, episodes))
+    tilt_start = tilt_start and random_start(sim)
+    start = start if tilt_start else ()
+    k = len(jax.tree.leaves(steps)[0])
+    if mixing == "trace":
+        start, steps = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), (start, steps))
+        log_weights = jnp.log(jnp.append(jnp.full((k,), (1 - epsilon) / k), epsilon))
+    else:
+        log_weights = jnp.full((k,), -jnp.log(jnp.asarray(k, epsilon.dtype)))
+    share = epsilon if mixing == "step" else None
+    first = Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start
+    many = Policy(first, Partial(_trace_step, sim.disturbance, steps, share))
+    one = Policy(
+        Partial(_trace_start, sim.start, jax.tree.map(lambda a: a[0], start), share) if tilt_start else sim.start,
+        Partial(_trace_step, sim.disturbance, jax.tree.map(lambda a: a[0], steps), share),
+    )
+    return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
+
+
+def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"):
+    """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
+
+    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from the model alone, as Algorithm 2 is printed. Where x0 decides
+    whether the system fails that estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate.reliable`. ``epsilon`` and ``mixing`` as in
+    `trace_proposal`. A policy that itself draws from all failures can be given to `importance` as it is.
+
+    Raises ValueError for another epsilon or mixing, what is no `jast.Policy`, and a disturbance that cannot be tilted (named).
+    """
+    epsilon = _epsilon("policy_proposal", epsilon, mixing)
+    contract(sim, observed=False)
+    if not isinstance(policy, Policy):
+        raise ValueError(f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}")
+    tilt_start = tilt_start and random_start(sim)
+    share = epsilon if mixing == "step" else None
+    on = jnp.ones((), epsilon.dtype)
+    strength = on[None] if mixing == "step" else jnp.stack([on, on * 0])
+    make = lambda strength: Policy(
+        Partial(_policy_start, sim.start, policy.start, strength, share) if tilt_start else sim.start,
+        Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share),
+    )
+    log_weights = jnp.zeros((1,), epsilon.dtype) if mixing == "step" else jnp.log(jnp.stack([1 - epsilon, epsilon]))
+    many, one = make(strength), make(strength[0])
+    _try(lambda: one.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))), jnp.int32(0)), "policy_proposal")
+    return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
+
+
+def as_proposal(function, sim, proposal):
+    """A `Proposal`: ``proposal`` itself, or a mixture of the one `Policy` that it is. ValueError for anything else, and for a policy without a density."""
+    if isinstance(proposal, Policy):
+        dtype = jnp.zeros(()).dtype
+        proposal = Proposal(jnp.zeros((1,), dtype), jax.tree.map(lambda a: jnp.asarray(a)[None], proposal))
+    if not isinstance(proposal, Proposal):
+        raise ValueError(f"{function}: proposal must be a Proposal or a jast.Policy, received {type(proposal).__name__}")
+
+    def look():
+        policy = jax.tree.map(lambda a: a[0], proposal.policies)
+        x0 = D.sample(sim.start(), jax.random.key(0))
+        return [d for d in (policy.start(), policy.disturbance(sim.init(x0), jnp.int32(0))) if isinstance(d, D.Deterministic)]
+
+    if _host(look):
+        raise ValueError(f"{function}: a policy that plays one value has no density; make a proposal of it with trace_proposal or policy_proposal")
+    return proposal
+
+
+def _epsilon(function, epsilon, mixing):
+    if mixing not in MIXING:
+        raise ValueError(f'{function}: mixing must be "step" or "trace", received {mixing!r}')
+    return real(function, "epsilon", epsilon, lambda v: 0 < v <= 1, "above 0 and at most 1")
+
+
+def _stacked(sim, episodes):
+    """x0, disturbances and lengths with one leading axis [K]."""
+    parts = list(episodes) if isinstance(episodes, list) or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields")) else [episodes]
+    if not parts or not all(isinstance(e, Episode) for e in parts):
+        raise ValueError(f"trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received {[type(e).__name__ for e in parts]}")
+    batched = [(e.x0, e.disturbances, e.length) if np.ndim(e.length) else jax.tree.map(lambda a: jnp.asarray(a)[None], (e.x0, e.disturbances, e.length)) for e in parts]
+    if not all(len(np.shape(b[2])) == 1 and len(b[2]) for b in batched):
+        raise ValueError(f"trace_proposal: episodes must have at most one leading axis, of at least 1, received lengths {[np.shape(b[2]) for b in batched]}")
+    like_x0, like = jax.eval_shape(_shapes, sim)
+    full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like)
+    for x0, x, n in batched:
+        one = jax.tree.map(lambda a: a[0], (x0, x))
+        _fitted("x0", one[0], like_x0)
+        _fitted("disturbances", one[1], full)
+    return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
+
+
+@jax.jit
+def _latents(sim, recorded):
+    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end of each."""
+
+    def one(x0, x, length):
+        e = replay(sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(())))
+        states = jax.tree.map(lambda a: a[:-1], e.states)
+        z = jax.vmap(lambda s, x: latent(sim.disturbance(s), x))(states, e.disturbances)
+        live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
+        z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
+        return latent(sim.start(), x0) if random_start(sim) else (), z
+
+    return jax.vmap(one)(*recorded)
+
+
+def _host(look):
+    """What ``look`` returns while it is traced: a Python value."""
+    found = []
+
+    def traced():
+        found.append(look())
+
+    jax.eval_shape(traced)
+    return found[0]
+
+
+def _try(look, function):
+    try:
+        _host(look)
+    except ValueError as error:
+        raise ValueError(f"{function}: disturbance: {error}") from None
+
+
+def _stack(many, one, k):
+    """``many``, whose own leaves have the axis [K], with the leaves that it shares with the simulator repeated to have it as well."""
+    return jax.tree.map(lambda a, b: jnp.asarray(a) if np.ndim(a) > np.ndim(b) else jnp.broadcast_to(jnp.asarray(a), (k, *np.shape(a))), many, one)
+
+
+def _moved(p, z):
+    return tilted(p, z, jax.tree.map(jnp.ones_like, z))
+
+
+def _mixed(share, p, q):
+    """epsilon p + (1 - epsilon) q (eq. 12), or q alone."""
+    return q if share is None else blend(jnp.stack([share, 1 - share]), p, q)
+
+
+def _trace_start(start, z, share):
+    p = start()
+    return _mixed(share, p, _moved(p, z))
+
+
+def _trace_step(disturbance, z, share, state, t):
+    p = disturbance(state)
+    return _mixed(share, p, _moved(p, jax.tree.map(lambda a: a[t], z)))
+
+
+def _policy_start(start, other, strength, share):
+    p, q = start(), other()
+    if isinstance(q, D.Deterministic):
+        q = _towards(p, D.mode(q), strength)
+    elif share is None:
+        q = blend(jnp.stack([1 - strength, strength]), p, q)
+    return _mixed(share, p, q)
+
+
+def _policy_step(disturbance, policy, strength, share, state, t):
+    p = disturbance(state)
+    return _mixed(share, p, _towards(p, D.mode(policy(state, t)), strength))
+
+
+def _towards(p, x, strength):
+    """p moved so that its middle is x (eq. 10-11)."""
+    return _moved(p, jax.tree.map(lambda z: strength.astype(z.dtype) * z, latent(p, x)))

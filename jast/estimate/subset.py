@@ -1,0 +1,171 @@
+"""Populations that find failures: down the levels of the miss distance (subset simulation, Au and Beck 2001), or from wider noise inwards.
+
+The Markov moves are those of conditional sampling in the space of normal numbers (Papaioannou, Betz, Zwirglmaier and Straub 2015), with the size of the moves
+adapted. One population serves as an estimator of its own; as an explorer it may be kept out of the failures that a proposal covers already.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+
+from jast.estimate.latent import dimension, log_ratios, normal_numbers, outcomes
+
+__all__ = ["Explored", "cool", "explore"]
+
+QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
+WIDTHS, FAILING, COLD, COOLING = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60
+
+
+class Explored(NamedTuple):
+    """What one population came to. On the host."""
+
+    points: Any
+    """[n, D] failing points, drawn nearly from p(z | failure); empty where none was reached"""
+    used: Any
+    """[n] int32 numbers that each one used"""
+    log_mean: float
+    """Log of the product of the levels' shares: the estimate; -inf where no failure was reached"""
+    levels: tuple
+    """The miss distances of the levels, or the widths of the noise, falling"""
+    evaluations: int
+    invalid: int
+
+    @property
+    def reached(self):
+        """Whether failures were."""
+        return len(self.points) > 0
+
+
+class Population(NamedTuple):
+    z: Any
+    score: Any
+    used: Any
+    invalid: Any
+
+
+class _Chain:
+    """A population on its way: the moves, their size and the counts, which both explorers share."""
+
+    def __init__(self, key, sim, size, covered):
+        self.key, self.sim, self.size, self.covered = key, sim, size, covered
+        self.scale, self.evaluations, self.invalid = 0.7, 0, 0
+        self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
+
+    def next_key(self):
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def draw(self, width):
+        """A new population N(0, width^2 I)."""
+        z = width * jax.random.normal(self.next_key(), (self.size, self.dimension), self.dtype)
+        return self.count(_judge(self.sim, z, self.covered))
+
+    def move(self, people, rows, level, width, times):
+        """``people[rows]`` after Markov moves that keep N(0, width^2 I) given score <= level."""
+        for _ in range(times):
+            numbers = (jnp.asarray(v, d) for v, d in ((level, people.score.dtype), (self.scale, self.dtype), (width, self.dtype)))
+            people, accepted = _move(self.next_key(), self.sim, people, jnp.asarray(rows, jnp.int32), *numbers, self.covered)
+            self.count(people)
+            self.scale = float(np.clip(self.scale * math.exp(float(accepted) - ACCEPTANCE), 0.02, 1.0))
+            rows = np.arange(self.size)
+        return people
+
+    def count(self, people):
+        self.evaluations += self.size
+        self.invalid += int(people.invalid.sum())
+        return people
+
+    def end(self, people, log_mean, levels):
+        if people is None:
+            return Explored(np.zeros((0, self.dimension)), np.zeros(0, np.int32), -math.inf, tuple(levels), self.evaluations, self.invalid)
+        return Explored(np.asarray(people.z), np.asarray(people.used), log_mean, tuple(levels), self.evaluations, self.invalid)
+
+
+def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
+    """Subset simulation: take a population of ``size`` points down the levels of the miss distance to the failures of ``sim``: `Explored`.
+
+    ``covered``: (`Latent` q, log threshold): points with log q - log p above it are left out, so that the population looks for failures that q does not
+    draw, and the estimate is of those alone. It gives up below the log probability ``least``, where it would take more than ``most`` evaluations, or where no
+    level falls further.
+    """
+    chain = _Chain(key, sim, size, covered)
+    people = chain.draw(1.0)
+    log_mean, level, levels = 0.0, math.inf, []
+    while True:
+        score = np.asarray(people.score)
+        share = np.mean(score == -np.inf)
+        if share >= QUANTILE:
+            level = -math.inf
+        elif chain.evaluations + size * (1 + LAST) > most or log_mean < least:
+            return chain.end(None, log_mean, levels)
+        else:
+            level = _next(score, level)
+            if level is None and share == 0:
+                return chain.end(None, log_mean, levels)
+            level = -math.inf if level is None else level
+        log_mean += math.log(np.mean(score <= level))
+        elites = np.flatnonzero(score <= level)
+        # each elite as often as any other, or once more
+        rows = elites[(np.arange(size) + len(levels)) % len(elites)]
+        if level == -math.inf:
+            return chain.end(chain.move(people, rows, level, 1.0, LAST), log_mean, levels)
+        people = chain.move(people, rows, level, 1.0, 1)
+        levels.append(level)
+
+
+def cool(key, sim, size, chains):
+    """Failing points of small norm, one a chain, found without a miss distance that could mislead: `Explored`.
+
+    Under wider noise N(0, s^2 I) failures are frequent: ``size`` points of the first width that makes a share of ``FAILING`` fail (nothing is found where none
+    does). ``chains`` of them go on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain replaces another one, no
+    failure mode is lost on the way, however little of the probability it has.
+    """
+    chain = _Chain(key, sim, size, None)
+    for width in WIDTHS:
+        people = chain.draw(width)
+        failing = np.flatnonzero(np.asarray(people.score) == -np.inf)
+        if len(failing) >= FAILING * size:
+            break
+    if len(failing) < FAILING * size:
+        return chain.end(None, -math.inf, (width,))
+    widths = np.geomspace(width, COLD, COOLING)
+    chain.size, rows = chains, failing[np.arange(chains) % len(failing)]
+    for width in widths:
+        people = chain.move(people, rows, -math.inf, width, 1)
+        rows = np.arange(chains)
+    return chain.end(people, math.nan, widths)
+
+
+def _next(score, last):
+    """The next level: the sample quantile of the scores, below the last one; None where there is none above the failures."""
+    level = np.sort(score)[math.ceil(QUANTILE * len(score)) - 1]
+    if level < last:
+        return float(level)
+    below = score[(score < last) & (score > -np.inf)]
+    return float(below.max()) if below.size else None
+
+
+@jax.jit
+def _judge(sim, z, covered):
+    o = outcomes(sim, z)
+    score = o.score
+    if covered is not None:
+        q, threshold = covered
+        inside = logsumexp(log_ratios(q, z, o.used) + q.log_weights[None], axis=1) > threshold
+        score = jnp.where(inside, jnp.inf, score)
+    return Population(z, score, o.used, o.invalid)
+
+
+@jax.jit
+def _move(key, sim, people, rows, level, scale, width, covered):
+    """One Markov move of ``people[rows]``: (`Population`, with the invalid ones of the candidates, accepted share)."""
+    people = jax.tree.map(lambda a: a[rows], people)
+    noise = width * jax.random.normal(key, people.z.shape, people.z.dtype)
+    new = _judge(sim, jnp.sqrt(1 - scale**2) * people.z + scale * noise, covered)
+    good = new.score <= level
+    kept = jax.tree.map(lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people)
+    return kept._replace(invalid=new.invalid), jnp.mean(good, dtype=scale.dtype)

@@ -1,0 +1,70 @@
+"""What an estimate needs of its weights, added chunk by chunk on the host: constant memory, double precision, any range."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["Sums", "add", "nothing"]
+
+
+class Sums(NamedTuple):
+    """Weights w = p / q of failing episodes, all over exp(top)."""
+
+    samples: int
+    """Episodes counted"""
+    steps: int
+    failures: int
+    """Failing episodes"""
+    invalid: int
+    """Episodes in which the simulator or the model's density returned NaN"""
+    undefined: int
+    """Failing episodes whose weight is NaN or infinite; they count for nothing"""
+    top: float
+    """Greatest log weight; -inf before any"""
+    first: float
+    """Sum of w / exp(top)"""
+    second: float
+    """Sum of the squares"""
+    by_component: Any
+    """[K] sums by the component that made a trace (its probability)"""
+    tail: Any
+    """The greatest log weights, at most ``keep``, falling"""
+    keep: int
+
+
+def nothing(samples):
+    """The `Sums` before the first of ``samples`` episodes."""
+    return Sums(0, 0, 0, 0, 0, -np.inf, 0.0, 0.0, None, np.zeros(0), tail_size(samples))
+
+
+def tail_size(samples):
+    """How many of the greatest weights the Pareto fit looks at: min(n / 5, 3 sqrt(n)) (Vehtari et al. 2024)."""
+    return int(min(samples / 5, 3 * np.sqrt(samples))) + 1
+
+
+def add(total, traces):
+    """`Sums` with the `Traces` [n] (NumPy) as well."""
+    log_w = np.asarray(traces.log_weight, np.float64)
+    good = np.asarray(traces.failure) & np.isfinite(log_w) | np.asarray(traces.failure) & (log_w == -np.inf)
+    shares = np.exp(np.asarray(traces.shares, np.float64)[good])
+    log_w = log_w[good]
+    top = max(total.top, log_w.max(initial=-np.inf))
+    rescale = np.exp(total.top - top) if total.top > -np.inf else 0.0
+    w = np.exp(log_w - top) if top > -np.inf else np.zeros(0)
+    by = w @ shares if w.size else np.zeros(shares.shape[1])
+    tail = np.concatenate([total.tail, log_w])
+    if len(tail) > total.keep:
+        tail = np.partition(tail, -total.keep)[-total.keep :]
+    return Sums(
+        samples=total.samples + len(traces.failure),
+        steps=total.steps + int(np.asarray(traces.length, np.int64).sum()),
+        failures=total.failures + int(np.asarray(traces.failure).sum()),
+        invalid=total.invalid + int(np.asarray(traces.invalid).sum()),
+        undefined=total.undefined + int(np.asarray(traces.failure).sum()) - len(log_w),
+        top=top,
+        first=total.first * rescale + w.sum(),
+        second=total.second * rescale**2 + (w**2).sum(),
+        by_component=by if total.by_component is None else total.by_component * rescale + by,
+        tail=np.sort(tail)[::-1],
+        keep=total.keep,
+    )
