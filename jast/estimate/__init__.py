@@ -1,5 +1,6 @@
 """Failure probabilities: importance resampling of failure traces and failure policies, and estimators that find their own proposal."""
 
+from jast.estimate.adaptive import adaptive_cross_entropy, failure_probability, monte_carlo, subset_simulation
 from jast.estimate.diagnostics import pareto_k
 from jast.estimate.estimate import Estimate
 from jast.estimate.importance import Traces, importance, log_weights
@@ -7,5 +8,6 @@ from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
 
 __all__ = [
-    "Estimate", "Proposal", "Traces", "chernoff", "clopper_pearson", "importance", "jeffreys", "log_weights", "pareto_k", "policy_proposal", "trace_proposal",
+    "Estimate", "Proposal", "Traces", "adaptive_cross_entropy", "chernoff", "clopper_pearson", "failure_probability", "importance", "jeffreys", "log_weights",
+    "monte_carlo", "pareto_k", "policy_proposal", "subset_simulation", "trace_proposal",
 ]  # fmt: skip

@@ -11,11 +11,13 @@ import numpy as np
 
 from jast.estimate.latent import Latent
 
-__all__ = ["Gaussians", "as_latent", "fit", "shrunk"]
+__all__ = ["Gaussians", "as_latent", "effective", "fit", "shrunk", "together", "unit"]
 
 COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16)
 ITERATIONS = 12
 MOST = 4000
+SIZE = 40
+"""Components of a `Latent`, unused ones included."""
 
 
 class Gaussians(NamedTuple):
@@ -31,22 +33,21 @@ class Gaussians(NamedTuple):
     """[K, D, D]"""
 
 
-def fit(rng, points, weights, effective, known=None, limit=16):
-    """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``effective`` independent ones; of at most ``limit`` components.
+def fit(rng, points, weights, count, known=None, limit=16):
+    """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``count`` independent ones; of at most ``limit`` components.
 
     ``known``: how many they count for as to covariances, where that is less. Of many points ``MOST`` are looked at.
     """
-    known = effective if known is None else known
+    known = count if known is None else known
     if len(points) > MOST:
         chosen = rng.choice(len(points), MOST, replace=False)
         points, weights, part = points[chosen], weights[chosen], weights[chosen].sum()
-        weights, effective, known = weights / part, *(min(v, MOST, v * max(part, 0.1)) for v in (effective, known))
+        weights, count, known = weights / part, *(min(v, MOST, v * max(part, 0.1)) for v in (count, known))
     n = len(points)
     half = rng.permutation(n) < n // 2
     best, score = 1, -np.inf
-    for k in COMPONENTS:
-        if k > limit or effective / 2 < 10 * k or np.count_nonzero(weights) < 4 * k:
-            break
+    starts = [k for k in COMPONENTS if k <= limit and count / 2 >= 10 * k and np.count_nonzero(weights) >= 4 * k] or [1]
+    for k in starts:
         value = 0.0
         for part in (half, ~half):
             w, v = (np.where(side, weights, 0) for side in (part, ~part))
@@ -55,27 +56,38 @@ def fit(rng, points, weights, effective, known=None, limit=16):
                 break
             g = _em(rng, points[part], w[part] / w.sum(), known / 2, k)
             value += v[~part] @ _log_sum(_log_joint(g, points[~part])) / v.sum()
-        if value > score + 0.02 or k == 1:
+        if value > score + 0.02:
             best, score = k, value
-        elif value < score - 0.5:
-            break
     return _em(rng, points, weights, known, best)
 
 
-def as_latent(parts, dtype, size):
-    """The `Latent` of [(share, Gaussians), ...], padded to ``size`` components with ones of weight 0, so that programs are compiled once."""
+def as_latent(parts, dtype):
+    """The `Latent` of [(share, Gaussians), ...]: its ``SIZE`` greatest components, padded with ones of weight 0, so that programs are compiled once."""
     weights = np.concatenate([share * g.weights for share, g in parts])
-    means = np.concatenate([g.means for _, g in parts])
-    values, vectors = (np.concatenate([getattr(g, name) for _, g in parts]) for name in ("values", "vectors"))
-    keep = np.argsort(-weights, kind="stable")[:size]
-    weights, means, values, vectors = weights[keep], means[keep], values[keep], vectors[keep]
+    kept = np.argsort(-weights, kind="stable")[:SIZE]
+    weights, (means, values, vectors) = weights[kept], (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3))
     factors = np.linalg.cholesky(np.einsum("kij,kj,klj->kil", vectors, values, vectors))
-    inverses = np.linalg.inv(factors)
     k, d = means.shape
-    pad = lambda a, fill: np.concatenate([a, np.broadcast_to(fill, (size - k, *a.shape[1:]))])
+    pad = lambda a, fill: np.concatenate([a, np.broadcast_to(fill, (SIZE - k, *a.shape[1:]))])
     with np.errstate(divide="ignore"):
         log_weights = np.log(pad(weights / weights.sum(), 0.0))
-    return Latent(*(jnp.asarray(a, dtype) for a in (log_weights, pad(means, 0.0), pad(factors, np.eye(d)), pad(np.tril(inverses), np.eye(d)))))
+    arrays = log_weights, pad(means, 0.0), pad(factors, np.eye(d)), pad(np.tril(np.linalg.inv(factors)), np.eye(d))
+    return Latent(*(jnp.asarray(a, dtype) for a in arrays))
+
+
+def together(a, b, share):
+    """The mixture of two `Latent`, ``share`` of the second; of their components the least give way."""
+    weights = np.concatenate([np.exp(np.asarray(q.log_weights, np.float64)) * s for q, s in ((a, 1 - share), (b, share))])
+    kept = np.argsort(-weights, kind="stable")[:SIZE]
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(weights[kept] / weights[kept].sum())
+    return Latent(jnp.asarray(log_weights, a.means.dtype), *(jnp.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)))
+
+
+def effective(log_weights):
+    """(sum w)^2 / sum w^2."""
+    w = np.exp(log_weights - log_weights.max())
+    return w.sum() ** 2 / (w**2).sum()
 
 
 def shrunk(values, count):
@@ -95,34 +107,37 @@ def shrunk(values, count):
     return np.where(inside, values[inside].mean(), values)
 
 
-def _em(rng, z, w, effective, k):
+def _em(rng, z, w, count, k):
     """Expectation maximisation from far-apart points on; components that almost nothing belongs to end."""
-    n, d = z.shape
     live = w > 0
     z, w = z[live], w[live]
     g = _start(rng, z, w, k)
-    for _ in range(ITERATIONS if k > 1 else 1):
-        joint = _log_joint(g, z) if k > 1 else np.zeros((len(z), 1))
+    one = len(g.weights) == 1
+    for _ in range(1 if one else ITERATIONS):
+        joint = np.zeros((len(z), 1)) if one else _log_joint(g, z)
         r = np.exp(joint - _log_sum(joint)[:, None]) * w[:, None]
-        g = _maximise(z, r, effective)
+        g = _maximise(z, r, count)
     return g
 
 
 def _start(rng, z, w, k):
     """Centres by the rule of k-means++ (Arthur and Vassilvitskii 2007), unit covariances."""
-    d = z.shape[1]
     centres = z[rng.choice(len(z), 1, p=w)]
     for _ in range(1, k):
         gap = ((z[:, None] - centres[None]) ** 2).sum(-1).min(axis=1) * w
         centres = np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]]) if gap.sum() > 0 else centres
-    k = len(centres)
+    return unit(centres)
+
+
+def unit(centres):
+    """Equal `Gaussians` of unit covariance at ``centres`` [k, D]."""
+    k, d = centres.shape
     return Gaussians(np.full(k, 1 / k), centres, np.ones((k, d)), np.broadcast_to(np.eye(d), (k, d, d)))
 
 
-def _maximise(z, r, effective):
-    d = z.shape[1]
+def _maximise(z, r, count):
     total = r.sum(axis=0)
-    kept = total * effective > 2
+    kept = total * count > 2
     if not kept.any():
         kept = total == total.max()
     parts = []
@@ -130,7 +145,7 @@ def _maximise(z, r, effective):
         mean = r[:, i] @ z / total[i]
         e = z - mean
         values, vectors = np.linalg.eigh((e * r[:, i : i + 1]).T @ e / total[i])
-        parts.append((total[i], mean, np.maximum(shrunk(values, effective * total[i]), 1e-4), vectors))
+        parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))
     weights, means, values, vectors = (np.stack(a) for a in zip(*parts, strict=True))
     return Gaussians(weights / weights.sum(), means, values, vectors)
 

@@ -19,10 +19,11 @@ from jast.check import contract
 from jast.episode import accumulator, advance, begin
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
+from jast.estimate.latent import raw
 from jast.estimate.proposals import as_proposal
 from jast.policy import nominal_policy
 
-__all__ = ["Traces", "chunks", "importance", "log_weights"]
+__all__ = ["Traces", "chunks", "importance", "log_weights", "traces"]
 
 LANES = 16384
 PROBES = 256
@@ -52,7 +53,7 @@ def log_weights(key, sim, proposal, samples, *, mode="default"):
     """
     if mode not in ("default", "paper"):
         raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
-    return _traces(key, sim, as_proposal("log_weights", sim, proposal), whole("log_weights", "samples", samples), mode == "paper")
+    return traces(key, sim, as_proposal("log_weights", sim, proposal), whole("log_weights", "samples", samples), mode == "paper")
 
 
 def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.95, progress=False, callback=None):
@@ -75,7 +76,7 @@ def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.9
     key, for_probes = jax.random.split(key)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = min(LANES, 1 << (samples - 1).bit_length())
-    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
+    simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
     total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
     return estimate("importance", total, level=level, reasons=reasons, notes=stopped)
 
@@ -91,10 +92,10 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
     try:
         ahead = simulate(0)
         while done < samples:
-            n, traces = min(lanes, samples - done), ahead
+            n, now = min(lanes, samples - done), ahead
             if done + n < samples:
                 ahead = simulate(done // lanes + 1)  # the device goes on while the host sums
-            total = sums.add(total, jax.tree.map(lambda a: a[:n], jax.device_get(traces)))
+            total = sums.add(total, jax.tree.map(lambda a: a[:n], jax.device_get(now)))
             done += n
             if bar is not None:
                 bar.update(n)
@@ -110,14 +111,10 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
     return total, notes
 
 
-@partial(jax.jit, static_argnums=(3, 4))
-def _traces(key, sim, proposal, n, to_horizon):
+@partial(jax.jit, static_argnames=("n", "to_horizon"))
+def traces(key, sim, proposal, n, to_horizon=False):
+    """`log_weights` without its checks."""
     return jax.vmap(lambda k: _trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
-
-
-def raw(log_p, event, distance, terminal, approach=0.0):
-    """A reward that costs nothing: the log density."""
-    return log_p
 
 
 def _trace(key, sim, proposal, to_horizon, drawn=None):
@@ -164,6 +161,6 @@ def _probe(key, sim, proposal, n):
 
 def _uncovered(key, sim, proposal):
     """Why the proposal cannot be right, tried on episodes of the model."""
-    traces = jax.device_get(_probe(key, sim, proposal, PROBES))
-    missing = int((~traces.invalid & ~(traces.log_weight < np.inf)).sum())
+    seen = jax.device_get(_probe(key, sim, proposal, PROBES))
+    missing = int((~seen.invalid & ~(seen.log_weight < np.inf)).sum())
     return [f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: what it cannot draw is missing"] if missing else []

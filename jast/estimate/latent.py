@@ -18,7 +18,7 @@ from jast.check import contract
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, random_start, rollout
 
-__all__ = ["Latent", "Outcomes", "check_latent", "dimension", "draw", "episodes", "log_ratios", "normal_numbers", "outcome", "outcomes"]
+__all__ = ["Latent", "Outcomes", "check", "dimension", "draw", "episodes", "log_ratios", "normal_numbers", "outcome", "outcomes"]
 
 
 class Outcomes(NamedTuple):
@@ -54,7 +54,7 @@ class Latent(NamedTuple):
     """[K, D, D] their inverses"""
 
 
-def check_latent(function, sim):
+def check(function, sim):
     """ValueError unless the simulator fits the contract and its disturbances have a quantile function."""
     contract(sim, observed=False)
     missing = []

@@ -128,7 +128,9 @@ def _stacked(sim, episodes):
     parts = list(episodes) if isinstance(episodes, list) or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields")) else [episodes]
     if not parts or not all(isinstance(e, Episode) for e in parts):
         raise ValueError(f"trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received {[type(e).__name__ for e in parts]}")
-    batched = [(e.x0, e.disturbances, e.length) if np.ndim(e.length) else jax.tree.map(lambda a: jnp.asarray(a)[None], (e.x0, e.disturbances, e.length)) for e in parts]
+    batched = [
+        (e.x0, e.disturbances, e.length) if np.ndim(e.length) else jax.tree.map(lambda a: jnp.asarray(a)[None], (e.x0, e.disturbances, e.length)) for e in parts
+    ]
     if not all(len(np.shape(b[2])) == 1 and len(b[2]) for b in batched):
         raise ValueError(f"trace_proposal: episodes must have at most one leading axis, of at least 1, received lengths {[np.shape(b[2]) for b in batched]}")
     like_x0, like = jax.eval_shape(_shapes, sim)

@@ -1,0 +1,260 @@
+"""The search for a proposal: design points, populations, mixtures fitted by cross-entropy, and a guard against failure modes that were lost.
+
+Every failing point that a batch draws is weighted by the balance heuristic over all batches (Veach and Guibas 1995), and the next mixture is fitted to all of
+them. None of these points serves the estimate, which is made with the proposal as it stands at the end.
+"""
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+
+from jast.estimate import latent
+from jast.estimate.design_points import design_points, distinct
+from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
+from jast.estimate.populations import cool, explore
+
+__all__ = ["Seeker", "log_ratio", "seek"]
+
+WIDE, MODEL = 0.2, 0.1
+"""Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that no weight is without variance; where failures are not rare
+the model itself."""
+COVERED = 50.0
+"""A failure is covered where its weight is at most so many times the mean."""
+LOST = 0.01
+"""A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
+REFITS, GUARDS, CHAINS, POINTS = 5, 3, 100, 16
+RARE, CUT, FEW, NOTHING = math.log(1e-4), 0.3, 20, 1e-6
+
+
+class Batch(NamedTuple):
+    """Points drawn from one proposal. On the host."""
+
+    q: latent.Latent
+    z: np.ndarray
+    used: np.ndarray
+    failure: np.ndarray
+    log_weight: np.ndarray
+
+
+class Seeker:
+    """What the search knows so far: a proposal, the batches and populations behind it, what they cost, and in words how it went."""
+
+    def __init__(self, key, sim, budget):
+        self.key, self.sim, self.budget = key, sim, budget
+        self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
+        self.size, self.batch = max(budget // 100, 100), max(budget // 25, 300)
+        self.rng = np.random.default_rng(np.asarray(jax.random.key_data(self.next_key())).astype(np.uint32).ravel().tolist())
+        self.q, self.log_mean, self.rare = None, None, True
+        self.batches, self.populations = [], []
+        self.spent, self.invalid, self.reasons, self.history = 0, 0, [], []
+
+    def next_key(self):
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def note(self, text, evaluations=0):
+        self.spent += evaluations
+        self.history.append(f"{text}, {evaluations} evaluations" if evaluations else text)
+
+    def add(self, g, share=None, low=0.3):
+        """Take the `Gaussians` ``g`` into the proposal, for ``share`` of it; no variance is below ``low`` times the model's."""
+        new = as_latent(_defended(g, low, self.rare), self.dtype)
+        self.q = new if self.q is None or share is None else together(self.q, new, share)
+
+    def filled(self, z, used):
+        """The points with the numbers that decided nothing drawn anew from the model, which is what they are given the failure."""
+        return np.where(np.arange(self.dimension)[None] < used[:, None], z.astype(np.float64), self.rng.standard_normal(z.shape))
+
+    def fitted(self, z, used):
+        """`Gaussians` of a population, whose members are not independent: so they count for a fifth in all, and for a twentieth as to covariances."""
+        n = len(z)
+        return fit(self.rng, self.filled(z, used), np.full(n, 1 / n), n / 5, n / 20)
+
+
+def seek(key, sim, budget, gradients=True):
+    """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was found."""
+    s = Seeker(key, sim, budget)
+    parts = _explore(s, gradients)
+    if not parts:
+        return s
+    if s.populations:
+        s.rare = max(p.log_mean for p in s.populations) < RARE
+    for i, g in enumerate(parts, 1):
+        s.add(g, 1 / i)
+    _refine(s, REFITS)
+    for i in range(GUARDS):
+        if s.log_mean is None or _guarded(s, last=i == GUARDS - 1):
+            break
+        _refine(s, 3)
+    return s
+
+
+def _explore(s, gradients):
+    """What the first proposal is made of: a list of `Gaussians`, one for each explorer that found failures."""
+    parts = []
+
+    def around(name, points, evaluations):
+        norms = np.linalg.norm(points, axis=1)
+        s.note(f"{name}: {len(points)} points" + (f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""), evaluations)
+        if len(points):
+            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + 0.05
+            parts.append(unit(points)._replace(weights=weights / weights.sum()))
+        return len(points) > 0
+
+    found = design_points(s.next_key(), s.sim, POINTS) if gradients else None
+    differentiable = found is not None and around("design points by gradients", found.points, found.evaluations)
+    cold = cool(s.next_key(), s.sim, s.size // 2, CHAINS)
+    points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
+    around("design points by cooling", distinct(points, POINTS), cold.evaluations)
+    if not differentiable:
+        population = explore(s.next_key(), s.sim, s.size, most=int(0.4 * s.budget))
+        s.note(f"subset simulation: {len(population.levels)} levels, log p {population.log_mean:.2f}", population.evaluations)
+        s.invalid += population.invalid
+        if population.reached:
+            s.populations.append(population)
+            parts.append(s.fitted(population.points, population.used))
+    return parts
+
+
+def _refine(s, most):
+    """Batches, each of the mixture fitted to all before it, for as long as they get better."""
+    before = 0.0
+    for _ in range(most):
+        z, o, log_w = jax.device_get(_batch(s.next_key(), s.sim, s.q, s.batch))
+        b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
+        s.invalid += int(o.invalid.sum())
+        if not b.failure.any():
+            s.note("batch: no failure", s.batch)
+            return
+        s.batches.append(b)
+        own, power, groups = effective(b.log_weight[b.failure]), *_fit(s)
+        s.note(f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f}, {groups} modes, power {power:.2f}", s.batch)
+        if own < 1.15 * before and power == 1:
+            return
+        before = own
+
+
+def _fit(s):
+    """The mixture for the failures of all batches becomes the proposal, each failure mode with a part of its own: the least power of the weights."""
+    log_w, failing = balanced(s.batches)
+    w = np.exp(log_w - log_w.max())
+    s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
+    z, used = (np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used"))
+    points, centres = s.filled(z, used), _centres(s)
+    owner = _nearest(points, centres)
+    many = np.bincount(owner, minlength=len(centres)) >= FEW
+    owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
+    parts, least, groups = [], 1.0, np.unique(owner)
+    for i in groups:
+        rows = np.flatnonzero(owner == i)
+        mass = w[rows].sum() / w.sum()
+        if mass < NOTHING:
+            continue
+        # few great weights would make a mixture fit their own noise: a power below 1 of them leads the same way, in more batches
+        power = _power(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
+        v = np.exp(power * (log_w[rows] - log_w[rows].max()))
+        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(groups), 2))
+        parts.append(g._replace(weights=g.weights * max(mass, 0.003 if power == 1 else 0.02)))
+        least = min(least, power)
+    s.add(Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), low=0.0)
+    return least, len(parts)
+
+
+def _nearest(points, centres):
+    """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n, D]."""
+    return np.argmax(points @ centres.T - 0.5 * (centres**2).sum(axis=1), axis=1)
+
+
+def _guarded(s, last):
+    """Whether nothing was lost, by populations that the proposal was not fitted to; what was is taken in, or becomes a reason against the estimate."""
+    threshold = -s.log_mean - math.log(COVERED)
+    found = []
+    near = jnp.asarray(-threshold * CUT, s.dtype)  # on the way to a known mode, so that nothing but other ones is left
+    for name, covered in (("far", (_unit(s), near)), ("thin", (s.q, jnp.asarray(threshold, s.dtype)))):
+        p = explore(s.next_key(), s.sim, s.size // 2, covered=covered, least=s.log_mean + math.log(LOST), most=int(0.15 * s.budget))
+        s.invalid += p.invalid
+        share = math.exp(min(p.log_mean - s.log_mean, 50)) if p.reached else 0.0
+        bare = np.asarray(log_ratio(s.q, p.points, p.used)) < threshold if p.reached else np.zeros(0, bool)
+        s.note(f"guard ({name}): {share:.2%} of the probability, {bare.mean() if len(bare) else 0:.0%} of it not covered", p.evaluations)
+        if bare.any():
+            found.append((share * bare.mean(), p.points[bare], p.used[bare]))
+    for p in s.populations:
+        bare = np.asarray(log_ratio(s.q, p.points, p.used)) < threshold
+        found.append((bare.mean(), p.points[bare], p.used[bare]))
+    log_w, _ = balanced(s.batches)
+    w = np.exp(log_w - log_w.max())
+    thin = w[log_w > -threshold].sum() / w.sum()
+    most = max((share for share, *_ in found), default=0.0)
+    s.note(f"guard: {most:.2%} of the probability where the proposal is thin, {thin:.2%} by its own batches")
+    found = [f for f in found if len(f[1]) and f[0] > 2 * (thin + LOST)]
+    if not found:
+        return True
+    if last or s.spent + 3 * s.batch > 0.75 * s.budget:
+        s.reasons.append(f"failures that the proposal hardly draws may carry {most:.0%} of what it found")
+        return True
+    for share, points, used in found:
+        s.add(s.fitted(points, used), min(max(share / (1 + share), 0.15), 0.85))
+    return False
+
+
+def _centres(s):
+    """The distinct means of the proposal [m, D]."""
+    means = np.asarray(s.q.means, np.float64)[np.asarray(s.q.log_weights) > math.log(0.003)]
+    return distinct(means, POINTS)
+
+
+def _unit(s):
+    """A unit Gaussian at each distinct mean that is away from the origin: a `Latent`."""
+    z = _centres(s)
+    z = z[np.linalg.norm(z, axis=1) > 1]
+    z = z if len(z) else np.full((1, s.dimension), 1e3)
+    return as_latent([(1.0, unit(z))], s.dtype)
+
+
+def balanced(batches):
+    """Log weights of the failing points of all ``batches``, p over the mean of their proposals (the balance heuristic), and which points those are."""
+    failing = np.concatenate([b.failure for b in batches])
+    logs = np.stack([_over_batches(c.q, batches)[failing] for c in batches])
+    top = logs.max(axis=0)
+    return -top - np.log(np.exp(logs - top).mean(axis=0)), failing
+
+
+def _over_batches(q, batches):
+    return np.concatenate([-b.log_weight if b.q is q else np.asarray(log_ratio(q, b.z, b.used), np.float64) for b in batches])
+
+
+def _defended(g, low, rare):
+    """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the model."""
+    d, model = g.means.shape[1], 0.0 if rare else MODEL
+    wide = g._replace(values=np.maximum(g.values, 1.0))
+    parts = [(1 - WIDE - model, g._replace(values=np.maximum(g.values, low))), (WIDE, wide)] if (g.values < 1).any() else [(1 - model, g)]
+    return [*parts, (model, unit(np.zeros((1, d))))] if model else parts
+
+
+def _power(log_w, least):
+    """The greatest power, at most 1, of the weights that leaves an effective number of ``least``."""
+    if effective(log_w) >= least:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if effective(middle * log_w) >= least else (low, middle)
+    return low
+
+
+@jax.jit
+def log_ratio(q, z, used):
+    """log q - log p [n] of points ``z`` [n, D] over their first ``used`` numbers."""
+    return logsumexp(latent.log_ratios(q, z, used) + q.log_weights[None], axis=1)
+
+
+@partial(jax.jit, static_argnums=3)
+def _batch(key, sim, q, n):
+    z = latent.draw(key, q, n)
+    o = latent.outcomes(sim, z)
+    return z, o, -log_ratio(q, z, o.used)
