@@ -57,8 +57,8 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
         return of_counts(name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about)
     simulate = lambda i: _drawn(jax.random.fold_in(key, i), sim, s.q, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
-    modes = _by_direction(s.q, total.by_component / total.first) if total.first > 0 else None
-    return estimate(name, total, notes=notes, evaluations=s.spent + total.samples, modes=modes, proposal=s.q, **about)
+    groups = _by_direction(s.q) if total.first > 0 else []
+    return estimate(name, total, notes=notes, evaluations=s.spent + total.samples, groups=groups, proposal=s.q, **about)
 
 
 def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callback=None):
@@ -137,19 +137,18 @@ def _plain_is_better(s):
     return (w**2).mean() - w.mean() ** 2 > (1 - p) / p
 
 
-def _by_direction(q, shares):
-    """The parts of the estimate by groups of components whose means point the same way, greatest first."""
-    means = np.asarray(q.means, np.float64)
+def _by_direction(q):
+    """Groups of the components whose means point the same way: failure modes, as lists of numbers."""
+    means, left, out = np.asarray(q.means, np.float64), list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))), []
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
-    left, out = list(np.argsort(-shares, kind="stable")), []
     while left:
         group, grown = {left[0]}, True
         while grown:
             new = {j for j in left if j not in group and max(float(unit[i] @ unit[j]) for i in group) > APART}
             group, grown = group | new, bool(new)
-        out.append(shares[list(group)].sum())
+        out.append(sorted(group))
         left = [i for i in left if i not in group]
-    return np.sort([v for v in out if v > 1e-4])[::-1]
+    return out
 
 
 def _student(degrees, level):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-__all__ = ["pareto_k", "reasons"]
+__all__ = ["by_mode", "pareto_k", "reasons", "thin_modes"]
 
-K_HAT, ESS, SHARE, PER_FAILURE = 0.7, 100, 0.05, 0.01
+K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
 def pareto_k(log_weights, samples):
@@ -35,6 +35,19 @@ def _shape(x):
     weights = np.exp(log_likelihood - log_likelihood.max())
     best = (theta * weights).sum() / weights.sum()
     return float((n * np.log1p(-best * x).mean() + 5) / (n + 10))
+
+
+def by_mode(sums, groups):
+    """(share of the estimate, effective sample size) of groups of components, greatest share first: [m], [m]."""
+    first = np.array([sums.by_component[g].sum() for g in groups])
+    second = np.array([sums.squares[g].sum() for g in groups])
+    order = np.argsort(-first, kind="stable")
+    return first[order] / sums.first, np.where(second > 0, first**2 / np.where(second > 0, second, 1), 0)[order]
+
+
+def thin_modes(shares, sizes):
+    """Texts for the modes that matter and that few effective episodes speak for."""
+    return [f"a mode of {v:.1%} of the estimate has an effective sample size of {n:.3g}" for v, n in zip(shares, sizes, strict=True) if v > MATTERS and n < FEW]
 
 
 def reasons(failures, ess, k_hat, max_share):

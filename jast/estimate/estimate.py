@@ -89,8 +89,11 @@ class Estimate(NamedTuple):
         return "\n".join([*head, f"{'method':<14} {self.method}", *(f"{name:<14} {text}" for name, text in rows), *tail])
 
 
-def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, modes=None, proposal=None, history=None):
-    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside, ``notes`` are remarks."""
+def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, groups=None, proposal=None, history=None):
+    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside, ``notes`` are remarks.
+
+    ``groups``: lists of components that are one failure mode (default: each by itself).
+    """
     level = float(real(method, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
     n, seen = sums.samples, sums.first > 0
     found = list(reasons)
@@ -103,8 +106,11 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
     k_hat = diagnostics.pareto_k(sums.tail, n)
     share = 1 / sums.first if seen else math.nan
     found += diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
-    if modes is None and seen:
-        modes = sums.by_component / sums.first
+    modes = None
+    if seen:
+        groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
+        modes, sizes = diagnostics.by_mode(sums, groups)
+        found += diagnostics.thin_modes(modes, sizes)
     mean = math.exp(log_mean) if seen else math.nan
     return Estimate(
         method=method,

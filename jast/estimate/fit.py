@@ -33,8 +33,10 @@ class Gaussians(NamedTuple):
     """[K, D, D]"""
 
 
-def fit(rng, points, weights, count, known=None, limit=16):
+def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
     """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``count`` independent ones; of at most ``limit`` components.
+
+    ``anchors`` [m, D]: design points, which means near to them are shrunk to by what may be noise.
 
     ``known``: how many they count for as to covariances, where that is less. Of many points ``MOST`` are looked at.
     """
@@ -54,11 +56,11 @@ def fit(rng, points, weights, count, known=None, limit=16):
             if not (w.sum() > 0 and v.sum() > 0):
                 value = -np.inf
                 break
-            g = _em(rng, points[part], w[part] / w.sum(), known / 2, k)
+            g = _em(rng, points[part], w[part] / w.sum(), known / 2, k, anchors)
             value += v[~part] @ _log_sum(_log_joint(g, points[~part])) / v.sum()
         if value > score + 0.02:
             best, score = k, value
-    return _em(rng, points, weights, known, best)
+    return _em(rng, points, weights, known, best, anchors)
 
 
 def as_latent(parts, dtype):
@@ -107,7 +109,7 @@ def shrunk(values, count):
     return np.where(inside, values[inside].mean(), values)
 
 
-def _em(rng, z, w, count, k):
+def _em(rng, z, w, count, k, anchors):
     """Expectation maximisation from far-apart points on; components that almost nothing belongs to end."""
     live = w > 0
     z, w = z[live], w[live]
@@ -116,7 +118,7 @@ def _em(rng, z, w, count, k):
     for _ in range(1 if one else ITERATIONS):
         joint = np.zeros((len(z), 1)) if one else _log_joint(g, z)
         r = np.exp(joint - _log_sum(joint)[:, None]) * w[:, None]
-        g = _maximise(z, r, count)
+        g = _maximise(z, r, count, anchors)
     return g
 
 
@@ -135,7 +137,7 @@ def unit(centres):
     return Gaussians(np.full(k, 1 / k), centres, np.ones((k, d)), np.broadcast_to(np.eye(d), (k, d, d)))
 
 
-def _maximise(z, r, count):
+def _maximise(z, r, count, anchors):
     total = r.sum(axis=0)
     kept = total * count > 2
     if not kept.any():
@@ -143,6 +145,11 @@ def _maximise(z, r, count):
     parts = []
     for i in np.flatnonzero(kept):
         mean = r[:, i] @ z / total[i]
+        if anchors is not None and len(anchors):
+            # what a mean differs from its design point may be noise alone (James and Stein 1961)
+            gaps = mean - anchors
+            gap = gaps[np.argmin((gaps**2).sum(axis=1))]
+            mean = mean - gap * min((z.shape[1] - 2) / (count * total[i] * (gap**2).sum() + 1e-12), 1) if z.shape[1] > 2 else mean
         e = z - mean
         values, vectors = np.linalg.eigh((e * r[:, i : i + 1]).T @ e / total[i])
         parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))

@@ -27,7 +27,9 @@ COVERED = 50.0
 """A failure is covered where its weight is at most so many times the mean."""
 LOST = 0.01
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
-REFITS, GUARDS, CHAINS, POINTS = 5, 3, 100, 16
+REFITTING = 0.5
+"""Of the budget, where refits end."""
+REFITS, GUARDS, CHAINS, POINTS = 8, 3, 100, 16
 RARE, CUT, FEW, NOTHING = math.log(1e-4), 0.3, 20, 1e-6
 
 
@@ -51,6 +53,7 @@ class Seeker:
         self.rng = np.random.default_rng(np.asarray(jax.random.key_data(self.next_key())).astype(np.uint32).ravel().tolist())
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
+        self.anchors = np.zeros((0, self.dimension))
         self.spent, self.invalid, self.reasons, self.history = 0, 0, [], []
 
     def next_key(self):
@@ -102,6 +105,7 @@ def _explore(s, gradients):
         norms = np.linalg.norm(points, axis=1)
         s.note(f"{name}: {len(points)} points" + (f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""), evaluations)
         if len(points):
+            s.anchors = np.concatenate([s.anchors, points])
             weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + 0.05
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return len(points) > 0
@@ -122,9 +126,9 @@ def _explore(s, gradients):
 
 
 def _refine(s, most):
-    """Batches, each of the mixture fitted to all before it, for as long as they get better."""
-    before = 0.0
-    for _ in range(most):
+    """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they get better."""
+    before, limit = 0.0, s.spent + most * s.batch
+    while s.spent < limit and (before == 0 or s.spent < REFITTING * s.budget):
         z, o, log_w = jax.device_get(_batch(s.next_key(), s.sim, s.q, s.batch))
         b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
         s.invalid += int(o.invalid.sum())
@@ -158,7 +162,7 @@ def _fit(s):
         # few great weights would make a mixture fit their own noise: a power below 1 of them leads the same way, in more batches
         power = _power(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
         v = np.exp(power * (log_w[rows] - log_w[rows].max()))
-        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(groups), 2))
+        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(groups), 2), anchors=s.anchors)
         parts.append(g._replace(weights=g.weights * max(mass, 0.003 if power == 1 else 0.02)))
         least = min(least, power)
     s.add(Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), low=0.0)

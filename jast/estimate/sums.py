@@ -27,6 +27,8 @@ class Sums(NamedTuple):
     """Sum of the squares"""
     by_component: Any
     """[K] sums by the component that made a trace (its probability)"""
+    squares: Any
+    """[K] sums of the squares of these parts"""
     tail: Any
     """The greatest log weights, at most ``keep``, falling"""
     keep: int
@@ -34,7 +36,7 @@ class Sums(NamedTuple):
 
 def nothing(samples):
     """The `Sums` before the first of ``samples`` episodes."""
-    return Sums(0, 0, 0, 0, 0, -np.inf, 0.0, 0.0, None, np.zeros(0), tail_size(samples))
+    return Sums(0, 0, 0, 0, 0, -np.inf, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples))
 
 
 def tail_size(samples):
@@ -51,7 +53,7 @@ def add(total, traces):
     top = max(total.top, log_w.max(initial=-np.inf))
     rescale = np.exp(total.top - top) if total.top > -np.inf else 0.0
     w = np.exp(log_w - top) if top > -np.inf else np.zeros(0)
-    by = w @ shares if w.size else np.zeros(shares.shape[1])
+    by, squares = (w**i @ shares**i if w.size else np.zeros(shares.shape[1]) for i in (1, 2))
     tail = np.concatenate([total.tail, log_w])
     if len(tail) > total.keep:
         tail = np.partition(tail, -total.keep)[-total.keep :]
@@ -65,6 +67,7 @@ def add(total, traces):
         first=total.first * rescale + w.sum(),
         second=total.second * rescale**2 + (w**2).sum(),
         by_component=by if total.by_component is None else total.by_component * rescale + by,
+        squares=squares if total.squares is None else total.squares * rescale**2 + squares,
         tail=np.sort(tail)[::-1],
         keep=total.keep,
     )
