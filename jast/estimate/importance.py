@@ -16,14 +16,14 @@ from jax.scipy.special import logsumexp
 from jast import distributions as D
 from jast._checks import whole
 from jast.check import contract
-from jast.episode import accumulator, advance, begin
+from jast.episode import accumulator, advance, begin, rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
 from jast.estimate.latent import raw
 from jast.estimate.proposals import as_proposal
 from jast.policy import nominal_policy
 
-__all__ = ["Traces", "chunks", "importance", "log_weights", "traces"]
+__all__ = ["Traces", "chunks", "importance", "log_weights", "played", "traces"]
 
 LANES = 16384
 PROBES = 256
@@ -151,6 +151,26 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
     prior = proposal.log_weights.astype(dtype)
     log_q = logsumexp(prior + ratios)
     return Traces(jnp.where(impossible, -jnp.inf, -log_q), jnp.where(impossible, prior, prior + ratios - log_q), last.failure, last.invalid, length)
+
+
+@partial(jax.jit, static_argnames="n")
+def played(key, sim, proposal, n):
+    """``n`` episodes drawn from ``proposal``, with their disturbances but without states, and their log weights to the end of each."""
+
+    def one(key):
+        for_component, for_episode = jax.random.split(key)
+        k = jax.random.categorical(for_component, proposal.log_weights)
+        e = rollout(for_episode, sim, jax.tree.map(lambda a: a[k], proposal.policies), raw)
+        t, states = jnp.arange(sim.horizon, dtype=jnp.int32), jax.tree.map(lambda a: a[:-1], e.states)
+
+        def log_q(policy):
+            steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(states, t, e.disturbances)
+            return jnp.sum(jnp.where(t < e.length, steps, 0)) + policy.start().log_prob(e.x0)
+
+        logs = jax.vmap(log_q, axis_size=len(proposal.log_weights))(proposal.policies)
+        return e._replace(states=None), e.log_prob - logsumexp(proposal.log_weights.astype(logs.dtype) + logs).astype(e.log_prob.dtype)
+
+    return jax.vmap(one)(jax.random.split(key, n))
 
 
 @partial(jax.jit, static_argnums=3)

@@ -18,7 +18,7 @@ from jast.check import contract
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, random_start, rollout
 
-__all__ = ["Latent", "Outcomes", "check", "dimension", "draw", "episodes", "log_ratios", "normal_numbers", "outcome", "outcomes"]
+__all__ = ["Latent", "Outcomes", "check", "dimension", "draw", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes"]
 
 
 class Outcomes(NamedTuple):
@@ -101,13 +101,9 @@ def outcomes(sim, z):
     return jax.vmap(lambda z: outcome(sim, z))(z)
 
 
+@jax.jit
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
-    return _episodes(sim, z)
-
-
-@jax.jit
-def _episodes(sim, z):
     return jax.vmap(lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None))(z)
 
 
@@ -144,6 +140,14 @@ def _policy(sim, z):
     like0, like = jax.eval_shape(_shapes, sim)
     size0, _ = _sizes(sim)
     return player(sim, choices.quantiles(), _unflat(like0, z[:size0]), jax.vmap(partial(_unflat, like))(z[size0:].reshape(sim.horizon, -1)))
+
+
+def flat(sim, z0, z):
+    """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
+    rows = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
+    first = [a.reshape(a.shape[0], -1) for a in jax.tree.leaves(z0)]
+    n = rows[0].shape[0]
+    return jnp.concatenate([a.astype(normal_numbers(sim)) for a in (*first, jnp.concatenate(rows, axis=2).reshape(n, -1))], axis=1)
 
 
 def _sizes(sim):

@@ -14,7 +14,7 @@ from jax.scipy.special import logsumexp
 
 from jast.estimate.latent import dimension, log_ratios, normal_numbers, outcomes
 
-__all__ = ["Explored", "cool", "explore"]
+__all__ = ["Chain", "Explored", "Population", "cool", "explore"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 WIDTHS, FAILING, COLD, COOLING = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60
@@ -47,12 +47,12 @@ class Population(NamedTuple):
     invalid: Any
 
 
-class _Chain:
+class Chain:
     """A population on its way: the moves, their size and the counts, which both explorers share."""
 
     def __init__(self, key, sim, size, covered):
         self.key, self.sim, self.size, self.covered = key, sim, size, covered
-        self.scale, self.evaluations, self.invalid = 0.7, 0, 0
+        self.scale, self.accepted, self.evaluations, self.invalid = 0.7, math.nan, 0, 0
         self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
 
     def next_key(self):
@@ -61,7 +61,10 @@ class _Chain:
 
     def draw(self, width):
         """A new population N(0, width^2 I)."""
-        z = width * jax.random.normal(self.next_key(), (self.size, self.dimension), self.dtype)
+        return self.judge(width * jax.random.normal(self.next_key(), (self.size, self.dimension), self.dtype))
+
+    def judge(self, z):
+        """The population of these points."""
         return self.count(_judge(self.sim, z, self.covered))
 
     def move(self, people, rows, level, width, times):
@@ -70,7 +73,8 @@ class _Chain:
             numbers = (jnp.asarray(v, d) for v, d in ((level, people.score.dtype), (self.scale, self.dtype), (width, self.dtype)))
             people, accepted = _move(self.next_key(), self.sim, people, jnp.asarray(rows, jnp.int32), *numbers, self.covered)
             self.count(people)
-            self.scale = float(np.clip(self.scale * math.exp(float(accepted) - ACCEPTANCE), 0.02, 1.0))
+            self.accepted = float(accepted)
+            self.scale = float(np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0))
             rows = np.arange(self.size)
         return people
 
@@ -92,7 +96,7 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
     draw, and the estimate is of those alone. It gives up below the log probability ``least``, where it would take more than ``most`` evaluations, or where no
     level falls further.
     """
-    chain = _Chain(key, sim, size, covered)
+    chain = Chain(key, sim, size, covered)
     people = chain.draw(1.0)
     log_mean, level, levels = 0.0, math.inf, []
     while True:
@@ -124,7 +128,7 @@ def cool(key, sim, size, chains):
     does). ``chains`` of them go on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain replaces another one, no
     failure mode is lost on the way, however little of the probability it has.
     """
-    chain = _Chain(key, sim, size, None)
+    chain = Chain(key, sim, size, None)
     for width in WIDTHS:
         people = chain.draw(width)
         failing = np.flatnonzero(np.asarray(people.score) == -np.inf)

@@ -20,7 +20,7 @@ from jast.episode import Episode, _fitted, _shapes, random_start, replay
 from jast.estimate.blend import blend
 from jast.policy import Policy
 
-__all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
+__all__ = ["Proposal", "as_proposal", "latents", "policy_proposal", "trace_proposal"]
 
 MIXING = ("step", "trace")
 
@@ -53,7 +53,7 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
-    start, steps = _latents(sim, _stacked(sim, episodes))
+    start, steps = latents(sim, _stacked(sim, episodes))
     tilt_start = tilt_start and random_start(sim)
     start = start if tilt_start else ()
     k = len(jax.tree.leaves(steps)[0])
@@ -143,7 +143,7 @@ def _stacked(sim, episodes):
 
 
 @jax.jit
-def _latents(sim, recorded):
+def latents(sim, recorded):
     """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end of each."""
 
     def one(x0, x, length):

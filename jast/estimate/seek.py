@@ -18,7 +18,7 @@ from jast.estimate.design_points import design_points, distinct
 from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
 from jast.estimate.populations import cool, explore
 
-__all__ = ["Seeker", "log_ratio", "seek"]
+__all__ = ["Seeker", "drawn", "log_ratio", "seek"]
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that no weight is without variance; where failures are not rare
@@ -129,7 +129,7 @@ def _refine(s, most):
     """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they get better."""
     before, limit = 0.0, s.spent + most * s.batch
     while s.spent < limit and (before == 0 or s.spent < REFITTING * s.budget):
-        z, o, log_w = jax.device_get(_batch(s.next_key(), s.sim, s.q, s.batch))
+        z, o, log_w = jax.device_get(drawn(s.next_key(), s.sim, s.q, s.batch))
         b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
         s.invalid += int(o.invalid.sum())
         if not b.failure.any():
@@ -258,7 +258,8 @@ def log_ratio(q, z, used):
 
 
 @partial(jax.jit, static_argnums=3)
-def _batch(key, sim, q, n):
+def drawn(key, sim, q, n):
+    """``n`` points of ``q``: (z [n, D], `Outcomes`, log p - log q)."""
     z = latent.draw(key, q, n)
     o = latent.outcomes(sim, z)
     return z, o, -log_ratio(q, z, o.used)

@@ -4,16 +4,17 @@ Every function draws into the ``ax`` (or ``axes``) it is given, or into a new fi
 colour-blind readers; what matters is told by shape or words as well.
 
 Of any system: `history`, `disturbances`, `distances`. Of one simulator: `ferry`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
-`convergence`, `proposal_contours`, `surrogate_samples`.
+`convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `failure_fan`, `weights`.
 """
 
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.ferry import ferry
 from jast.plot.general import distances, disturbances, history
+from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
 
 __all__ = [
-    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "ferry", "history", "proposal_contours",
-    "surrogate_samples",
+    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "ferry", "history",
+    "probability", "proposal_contours", "surrogate_samples", "weights",
 ]  # fmt: skip

@@ -1,0 +1,79 @@
+"""The failure distribution p(x | failure): independent failures as they would happen, which is what a user looks at."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._checks import whole
+from jast.episode import Episode
+from jast.estimate import latent
+from jast.estimate.estimate import Estimate
+from jast.estimate.fit import effective
+from jast.estimate.importance import played
+from jast.estimate.populations import Chain
+from jast.estimate.proposals import as_proposal, latents
+from jast.estimate.seek import drawn
+
+__all__ = ["FailureSamples", "failure_samples"]
+
+PER_SAMPLE = 10
+
+
+class FailureSamples(NamedTuple):
+    """Failures drawn from p(x | failure)."""
+
+    episodes: Episode
+    """Leading axis [n]; without states (`jast.replay` gives them)"""
+    ess: float
+    """Effective number of the weighted failures that they were resampled from"""
+    distinct: int
+    """How many different ones the resampling took; the Markov chain parted the copies"""
+    accepted: float
+    """Share of the last Markov moves that was accepted"""
+    evaluations: int
+
+    def __str__(self):
+        n, e = len(self.episodes.length), self.episodes
+        steps = f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to {np.max(e.log_prob):.4g}"
+        return f"{n} failures from {self.distinct} distinct ones (ESS {self.ess:.4g}), {self.accepted:.0%} of the last moves accepted; {steps}"
+
+
+def failure_samples(key, sim, source, samples=1000, *, moves=20):
+    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are resampled, and each then makes ``moves`` Markov moves: `FailureSamples`.
+
+    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The moves
+    change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks, and the
+    shares of modes are those of the weights. Raises ValueError for a source without a proposal or without a failure among its episodes, a count below 1, and
+    disturbances without a quantile function.
+    """
+    name = "failure_samples"
+    samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
+    latent.check(name, sim)
+    key, for_draws, for_rows = jax.random.split(key, 3)
+    q = source.proposal if isinstance(source, Estimate) else source
+    if q is None:
+        raise ValueError(f"{name}: source must hold a proposal, received an Estimate of {source.method} without one")
+    n = PER_SAMPLE * samples
+    if isinstance(q, latent.Latent):
+        z, o, log_w = jax.device_get(drawn(for_draws, sim, q, n))
+        failure = o.failure
+    else:
+        e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
+        z = latent.flat(sim, *latents(sim, (e.x0, e.disturbances, e.length)))
+        z, failure, log_w = jax.device_get((z, e.failure, log_w))
+    log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
+    if not np.isfinite(log_w).any():
+        raise ValueError(f"{name}: source gave no failure in {n} episodes: expected a proposal under which failures are frequent")
+    w = np.exp(log_w - log_w.max())
+    at = (np.arange(samples) + float(jax.random.uniform(for_rows))) / samples
+    rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
+    chain = Chain(key, sim, samples, None)
+    people = chain.judge(jnp.asarray(z[rows], chain.dtype))
+    people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
+    episodes = jax.device_get(latent.episodes(sim, people.z))
+    # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other side in another program
+    episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
+    return FailureSamples(episodes, effective(log_w), len(np.unique(rows)), chain.accepted, n + chain.evaluations)
