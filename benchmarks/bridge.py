@@ -6,7 +6,6 @@ by importance sampling with 10,000 new episodes, over the truth, where one is kn
 
 import argparse
 import json
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from jax.tree_util import Partial
 import jast
 from benchmarks.ferry import REWARD
 from jast import cross_entropy as ce
-from jast.estimate.intervals import clopper_pearson
+from jast.estimate import clopper_pearson, importance
 
 SIZE = dict(samples=100, elites=30, iterations=10)
 FRESH = 10_000
@@ -52,29 +51,14 @@ SYSTEMS = {  # name -> simulator, truth
 }
 
 
-@partial(jax.jit, static_argnums=3)
-def log_weights(key, sim, policy, n):
-    """log p - log q of ``n`` new episodes that fail, to the end of each, -inf of the others."""
-
-    def one(key):
-        e = jast.rollout(key, sim, policy)
-        states = jax.tree.map(lambda a: a[:-1], e.states)
-        t = jnp.arange(sim.horizon, dtype=jnp.int32)
-        steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(states, t, e.disturbances)
-        log_q = jnp.sum(jnp.where(t < e.length, steps, 0)) + policy.start().log_prob(e.x0)
-        return jnp.where(e.failure, e.log_prob - log_q, -jnp.inf)
-
-    return jax.vmap(one)(jax.random.split(key, n))
-
-
 def proposals(name, seeds):
     """Estimate over truth, and its relative standard error, of each seed."""
     make, truth = SYSTEMS[name]
     sim, rows = make(), []
     for seed in range(seeds):
         proposal = ce.failure_proposal(jax.random.key(seed), sim, iterations=20)
-        w = np.exp(np.asarray(log_weights(jax.random.key(1000 + seed), sim, proposal.policy, FRESH), float))
-        rows.append((w.mean() / truth, w.std(ddof=1) / np.sqrt(FRESH) / max(w.mean(), 1e-300), bool(proposal.reached)))
+        r = importance(jax.random.key(1000 + seed), sim, proposal.policy, FRESH)
+        rows.append((r.mean / truth, r.relative_error, bool(proposal.reached)))
     ratio, error, reached = map(list, zip(*rows, strict=True))
     return {"truth": truth, "ratio": ratio, "relative_error": error, "reached": reached, "crude": float(np.sqrt((1 - truth) / truth / (FRESH + 20_000)))}
 

@@ -1,9 +1,9 @@
 """Failure probabilities: error, coverage and cost of jast's estimators, ``python -m benchmarks.probability [--json] [--quick] [--only PART ...]``.
 
-``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the published Algorithm 2, traces a second; ``range``: log P to 1e-100
-in float32; ``policy``: learned failure policies, with compilation; ``default``: `failure_probability` over seeds, with and without gradients, beside
-OpenTURNS on the same limit states and evaluations; ``cases``: the fixed cases; ``coverage``: problems drawn by seed (benchmarks.limit_states), how often the 95 %
-interval covers, how often an estimate is flagged, and how often an interval misses without a flag. Float32 throughout.
+``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the published Algorithm 2, traces a second; ``range``: log P to
+1e-100 in float32; ``policy``: learned failure policies, with compilation; ``default``: `failure_probability` over seeds, with and without gradients, beside
+OpenTURNS on the same limit states and evaluations; ``cases``: the fixed cases; ``coverage``: problems drawn by seed (benchmarks.limit_states), how often the
+95 % interval covers, how often an estimate is flagged, and how often an interval misses without a flag. Float32 throughout.
 """
 
 import argparse

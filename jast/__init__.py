@@ -10,6 +10,6 @@ from jast.simulator import Simulator
 __version__ = "0.1.0"
 
 __all__ = [
-    "Episode", "Policy", "Simulator", "actions", "check", "cross_entropy", "distributions", "estimate", "failures", "heads", "nominal", "policies", "replay", "rewards", "rollout",
-    "search", "simulators",
+    "Episode", "Policy", "Simulator", "actions", "check", "cross_entropy", "distributions", "estimate", "failures", "heads", "nominal", "policies", "replay",
+    "rewards", "rollout", "search", "simulators",
 ]  # fmt: skip

@@ -9,6 +9,6 @@ from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
 
 __all__ = [
-    "Estimate", "FailureSamples", "Proposal", "Traces", "adaptive_cross_entropy", "chernoff", "clopper_pearson", "failure_probability", "failure_samples", "importance", "jeffreys", "log_weights",
-    "monte_carlo", "pareto_k", "policy_proposal", "subset_simulation", "trace_proposal",
+    "Estimate", "FailureSamples", "Proposal", "Traces", "adaptive_cross_entropy", "chernoff", "clopper_pearson", "failure_probability", "failure_samples",
+    "importance", "jeffreys", "log_weights", "monte_carlo", "pareto_k", "policy_proposal", "subset_simulation", "trace_proposal",
 ]  # fmt: skip

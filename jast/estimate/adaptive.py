@@ -6,7 +6,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from jast._checks import real, whole
 from jast.check import contract
@@ -17,7 +16,7 @@ from jast.estimate.importance import LANES, Traces, chunks, importance, traces
 from jast.estimate.intervals import log_normal
 from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
-from jast.estimate.seek import seek
+from jast.estimate.seek import drawn, numbers, seek
 from jast.policy import nominal_policy
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
@@ -49,13 +48,13 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
     for_search, key = jax.random.split(key)
     s = seek(for_search, sim, budget, gradients)
     n = max(budget - s.spent, budget // 10)
-    lanes = min(LANES, n)
+    lanes = s.batch  # one program for the search and for this
     about = dict(level=level, reasons=s.reasons, history=tuple(s.history))
     if s.log_mean is None or _plain_is_better(s):
         simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
         return of_counts(name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about)
-    simulate = lambda i: _drawn(jax.random.fold_in(key, i), sim, s.q, lanes)
+    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, s.q, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
     groups = _by_direction(s.q) if total.first > 0 else []
     return estimate(name, total, notes=notes, evaluations=s.spent + total.samples, groups=groups, proposal=s.q, **about)
@@ -160,17 +159,13 @@ def _student(degrees, level):
     return 1 + terms / z
 
 
-@partial(jax.jit, static_argnums=3)
-def _drawn(key, sim, q, n):
-    z = latent.draw(key, q, n)
-    o = latent.outcomes(sim, z)
-    joint = latent.log_ratios(q, z, o.used) + q.log_weights[None]
-    log_q = logsumexp(joint, axis=1)
-    return Traces(-log_q, joint - log_q[:, None], o.failure, o.invalid, o.length)
+def _traces(key, sim, q, n):
+    _, o, log_w, shares = drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
+    return Traces(log_w, shares, o.failure, o.invalid, o.length)
 
 
 @partial(jax.jit, static_argnums=2)
 def _plain(key, sim, n):
-    z = jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))
+    z = jax.random.normal(key, (n, latent.dimension(sim)), latent.normalnumbers(sim))
     o = latent.outcomes(sim, z)
     return Traces(jnp.zeros(n, z.dtype), jnp.zeros((n, 1), z.dtype), o.failure, o.invalid, o.length)

@@ -7,6 +7,8 @@ from jast import distributions as D
 
 __all__ = ["Blend", "blend"]
 
+COIN = 0x5EED
+
 
 class Blend(D.Distribution):
     """What `blend` makes."""
@@ -23,13 +25,12 @@ class Blend(D.Distribution):
         """One value; ``sample_shape`` must be ()."""
         if sample_shape != ():
             raise ValueError(f"Blend: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys")
-        of_part, of_value = jax.random.split(seed)
-        u = jax.random.uniform(of_part, (), self._log_weights.dtype)
+        # the coin is drawn with a key folded from the value's, one hash less than of a split; only one of the draws is seen, so that one key serves all
+        u = jax.random.uniform(jax.random.fold_in(jax.random.clone(seed), COIN), (), self._log_weights.dtype)
         edges = jnp.cumsum(jnp.exp(self._log_weights))[:-1]
-        # only one of the draws is seen, so that one key serves all of them
-        value = D.sample(self._parts[0], of_value)
+        value = D.sample(self._parts[0], seed)
         for part, edge in zip(self._parts[1:], edges, strict=True):
-            value = jax.tree.map(lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)), value, D.sample(part, jax.random.clone(of_value)))  # noqa: B023
+            value = jax.tree.map(lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)), value, D.sample(part, jax.random.clone(seed)))  # noqa: B023
         return value
 
     def _sample_n(self, key, n):

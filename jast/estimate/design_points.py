@@ -1,7 +1,7 @@
 """Most probable failure points by gradients: the points of least norm on the boundary of failure, from many starts.
 
-Each step goes to the nearest point of the linearised boundary (Hasofer and Lind 1974; Rackwitz and Fiessler 1978). A miss distance is flat once a system fails, so
-a step that arrives among the failures is halved back to the boundary.
+Each step goes to the nearest point of the linearised boundary (Hasofer and Lind 1974; Rackwitz and Fiessler 1978). A miss distance is flat once a system
+fails, so a step that arrives among the failures is halved back to the boundary.
 """
 
 from functools import partial

@@ -15,7 +15,7 @@ from jast.estimate.fit import effective
 from jast.estimate.importance import played
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal, latents
-from jast.estimate.seek import drawn
+from jast.estimate.seek import drawn, numbers
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -42,10 +42,10 @@ class FailureSamples(NamedTuple):
 
 
 def failure_samples(key, sim, source, samples=1000, *, moves=20):
-    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are resampled, and each then makes ``moves`` Markov moves: `FailureSamples`.
+    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are resampled, each then makes Markov moves: `FailureSamples`.
 
-    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The moves
-    change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks, and the
+    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The
+    ``moves`` change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks, and the
     shares of modes are those of the weights. Raises ValueError for a source without a proposal or without a failure among its episodes, a count below 1, and
     disturbances without a quantile function.
     """
@@ -55,10 +55,10 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     key, for_draws, for_rows = jax.random.split(key, 3)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None:
-        raise ValueError(f"{name}: source must hold a proposal, received an Estimate of {source.method} without one")
+        raise ValueError(f"{name}: source must hold a proposal, received one of {source.method} without one")
     n = PER_SAMPLE * samples
     if isinstance(q, latent.Latent):
-        z, o, log_w = jax.device_get(drawn(for_draws, sim, q, n))
+        z, o, log_w, _ = jax.device_get(drawn(sim, q, *numbers(for_draws, n, latent.dimension(sim), q.means.dtype)))
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
@@ -70,7 +70,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     w = np.exp(log_w - log_w.max())
     at = (np.arange(samples) + float(jax.random.uniform(for_rows))) / samples
     rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
-    chain = Chain(key, sim, samples, None)
+    chain = Chain(key, sim, samples)
     people = chain.judge(jnp.asarray(z[rows], chain.dtype))
     people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
     episodes = jax.device_get(latent.episodes(sim, people.z))

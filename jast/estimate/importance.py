@@ -59,8 +59,8 @@ def log_weights(key, sim, proposal, samples, *, mode="default"):
 def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.95, progress=False, callback=None):
     """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal: `Estimate`.
 
-    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities. Unbiased where the proposal can draw all that the model can: one
-    that holds no share of the model is tried on a few of the model's own episodes. It says nothing of failures that it hardly draws: `Estimate` on how to know.
+    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities. Unbiased where it can draw all that the model can: one that
+    holds no share of the model is tried on a few of the model's own episodes. It says nothing of failures that it hardly draws: `Estimate` on how to know.
     ``mode`` as in `log_weights`; ``level`` of the interval. Memory does not grow with ``samples``. The key is consumed; chunk i is drawn with
     ``jax.random.fold_in(key, i)``. ``progress=True`` shows a bar, ``callback(done, total)`` is called after each chunk; a KeyboardInterrupt ends it with the
     estimate of the whole chunks, and a word in ``warnings``. Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
@@ -95,7 +95,7 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
             n, now = min(lanes, samples - done), ahead
             if done + n < samples:
                 ahead = simulate(done // lanes + 1)  # the device goes on while the host sums
-            total = sums.add(total, jax.tree.map(lambda a: a[:n], jax.device_get(now)))
+            total = sums.add(total, jax.tree.map(lambda a, n=n: a[:n], jax.device_get(now)))
             done += n
             if bar is not None:
                 bar.update(n)

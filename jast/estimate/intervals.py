@@ -65,8 +65,8 @@ def _betainc(a, b, x):
 def chernoff(k, n, level=0.95):
     """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u above k/n with n KL(k/n || u) = log(1 / (1 - level)).
 
-    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of the time and is above Clopper and Pearson's. Raises ValueError as
-    `clopper_pearson`.
+    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of the time, and is not below Clopper and Pearson's. Raises
+    ValueError as `clopper_pearson`.
     """
     _counts("chernoff", k, n, level)
     k, n = int(k), int(n)

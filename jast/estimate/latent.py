@@ -18,7 +18,7 @@ from jast.check import contract
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, random_start, rollout
 
-__all__ = ["Latent", "Outcomes", "check", "dimension", "draw", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes"]
+__all__ = ["Latent", "Outcomes", "check", "dimension", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes", "place"]
 
 
 class Outcomes(NamedTuple):
@@ -107,11 +107,9 @@ def episodes(sim, z):
     return jax.vmap(lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None))(z)
 
 
-def draw(key, q, n):
-    """``n`` points [n, D] of the mixture ``q``."""
-    for_component, for_noise = jax.random.split(key)
-    k = jax.random.categorical(for_component, q.log_weights, shape=(n,))
-    e = jax.random.normal(for_noise, (n, q.means.shape[1]), q.means.dtype)
+def place(q, u, e):
+    """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and normal ones ``e`` [n, D]."""
+    k = jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None, :-1], axis=1)
 
     def component(i, z):
         return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)

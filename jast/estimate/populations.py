@@ -14,10 +14,10 @@ from jax.scipy.special import logsumexp
 
 from jast.estimate.latent import dimension, log_ratios, normal_numbers, outcomes
 
-__all__ = ["Chain", "Explored", "Population", "cool", "explore"]
+__all__ = ["Chain", "Explored", "Population", "cool", "explore", "generator"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
-WIDTHS, FAILING, COLD, COOLING = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60
+WIDTHS, FAILING, COLD, COOLING, DRAWS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60, 4
 
 
 class Explored(NamedTuple):
@@ -48,20 +48,22 @@ class Population(NamedTuple):
 
 
 class Chain:
-    """A population on its way: the moves, their size and the counts, which both explorers share."""
+    """A population on its way: the moves, their size and the counts, which all explorers share.
 
-    def __init__(self, key, sim, size, covered):
-        self.key, self.sim, self.size, self.covered = key, sim, size, covered
+    Random numbers are NumPy's, from the key: programs without a generator compile in a third of the time, and nothing of it enters an estimate's own draws.
+    """
+
+    def __init__(self, key, sim, size, covered=None):
+        self.rng, self.sim, self.size, self.covered = generator(key), sim, size, covered
         self.scale, self.accepted, self.evaluations, self.invalid = 0.7, math.nan, 0, 0
         self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
 
-    def next_key(self):
-        self.key, key = jax.random.split(self.key)
-        return key
+    def noise(self):
+        return jnp.asarray(self.rng.standard_normal((self.size, self.dimension)), self.dtype)
 
     def draw(self, width):
         """A new population N(0, width^2 I)."""
-        return self.judge(width * jax.random.normal(self.next_key(), (self.size, self.dimension), self.dtype))
+        return self.judge(jnp.asarray(width, self.dtype) * self.noise())
 
     def judge(self, z):
         """The population of these points."""
@@ -71,7 +73,7 @@ class Chain:
         """``people[rows]`` after Markov moves that keep N(0, width^2 I) given score <= level."""
         for _ in range(times):
             numbers = (jnp.asarray(v, d) for v, d in ((level, people.score.dtype), (self.scale, self.dtype), (width, self.dtype)))
-            people, accepted = _move(self.next_key(), self.sim, people, jnp.asarray(rows, jnp.int32), *numbers, self.covered)
+            people, accepted = _move(self.sim, people, jnp.asarray(rows, jnp.int32), self.noise(), *numbers, self.covered)
             self.count(people)
             self.accepted = float(accepted)
             self.scale = float(np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0))
@@ -87,6 +89,11 @@ class Chain:
         if people is None:
             return Explored(np.zeros((0, self.dimension)), np.zeros(0, np.int32), -math.inf, tuple(levels), self.evaluations, self.invalid)
         return Explored(np.asarray(people.z), np.asarray(people.used), log_mean, tuple(levels), self.evaluations, self.invalid)
+
+
+def generator(key):
+    """A NumPy generator from a JAX key."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist())
 
 
 def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
@@ -121,26 +128,26 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
         levels.append(level)
 
 
-def cool(key, sim, size, chains):
+def cool(key, sim, chains):
     """Failing points of small norm, one a chain, found without a miss distance that could mislead: `Explored`.
 
-    Under wider noise N(0, s^2 I) failures are frequent: ``size`` points of the first width that makes a share of ``FAILING`` fail (nothing is found where none
-    does). ``chains`` of them go on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain replaces another one, no
+    Under wider noise N(0, s^2 I) failures are frequent: the first width that makes a share of ``FAILING`` fail (nothing is found where none does). ``chains``
+    of these failures go on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain replaces another one, no
     failure mode is lost on the way, however little of the probability it has.
     """
-    chain = Chain(key, sim, size, None)
+    chain = Chain(key, sim, chains)
     for width in WIDTHS:
-        people = chain.draw(width)
+        drawn = [chain.draw(width) for _ in range(DRAWS)]
+        people = jax.tree.map(lambda *parts: jnp.concatenate(parts), *drawn)
         failing = np.flatnonzero(np.asarray(people.score) == -np.inf)
-        if len(failing) >= FAILING * size:
+        if len(failing) >= FAILING * DRAWS * chains:
             break
-    if len(failing) < FAILING * size:
+    else:
         return chain.end(None, -math.inf, (width,))
-    widths = np.geomspace(width, COLD, COOLING)
-    chain.size, rows = chains, failing[np.arange(chains) % len(failing)]
+    rows = failing[np.arange(chains) % len(failing)]
+    people, widths = jax.tree.map(lambda a: a[rows], people), np.geomspace(width, COLD, COOLING)
     for width in widths:
-        people = chain.move(people, rows, -math.inf, width, 1)
-        rows = np.arange(chains)
+        people = chain.move(people, np.arange(chains), -math.inf, width, 1)
     return chain.end(people, math.nan, widths)
 
 
@@ -165,11 +172,10 @@ def _judge(sim, z, covered):
 
 
 @jax.jit
-def _move(key, sim, people, rows, level, scale, width, covered):
+def _move(sim, people, rows, noise, level, scale, width, covered):
     """One Markov move of ``people[rows]``: (`Population`, with the invalid ones of the candidates, accepted share)."""
     people = jax.tree.map(lambda a: a[rows], people)
-    noise = width * jax.random.normal(key, people.z.shape, people.z.dtype)
-    new = _judge(sim, jnp.sqrt(1 - scale**2) * people.z + scale * noise, covered)
+    new = _judge(sim, jnp.sqrt(1 - scale**2) * people.z + scale * width * noise, covered)
     good = new.score <= level
     kept = jax.tree.map(lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people)
     return kept._replace(invalid=new.invalid), jnp.mean(good, dtype=scale.dtype)

@@ -75,8 +75,8 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
 def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"):
     """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
 
-    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from the model alone, as Algorithm 2 is printed. Where x0 decides
-    whether the system fails that estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate.reliable`. ``epsilon`` and ``mixing`` as in
+    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from the model alone, as Algorithm 2 is printed. Where x0
+    decides whether the system fails that estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate`. ``epsilon`` and ``mixing`` as in
     `trace_proposal`. A policy that itself draws from all failures can be given to `importance` as it is.
 
     Raises ValueError for another epsilon or mixing, what is no `jast.Policy`, and a disturbance that cannot be tilted (named).
@@ -128,14 +128,13 @@ def _stacked(sim, episodes):
     parts = list(episodes) if isinstance(episodes, list) or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields")) else [episodes]
     if not parts or not all(isinstance(e, Episode) for e in parts):
         raise ValueError(f"trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received {[type(e).__name__ for e in parts]}")
-    batched = [
-        (e.x0, e.disturbances, e.length) if np.ndim(e.length) else jax.tree.map(lambda a: jnp.asarray(a)[None], (e.x0, e.disturbances, e.length)) for e in parts
-    ]
+    fields = [(e.x0, e.disturbances, e.length) for e in parts]
+    batched = [f if np.ndim(f[2]) else jax.tree.map(lambda a: jnp.asarray(a)[None], f) for f in fields]
     if not all(len(np.shape(b[2])) == 1 and len(b[2]) for b in batched):
         raise ValueError(f"trace_proposal: episodes must have at most one leading axis, of at least 1, received lengths {[np.shape(b[2]) for b in batched]}")
     like_x0, like = jax.eval_shape(_shapes, sim)
     full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like)
-    for x0, x, n in batched:
+    for x0, x, _ in batched:
         one = jax.tree.map(lambda a: a[0], (x0, x))
         _fitted("x0", one[0], like_x0)
         _fitted("disturbances", one[1], full)

@@ -16,20 +16,20 @@ from jax.scipy.special import logsumexp
 from jast.estimate import latent
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
-from jast.estimate.populations import cool, explore
+from jast.estimate.populations import cool, explore, generator
 
-__all__ = ["Seeker", "drawn", "log_ratio", "seek"]
+__all__ = ["Seeker", "drawn", "log_ratio", "numbers", "seek"]
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that no weight is without variance; where failures are not rare
 the model itself."""
 COVERED = 50.0
 """A failure is covered where its weight is at most so many times the mean."""
-LOST = 0.01
+LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
 REFITTING = 0.5
 """Of the budget, where refits end."""
-REFITS, GUARDS, CHAINS, POINTS = 8, 3, 100, 16
+REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
 RARE, CUT, FEW, NOTHING = math.log(1e-4), 0.3, 20, 1e-6
 
 
@@ -50,7 +50,7 @@ class Seeker:
         self.key, self.sim, self.budget = key, sim, budget
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.size, self.batch = max(budget // 100, 100), max(budget // 25, 300)
-        self.rng = np.random.default_rng(np.asarray(jax.random.key_data(self.next_key())).astype(np.uint32).ravel().tolist())
+        self.rng = generator(self.next_key())
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
         self.anchors = np.zeros((0, self.dimension))
@@ -112,7 +112,7 @@ def _explore(s, gradients):
 
     found = design_points(s.next_key(), s.sim, POINTS) if gradients else None
     differentiable = found is not None and around("design points by gradients", found.points, found.evaluations)
-    cold = cool(s.next_key(), s.sim, s.size // 2, CHAINS)
+    cold = cool(s.next_key(), s.sim, CHAINS)
     points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
     around("design points by cooling", distinct(points, POINTS), cold.evaluations)
     if not differentiable:
@@ -129,22 +129,23 @@ def _refine(s, most):
     """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they get better."""
     before, limit = 0.0, s.spent + most * s.batch
     while s.spent < limit and (before == 0 or s.spent < REFITTING * s.budget):
-        z, o, log_w = jax.device_get(drawn(s.next_key(), s.sim, s.q, s.batch))
+        numbers = (jnp.asarray(a, s.dtype) for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension))))
+        z, o, log_w, _ = jax.device_get(drawn(s.sim, s.q, *numbers))
         b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
         s.invalid += int(o.invalid.sum())
         if not b.failure.any():
             s.note("batch: no failure", s.batch)
             return
         s.batches.append(b)
-        own, power, groups = effective(b.log_weight[b.failure]), *_fit(s)
-        s.note(f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f}, {groups} modes, power {power:.2f}", s.batch)
-        if own < 1.15 * before and power == 1:
+        own, (name, ess) = effective(b.log_weight[b.failure]), _fit(s)
+        s.note(f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f}, ESS {ess:.4g}; next: {name}", s.batch)
+        if own < 1.15 * before and effective(b.log_weight[b.failure]) > 0.1 * s.batch or name == "as it was":
             return
         before = own
 
 
 def _fit(s):
-    """The mixture for the failures of all batches becomes the proposal, each failure mode with a part of its own: the least power of the weights."""
+    """The proposal becomes what promises the least variance: a mixture for all failures, one with parts for each mode, a sphere, or itself."""
     log_w, failing = balanced(s.batches)
     w = np.exp(log_w - log_w.max())
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
@@ -153,8 +154,23 @@ def _fit(s):
     owner = _nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW
     owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
-    parts, least, groups = [], 1.0, np.unique(owner)
-    for i in groups:
+    # the second moment of the weights under another proposal, by the points at hand: sum of w p / q
+    variance = lambda q: np.logaddexp.reduce(log_w - _over_batches(q, s.batches)[failing])
+    choices = {"as it was": s.q, "modes": _by_owner(s, points, log_w, owner)}
+    if owner.any():
+        choices["one"] = _by_owner(s, points, log_w, np.zeros_like(owner))
+    # failures in all directions: no number of Gaussians elsewhere covers a sphere in many dimensions
+    spread = (w @ (points**2).mean(axis=1)) / w.sum()
+    choices["all around"] = as_latent([(1.0, unit(np.zeros((1, s.dimension)))._replace(values=np.full((1, s.dimension), spread)))], s.dtype)
+    name = min(choices, key=lambda name: variance(choices[name]))
+    s.q = choices[name]
+    return name, effective(log_w)
+
+
+def _by_owner(s, points, log_w, owner):
+    """A `Latent`: Gaussians fitted to the points of each owner apart."""
+    parts, w, owners = [], np.exp(log_w - log_w.max()), np.unique(owner)
+    for i in owners:
         rows = np.flatnonzero(owner == i)
         mass = w[rows].sum() / w.sum()
         if mass < NOTHING:
@@ -162,11 +178,9 @@ def _fit(s):
         # few great weights would make a mixture fit their own noise: a power below 1 of them leads the same way, in more batches
         power = _power(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
         v = np.exp(power * (log_w[rows] - log_w[rows].max()))
-        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(groups), 2), anchors=s.anchors)
+        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(owners), 2), anchors=s.anchors)
         parts.append(g._replace(weights=g.weights * max(mass, 0.003 if power == 1 else 0.02)))
-        least = min(least, power)
-    s.add(Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), low=0.0)
-    return least, len(parts)
+    return as_latent(_defended(Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), 0.0, s.rare), s.dtype)
 
 
 def _nearest(points, centres):
@@ -257,9 +271,18 @@ def log_ratio(q, z, used):
     return logsumexp(latent.log_ratios(q, z, used) + q.log_weights[None], axis=1)
 
 
-@partial(jax.jit, static_argnums=3)
-def drawn(key, sim, q, n):
-    """``n`` points of ``q``: (z [n, D], `Outcomes`, log p - log q)."""
-    z = latent.draw(key, q, n)
+@jax.jit
+def drawn(sim, q, u, e):
+    """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`, log p - log q, log shares of the components [n, K]."""
+    z = latent.place(q, u, e)
     o = latent.outcomes(sim, z)
-    return z, o, -log_ratio(q, z, o.used)
+    joint = latent.log_ratios(q, z, o.used) + q.log_weights[None]
+    log_q = logsumexp(joint, axis=1)
+    return z, o, -log_q, joint - log_q[:, None]
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def numbers(key, n, d, dtype):
+    """Uniform [n] and normal [n, d] numbers for `drawn`."""
+    for_component, for_noise = jax.random.split(key)
+    return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(for_noise, (n, d), dtype)

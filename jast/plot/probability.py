@@ -46,7 +46,7 @@ def probability(estimates, truth=None, ax=None):
         ax.grid(False, axis="y")
         handles = {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
         if handles:
-            ax.legend(handles.values(), handles, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+            ax.legend(handles.values(), handles, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
     return ax
 
 
@@ -84,8 +84,8 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
 def weights(traces, ax=None):
     """The greatest weights of an estimate: which share of the episodes has a weight above so many times the mean, both axes logarithmic. Returns the Axes.
 
-    Dashed over the tail: the Pareto distribution of the shape k-hat (`jast.estimate.pareto_k`) through the tail's median. Its slope is -1/k-hat: the flatter, the
-    more a few episodes decide; above 0.7 no standard error is to be trusted. A failure mode that is missing does not show.
+    Black over the tail: the Pareto distribution of the shape k-hat (`jast.estimate.pareto_k`) through the tail's median. Its slope falls to -1/k-hat: the
+    flatter, the fewer episodes decide; above 0.7 no standard error is to be trusted. A failure mode that is missing does not show.
 
     ``traces``: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`. ValueError for anything else, and with fewer than 2 failures.
     """
@@ -104,17 +104,17 @@ def weights(traces, ax=None):
             w = np.exp(log_w - log_w[0])
             w, share = w * n / w.sum(), np.arange(1, len(w) + 1) / n
             colour, words = style.COLOURS[i % len(style.COLOURS)], f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else "")
-            few = np.unique(np.geomspace(1, len(w), 300).astype(int)) - 1  # a point an episode would be a large picture of nothing more
-            look = dict(linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=3.5)
-            ax.plot(w[few], share[few], color=colour, label=f"{name}: {words}" if name else words, zorder=3, **look)
             m = min(int(np.ceil(min(n / 5, 3 * np.sqrt(n)))), len(w) - 1)  # the tail that pareto_k looks at
+            few = np.unique(np.geomspace(1, min(4 * m, len(w)), 200).astype(int)) - 1  # evenly along the axis
+            look = dict(linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4)
+            ax.plot(w[few], share[few], color=colour, label=f"{name}: {words}" if name else words, zorder=3, **look)
             if np.isfinite(k) and w[0] > w[m]:
                 x = np.geomspace(w[m], w[0], 100)
                 k = k if abs(k) > 1e-6 else 1e-6
                 scale = k * (np.median(w[:m]) - w[m]) / (2**k - 1)
                 above = np.maximum(1 + k * (x - w[m]) / scale, 0)
                 tail = m / n * np.where(above > 0, above, np.nan) ** (-1 / k)
-                ax.plot(x, np.where(tail >= 0.3 / n, tail, np.nan), color=colour, linestyle=(0, (4, 2)), linewidth=1.4, zorder=4)
+                ax.plot(x, np.where(tail >= 0.3 / n, tail, np.nan), color=style.INK, linewidth=1.2, zorder=4)
         ax.set(xscale="log", yscale="log", xlabel="weight over the mean weight", ylabel="share of episodes above it")
         ax.yaxis.set_major_locator(LogLocator(numticks=8))
         ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
