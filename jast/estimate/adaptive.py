@@ -166,6 +166,6 @@ def _traces(key, sim, q, n):
 
 @partial(jax.jit, static_argnums=2)
 def _plain(key, sim, n):
-    z = jax.random.normal(key, (n, latent.dimension(sim)), latent.normalnumbers(sim))
+    z = jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))
     o = latent.outcomes(sim, z)
     return Traces(jnp.zeros(n, z.dtype), jnp.zeros((n, 1), z.dtype), o.failure, o.invalid, o.length)
