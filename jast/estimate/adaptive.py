@@ -21,7 +21,7 @@ from jast.policy import nominal_policy
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
 
-LEAST = 2000
+LEAST = 5000
 APART = 0.6
 
 
@@ -38,7 +38,7 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
     `jast.estimate.failure_samples`; ``history`` tells how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
 
     The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done, total)`` and a KeyboardInterrupt as in `importance`, for
-    the last part. Raises ValueError for a budget below 2000, a level outside (0, 1), disturbances without a quantile function, and where the simulator's
+    the last part. Raises ValueError for a budget below 5000, a level outside (0, 1), disturbances without a quantile function, and where the simulator's
     functions do not fit together.
     """
     name = "failure_probability"
@@ -47,12 +47,13 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
     latent.check(name, sim)
     for_search, key = jax.random.split(key)
     s = seek(for_search, sim, budget, gradients)
-    n = max(budget - s.spent, budget // 10)
+    n = budget - s.spent
     lanes = s.batch  # one program for the search and for this
     about = dict(level=level, reasons=s.reasons, history=tuple(s.history))
     if s.log_mean is None or _plain_is_better(s):
         simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
+        about["reasons"] = ()  # which are about the proposal
         return of_counts(name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about)
     simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, s.q, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
@@ -116,7 +117,7 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one Gaussian, then importance sampling with the rest: `Estimate`.
 
     Of ``budget``, ``budget // 100`` episodes in each of 20 iterations find the proposal (`jast.cross_entropy.failure_proposal`). It settles on one failure mode
-    without a sign of the others: a baseline, and quick where there is one. ValueError for a budget below 2000 and as `failure_proposal`.
+    without a sign of the others: a baseline, and quick where there is one. ValueError for a budget below 5000 and as `failure_proposal`.
     """
     name = "adaptive_cross_entropy"
     budget = whole(name, "budget", budget, LEAST)
@@ -133,7 +134,7 @@ def _plain_is_better(s):
     """Whether counting failures of the model has less variance than weighing those of the proposal."""
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
-    return (w**2).mean() - w.mean() ** 2 > (1 - p) / p
+    return (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
 
 
 def _by_direction(q):

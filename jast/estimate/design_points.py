@@ -16,7 +16,7 @@ from jast.estimate.latent import _policy, dimension, normal_numbers, outcome, ra
 
 __all__ = ["DesignPoints", "design_points", "distinct"]
 
-STARTS, STEPS, HALVINGS = 48, 12, 5
+STEPS, HALVINGS = 12, 5
 APART = 0.5
 """Points nearer to one another than so much of their norm are one."""
 GRADIENT = 3
@@ -31,12 +31,12 @@ class DesignPoints(NamedTuple):
     evaluations: int
 
 
-def design_points(key, sim, limit=16):
-    """At most ``limit`` distinct `DesignPoints` of ``sim``; none where the miss distance has no useful gradient."""
-    z = jax.random.normal(key, (STARTS, dimension(sim)), normal_numbers(sim))
+def design_points(key, sim, starts=48, limit=16):
+    """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none where the miss distance has no useful gradient."""
+    z = jax.random.normal(key, (starts, dimension(sim)), normal_numbers(sim))
     points, failing = jax.device_get(_descend(sim, z))
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
-    return DesignPoints(distinct(points, limit), STARTS * STEPS * (GRADIENT + HALVINGS + 1))
+    return DesignPoints(distinct(points, limit), starts * STEPS * (GRADIENT + HALVINGS + 1))
 
 
 def distinct(points, limit):

@@ -33,6 +33,8 @@ class Explored(NamedTuple):
     """The miss distances of the levels, or the widths of the noise, falling"""
     evaluations: int
     invalid: int
+    complete: bool = True
+    """False where it was ended by ``most`` evaluations"""
 
     @property
     def reached(self):
@@ -111,8 +113,10 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
         share = np.mean(score == -np.inf)
         if share >= QUANTILE:
             level = -math.inf
-        elif chain.evaluations + size * (1 + LAST) > most or log_mean < least:
+        elif log_mean < least:
             return chain.end(None, log_mean, levels)
+        elif chain.evaluations + size * (1 + LAST) > most:
+            return chain.end(None, log_mean, levels)._replace(complete=False)
         else:
             level = _next(score, level)
             if level is None and share == 0:

@@ -27,8 +27,8 @@ COVERED = 50.0
 """A failure is covered where its weight is at most so many times the mean."""
 LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
-REFITTING = 0.5
-"""Of the budget, where refits end."""
+REFITTING, MOST = 0.5, 0.85
+"""Of the budget, where refits and where the search end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
 RARE, CUT, FEW, NOTHING = math.log(1e-4), 0.3, 20, 1e-6
 
@@ -49,7 +49,7 @@ class Seeker:
     def __init__(self, key, sim, budget):
         self.key, self.sim, self.budget = key, sim, budget
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
-        self.size, self.batch = max(budget // 100, 100), max(budget // 25, 300)
+        self.size, self.batch = max(budget // 100, 100), budget // 25
         self.rng = generator(self.next_key())
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
@@ -93,7 +93,7 @@ def seek(key, sim, budget, gradients=True):
     for i in range(GUARDS):
         if s.log_mean is None or _guarded(s, last=i == GUARDS - 1):
             break
-        _refine(s, 3)
+        _refine(s, 2)
     return s
 
 
@@ -110,9 +110,9 @@ def _explore(s, gradients):
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return len(points) > 0
 
-    found = design_points(s.next_key(), s.sim, POINTS) if gradients else None
+    found = design_points(s.next_key(), s.sim, int(np.clip(s.budget // 2000, 4, 48)), POINTS) if gradients else None
     differentiable = found is not None and around("design points by gradients", found.points, found.evaluations)
-    cold = cool(s.next_key(), s.sim, CHAINS)
+    cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, 8, CHAINS)))
     points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
     around("design points by cooling", distinct(points, POINTS), cold.evaluations)
     if not differentiable:
@@ -149,6 +149,7 @@ def _fit(s):
     log_w, failing = balanced(s.batches)
     w = np.exp(log_w - log_w.max())
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
+    s.rare = s.log_mean < RARE
     z, used = (np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used"))
     points, centres = s.filled(z, used), _centres(s)
     owner = _nearest(points, centres)
@@ -194,7 +195,18 @@ def _guarded(s, last):
     found = []
     near = jnp.asarray(-threshold * CUT, s.dtype)  # on the way to a known mode, so that nothing but other ones is left
     for name, covered in (("far", (_unit(s), near)), ("thin", (s.q, jnp.asarray(threshold, s.dtype)))):
-        p = explore(s.next_key(), s.sim, s.size // 2, covered=covered, least=s.log_mean + math.log(LOST), most=int(0.15 * s.budget))
+        p = explore(
+            s.next_key(),
+            s.sim,
+            s.size // 2,
+            covered=covered,
+            least=s.log_mean + math.log(LOST),
+            most=int(min(0.15, max(MOST - s.spent / s.budget, 0)) * s.budget),
+        )
+        if not p.complete:
+            s.reasons.append("the budget did not last to look for lost failure modes")
+            s.note(f"guard ({name}): ended by the budget after {len(p.levels)} levels", p.evaluations)
+            return True
         s.invalid += p.invalid
         share = math.exp(min(p.log_mean - s.log_mean, 50)) if p.reached else 0.0
         bare = np.asarray(log_ratio(s.q, p.points, p.used)) < threshold if p.reached else np.zeros(0, bool)
@@ -212,7 +224,7 @@ def _guarded(s, last):
     found = [f for f in found if len(f[1]) and f[0] > 2 * (thin + LOST)]
     if not found:
         return True
-    if last or s.spent + 3 * s.batch > 0.75 * s.budget:
+    if last or s.spent + 2 * s.batch > MOST * s.budget:
         s.reasons.append(f"failures that the proposal hardly draws may carry {most:.0%} of what it found")
         return True
     for share, points, used in found:

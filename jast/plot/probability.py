@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from jast._checks import whole
 from jast.episode import Episode, replay
 from jast.estimate import Estimate, FailureSamples, Traces, pareto_k
 from jast.plot import style
@@ -54,8 +55,8 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
     """How a number of the state runs to failure, a line an episode with a mark where it fails, in two colours where some end above 0 and others below.
 
     ``samples``: `jast.estimate.FailureSamples` or a batch of `Episode` with one leading axis; each is replayed. ``value``: state -> number (default: the miss
-    distance). ``nominal``: a batch of other episodes, grey and behind. At most the first ``most`` of a batch are drawn. Returns the Axes. ValueError for
-    samples of another kind and a value that is not one number.
+    distance). ``nominal``: a batch of other episodes, grey and behind. At most ``most`` of a batch are drawn, evenly taken. Returns the Axes. ValueError
+    for samples of another kind, a value that is not one number and ``most`` below 1.
     """
     caller = "failure_fan"
     samples = samples.episodes if isinstance(samples, FailureSamples) else samples
@@ -68,7 +69,7 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
         both = up.any() and (~up & (np.array([line[-1] for line in lines]) < 0)).any()
         for side, colour, marker in ((True, style.BLUE, "^"), (False, style.VERMILION, "v")) if both else ((None, style.BLUE, "o"),):
             own = [line for line, above in zip(lines, up, strict=True) if side is None or above == side]
-            name = f"{len(own)} failures" if side is None else f"{len(own)} of {len(lines)} failures end {'above' if side else 'below'} 0"
+            name = f"{len(own)} failures" if side is None else f"{len(own)} of {len(lines)} failures {'above' if side else 'below'} 0"
             alpha = float(np.clip(12 / len(own), 0.12, 0.8))
             for line in own:
                 ax.plot(line, color=colour, linewidth=0.8, alpha=alpha, zorder=3)
@@ -150,7 +151,8 @@ def _lines(caller, name, sim, episodes, value, most):
     if not isinstance(episodes, Episode) or np.ndim(episodes.length) != 1 or not len(episodes.length):
         received = f"leading axes {np.shape(episodes.length)}" if isinstance(episodes, Episode) else type(episodes).__name__
         raise ValueError(f"plot.{caller}: {name} must be FailureSamples or Episodes with one leading axis, received {received}")
-    few = jax.tree.map(lambda a: np.asarray(a)[:most], episodes._replace(states=None))
+    rows = np.unique(np.linspace(0, len(episodes.length) - 1, whole(f"plot.{caller}", "most", most)).astype(int))
+    few = jax.tree.map(lambda a: np.asarray(a)[rows], episodes._replace(states=None))
     number = value if value is not None else lambda s: sim.evaluate(s)[1]
     out = np.asarray(jax.jit(jax.vmap(lambda e: jax.vmap(number)(replay(sim, e).states)))(few), float)
     if out.ndim != 2:
