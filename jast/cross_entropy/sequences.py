@@ -8,14 +8,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import ndtr, ndtri
+from jax.scipy.special import log_ndtr, ndtr, ndtri
 from jax.tree_util import Partial
 
 from jast import actions as choices
 from jast import distributions as D
 from jast.policy import Policy
 
-__all__ = ["Steps", "fit", "latent", "log_ratio", "noise", "normal_score", "phi", "place", "player", "quantile", "standard"]
+__all__ = ["Steps", "cells", "fit", "latent", "log_ratio", "noise", "normal_score", "phi", "place", "player", "quantile", "standard"]
+
+
+LOG_2 = 0.6931471805599453
 
 
 class Steps(NamedTuple):
@@ -98,7 +101,30 @@ def quantile(dist, z):
         return dist._select(quantile(dist._a, z), quantile(dist._b, z))
     if isinstance(dist, D.Joint):
         return jax.tree.map(quantile, dist.distributions, z, is_leaf=lambda d: isinstance(d, D.Distribution))
+    # not by way of Phi(z), whose grid below 1 is 6e-8 in float32
+    if isinstance(dist, D.Laplace):
+        return dist.loc - dist.scale * jnp.sign(z) * (LOG_2 + log_ndtr(-jnp.abs(z)))
+    if isinstance(dist, D.Logistic):
+        return dist.loc + dist.scale * (log_ndtr(z) - log_ndtr(-z))
+    if isinstance(dist, D.Uniform):
+        width = dist.high - dist.low
+        return jnp.where(z < 0, dist.low + width * ndtr(z), dist.high - width * ndtr(-z))
+    if isinstance(dist, D.Bernoulli):
+        return jnp.asarray(z >= -ndtri(dist.probs), dist.dtype)
+    if isinstance(dist, D.Categorical):
+        order, edges = cells(dist.probs)
+        i = jnp.sum(z[..., None] >= edges, axis=-1)
+        return jnp.take_along_axis(order, i[..., None], axis=-1)[..., 0].astype(dist.dtype)
     return D.quantile(dist, jax.tree.map(phi, z))
+
+
+def cells(probs):
+    """(the whole numbers by falling probability [..., k], the z between them [..., k - 1]): rare ones lie in the upper tail, where more noise reaches them."""
+    order = jnp.argsort(-probs, axis=-1)
+    p = jnp.take_along_axis(probs / jnp.sum(probs, axis=-1, keepdims=True), order, axis=-1)
+    below = jnp.cumsum(p, axis=-1)[..., :-1]
+    above = jnp.flip(jnp.cumsum(jnp.flip(p, axis=-1), axis=-1), axis=-1)[..., 1:]
+    return order, jnp.where(below < 0.5, ndtri(below), -ndtri(above))
 
 
 def latent(dist, x):
@@ -115,6 +141,22 @@ def latent(dist, x):
         return dist._select(latent(dist._a, x), latent(dist._b, x))
     if isinstance(dist, D.Joint):
         return jax.tree.map(latent, dist.distributions, x, is_leaf=lambda d: isinstance(d, D.Distribution))
+    if isinstance(dist, D.Laplace):
+        v = (x - dist.loc) / dist.scale
+        return -jnp.sign(v) * ndtri(jnp.exp(-jnp.abs(v)) / 2)
+    if isinstance(dist, D.Logistic):
+        v = (x - dist.loc) / dist.scale
+        return -jnp.sign(v) * ndtri(jax.nn.sigmoid(-jnp.abs(v)))
+    if isinstance(dist, D.Uniform):
+        below, above = (jnp.maximum(gap / (dist.high - dist.low), jnp.finfo(x.dtype).tiny) for gap in (x - dist.low, dist.high - x))
+        return jnp.where(below < above, ndtri(jnp.minimum(below, 0.5)), -ndtri(jnp.minimum(above, 0.5)))
+    if isinstance(dist, D.Categorical):
+        order, edges = cells(dist.probs)
+        i = jnp.argmax(order == x[..., None].astype(order.dtype), axis=-1)[..., None]
+        end = jnp.full((*edges.shape[:-1], 1), jnp.inf, edges.dtype)
+        low, high = (jnp.take_along_axis(e, i, axis=-1)[..., 0] for e in (jnp.concatenate([-end, edges], -1), jnp.concatenate([edges, end], -1)))
+        # the middle in probability, from the side where the numbers are small
+        return jnp.where(low + high > 0, -ndtri((ndtr(-low) + ndtr(-high)) / 2), ndtri((ndtr(low) + ndtr(high)) / 2))
     return jax.tree.map(normal_score, D.cdf(dist, x))
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr, ndtri
 
 from jast import distributions as D
-from jast.cross_entropy.sequences import normal_score, quantile
+from jast.cross_entropy.sequences import cells, latent, quantile
 
 __all__ = ["Tilted", "tilted"]
 
@@ -32,7 +32,7 @@ class Tilted(D.Distribution):
     def log_prob(self, value):
         """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is the same in both."""
         log_p = self._distribution.log_prob(value)
-        z = normal_score(D.cdf(self._distribution, value))
+        z = latent(self._distribution, value)
         e = (z - self._mean) / self._deviation
         gain = 0.5 * (z - e) * (z + e) - jnp.log(self._deviation)
         return log_p + jnp.sum(gain, axis=tuple(range(log_p.ndim, gain.ndim)))
@@ -75,9 +75,10 @@ def _above(edge, mean, deviation):
 
 def _cells(probs, mean, deviation):
     """P(z in the i-th cell), [..., k], for the cells of N(0, 1) of these probabilities."""
-    below = jnp.cumsum(probs, axis=-1)[..., :-1]
-    end = jnp.full((*below.shape[:-1], 1), jnp.inf, below.dtype)
-    edges = jnp.concatenate([-end, ndtri(jnp.clip(below, 0, 1)), end], axis=-1)
+    order, edges = cells(probs)
+    end = jnp.full((*edges.shape[:-1], 1), jnp.inf, edges.dtype)
+    edges = jnp.concatenate([-end, edges, end], axis=-1)
     a, b = ((e - mean[..., None]) / deviation[..., None] for e in (edges[..., :-1], edges[..., 1:]))
     # in the upper tail from the other side, where the numbers are small
-    return jnp.maximum(jnp.where(a > 0, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a)), 0)
+    p = jnp.maximum(jnp.where(a > 0, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a)), 0)
+    return jnp.take_along_axis(p, jnp.argsort(order, axis=-1), axis=-1)

@@ -11,12 +11,13 @@ from jast._checks import real, whole
 from jast.check import contract
 from jast.cross_entropy.failure_proposal import failure_proposal
 from jast.estimate import latent
+from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts
-from jast.estimate.importance import LANES, Traces, chunks, importance, traces
+from jast.estimate.importance import Traces, chunks, even, importance, traces
 from jast.estimate.intervals import log_normal
 from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
-from jast.estimate.seek import drawn, numbers, seek
+from jast.estimate.seek import seek
 from jast.policy import nominal_policy
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
@@ -70,7 +71,7 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     samples = whole(name, "samples", samples)
     level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
     contract(sim, observed=False)
-    proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), min(LANES, 1 << (samples - 1).bit_length())
+    proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), even(samples)
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes)
     total, notes = chunks(simulate, lanes, samples, progress=progress, callback=callback, name=name)
     return of_counts(name, total, level=level, notes=notes)
@@ -121,6 +122,7 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     """
     name = "adaptive_cross_entropy"
     budget = whole(name, "budget", budget, LEAST)
+    level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
     for_search, key = jax.random.split(key)
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
     result = importance(key, sim, found.policy, budget - int(found.evaluations), level=level)

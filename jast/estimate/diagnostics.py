@@ -7,21 +7,28 @@ __all__ = ["by_mode", "pareto_k", "reasons", "thin_modes"]
 K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
-def pareto_k(log_weights, samples):
+def pareto_k(log_weights, samples, failures=None):
     """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those above 0, of ``samples`` in all): a float.
 
     Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The tail is
-    min(n / 5, 3 sqrt(n)) weights, and at most a fifth of those above 0. NaN below 5 of them; -inf where the greatest are all equal.
+    min(n / 5, 3 sqrt(n)) weights, and at most a fifth of ``failures``, how many are above 0 in all
+    (default: of those given). NaN for fewer than 5, and where one is NaN; -inf where the greatest are all equal.
     """
     log_w = np.sort(np.asarray(log_weights, np.float64))
+    if np.isnan(log_w).any():
+        return float("nan")
     log_w = log_w[log_w > -np.inf]
-    m = int(np.ceil(min(samples / 5, 3 * np.sqrt(samples))))
+    failures = len(log_w) if failures is None else failures
+    m = int(np.ceil(min(samples / 5, 3 * np.sqrt(samples), max(failures / 5, 5))))
     m = min(m, len(log_w) - 1)
     if m < 5:
         return float("nan")
     w = np.exp(log_w[-m - 1 :] - log_w[-1])
     excess = w[1:] - w[0]
-    return _shape(excess) if excess[-1] > 1e-9 and excess[m // 4] > 0 else float("-inf")
+    excess = excess[excess > 1e-9]
+    if not excess.size:
+        return float("-inf")
+    return _shape(excess) if len(excess) >= 5 else float("nan")
 
 
 def _shape(x):
@@ -47,6 +54,8 @@ def by_mode(sums, groups):
 
 def thin_modes(shares, sizes):
     """Texts for the modes that matter and that few effective episodes speak for."""
+    if len(shares) < 2:
+        return []
     return [f"a mode of {v:.1%} of the estimate has an effective sample size of {n:.3g}" for v, n in zip(shares, sizes, strict=True) if v > MATTERS and n < FEW]
 
 

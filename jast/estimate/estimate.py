@@ -11,6 +11,8 @@ from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys, log_nor
 
 __all__ = ["Estimate", "estimate", "of_counts"]
 
+INVALID = 0.01
+
 
 class Estimate(NamedTuple):
     """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why before any number where it must not be believed.
@@ -68,7 +70,7 @@ class Estimate(NamedTuple):
 
     def __str__(self):
         rows, low, high = [], *self.interval
-        if self.failures_seen:
+        if not math.isnan(self.log_mean):
             value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
             rows.append(("probability", f"{value}   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"))
             rows.append(("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}"))
@@ -84,7 +86,7 @@ class Estimate(NamedTuple):
             rows.append(("modes", "  ".join(f"{100 * v:.1f} %" for v in self.modes[:12]) + (" ..." if len(self.modes) > 12 else "")))
         if self.invalid:
             rows.append(("invalid", f"{self.invalid}"))
-        head = [] if self.reliable else ["UNRELIABLE: " + "; ".join(self.warnings)]
+        head = [] if self.reliable else ["UNRELIABLE: " + f"\n{'':12}".join(self.warnings)]
         tail = [f"{'remark':<14} {text}" for text in self.warnings] if self.reliable else []
         return "\n".join([*head, f"{'method':<14} {self.method}", *(f"{name:<14} {text}" for name, text in rows), *tail])
 
@@ -99,12 +101,13 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
     found = list(reasons)
     if sums.undefined:
         found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
+    found += _if_invalid_failed(sums)
     log_mean = sums.top + math.log(sums.first / n) if seen else math.nan
     # eq. 14 over the square of the mean; n - 1 for an unbiased variance
     relative = math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1)) if seen and n > 1 else math.nan
     ess = sums.first**2 / sums.second if seen else 0.0
-    k_hat = diagnostics.pareto_k(sums.tail, n)
-    share = 1 / sums.first if seen else math.nan
+    k_hat = diagnostics.pareto_k(sums.tail, n, sums.failures)
+    share = math.exp(sums.tail[0] - sums.top) / sums.first if seen else math.nan
     found += diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
     modes = None
     if seen:
@@ -112,6 +115,8 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
         modes, sizes = diagnostics.by_mode(sums, groups)
         found += diagnostics.thin_modes(modes, sizes)
     mean = math.exp(log_mean) if seen else math.nan
+    if seen and mean > 1 + 4 * mean * relative:
+        found.append(f"the estimate is {mean:.4g}, above 1: a density does not fit its samples")
     return Estimate(
         method=method,
         log_mean=log_mean,
@@ -142,12 +147,21 @@ def of_counts(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=Non
     n, k = sums.samples, sums.failures
     mean = k / n if k else math.nan
     found = [*reasons, *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",))]
+    found += _if_invalid_failed(sums._replace(first=float(k), invalid_first=float(sums.invalid)))
     relative = math.sqrt((1 - mean) / k) if k else math.nan
     return Estimate(
         method, math.log(mean) if k else math.nan, mean, mean * relative, relative, clopper_pearson(k, n, level), level, float(k), math.nan,
         1 / k if k else math.nan, k, n, n if evaluations is None else evaluations, sums.steps, sums.invalid, np.ones(1) if k else None, not found,
         (*found, *_remarks(sums), *notes), chernoff(k, n, level), jeffreys(k, n, level), proposal, history,
     )  # fmt: skip
+
+
+def _if_invalid_failed(sums):
+    """Texts: where the episodes without a finite number would matter if they were failures."""
+    if not sums.invalid_first > INVALID * sums.first:
+        return []
+    share = f"{sums.invalid_first / sums.first:.2g} times the estimate" if sums.first > 0 else "all of it"
+    return [f"{sums.invalid} episodes are invalid (a number that is not finite): if they failed, they would add {share}"]
 
 
 def _remarks(sums):

@@ -10,12 +10,12 @@ import numpy as np
 from jast._checks import whole
 from jast.episode import Episode
 from jast.estimate import latent
+from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
 from jast.estimate.fit import effective
 from jast.estimate.importance import played
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal, latents
-from jast.estimate.seek import drawn, numbers
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -45,9 +45,9 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are resampled, each then makes Markov moves: `FailureSamples`.
 
     ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The
-    ``moves`` change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks, and the
-    shares of modes are those of the weights. Raises ValueError for a source without a proposal or without a failure among its episodes, a count below 1, and
-    disturbances without a quantile function.
+    ``moves`` change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks,
+    and the shares of modes are those of the weights. Raises ValueError for a source without a proposal or without a failure among its episodes, a count below
+    1, and disturbances without a quantile function.
     """
     name = "failure_samples"
     samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
@@ -58,6 +58,8 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         raise ValueError(f"{name}: source must hold a proposal, received one of {source.method} without one")
     n = PER_SAMPLE * samples
     if isinstance(q, latent.Latent):
+        if (received := q.means.shape[1]) != latent.dimension(sim):
+            raise ValueError(f"{name}: source must be of this simulator, of {latent.dimension(sim)} numbers, received one of {received}")
         z, o, log_w, _ = jax.device_get(drawn(sim, q, *numbers(for_draws, n, latent.dimension(sim), q.means.dtype)))
         failure = o.failure
     else:

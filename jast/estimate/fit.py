@@ -13,8 +13,8 @@ from jast.estimate.latent import Latent
 
 __all__ = ["Gaussians", "as_latent", "effective", "fit", "shrunk", "together", "unit"]
 
-COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16)
-ITERATIONS = 12
+COMPONENTS = (1, 2, 4, 8, 16)
+ITERATIONS = 10
 MOST = 4000
 SIZE = 40
 """Components of a `Latent`, unused ones included."""
@@ -60,6 +60,8 @@ def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
             value += v[~part] @ _log_sum(_log_joint(g, points[~part])) / v.sum()
         if value > score + 0.02:
             best, score = k, value
+        elif k > 2 * best:
+            break
     return _em(rng, points, weights, known, best, anchors)
 
 

@@ -14,7 +14,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jast import distributions as D
-from jast._checks import whole
+from jast._checks import real, whole
 from jast.check import contract
 from jast.episode import accumulator, advance, begin, rollout
 from jast.estimate import sums
@@ -23,7 +23,7 @@ from jast.estimate.latent import raw
 from jast.estimate.proposals import as_proposal
 from jast.policy import nominal_policy
 
-__all__ = ["Traces", "chunks", "importance", "log_weights", "played", "traces"]
+__all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
 
 LANES = 16384
 PROBES = 256
@@ -71,14 +71,20 @@ def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.9
     samples = whole("importance", "samples", samples, 2)
     if mode not in ("default", "paper"):
         raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
+    level = float(real("importance", "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
     contract(sim, observed=False)
     proposal = as_proposal("importance", sim, proposal)
     key, for_probes = jax.random.split(key)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
-    lanes = min(LANES, 1 << (samples - 1).bit_length())
+    lanes = even(samples)
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
     total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
     return estimate("importance", total, level=level, reasons=reasons, notes=stopped)
+
+
+def even(samples):
+    """Episodes of a chunk, at most ``LANES``, such that the last one is as full as the others."""
+    return -(-samples // -(-samples // LANES))
 
 
 def chunks(simulate, lanes, samples, progress=False, callback=None, name="importance"):

@@ -109,12 +109,13 @@ def episodes(sim, z):
 
 def place(q, u, e):
     """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and normal ones ``e`` [n, D]."""
-    k = jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None, :-1], axis=1)
+    live = _live(q)
+    k = jnp.minimum(jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1), live - 1)
 
     def component(i, z):
         return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)
 
-    return lax.fori_loop(0, len(q.means), component, e)
+    return lax.fori_loop(0, live, component, e)
 
 
 def log_ratios(q, z, used):
@@ -126,7 +127,13 @@ def log_ratios(q, z, used):
         kept = jnp.arange(z.shape[1], dtype=jnp.int32)[None] < used[:, None]
         return jnp.sum(jnp.where(kept, each, 0), axis=1)
 
-    return lax.map(lambda c: component(*c), (q.means, q.inverses)).T
+    one = lambda i, out: out.at[:, i].set(component(q.means[i], q.inverses[i]))
+    return lax.fori_loop(0, _live(q), one, jnp.zeros((len(z), len(q.means)), z.dtype))
+
+
+def _live(q):
+    """How many components are used: they come first."""
+    return jnp.sum(jnp.isfinite(q.log_weights), dtype=jnp.int32)
 
 
 def raw(log_p, event, distance, terminal, approach=0.0):

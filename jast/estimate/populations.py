@@ -144,7 +144,7 @@ def cool(key, sim, chains):
         drawn = [chain.draw(width) for _ in range(DRAWS)]
         people = jax.tree.map(lambda *parts: jnp.concatenate(parts), *drawn)
         failing = np.flatnonzero(np.asarray(people.score) == -np.inf)
-        if len(failing) >= FAILING * DRAWS * chains:
+        if len(failing) >= FAILING * DRAWS * chains or (width == WIDTHS[-1] and len(failing)):
             break
     else:
         return chain.end(None, -math.inf, (width,))

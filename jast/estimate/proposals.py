@@ -53,7 +53,13 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
-    start, steps = latents(sim, _stacked(sim, episodes))
+    recorded = _stacked(sim, episodes)
+    try:
+        start, steps = latents(sim, recorded)
+    except ValueError as error:
+        raise ValueError(f"trace_proposal: disturbance: {error}") from None
+    if not all(isinstance(a, jax.core.Tracer) or np.isfinite(a).all() for a in jax.tree.leaves((start, steps))):
+        raise ValueError("trace_proposal: episodes must hold finite disturbances that the model can draw, received others")
     tilt_start = tilt_start and random_start(sim)
     start = start if tilt_start else ()
     k = len(jax.tree.leaves(steps)[0])
@@ -136,8 +142,10 @@ def _stacked(sim, episodes):
     full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like)
     for x0, x, _ in batched:
         one = jax.tree.map(lambda a: a[0], (x0, x))
-        _fitted("x0", one[0], like_x0)
-        _fitted("disturbances", one[1], full)
+        try:
+            _fitted("x0", one[0], like_x0), _fitted("disturbances", one[1], full)
+        except ValueError as error:
+            raise ValueError(f"trace_proposal: episodes do not fit the simulator: {str(error).removeprefix('replay: ')}") from None
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
 
 

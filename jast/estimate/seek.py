@@ -5,42 +5,29 @@ them. None of these points serves the estimate, which is made with the proposal 
 """
 
 import math
-from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from jast.estimate import latent
+from jast.estimate.batches import Batch, balanced, drawn, over_batches
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
+from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore, generator
 
-__all__ = ["Seeker", "drawn", "log_ratio", "numbers", "seek"]
+__all__ = ["Seeker", "seek"]
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that no weight is without variance; where failures are not rare
 the model itself."""
 COVERED = 50.0
 """A failure is covered where its weight is at most so many times the mean."""
-LOST = 0.005
-"""A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
-REFITTING, MOST = 0.5, 0.85
-"""Of the budget, where refits and where the search end."""
+REFITTING = 0.5
+"""Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
-RARE, CUT, FEW, NOTHING = math.log(1e-4), 0.3, 20, 1e-6
-
-
-class Batch(NamedTuple):
-    """Points drawn from one proposal. On the host."""
-
-    q: latent.Latent
-    z: np.ndarray
-    used: np.ndarray
-    failure: np.ndarray
-    log_weight: np.ndarray
+RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
 
 
 class Seeker:
@@ -54,7 +41,8 @@ class Seeker:
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
         self.anchors = np.zeros((0, self.dimension))
-        self.spent, self.invalid, self.reasons, self.history = 0, 0, [], []
+        self.seeds = self.anchors  # failures of many places, whatever their probability
+        self.spent, self.reasons, self.history = 0, [], []
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
@@ -78,6 +66,14 @@ class Seeker:
         n = len(z)
         return fit(self.rng, self.filled(z, used), np.full(n, 1 / n), n / 5, n / 20)
 
+    def thin(self):
+        """The log density ratio q / p below which a failure is not covered."""
+        return -self.log_mean - math.log(COVERED)
+
+    def centres(self):
+        """The distinct means of the proposal [m, D]."""
+        return distinct(np.asarray(self.q.means, np.float64)[np.asarray(self.q.log_weights) > math.log(0.003)], POINTS)
+
 
 def seek(key, sim, budget, gradients=True):
     """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was found."""
@@ -91,7 +87,7 @@ def seek(key, sim, budget, gradients=True):
         s.add(g, 1 / i)
     _refine(s, REFITS)
     for i in range(GUARDS):
-        if s.log_mean is None or _guarded(s, last=i == GUARDS - 1):
+        if s.log_mean is None or guarded(s, i, GUARDS - 1):
             break
         _refine(s, 2)
     return s
@@ -115,10 +111,10 @@ def _explore(s, gradients):
     cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, 8, CHAINS)))
     points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
     around("design points by cooling", distinct(points, POINTS), cold.evaluations)
+    s.seeds = points[s.rng.permutation(len(points))]
     if not differentiable:
         population = explore(s.next_key(), s.sim, s.size, most=int(0.4 * s.budget))
         s.note(f"subset simulation: {len(population.levels)} levels, log p {population.log_mean:.2f}", population.evaluations)
-        s.invalid += population.invalid
         if population.reached:
             s.populations.append(population)
             parts.append(s.fitted(population.points, population.used))
@@ -132,7 +128,6 @@ def _refine(s, most):
         numbers = (jnp.asarray(a, s.dtype) for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension))))
         z, o, log_w, _ = jax.device_get(drawn(s.sim, s.q, *numbers))
         b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
-        s.invalid += int(o.invalid.sum())
         if not b.failure.any():
             s.note("batch: no failure", s.batch)
             return
@@ -151,12 +146,12 @@ def _fit(s):
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
     s.rare = s.log_mean < RARE
     z, used = (np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used"))
-    points, centres = s.filled(z, used), _centres(s)
+    points, centres = s.filled(z, used), s.centres()
     owner = _nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW
     owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
     # the second moment of the weights under another proposal, by the points at hand: sum of w p / q
-    variance = lambda q: np.logaddexp.reduce(log_w - _over_batches(q, s.batches)[failing])
+    variance = lambda q: np.logaddexp.reduce(log_w - over_batches(q, s.batches)[failing])
     choices = {"as it was": s.q, "modes": _by_owner(s, points, log_w, owner)}
     if owner.any():
         choices["one"] = _by_owner(s, points, log_w, np.zeros_like(owner))
@@ -189,75 +184,6 @@ def _nearest(points, centres):
     return np.argmax(points @ centres.T - 0.5 * (centres**2).sum(axis=1), axis=1)
 
 
-def _guarded(s, last):
-    """Whether nothing was lost, by populations that the proposal was not fitted to; what was is taken in, or becomes a reason against the estimate."""
-    threshold = -s.log_mean - math.log(COVERED)
-    found = []
-    near = jnp.asarray(-threshold * CUT, s.dtype)  # on the way to a known mode, so that nothing but other ones is left
-    for name, covered in (("far", (_unit(s), near)), ("thin", (s.q, jnp.asarray(threshold, s.dtype)))):
-        p = explore(
-            s.next_key(),
-            s.sim,
-            s.size // 2,
-            covered=covered,
-            least=s.log_mean + math.log(LOST),
-            most=int(min(0.15, max(MOST - s.spent / s.budget, 0)) * s.budget),
-        )
-        if not p.complete:
-            s.reasons.append("the budget did not last to look for lost failure modes")
-            s.note(f"guard ({name}): ended by the budget after {len(p.levels)} levels", p.evaluations)
-            return True
-        s.invalid += p.invalid
-        share = math.exp(min(p.log_mean - s.log_mean, 50)) if p.reached else 0.0
-        bare = np.asarray(log_ratio(s.q, p.points, p.used)) < threshold if p.reached else np.zeros(0, bool)
-        s.note(f"guard ({name}): {share:.2%} of the probability, {bare.mean() if len(bare) else 0:.0%} of it not covered", p.evaluations)
-        if bare.any():
-            found.append((share * bare.mean(), p.points[bare], p.used[bare]))
-    for p in s.populations:
-        bare = np.asarray(log_ratio(s.q, p.points, p.used)) < threshold
-        found.append((bare.mean(), p.points[bare], p.used[bare]))
-    log_w, _ = balanced(s.batches)
-    w = np.exp(log_w - log_w.max())
-    thin = w[log_w > -threshold].sum() / w.sum()
-    most = max((share for share, *_ in found), default=0.0)
-    s.note(f"guard: {most:.2%} of the probability where the proposal is thin, {thin:.2%} by its own batches")
-    found = [f for f in found if len(f[1]) and f[0] > 2 * (thin + LOST)]
-    if not found:
-        return True
-    if last or s.spent + 2 * s.batch > MOST * s.budget:
-        s.reasons.append(f"failures that the proposal hardly draws may carry {most:.0%} of what it found")
-        return True
-    for share, points, used in found:
-        s.add(s.fitted(points, used), min(max(share / (1 + share), 0.15), 0.85))
-    return False
-
-
-def _centres(s):
-    """The distinct means of the proposal [m, D]."""
-    means = np.asarray(s.q.means, np.float64)[np.asarray(s.q.log_weights) > math.log(0.003)]
-    return distinct(means, POINTS)
-
-
-def _unit(s):
-    """A unit Gaussian at each distinct mean that is away from the origin: a `Latent`."""
-    z = _centres(s)
-    z = z[np.linalg.norm(z, axis=1) > 1]
-    z = z if len(z) else np.full((1, s.dimension), 1e3)
-    return as_latent([(1.0, unit(z))], s.dtype)
-
-
-def balanced(batches):
-    """Log weights of the failing points of all ``batches``, p over the mean of their proposals (the balance heuristic), and which points those are."""
-    failing = np.concatenate([b.failure for b in batches])
-    logs = np.stack([_over_batches(c.q, batches)[failing] for c in batches])
-    top = logs.max(axis=0)
-    return -top - np.log(np.exp(logs - top).mean(axis=0)), failing
-
-
-def _over_batches(q, batches):
-    return np.concatenate([-b.log_weight if b.q is q else np.asarray(log_ratio(q, b.z, b.used), np.float64) for b in batches])
-
-
 def _defended(g, low, rare):
     """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the model."""
     d, model = g.means.shape[1], 0.0 if rare else MODEL
@@ -275,26 +201,3 @@ def _power(log_w, least):
         middle = (low + high) / 2
         low, high = (middle, high) if effective(middle * log_w) >= least else (low, middle)
     return low
-
-
-@jax.jit
-def log_ratio(q, z, used):
-    """log q - log p [n] of points ``z`` [n, D] over their first ``used`` numbers."""
-    return logsumexp(latent.log_ratios(q, z, used) + q.log_weights[None], axis=1)
-
-
-@jax.jit
-def drawn(sim, q, u, e):
-    """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`, log p - log q, log shares of the components [n, K]."""
-    z = latent.place(q, u, e)
-    o = latent.outcomes(sim, z)
-    joint = latent.log_ratios(q, z, o.used) + q.log_weights[None]
-    log_q = logsumexp(joint, axis=1)
-    return z, o, -log_q, joint - log_q[:, None]
-
-
-@partial(jax.jit, static_argnums=(1, 2, 3))
-def numbers(key, n, d, dtype):
-    """Uniform [n] and normal [n, d] numbers for `drawn`."""
-    for_component, for_noise = jax.random.split(key)
-    return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(for_noise, (n, d), dtype)

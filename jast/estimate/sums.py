@@ -17,6 +17,8 @@ class Sums(NamedTuple):
     """Failing episodes"""
     invalid: int
     """Episodes in which the simulator or the model's density returned NaN"""
+    invalid_first: float
+    """Sum of the weights of the invalid ones, over exp(top)"""
     undefined: int
     """Failing episodes whose weight is NaN or infinite; they count for nothing"""
     top: float
@@ -36,21 +38,23 @@ class Sums(NamedTuple):
 
 def nothing(samples):
     """The `Sums` before the first of ``samples`` episodes."""
-    return Sums(0, 0, 0, 0, 0, -np.inf, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples))
+    return Sums(0, 0, 0, 0, 0.0, 0, -np.inf, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples))
 
 
 def tail_size(samples):
     """How many of the greatest weights the Pareto fit looks at: min(n / 5, 3 sqrt(n)) (Vehtari et al. 2024)."""
-    return int(min(samples / 5, 3 * np.sqrt(samples))) + 1
+    return int(np.ceil(min(samples / 5, 3 * np.sqrt(samples)))) + 1
 
 
 def add(total, traces):
     """`Sums` with the `Traces` [n] (NumPy) as well."""
     log_w = np.asarray(traces.log_weight, np.float64)
-    good = np.asarray(traces.failure) & np.isfinite(log_w) | np.asarray(traces.failure) & (log_w == -np.inf)
+    good = np.asarray(traces.failure) & (log_w < np.inf)
     shares = np.exp(np.asarray(traces.shares, np.float64)[good])
     log_w = log_w[good]
-    top = max(total.top, log_w.max(initial=-np.inf))
+    bad = np.asarray(traces.log_weight, np.float64)[np.asarray(traces.invalid)]
+    bad = bad[bad < np.inf]
+    top = max(total.top, log_w.max(initial=-np.inf), bad.max(initial=-np.inf))
     rescale = np.exp(total.top - top) if total.top > -np.inf else 0.0
     w = np.exp(log_w - top) if top > -np.inf else np.zeros(0)
     by, squares = (w**i @ shares**i if w.size else np.zeros(shares.shape[1]) for i in (1, 2))
@@ -62,6 +66,7 @@ def add(total, traces):
         steps=total.steps + int(np.asarray(traces.length, np.int64).sum()),
         failures=total.failures + int(np.asarray(traces.failure).sum()),
         invalid=total.invalid + int(np.asarray(traces.invalid).sum()),
+        invalid_first=total.invalid_first * rescale + (np.exp(bad - top).sum() if bad.size and top > -np.inf else 0.0),
         undefined=total.undefined + int(np.asarray(traces.failure).sum()) - len(log_w),
         top=top,
         first=total.first * rescale + w.sum(),
