@@ -104,3 +104,52 @@ def test_player_at_standard_noise_is_the_model(key, make):
     latent, nominal = shares(key)
     p = (latent + nominal) / 2
     assert 0.01 < p < 0.5 and abs(latent - nominal) < 4 * np.sqrt(2 * p * (1 - p) / n)
+
+
+def test_latent_is_the_inverse_of_quantile(dtype):
+    """z -> x -> z, far out where the distribution is normal; through vectors, choices and structures."""
+    one = lambda *v: jnp.asarray(v, dtype)
+    z, far, loc, scale, no = one(-2.5, 1.3), one(-20.0, 30.0), one(1.0, -2.0), one(0.5, 3.0), jnp.asarray(False)
+    factor = jnp.stack([one(2, 0), one(1, 0.5)])
+
+    @jax.jit
+    def there_and_back():
+        normal = D.Normal(loc, scale)
+        normals = D.MultivariateNormalDiag(loc, scale), D.Independent(normal, 1), D.MultivariateNormalTri(loc, factor)
+        others = (
+            D.Uniform(loc, loc + scale),
+            D.Laplace(loc, scale),
+            D.Logistic(loc, scale),
+            D.tent(one(0.3, 0.6)),
+            D.where(no, normal, D.Uniform(loc, scale + 1)),
+        )
+        joint = D.Joint({"a": normal, "b": (others[0],)}), {"a": far, "b": (z,)}
+        pairs = [*((d, far) for d in normals), *((d, z) for d in (*normals, *others)), joint]
+        return [(v, S.latent(d, S.quantile(d, v))) for d, v in pairs]
+
+    for latent, found in there_and_back():
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(latent), strict=True):
+            assert a.dtype == dtype
+            np.testing.assert_allclose(a, b, rtol=3e-4)
+    assert S.latent(D.Fixed(), ()) == ()
+
+
+def test_latent_of_whole_numbers(dtype):
+    """The middle in probability of the normal numbers that give it, rare numbers last, by scipy; so it goes back to it."""
+    dice = D.Categorical(probs=jnp.asarray([0.2, 0.5, 0.3], dtype))
+    z = jax.jit(jax.vmap(lambda x: S.latent(dice, x)))(jnp.arange(3, dtype=jnp.int32))
+    np.testing.assert_allclose(z, scipy.stats.norm.ppf([0.9, 0.25, 0.65]), atol=1e-4)
+    assert jax.vmap(lambda z: S.quantile(dice, z))(z).tolist() == [0, 1, 2]
+
+
+def test_latent_is_finite(dtype):
+    """At and beyond the ends of what a distribution can give, and at what rounds to them."""
+    flat, tiny = D.Uniform(jnp.zeros((), dtype), jnp.ones((), dtype)), jnp.finfo(dtype).tiny
+    z = np.asarray(jax.jit(lambda x: S.latent(flat, x))(jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype)))
+    assert np.isfinite(z).all() and (np.diff(z[2:]) >= 0).all() and z[3] == 0 and z[0] == z[1] < -5 < 5 < z[4] == z[5]
+    assert S.normal_score(jnp.asarray([0.5, 1.0], dtype)).dtype == dtype
+
+
+def test_latent_names_what_has_none(dtype):
+    with pytest.raises(ValueError, match="Gamma"):
+        S.latent(D.Gamma(jnp.asarray(2.0, dtype), jnp.asarray(1.0, dtype)), jnp.asarray(0.3, dtype))

@@ -148,7 +148,10 @@ def latent(dist, x):
         v = (x - dist.loc) / dist.scale
         return -jnp.sign(v) * ndtri(jax.nn.sigmoid(-jnp.abs(v)))
     if isinstance(dist, D.Uniform):
-        below, above = (jnp.maximum(gap / (dist.high - dist.low), jnp.finfo(x.dtype).tiny) for gap in (x - dist.low, dist.high - x))
+        x = jnp.clip(x, dist.low, dist.high)
+        # at an end of the support half a unit of rounding from there
+        least = jnp.maximum(jnp.abs(x) * (jnp.finfo(x.dtype).eps / 4), jnp.finfo(x.dtype).tiny)
+        below, above = (jnp.maximum(gap, least) / (dist.high - dist.low) for gap in (x - dist.low, dist.high - x))
         return jnp.where(below < above, ndtri(jnp.minimum(below, 0.5)), -ndtri(jnp.minimum(above, 0.5)))
     if isinstance(dist, D.Categorical):
         order, edges = cells(dist.probs)

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import real, whole
+from jast._checks import whole
 from jast.check import contract
 from jast.cross_entropy.failure_proposal import failure_proposal
 from jast.estimate import latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.importance import Traces, chunks, even, importance, traces
-from jast.estimate.intervals import log_normal
+from jast.estimate.intervals import checked_level, log_normal
 from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import seek
@@ -44,7 +44,7 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
     """
     name = "failure_probability"
     budget = whole(name, "budget", budget, LEAST)
-    level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(name, level)
     latent.check(name, sim)
     for_search, key = jax.random.split(key)
     s = seek(for_search, sim, budget, gradients)
@@ -69,7 +69,7 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     """
     name = "monte_carlo"
     samples = whole(name, "samples", samples)
-    level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(name, level)
     contract(sim, observed=False)
     proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), even(samples)
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes)
@@ -85,7 +85,7 @@ def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
     """
     name = "subset_simulation"
     samples, replicates = whole(name, "samples", samples, 100), whole(name, "replicates", replicates, 3)
-    level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(name, level)
     latent.check(name, sim)
     runs = [explore(k, sim, samples) for k in jax.random.split(key, replicates)]
     logs = np.array([r.log_mean for r in runs])
@@ -122,7 +122,7 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     """
     name = "adaptive_cross_entropy"
     budget = whole(name, "budget", budget, LEAST)
-    level = float(real(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(name, level)
     for_search, key = jax.random.split(key)
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
     result = importance(key, sim, found.policy, budget - int(found.evaluations), level=level)
@@ -136,7 +136,7 @@ def _plain_is_better(s):
     """Whether counting failures of the model has less variance than weighing those of the proposal."""
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
-    return (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
+    return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
 
 
 def _by_direction(q):

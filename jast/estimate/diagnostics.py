@@ -28,7 +28,9 @@ def pareto_k(log_weights, samples, failures=None):
     excess = excess[excess > 1e-9]
     if not excess.size:
         return float("-inf")
-    return _shape(excess) if len(excess) >= 5 else float("nan")
+    if len(excess) >= 5:
+        return _shape(excess)
+    return float("-inf") if excess[-1] < w[0] else float("inf")  # a few above a crowd of equal ones
 
 
 def _shape(x):

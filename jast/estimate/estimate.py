@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast._checks import real
 from jast.estimate import diagnostics
-from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys, log_normal
+from jast.estimate.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
 __all__ = ["Estimate", "estimate", "of_counts"]
 
@@ -96,7 +95,7 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
 
     ``groups``: lists of components that are one failure mode (default: each by itself).
     """
-    level = float(real(method, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(method, level)
     n, seen = sums.samples, sums.first > 0
     found = list(reasons)
     if sums.undefined:
@@ -143,7 +142,7 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
 
 def of_counts(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, proposal=None, history=None):
     """The `Estimate` of episodes of the model itself: exact interval and upper bounds."""
-    level = float(real(method, "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level(method, level)
     n, k = sums.samples, sums.failures
     mean = k / n if k else math.nan
     found = [*reasons, *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",))]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import whole
-from jast.episode import Episode
+from jast.episode import Episode, random_start
 from jast.estimate import latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
@@ -54,7 +54,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     latent.check(name, sim)
     key, for_draws, for_rows = jax.random.split(key, 3)
     q = source.proposal if isinstance(source, Estimate) else source
-    if q is None:
+    if q is None and isinstance(source, Estimate):
         raise ValueError(f"{name}: source must hold a proposal, received one of {source.method} without one")
     n = PER_SAMPLE * samples
     if isinstance(q, latent.Latent):
@@ -64,7 +64,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
-        z = latent.flat(sim, *latents(sim, (e.x0, e.disturbances, e.length)))
+        z = latent.flat(sim, *latents(sim, (e.x0, e.disturbances, e.length), random_start(sim)))
         z, failure, log_w = jax.device_get((z, e.failure, log_w))
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():

@@ -105,7 +105,9 @@ def shrunk(values, count):
     for _ in range(20):
         s = values[inside].mean()
         now = (values > s * (1 - ratio) ** 2 * 0.9) & (values < s * (1 + ratio) ** 2 * 1.1)
-        if not now.any() or (now == inside).all():
+        if not now.any():
+            return values
+        if (now == inside).all():
             break
         inside = now
     return np.where(inside, values[inside].mean(), values)

@@ -14,11 +14,12 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jast import distributions as D
-from jast._checks import real, whole
+from jast._checks import whole
 from jast.check import contract
 from jast.episode import accumulator, advance, begin, rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
+from jast.estimate.intervals import checked_level
 from jast.estimate.latent import raw
 from jast.estimate.proposals import as_proposal
 from jast.policy import nominal_policy
@@ -71,7 +72,7 @@ def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.9
     samples = whole("importance", "samples", samples, 2)
     if mode not in ("default", "paper"):
         raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
-    level = float(real("importance", "level", level, lambda v: 0 < v < 1, "between 0 and 1"))
+    level = checked_level("importance", level)
     contract(sim, observed=False)
     proposal = as_proposal("importance", sim, proposal)
     key, for_probes = jax.random.split(key)

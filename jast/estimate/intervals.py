@@ -3,7 +3,9 @@
 import math
 from statistics import NormalDist
 
-__all__ = ["chernoff", "clopper_pearson", "jeffreys", "log_normal"]
+from jast._checks import real
+
+__all__ = ["checked_level", "chernoff", "clopper_pearson", "jeffreys", "log_normal"]
 
 
 def clopper_pearson(k, n, level=0.95):
@@ -18,6 +20,12 @@ def clopper_pearson(k, n, level=0.95):
     low = 0.0 if k == 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
     high = 1.0 if k == n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
     return low, high
+
+
+def checked_level(function, level):
+    """``level`` as a float. ValueError unless it is a number between 0 and 1."""
+    real(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+    return float(level)
 
 
 def _counts(function, k, n, level):

@@ -4,6 +4,7 @@ Lipkis and Agogino, Discovery and Analysis of Rare High-Impact Failure Modes Usi
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -53,15 +54,13 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
-    recorded = _stacked(sim, episodes)
+    recorded, tilt_start = _stacked(sim, episodes), tilt_start and random_start(sim)
     try:
-        start, steps = latents(sim, recorded)
+        start, steps = latents(sim, recorded, tilt_start)
     except ValueError as error:
         raise ValueError(f"trace_proposal: disturbance: {error}") from None
     if not all(isinstance(a, jax.core.Tracer) or np.isfinite(a).all() for a in jax.tree.leaves((start, steps))):
         raise ValueError("trace_proposal: episodes must hold finite disturbances that the model can draw, received others")
-    tilt_start = tilt_start and random_start(sim)
-    start = start if tilt_start else ()
     k = len(jax.tree.leaves(steps)[0])
     if mixing == "trace":
         start, steps = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), (start, steps))
@@ -116,7 +115,8 @@ def as_proposal(function, sim, proposal):
     def look():
         policy = jax.tree.map(lambda a: a[0], proposal.policies)
         x0 = D.sample(sim.start(), jax.random.key(0))
-        return [d for d in (policy.start(), policy.disturbance(sim.init(x0), jnp.int32(0))) if isinstance(d, D.Deterministic)]
+        pairs = (policy.start(), sim.start()), (policy.disturbance(sim.init(x0), jnp.int32(0)), None)
+        return [q for q, p in pairs if isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic)]
 
     if _host(look):
         raise ValueError(f"{function}: a policy that plays one value has no density; make a proposal of it with trace_proposal or policy_proposal")
@@ -149,8 +149,8 @@ def _stacked(sim, episodes):
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
 
 
-@jax.jit
-def latents(sim, recorded):
+@partial(jax.jit, static_argnums=2)
+def latents(sim, recorded, of_start):
     """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end of each."""
 
     def one(x0, x, length):
@@ -159,7 +159,7 @@ def latents(sim, recorded):
         z = jax.vmap(lambda s, x: latent(sim.disturbance(s), x))(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
         z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
-        return latent(sim.start(), x0) if random_start(sim) else (), z
+        return latent(sim.start(), x0) if of_start else (), z
 
     return jax.vmap(one)(*recorded)
 
