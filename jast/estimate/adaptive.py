@@ -80,37 +80,34 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
 def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
     """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of ``samples``: `Estimate`, the mean of theirs.
 
-    The interval is that of the replicates, log-normal. It needs a miss distance that leads to failures, and no gradient; a mode that few members reach is lost
-    at times, and the others do not show it. Raises ValueError for fewer than 100 samples or 3 replicates, and as `failure_probability`.
+    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too, ``samples`` counts the members of the last populations. It
+    needs a miss distance that leads to failures, and no gradient; a mode that few members reach is lost at times, and the others do not show it. A population
+    gives up below a probability of 1e-300. Raises ValueError for fewer than 100 samples or 3 replicates, and as `failure_probability`.
     """
     name = "subset_simulation"
     samples, replicates = whole(name, "samples", samples, 100), whole(name, "replicates", replicates, 3)
     level = checked_level(name, level)
     latent.check(name, sim)
-    runs = [explore(k, sim, samples) for k in jax.random.split(key, replicates)]
+    runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
     logs = np.array([r.log_mean for r in runs])
     evaluations, invalid = sum(r.evaluations for r in runs), sum(r.invalid for r in runs)
     history = tuple(f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations" for r in runs)
     seen, found = int(np.isfinite(logs).sum()), []
     if seen < replicates:
         found.append(f"{replicates - seen} of {replicates} populations reached no failure")
-    if not seen:
-        return Estimate(
-            name, math.nan, math.nan, math.nan, math.nan, (0.0, 1.0), level, 0.0, math.nan, math.nan, 0, replicates, evaluations, 0, invalid, None, False,
-            tuple(found), history=history,
-        )  # fmt: skip
-    top = logs.max()
+    top = logs.max() if seen else 0.0
     p = np.exp(logs - top)
-    log_mean, relative = top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())
-    share = float(p.max() / p.sum())
+    log_mean, relative = (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())) if seen else (math.nan, math.nan)
     if relative > 0.5:
         found.append(f"the replicates disagree: relative standard error {relative:.0%}")
     # few replicates: Student's t in place of the normal quantile, as a wider error
-    wide = relative * _student(replicates - 1, level)
+    interval = log_normal(log_mean, relative * _student(replicates - 1, level), level) if seen else (0.0, 1.0)
     mean = math.exp(log_mean)
     return Estimate(
-        name, log_mean, mean, mean * relative, relative, log_normal(log_mean, wide, level), level, float(p.sum() ** 2 / (p**2).sum()), math.nan, share, seen,
-        replicates, evaluations, 0, invalid, None, not found, tuple(found), history=history,
+        method=name, log_mean=log_mean, mean=mean, standard_error=mean * relative, relative_error=relative, interval=interval, level=level,
+        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0, k_hat=math.nan, max_share=float(p.max() / p.sum()) if seen else math.nan,
+        failures_seen=sum(len(r.points) for r in runs), samples=sum(max(len(r.points), samples) for r in runs), evaluations=evaluations, steps=0,
+        invalid=invalid, modes=None, reliable=not found, warnings=tuple(found), history=history,
     )  # fmt: skip
 
 

@@ -149,9 +149,10 @@ def of_counts(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=Non
     found += _if_invalid_failed(sums._replace(first=float(k), invalid_first=float(sums.invalid)))
     relative = math.sqrt((1 - mean) / k) if k else math.nan
     return Estimate(
-        method, math.log(mean) if k else math.nan, mean, mean * relative, relative, clopper_pearson(k, n, level), level, float(k), math.nan,
-        1 / k if k else math.nan, k, n, n if evaluations is None else evaluations, sums.steps, sums.invalid, np.ones(1) if k else None, not found,
-        (*found, *_remarks(sums), *notes), chernoff(k, n, level), jeffreys(k, n, level), proposal, history,
+        method=method, log_mean=math.log(mean) if k else math.nan, mean=mean, standard_error=mean * relative, relative_error=relative,
+        interval=clopper_pearson(k, n, level), level=level, ess=float(k), k_hat=math.nan, max_share=1 / k if k else math.nan, failures_seen=k, samples=n,
+        evaluations=n if evaluations is None else evaluations, steps=sums.steps, invalid=sums.invalid, modes=np.ones(1) if k else None, reliable=not found,
+        warnings=(*found, *_remarks(sums), *notes), chernoff=chernoff(k, n, level), jeffreys=jeffreys(k, n, level), proposal=proposal, history=history,
     )  # fmt: skip
 
 
