@@ -33,7 +33,7 @@ def test_names_in_the_tables_exist():
         thing = jast
         for part in name.split(".")[1:]:
             thing = getattr(thing, part, None)
-        assert callable(thing) or name in ("jast.actions", "jast.cross_entropy", "jast.rewards", "jast.plot"), name
+        assert callable(thing) or name in ("jast.actions", "jast.cross_entropy", "jast.estimate", "jast.rewards", "jast.plot"), name
 
 
 def test_files_exist():

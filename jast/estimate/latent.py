@@ -17,6 +17,7 @@ from jast import distributions as D
 from jast.check import contract
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, random_start, rollout
+from jast.heads.heads import unflat
 
 __all__ = ["Latent", "Outcomes", "check", "dimension", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes", "place"]
 
@@ -144,7 +145,7 @@ def raw(log_p, event, distance, terminal, approach=0.0):
 def _policy(sim, z):
     like0, like = jax.eval_shape(_shapes, sim)
     size0, _ = _sizes(sim)
-    return player(sim, choices.quantiles(), _unflat(like0, z[:size0]), jax.vmap(partial(_unflat, like))(z[size0:].reshape(sim.horizon, -1)))
+    return player(sim, choices.quantiles(), unflat(like0, z[:size0]), jax.vmap(partial(unflat, like))(z[size0:].reshape(sim.horizon, -1)))
 
 
 def flat(sim, z0, z):
@@ -160,14 +161,3 @@ def _sizes(sim):
     like0, like = jax.eval_shape(_shapes, sim)
     count = lambda like: sum(int(np.prod(s.shape)) for s in jax.tree.leaves(like))
     return count(like0) if random_start(sim) else 0, count(like)
-
-
-def _unflat(like, z):
-    """A pytree of floats like a disturbance, from its numbers."""
-    leaves, treedef = jax.tree.flatten(like)
-    parts, at = [], 0
-    for s in leaves:
-        size = int(np.prod(s.shape))
-        parts.append(z[at : at + size].reshape(s.shape).astype(D.float_dtype(s.dtype)))
-        at += size
-    return treedef.unflatten(parts)
