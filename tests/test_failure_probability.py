@@ -158,7 +158,7 @@ def test_subset_simulation(key):
     """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30 %; each population is counted."""
     found = subset_simulation(key, planes(4.0), SIZE)
     assert abs(found.mean - norm.sf(4)) < 4 * found.standard_error and found.relative_error < 0.3 and found.reliable
-    assert found.samples == found.failures_seen == 10 and found.evaluations == sum(int(h.split()[-2]) for h in found.history)
+    assert found.samples == found.failures_seen == 5000 and found.evaluations == sum(int(h.split()[-2]) for h in found.history)
     assert found.interval[0] < found.mean < found.interval[1]
     with pytest.raises(ValueError, match="subset_simulation: replicates must be a whole number of at least 3, received 2"):
         subset_simulation(key, planes(4.0), SIZE, replicates=2)

@@ -4,7 +4,6 @@ z holds the latents of x0 first, then those of x_1, x_2 ..: x_t is the quantile 
 ``used`` numbers; the others decide nothing, so densities are taken over the used ones. With Cholesky factors, lower triangular, these are a cumulative sum.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -145,7 +144,7 @@ def raw(log_p, event, distance, terminal, approach=0.0):
 def _policy(sim, z):
     like0, like = jax.eval_shape(_shapes, sim)
     size0, _ = _sizes(sim)
-    return player(sim, choices.quantiles(), unflat(like0, z[:size0]), jax.vmap(partial(unflat, like))(z[size0:].reshape(sim.horizon, -1)))
+    return player(sim, choices.quantiles(), unflat(z[:size0], like0), jax.vmap(lambda row: unflat(row, like))(z[size0:].reshape(sim.horizon, -1)))
 
 
 def flat(sim, z0, z):
