@@ -110,7 +110,7 @@ def episodes(sim, z):
 def place(q, u, e):
     """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and normal ones ``e`` [n, D]."""
     live = _live(q)
-    k = jnp.minimum(jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1), live - 1)
+    k = jnp.minimum(jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1, dtype=jnp.int32), live - 1)
 
     def component(i, z):
         return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)
