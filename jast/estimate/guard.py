@@ -26,8 +26,7 @@ def guarded(s, i, last):
     Populations go down the levels of the miss distance, one kept far from all known modes, one from what the proposal covers; those of the search itself, which
     the proposal may have forgotten, are looked at again; and in the first round so are the failures that wider noise led to, wherever they are.
     """
-    found, asked = [], 0.0
-    least = s.log_mean + math.log(LOST)
+    found, least = [], s.log_mean + math.log(LOST)
     # as many as can afford the levels down to there, in steps so that programs are shared
     room = max(min(0.3, MOST - s.spent / s.budget), 0) * s.budget / 2
     size = min(s.size // 2, int(room / (least / math.log(QUANTILE) + LAST + 4)) // LEAST * LEAST)

@@ -134,7 +134,7 @@ def _refine(s, most):
         s.batches.append(b)
         own, (name, ess) = effective(b.log_weight[b.failure]), _fit(s)
         s.note(f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f}, ESS {ess:.4g}; next: {name}", s.batch)
-        if own < 1.15 * before and effective(b.log_weight[b.failure]) > 0.1 * s.batch or name == "as it was":
+        if own < 1.15 * before and own > 0.1 * s.batch or name == "as it was":
             return
         before = own
 
