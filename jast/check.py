@@ -40,7 +40,7 @@ def check(sim, actions=None):
         raise ValueError(f"check: the first steps raised {_first_line(e)}") from e
     _densities(found)
     _numbers(found)
-    _repeats(sim, found["x0"], found["x"])
+    _repeats(sim, found["x0"], found["x"], found["judged"])
     if actions is not None and (share := found["actions"]) > 0.5:
         box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]" if isinstance(actions, UniformBox) else ""
         raise ValueError(
@@ -157,7 +157,7 @@ def _box(box, x):
 
 @jax.jit
 def _probe(sim, actions):
-    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps of each."""
+    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps of each (all, of an episodic system)."""
     has_mode = D.has_mode(sim.start()) and D.has_mode(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
 
     def episode(key, undisturbed):
@@ -168,12 +168,10 @@ def _probe(sim, actions):
             return jax.tree.map(lambda a, b: jnp.where(undisturbed, jnp.asarray(a, b.dtype), b), D.mode(dist), drawn)
 
         def seen(state):
+            if sim.episodic:  # judged at its end, below
+                return jnp.asarray(sim.is_terminal(state)), (jax.tree.map(_any_nan, state), jnp.zeros((), bool))
             event, distance = sim.evaluate(state)
-            ends = jnp.asarray(sim.is_terminal(state))
-            done = ends if sim.episodic else jnp.asarray(event) | ends
-            # between its ends an episodic system's distance means nothing
-            invalid = ~jnp.isfinite(distance) & (done if sim.episodic else True)
-            return done, (jax.tree.map(_any_nan, state), invalid)
+            return jnp.asarray(event) | jnp.asarray(sim.is_terminal(state)), (jax.tree.map(_any_nan, state), ~jnp.isfinite(distance))
 
         def step(carry, t):
             state, done = carry
@@ -190,14 +188,16 @@ def _probe(sim, actions):
         x0 = choose(start, jax.random.fold_in(key, 0))
         first = _arrays("init", sim.init(x0))
         done, flags = seen(first)
-        steps = min(sim.horizon, STEPS)
-        _, (later, xs) = lax.scan(step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32))
-        flags = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), (~jnp.isfinite(start.log_prob(x0)), *flags), later)
-        return flags, x0, jax.tree.map(lambda a: a[0], xs)
+        steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
+        (last, _), (later, xs) = lax.scan(step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32))
+        density, state, distance = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), (~jnp.isfinite(start.log_prob(x0)), *flags), later)
+        if sim.episodic:
+            distance = distance.at[-1].set(~jnp.isfinite(sim.evaluate(last)[1]))
+        return (density, state, distance), x0, jax.tree.map(lambda a: a[0], xs), last if sim.episodic else first
 
     keys = jax.random.split(jax.random.key(0), LANES + 1)
-    flags, x0, x = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
-    here = jax.tree.map(lambda a: a[0], x0)
+    flags, *of = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
+    here, x, judged = jax.tree.map(lambda a: a[0], of)
     density, state, distance = flags
     share = None
     if actions is not None:
@@ -207,7 +207,7 @@ def _probe(sim, actions):
             return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
 
         share = jnp.mean(jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS)), dtype=jnp.float32)
-    return dict(has_mode=has_mode, density=density, state=state, distance=distance, x0=here, x=jax.tree.map(lambda a: a[0], x), actions=share)
+    return dict(has_mode=has_mode, density=density, state=state, distance=distance, x0=here, x=x, judged=judged, actions=share)
 
 
 def _any_nan(a):
@@ -233,11 +233,11 @@ def _numbers(found):
         raise ValueError(f"evaluate: distance is not finite after {t} steps, expected a number")
 
 
-def _repeats(sim, x0, x):
-    """ValueError unless init, evaluate and step, run twice outside of jit, agree to the bit."""
-    x0, x = jax.tree.map(jnp.asarray, (x0, x))
+def _repeats(sim, x0, x, judged):
+    """ValueError unless init, evaluate (at ``judged``) and step, run twice outside of jit, agree to the bit."""
+    x0, x, judged = jax.tree.map(jnp.asarray, (x0, x, judged))
     state = _twice("init", sim.init, x0)
-    _twice("evaluate", sim.evaluate, state)
+    _twice("evaluate", sim.evaluate, judged)
     _twice("step", sim.step, state, x)
 
 

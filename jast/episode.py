@@ -1,6 +1,6 @@
 """Episodes: one run of a simulated system, from its start to a failure, an end or the horizon.
 
-`begin` and `advance` are the meaning of an episode, once, for every rollout, replay and search of the package.
+`begin`, `advance` and `conclude` are the meaning of an episode, once, for every rollout, replay and search of the package.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from jast import distributions as D
 from jast import rewards
 from jast.policy import nominal_policy
 
-__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "play_back", "random_start", "replay", "rollout"]
+__all__ = ["Episode", "Progress", "accumulator", "advance", "begin", "blank", "conclude", "play_back", "random_start", "replay", "rollout"]
 
 
 class Episode(NamedTuple):
@@ -48,6 +48,8 @@ class Progress(NamedTuple):
     done: jax.Array
     invalid: jax.Array
     """The simulator, the density or the reward returned NaN, or an infinity that has no meaning: the episode ended there."""
+    owed: Any = ()
+    """Of an episodic system: the log p of the arrival at its end, which the reward has not seen before `conclude`; 0 before the end. Else ``()``."""
 
 
 def accumulator(sim):
@@ -67,15 +69,18 @@ def random_start(sim):
     return bool(jax.tree.leaves(jax.eval_shape(lambda: D.sample(sim.start(), jax.random.key(0)))))
 
 
-def begin(sim, reward, x0):
-    """The `Progress` at s0, which x0 leads to; a failure there is an episode of length 0."""
-    dtype = accumulator(sim)
+def blank(sim, state):
+    """The `Progress` at ``state``, with nothing behind it."""
+    zero, no = jnp.zeros((), accumulator(sim)), jnp.zeros((), bool)
+    return Progress(state, zero, zero, zero + jnp.inf, no, no, no, zero if sim.episodic else ())
+
+
+def begin(sim, reward, x0, last=False):
+    """The `Progress` at s0, which x0 leads to; a failure there is an episode of length 0. ``last``: the episode is to end here."""
     start = sim.start()
     state = _strong(sim.init(x0))
-    zero = jnp.zeros((), dtype)
     log_p = (D.log_density(start, x0, density) for density in ("raw", rewards.density_of(reward)))
-    before = Progress(state, zero, zero, zero + jnp.inf, *(jnp.zeros((), bool),) * 3)
-    return _arrive(sim, reward, before, state, log_p, jnp.zeros((), bool), lambda d: jnp.zeros_like(d))
+    return _arrive(sim, reward, blank(sim, state), state, log_p, jnp.asarray(last), lambda d: jnp.zeros_like(d))
 
 
 def advance(sim, reward, progress, x, last):
@@ -86,28 +91,53 @@ def advance(sim, reward, progress, x, last):
     return _arrive(sim, reward, progress, state, log_p, last, lambda d: sim.evaluate(progress.state)[1] - d)
 
 
+def conclude(sim, reward, progress, live=True):
+    """The `Progress` with the outcome of an episodic system, whose episode is ``done``; that of any other system stays as it is.
+
+    Here and nowhere else such a system is evaluated. Where not ``live`` the state is replaced by zeros, and the outcome means nothing.
+    """
+    if not sim.episodic:
+        return progress
+    live = jnp.asarray(live) & ~progress.invalid
+    event, own = sim.evaluate(jax.tree.map(lambda a: jnp.where(live, a, jnp.zeros((), a.dtype)), progress.state))
+    event, own = jnp.asarray(event), jnp.asarray(own).astype(progress.reward.dtype)
+    total = _paid(reward, progress.reward, progress.owed, event, own, jnp.ones((), bool), -own)
+    invalid = progress.invalid | ~jnp.isfinite(own) | jnp.isnan(total) | (total == jnp.inf)
+    return progress._replace(owed=jnp.zeros_like(progress.owed), **_outcome(total, own, event, jnp.ones((), bool), invalid))
+
+
 def _arrive(sim, reward, before, state, log_p, last, approach):
     dtype = before.reward.dtype
     log_prob, counted = (jnp.asarray(p).astype(dtype) for p in log_p)
-    event, own = sim.evaluate(state)
-    event, own = jnp.asarray(event), jnp.asarray(own).astype(dtype)
     ends = jnp.asarray(sim.is_terminal(state)) | last
-    # the order at a state: failure, then is_terminal, then the horizon; an episodic system is evaluated at its end only
-    failure = event & ends if sim.episodic else event
-    done = ends if sim.episodic else event | ends
-    distance = own if sim.episodic else jnp.minimum(before.distance, own)
-    gain = jnp.asarray(reward(counted, failure, distance, done, approach(own).astype(dtype))).astype(dtype)
-    seen = done if sim.episodic else jnp.ones((), bool)
-    invalid = (seen & ~jnp.isfinite(own)) | jnp.isnan(log_prob) | (log_prob == jnp.inf) | jnp.isnan(gain) | (gain == jnp.inf)
-    return Progress(
-        state=state,
-        log_prob=before.log_prob + log_prob,
-        reward=jnp.where(invalid, -jnp.inf, before.reward + gain),
-        distance=jnp.where(invalid, jnp.inf, distance),
-        failure=failure & ~invalid,
-        done=done | invalid,
-        invalid=invalid,
-    )
+    invalid = jnp.isnan(log_prob) | (log_prob == jnp.inf)
+    if sim.episodic:  # evaluated at its end, by `conclude`
+        none = jnp.zeros((), dtype)
+        total, owed = jnp.where(ends, before.reward, _paid(reward, before.reward, counted, False, none, False, none)), jnp.where(ends, counted, 0)
+        event, distance, done = jnp.zeros((), bool), before.distance, ends
+    else:
+        event, own = sim.evaluate(state)
+        event, own = jnp.asarray(event), jnp.asarray(own).astype(dtype)
+        # the order at a state: failure, then is_terminal, then the horizon
+        done, distance, owed = event | ends, jnp.minimum(before.distance, own), ()
+        total = _paid(reward, before.reward, counted, event, distance, done, approach(own).astype(dtype))
+        invalid |= ~jnp.isfinite(own)
+    invalid |= jnp.isnan(total) | (total == jnp.inf)
+    return Progress(state, before.log_prob + log_prob, owed=owed, **_outcome(total, distance, event, done, invalid))
+
+
+def _paid(reward, total, log_p, event, distance, terminal, approach):
+    """The episode's reward, ``total`` before, after one more arrival."""
+    event, terminal = jnp.asarray(event), jnp.asarray(terminal)
+    if rewards.once(reward):  # it is paid for the whole episode, at its end
+        total = total + log_p
+        return jnp.where(terminal, jnp.asarray(reward(total, event, distance, terminal, approach)).astype(total.dtype), total)
+    return total + jnp.asarray(reward(log_p, event, distance, terminal, approach)).astype(total.dtype)
+
+
+def _outcome(reward, distance, failure, done, invalid):
+    reward, distance = jnp.where(invalid, -jnp.inf, reward), jnp.where(invalid, jnp.inf, distance)
+    return dict(reward=reward, distance=distance, failure=failure & ~invalid, done=done | invalid, invalid=invalid)
 
 
 def rollout(key, sim, policy=None, reward=rewards.STANDARD):
@@ -164,8 +194,7 @@ def play_back(sim, reward, x0, disturbances, steps):
 
 def _play(sim, reward, x0, choose, rows, steps):
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the disturbances."""
-    first = begin(sim, reward, x0)
-    first = first._replace(done=first.done | (steps <= 0))
+    first = begin(sim, reward, x0, last=steps <= 0)
 
     def body(before, at):
         t, row = at
@@ -178,7 +207,7 @@ def _play(sim, reward, x0, choose, rows, steps):
 
     last, (disturbances, states, live) = lax.scan(body, first, (jnp.arange(sim.horizon, dtype=jnp.int32), rows))
     states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.state, states)
-    length = jnp.sum(live, dtype=jnp.int32)
+    length, last = jnp.sum(live, dtype=jnp.int32), conclude(sim, reward, last)
     return Episode(x0, disturbances, last.log_prob, last.distance, last.failure, length, last.reward, states)
 
 

@@ -11,7 +11,7 @@ from jax import lax
 from jast import distributions as D
 from jast import rewards
 from jast.check import contract
-from jast.episode import Episode, advance, begin, rollout
+from jast.episode import Episode, advance, begin, conclude, rollout
 from jast.estimate.intervals import clopper_pearson
 from jast.policy import undisturbed
 
@@ -112,7 +112,8 @@ def _outcome(key, sim, live):
         return advance(sim, reward, progress, x, t + 1 >= sim.horizon), t + 1
 
     first = first._replace(done=first.done | ~jnp.asarray(live))
-    return lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))[0]
+    last, _ = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
+    return conclude(sim, reward, last, live)
 
 
 def _has_undisturbed(sim):

@@ -16,7 +16,7 @@ from jax.scipy.special import logsumexp
 from jast import distributions as D
 from jast._checks import whole
 from jast.check import contract
-from jast.episode import accumulator, advance, begin, rollout
+from jast.episode import accumulator, advance, begin, conclude, rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
 from jast.estimate.intervals import checked_level
@@ -155,7 +155,7 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
     goes_on = (lambda c: c[2] < sim.horizon) if to_horizon else (lambda c: ~c[0].done)
     zero = jnp.zeros((), jnp.int32)
     last, (ratios, impossible), _, length = lax.while_loop(goes_on, body, (first, ratio, zero, zero))
-    prior = proposal.log_weights.astype(dtype)
+    last, prior = conclude(sim, raw, last), proposal.log_weights.astype(dtype)
     log_q = logsumexp(prior + ratios)
     return Traces(jnp.where(impossible, -jnp.inf, -log_q), jnp.where(impossible, prior, prior + ratios - log_q), last.failure, last.invalid, length)
 

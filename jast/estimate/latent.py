@@ -15,7 +15,7 @@ from jast import actions as choices
 from jast import distributions as D
 from jast.check import contract
 from jast.cross_entropy.sequences import player
-from jast.episode import _shapes, advance, begin, random_start, rollout
+from jast.episode import _shapes, advance, begin, conclude, random_start, rollout
 from jast.heads.heads import unflat
 
 __all__ = ["Latent", "Outcomes", "check", "dimension", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes", "place"]
@@ -91,6 +91,7 @@ def outcome(sim, z):
         return advance(sim, raw, progress, D.mode(policy.disturbance(progress.state, t)), t + 1 >= last), t + 1
 
     end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
+    end = conclude(sim, raw, end)
     size0, row = _sizes(sim)
     return Outcomes(end.failure, end.distance, size0 + length * row, length, end.invalid)
 

@@ -55,7 +55,7 @@ class Pool(NamedTuple):
 
 def cem(
     key, sim, *, samples=300, elites=30, iterations=30, reward=rewards.STANDARD, actions=None, smoothing=0.3, floor=0.05, fresh=0.1, trees=1, top=64,
-    progress=False, callback=None,
+    record=False, progress=False, callback=None,
 ):  # fmt: skip
     """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the ``elites`` best distinct ones so far; maximises ``reward``.
 
@@ -66,7 +66,8 @@ def cem(
     box. Default ``actions``: quantiles where all disturbances have them, else samples.
 
     ``trees``: independent searches, side by side; tree k is the same whatever their number. Defaults are tuned on the ferry; 1000 samples, 100 elites and 10
-    iterations are the customary ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed. ``top``: distinct failures kept.
+    iterations are the customary ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed. ``top``: distinct failures kept;
+    ``record=True`` keeps the numbers of every episode (``result.trials``).
     ``progress=True`` shows a bar; ``callback(done, total)`` is called after every iteration with the episodes of all trees; KeyboardInterrupt ends the search
     with the result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks.
 
@@ -91,14 +92,18 @@ def cem(
 
         def body(i, carry):
             inner, counted = carry
-            inner, more, _ = search(inner, i * samples)
+            inner, more, *_ = search(inner, i * samples)
             return inner, E.add(counted, more)
 
         (pool, _), counted = lax.fori_loop(0, iterations, body, (carry, E.nothing(trees)))
         return E.finish_traced(sim, reward, counted, _best(pool), pool.episode.reward[:, 0])
 
+    def chunk(carry, begin, end):
+        carry, counted, best, rows = search(carry, begin)
+        return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
+
     ends = [samples * (i + 1) for i in range(iterations)]
-    (pool, _), log = E.drive(lambda c, begin, _: search(c, begin), carry, ends, trees=trees, progress=progress, callback=callback, name="cem")
+    (pool, _), log = E.drive(chunk, carry, ends, trees=trees, progress=progress, callback=callback, name="cem")
     found, tree, number, count = jax.device_get(_archive(pool, top))
     n = int((found.reward > -jnp.inf).sum())
     return E.finish(sim, reward, log, _best(pool), jax.tree.map(lambda a: a[:n], found), tree[:n], number[:n], count[:n], settings, top)
@@ -106,7 +111,7 @@ def cem(
 
 @partial(jax.jit, static_argnums=5)
 def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
-    """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and x), `E.Tally`, best reward [trees])."""
+    """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and x), `E.Tally`, best reward [trees], `Trials`)."""
     pool, proposals = carry
     (trees,), samples = keys.shape, plan.samples
     number = begin + jnp.arange(samples, dtype=jnp.int32)
@@ -126,7 +131,7 @@ def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
     new = Pool(jax.tree.map(apart, played.episode), latent, apart(played.tag), number, jnp.ones_like(number))
     pool = jax.vmap(_merge)(pool, new)
     proposals = jax.vmap(lambda g, p: _fit(g, p, real, plan))(proposals, pool)
-    return (pool, proposals), counted, pool.episode.reward[:, 0]
+    return (pool, proposals), counted, pool.episode.reward[:, 0], jax.tree.map(apart, E.trials(played))
 
 
 def _propose(keys, sim, real, plan, pool, proposals):

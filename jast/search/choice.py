@@ -22,12 +22,17 @@ class Choice:
     for each node) where the actions are points of a cube, so that a few children cover it. ``focus``: every second child is ``mode + focus (x - mode)``, with
     the mode of the disturbance: below 1 likelier and in finer steps, above 1 in the tails; so are half of the rollout steps of half of the trees, because
     there it helps on some systems and hurts on others. Off where the disturbance has no mode or is all integers.
+
+    ``follow``: as soon as an episode is the best of its tree, the next simulations put its disturbances into the tree, one a simulation, so that it can be
+    varied from any of its steps. ``feed``: with half of the steps to go, a rollout takes what the best episode took there (thesis Algorithm 9).
     """
 
     actions: Any
     focus: Any
     spread: bool = field(default=True, metadata=dict(static=True))
     focused: bool = field(default=True, metadata=dict(static=True))
+    follow: bool = field(default=False, metadata=dict(static=True))
+    feed: bool = field(default=False, metadata=dict(static=True))
 
     def child(self, key, slot, dist, start=False):
         """The action of a node's child by the node's key and the child's place among its siblings; ``start``: it is an x0."""

@@ -14,11 +14,11 @@ from jax import lax
 from jast import failures as archive
 from jast import rewards
 from jast.check import ACTIONS, contract
-from jast.episode import Episode, advance, begin, random_start, replay
+from jast.episode import Episode, advance, begin, conclude, random_start, replay
 from jast.search.records import pack
-from jast.search.result import History, SearchResult
+from jast.search.result import History, SearchResult, Trials
 
-__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "tally", "whole"]
+__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "tally", "trials", "whole"]
 
 
 class Played(NamedTuple):
@@ -48,12 +48,13 @@ class Tally(NamedTuple):
 NEVER = np.int32(2**31 - 1)
 
 
-def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False):
+def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, judge=True):
     """Simulate one episode a lane, all lanes a step at a time: `Played`.
 
     ``keys`` [lanes]: of the episodes. ``draw_start(key, row, dist)`` and ``draw(key, row, dist)`` make x0 and x with the key of their level; ``rows``: a pair
     of pytrees, [1, lanes, ...] for x0 and [horizon, lanes, ...] for x, that the draws depend on. Lanes that are not ``live`` [lanes] bool come back as
-    episodes of length 0 and mean nothing. Ended lanes step on, and only what is summed up is masked.
+    episodes of length 0 and mean nothing. Ended lanes step on, and only what is summed up is masked (and the state, where it is yet to be judged). Without
+    ``judge`` an episodic system is not evaluated: for the disturbances of episodes whose outcome is known.
     """
     start = int(random_start(sim))
     rows = ((), ()) if rows is None else rows
@@ -79,13 +80,16 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False):
         t, length, tag, xs, before = carry
         on = ~before.done
         x, after, folded = move(*at(t + start, rows[1], t), before, tag, t + 1 >= sim.horizon)
-        kept = after._replace(**{name: jnp.where(on, getattr(after, name), getattr(before, name)) for name in before._fields[1:]})
+        masked = jax.tree.map(lambda a, b: jnp.where(on, a, b), after._replace(state=()), before._replace(state=()))
+        kept = masked._replace(state=jax.tree.map(lambda a, b: jax.vmap(jnp.where)(on, a, b), after.state, before.state) if sim.episodic else after.state)
         if record:
             xs = jax.tree.map(lambda a, b: a.at[t].set(jax.vmap(jnp.where)(on, b, jnp.zeros_like(b))), xs, x)
         return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), xs, kept
 
     carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, xs, progress._replace(done=progress.done | ~live)
     _, length, tag, xs, end = lax.while_loop(lambda c: jnp.any(~c[4].done), step, carry)
+    if judge:
+        end = jax.vmap(lambda e, on: conclude(sim, reward, e, on))(end, live)
     finite = jnp.isfinite(end.reward)
     xs = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), xs)
     value = jnp.where(finite, end.reward, -jnp.inf)
@@ -101,6 +105,12 @@ def tally(played, live, order, tree=None, trees=1):
     steps = jnp.sum(jnp.where(live, e.length, 0), dtype=jnp.int32)
     first = jnp.min(jnp.where(failing, order + 1, NEVER))
     return Tally(count(live), steps, count(e.failure), count(played.invalid), first, of_tree)
+
+
+def trials(played):
+    """The `Trials` of played episodes, all of them live."""
+    e = played.episode
+    return Trials(e.reward, e.distance, e.log_prob, e.failure, jnp.ones_like(e.failure))
 
 
 def add(a, b):
@@ -163,11 +173,13 @@ class Log(NamedTuple):
     tally: Tally
     history: History
     interrupted: str | None
+    trials: Trials | None
 
 
 def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="search"):
-    """``(carry, Log)`` after ``carry, tally, best [trees] = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
+    """``(carry, Log)`` after ``carry, tally, best, trials = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
 
+    ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None.
     ``callback(done, total)`` after each chunk: the episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised again
     where there is none.
     """
@@ -180,13 +192,13 @@ def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="s
     try:
         for end in ends:
             carry, done, total, moments = kept
-            carry, counted, best = jax.block_until_ready(chunk(carry, done, end))
-            counted, best = jax.device_get((counted, best))
+            carry, counted, best, record = jax.block_until_ready(chunk(carry, done, end))
+            counted, best, record = jax.device_get((counted, best, record))
             counted = Tally(*(int(v) for v in counted[:5]), counted.failing)  # Python's ints do not overflow
             if total is not None:
                 sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
                 counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
-            kept = carry, end, counted, [*moments, (end, best, counted.failures)]  # at once: an interruption finds all of a chunk or nothing
+            kept = carry, end, counted, [*moments, (end, best, counted.failures, record)]  # at once: an interruption finds all of a chunk or nothing
             if bar is not None:
                 bar.update(end * trees - bar.n)
                 bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}", refresh=False)
@@ -199,8 +211,10 @@ def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="s
         if bar is not None:
             bar.close()
     carry, done, total, moments = kept
-    history = History(*(np.array(v) for v in zip(*moments, strict=True)))
-    return carry, Log(total, history, f"after {done * trees} of {whole} episodes" if done < ends[-1] else None)
+    *moments, records = zip(*moments, strict=True)
+    record = None if records[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *records)
+    interrupted = f"after {done * trees} of {whole} episodes" if done < ends[-1] else None
+    return carry, Log(total, History(*(np.array(v) for v in moments)), interrupted, record)
 
 
 def finish(sim, reward, log, best, candidates, tree, simulation, counts, settings, top):
@@ -228,6 +242,7 @@ def finish(sim, reward, log, best, candidates, tree, simulation, counts, setting
         history=log.history,
         invalid=n.invalid,
         settings=settings | ({"interrupted": log.interrupted} if log.interrupted else {}),
+        trials=log.trials,
     )
 
 

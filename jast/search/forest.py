@@ -7,12 +7,18 @@ from jast.search.trees import grow_trees, settled
 __all__ = ["MODES", "forest"]
 
 SAMPLES = A.samples()
-MODES = {"default": dict(widening=(2.0, 0.5), spread=True, focus=None), "paper": dict(widening=(0.5, 0.6), spread=False, focus=1.0)}
+PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False)
+MODES = {
+    "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
+    "paper": PLAIN | dict(widening=(0.5, 0.6)),
+    "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True),
+}
 
 
 def forest(
     key, sim, *, trees=200, prunes=18, simulations=500, heads=None, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None,
-    spread=None, focus=None, head_settings=None, memoize="auto", top=64, threads=None, lanes=None, available=None, progress=False, callback=None,
+    spread=None, focus=None, follow=None, feed=None, head_settings=None, memoize="auto", top=64, record=False, threads=None, lanes=None, available=None,
+    progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
 
@@ -27,7 +33,11 @@ def forest(
     ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
 
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"
-    takes "node" where it fits. ``top``: failures kept in the archive.
+    takes "node" where it fits. ``top``: failures kept in the archive; ``record=True`` keeps the numbers of every episode as well (``result.trials``).
+
+    ``follow``: as soon as an episode is the best of its tree, the next simulations grow its path into the tree, an action each; from then on every step of it
+    can be varied. Made for failures that a chance rollout hits and that nothing points to. ``feed`` (``mode="thesis"``): with half of its steps to go, a
+    rollout takes the action that the tree's best episode took there (Moss's thesis, Algorithm 9).
 
     Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither changes a result. ``available``: bytes that the trees in
     flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.
@@ -42,9 +52,9 @@ def forest(
     Raises ValueError for counts below 1, a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not finite at the start, and
     trees that do not fit into memory, with the numbers.
     """
+    choices = settled("forest", MODES, mode, actions, widening=widening, spread=spread, focus=focus, follow=follow, feed=feed)
     return grow_trees(
-        "forest", key, sim, settled("forest", MODES, mode, widening, spread, focus, actions), trees=trees, prunes=prunes, simulations=simulations,
-        heads=heads, head_settings=head_settings,
-        reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, threads=threads, lanes=lanes, available=available,
+        "forest", key, sim, choices, trees=trees, prunes=prunes, simulations=simulations, heads=heads, head_settings=head_settings,
+        reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, record=record, threads=threads, lanes=lanes, available=available,
         progress=progress, callback=callback,
     )  # fmt: skip

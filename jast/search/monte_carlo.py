@@ -36,13 +36,14 @@ class Found(NamedTuple):
 SAMPLES = choices.samples()
 
 
-def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=SAMPLES, top=64, progress=False, callback=None):
+def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=SAMPLES, top=64, record=False, progress=False, callback=None):
     """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree. Maximises ``reward``.
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up to chance. A random start is drawn likewise (from its own
     distribution where actions are a box). The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``: distinct failures
-    kept, static like ``episodes``. Memory does not grow with ``episodes``. ``progress=True`` shows a bar; ``callback(done, total)`` is called after every
-    chunk, of which there are about 200; KeyboardInterrupt ends the search with the result of the whole chunks, and ``settings["interrupted"]``.
+    kept, static like ``episodes``. ``record=True`` keeps the numbers of every episode (``result.trials``); without it memory does not grow with ``episodes``.
+    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which there are about 200; KeyboardInterrupt ends the search with
+    the result of the whole chunks, and ``settings["interrupted"]``.
 
     Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or
     the actions do not fit together.
@@ -59,10 +60,13 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
         return E.finish_traced(sim, reward, counted, best, found.reward[None])
 
     def chunk(found, begin, end):
+        if record:
+            found, counted, rows = _block(key, sim, reward, actions, found, begin, end, lanes)
+            return found, counted, found.reward[None], jax.tree.map(lambda a: a[: end - begin, None], E.trials(rows))
         found, counted = _chunk(key, sim, reward, actions, found, begin, end, lanes)
-        return found, counted, found.reward[None]
+        return found, counted, found.reward[None], None
 
-    blocks = max(1, min(-(-episodes // (lanes * MOMENTS)), (2**31 - 1) // (lanes * sim.horizon)))  # the steps of a chunk are counted in int32
+    blocks = 1 if record else max(1, min(-(-episodes // (lanes * MOMENTS)), (2**31 - 1) // (lanes * sim.horizon)))  # the steps of a chunk are counted in int32
     ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
     found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback, name="monte_carlo")
     rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))
@@ -84,10 +88,8 @@ def _chunk(key, sim, reward, actions, found, begin, end, lanes):
 
     def block(carry):
         at, found, counted = carry
-        number = at + jnp.arange(lanes, dtype=jnp.int32)
-        live = (number < end) & (number >= at)
-        played = _play(key, sim, reward, actions, number, live)
-        return at + lanes, _keep(found, played, number, live), E.add(counted, E.tally(played, live, number))
+        found, more, _ = _block(key, sim, reward, actions, found, at, end, lanes)
+        return at + lanes, found, E.add(counted, more)
 
     begin, end = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
     # compared by what is left, as the end may be the last int32
@@ -95,16 +97,25 @@ def _chunk(key, sim, reward, actions, found, begin, end, lanes):
     return found, counted
 
 
-def _play(key, sim, reward, actions, number, live, record=False):
+@partial(jax.jit, static_argnames="lanes")
+def _block(key, sim, reward, actions, found, begin, end, lanes):
+    """Those of episodes ``begin`` .. ``end - 1`` that fit in the lanes: (`Found`, `Tally`, `Played`)."""
+    number = begin + jnp.arange(lanes, dtype=jnp.int32)
+    live = (number < end) & (number >= begin)
+    played = _play(key, sim, reward, actions, number, live)
+    return _keep(found, played, number, live), E.tally(played, live, number), played
+
+
+def _play(key, sim, reward, actions, number, live, **how):
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
     draw_start, draw = (lambda key, row, dist, f=f: f(key, dist) for f in (actions.draw_start, actions.draw))
-    return E.play(sim, reward, keys, draw_start, draw, live, record=record)
+    return E.play(sim, reward, keys, draw_start, draw, live, **how)
 
 
 @jax.jit
 def _rebuild(key, sim, reward, actions, number):
     """The episodes of these numbers [m], with their disturbances."""
-    return _play(key, sim, reward, actions, number, jnp.ones(number.shape, bool), record=True).episode
+    return _play(key, sim, reward, actions, number, jnp.ones(number.shape, bool), record=True, judge=False).episode
 
 
 def _keep(found, played, number, live):

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast.search.lead import fed_of, follows
 from jast.search.records import unpack
 from jast.search.simulate import child_state, replay_to, select_lanes
-from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, choose_child, node_keys, node_shapes
+from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, choose, node_shapes
 
 __all__ = ["Roots", "prune"]
 
@@ -44,9 +45,15 @@ def prune(problem, axes, tree, children, memoize="node"):
     rows, visits, total, child, reward = _children(tree, children)
     q = jnp.where(visits > 0, total / jnp.maximum(visits, 1) - tree.root_reward[:, None], 0)
 
-    slots = jnp.arange(children, dtype=jnp.int32)
-    draw = lambda p, key, state: jax.vmap(lambda slot: choose_child(p, key, slot, state))(slots)
-    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0))(problem, node_keys(tree.key, root), state)
+    slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
+    source, fed = (), ()
+    if follows(tree):
+        like = node_shapes(tree, memoize)
+        known = jax.vmap(jax.vmap(lambda w: unpack(w, like).source))(tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]])
+        source = jnp.where(visits > 0, known, 0)
+        fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[:, None])
+    draw = lambda p, key, root, level, state, *of: jax.vmap(lambda slot, *of: choose(p, key, root, slot, level, state, *of))(slots, *of)
+    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(problem, tree.key, root, level, state, source, fed)
     roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
 
     slot = jnp.argmax(visits, axis=1).astype(jnp.int32)
@@ -64,8 +71,12 @@ def prune(problem, axes, tree, children, memoize="node"):
         depth=level + move.astype(jnp.int32),
         alive=tree.alive & move & (to > 0),
     )
+    if follows(tree):  # what is known of another branch says nothing of this one
+        lead, keep = tree.lead, _pick(tree.lead.trail.T, level + 1) == new
+        tree = tree._replace(lead=lead._replace(on=lead.on & keep, value=jnp.where(keep, lead.value, -jnp.inf)))
     if memoize == "root":
-        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0))(problem, node_keys(tree.key, root), slot, level, state)
+        of = jax.tree.map(lambda a: jax.vmap(lambda row, j: row[j])(a, slot), (source, fed))
+        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(problem, tree.key, root, slot, level, state, *of)
         tree = tree._replace(base=select_lanes(move, after, state))
     return tree, roots
 

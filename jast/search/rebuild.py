@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.episode import Episode, Progress, accumulator
+from jast.episode import Episode, blank
+from jast.search.lead import fed_of
 from jast.search.records import unpack
-from jast.search.tree import FAILURE, FRESH, choose_child, choose_rollout, levels, node_keys, node_shapes, of_lanes, take
+from jast.search.tree import FAILURE, FRESH, choose, choose_rollout, levels, node_shapes, of_lanes, take
 
 __all__ = ["rebuild"]
 
@@ -28,24 +29,25 @@ def _one(problem, axes, tree, lane, i, memoize):
 
     def up(node, _):
         record = unpack(tree.nodes[node, lane], like)
-        return record.parent, (node, record.parent, record.slot)
+        return record.parent, (node, record.parent, record.slot, record.source)
 
-    _, (nodes, parents, slots) = lax.scan(up, leaf, None, length=height)
+    _, (nodes, parents, slots, sources) = lax.scan(up, leaf, None, length=height)
     depth = jnp.sum(nodes > 0, dtype=jnp.int32)  # choices made in the tree; those of the rollout follow
     rolling = jax.random.fold_in(key, i)
     begin = jax.tree.map(lambda a: a[lane], tree.origin)
-    zero, false = jnp.zeros((), accumulator(sim)), jnp.zeros((), bool)
 
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
-        chosen = choose_child(problem, node_keys(key[None], parents[up_there][None])[0], slots[up_there], at.state)
-        rolled = choose_rollout(problem, rolling, key, level, at.state)
+        source = jax.tree.map(lambda a: a[up_there], sources)
+        of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if problem.choice.follow else ()
+        chosen = choose(problem, key, parents[up_there], slots[up_there], level, at.state, *of)
+        rolled = choose_rollout(problem, rolling, key, level, at.state, fed_of(tree, i, lane))
         x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
         after = take(problem, level, at, action)
         kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)
         return kept, (x0, jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x), ~at.done)
 
-    start = Progress(begin, zero, zero, zero + jnp.inf, false, tree.ended[lane], false)
+    start = blank(sim, begin)._replace(done=tree.ended[lane])
     end, (x0s, xs, lived) = lax.scan(down, start, jnp.arange(height, dtype=jnp.int32))
     first = height - sim.horizon
     x0 = jax.tree.map(lambda a: a[0], x0s)

@@ -7,7 +7,7 @@ import numpy as np
 from jast.episode import Episode
 from jast.failures import Failures
 
-__all__ = ["History", "SearchResult", "table"]
+__all__ = ["History", "SearchResult", "Trials", "table"]
 
 
 class History(NamedTuple):
@@ -19,6 +19,21 @@ class History(NamedTuple):
     """[C, trees] float: reward of each tree's best episode so far (failures before all others)."""
     failures: Any
     """[C] int: failing episodes so far, over all trees."""
+
+
+class Trials(NamedTuple):
+    """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they were simulated."""
+
+    reward: Any
+    """float; -inf where the episode was invalid."""
+    distance: Any
+    """float: miss distance; inf where the episode was invalid."""
+    log_prob: Any
+    """float: true log density of the disturbances."""
+    failure: Any
+    """bool."""
+    ran: Any
+    """bool: there is such an episode; a tree whose root is an episode's end has no more."""
 
 
 class SearchResult(NamedTuple):
@@ -49,6 +64,10 @@ class SearchResult(NamedTuple):
     """Of trees: the statistics of every root (`jast.search.prune.Roots`, one for each prune)."""
     heads: Any = None
     """`jast.heads.Heads` as the search left them, to be used again; None without."""
+    trials: Trials | None = None
+    """Every episode, where the search was asked to ``record``."""
+    incidents: tuple = ()
+    """What went wrong on the host of a black box: `jast.incidents.Incident`, with counts and an example of each."""
     lessons: tuple = ()
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
 
@@ -82,6 +101,7 @@ def _words(result):
         text = f"no failure was found; the nearest episode came to distance {float(result.best.distance):.4f}"
     if result.invalid:
         text += f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward returned NaN or infinity"
+    text += "".join(f"\n  {incident}" for incident in result.incidents)
     for n, lesson in enumerate(result.lessons):
         for name, of in lesson.items():
             if of.rejected:

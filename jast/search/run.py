@@ -36,6 +36,8 @@ class Plan(NamedTuple):
     """Of a tree (`jast.search.tree.pages_of`)."""
     edges: bool = False
     """Whether all edges are kept for training."""
+    record: bool = False
+    """Whether the numbers of all episodes are kept."""
 
 
 class Harvest(NamedTuple):
@@ -56,11 +58,13 @@ class Harvest(NamedTuple):
     simulation: Any
     edges: Any = ()
     """`Edges`, where the plan asks for them."""
+    trials: Any = ()
+    """[S, 2, B] distance and log p of each simulation's episode, where the plan asks for them."""
 
 
-@functools.partial(jax.jit, static_argnames=("simulations", "memoize", "pages"))
-def _make(problem, keys, simulations, memoize, pages=None):
-    return make(problem, _shared(problem), keys, simulations, memoize, pages)
+@functools.partial(jax.jit, static_argnames=("simulations", "memoize", "pages", "record"))
+def _make(problem, keys, simulations, memoize, pages=None, record=False):
+    return make(problem, _shared(problem), keys, simulations, memoize, pages, record)
 
 
 @functools.partial(jax.jit, static_argnames=("memoize",), donate_argnames=("tree",))
@@ -91,7 +95,8 @@ def _shared(problem):
 def bytes_per_tree(problem, plan):
     """Bytes that one tree takes while it grows, from the shapes of its arrays."""
     simulations = plan.prunes * plan.simulations
-    tree = jax.eval_shape(lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize, plan.pages), problem, tree_keys(jax.random.key(0), 2))
+    build = lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize, plan.pages, plan.record)
+    tree = jax.eval_shape(build, problem, tree_keys(jax.random.key(0), 2))
     return sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree)) // 2
 
 
@@ -156,7 +161,7 @@ def _surroundings():
 
 
 def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
-    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages)
+    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record)
     turns = []
     for turn in range(plan.prunes):
         first, end = turn * plan.simulations, (turn + 1) * plan.simulations
@@ -176,7 +181,8 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
     found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
     roots = jax.tree.map(lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]), *turns)
     edges = jax.device_get(jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))) if plan.edges else ()
-    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32), edges)
+    trials = np.asarray(tree.trials)[..., : len(group)] if plan.record else ()
+    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32), edges, trials)
 
 
 def _candidates(log, outcome, most):

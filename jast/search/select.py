@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast.search.lead import follows
 from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
 
 __all__ = ["Best", "Walk", "select"]
@@ -139,23 +140,29 @@ def select(problem, tree):
             new=w.new.at[level, lane].set(jnp.where(w.grows, w.count, 0), mode="drop") if eager else (),
         )
 
-    row = tree.root * lanes + lane
-    count, grows, bonus = of_node(tree.root_visits)
+    node, visits, reward, depth, path, trail = tree.root, tree.root_visits, tree.root_reward, tree.depth, tree.path, tree.trail
+    if follows(tree):  # straight to the last node of the best episode's path, which was visited once
+        lead = tree.lead
+        place = (lead.node, jnp.ones_like(visits), lead.reward, lead.depth, lead.path, lead.trail)
+        root = (node, visits, reward, depth, path, trail)
+        node, visits, reward, depth, path, trail = (jnp.where(lead.on if a.ndim == 1 else lead.on[None], a, b) for a, b in zip(place, root, strict=True))
+    row = node * lanes + lane
+    count, grows, bonus = of_node(visits)
     nobody = Best(jnp.full((lanes,), -jnp.inf, dtype), nil, nil, nil, nil, jnp.zeros((lanes,), dtype))
     stay = ~tree.alive | tree.ended
     start = Walk(
-        tree.root,
+        node,
         row,
         nil,
         count,
         grows,
         bonus,
-        tree.root_reward,
-        tree.depth,
+        reward,
+        depth,
         nobody,
         stay,
-        tree.path,
-        tree.trail,
+        path,
+        trail,
         *(jnp.zeros((2, lanes, n), dtype) for n in (CHILD, PAGE + 1, 2)),
         jnp.zeros((2, lanes, PAGE + 1), dtype) if valued else (),
         *(jnp.zeros(tree.path.shape, jnp.int32) if eager else () for _ in range(2)),

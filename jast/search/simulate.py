@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.episode import Progress, accumulator
+from jast.episode import Progress, blank, conclude, random_start
 from jast.search.foresee import foresee
+from jast.search.lead import Lead, fed_of, feed_level, follows, onward, packed
 from jast.search.records import pack, unpack
 from jast.search.select import select
 from jast.search.tree import (
@@ -21,10 +22,9 @@ from jast.search.tree import (
     ROW,
     VISITS,
     Node,
-    choose_child,
+    choose,
     choose_rollout,
     levels,
-    node_keys,
     node_shapes,
     of_lanes,
     take,
@@ -46,6 +46,9 @@ def _simulation(problem, axes, tree, i, memoize):
     fresh = tree.alive & ~tree.ended & (walk.best.child == 0)
     nothing = jnp.zeros((lanes,), bool)
     zero = jnp.zeros((lanes,), tree.edges.dtype)
+    recorded, episodic = not isinstance(tree.trials, tuple), problem.sim.episodic
+    source = jnp.where(tree.lead.on & fresh, tree.lead.source, 0) if follows(tree) else ()
+    thin = lambda progress: progress if recorded else progress._replace(log_prob=zero)
 
     def expand():
         """The new child of each tree; and the node it is a child of, or the episode's end that selection ran into."""
@@ -54,26 +57,38 @@ def _simulation(problem, axes, tree, i, memoize):
         like = node_shapes(tree, memoize)
         node = jax.vmap(lambda w: unpack(w, like))(desk[0])
         state, replayed = (node.state, jnp.zeros_like(at)) if memoize == "node" else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
-        before = Progress(state, zero, walk.reward, node.distance, nothing, nothing, nothing)
-        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0))(problem, node_keys(tree.key, walk.node), walk.best.slot, walk.depth, before)
-        return desk, child._replace(log_prob=zero), replayed, node.reward, node.failure, node.invalid
+        so_far = node.log_prob if recorded else zero
+        before = Progress(state, so_far, walk.reward, node.distance, nothing, nothing, nothing, zero if episodic else ())
+        of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if follows(tree) else ((), ())
+        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of)
+        known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
+        return desk, thin(child), replayed, known, fed_of(tree, jnp.zeros_like(lane) + i, lane)
 
     # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA copies the tree
     nobody = lambda: (tree.desk, *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:]))
-    desk, child, replayed, known_reward, known_failure, known_invalid = lax.cond(jnp.any(tree.alive), expand, nobody)
+    desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = lax.cond(jnp.any(tree.alive), expand, nobody)
 
-    # roll out; lanes that have ended step on, and only what is summed up is masked
+    # roll out; lanes that have ended step on, and only what is summed up is masked (and the state, where it is yet to be judged)
     key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(tree.key, i)
+    middle = feed_level(problem.sim, int(random_start(problem.sim)))
 
     def roll(carry):
-        level, steps, at = carry
+        level, steps, at, taken = carry
         live = ~at.done
-        after = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0))(problem, key, tree.key, level, at)
-        kept = Progress(after.state, *(jnp.where(live, b, a) for a, b in zip(at[1:], after[1:], strict=True)))
-        return level + 1, steps + _one(live), kept._replace(log_prob=zero)
+        after, x = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0, 0))(problem, key, tree.key, level, at, fed)
+        kept = jax.tree.map(lambda a, b: jnp.where(live, b, a), at._replace(state=()), after._replace(state=()))
+        if problem.choice.feed:
+            here = live & (level == middle)
+            taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
+        state = select_lanes(live, after.state, at.state) if episodic else after.state
+        return level + 1, steps + _one(live), thin(kept._replace(state=state)), taken
 
     steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))  # a random start is a level, but no step
-    _, steps, end = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, (walk.depth + 1, steps, child._replace(done=child.done | ~fresh)))
+    carry = walk.depth + 1, steps, child._replace(done=child.done | ~fresh), jnp.zeros_like(fed) if problem.choice.feed else ()
+    _, steps, end, taken = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, carry)
+    if episodic:
+        end = jax.vmap(lambda p, e, live: conclude(p.sim, p.reward, e, live), in_axes=(axes, 0, 0))(problem, end, fresh)
+        child = jax.tree.map(lambda a, b: jnp.where(child.done, b, a), child._replace(state=()), end._replace(state=()))._replace(state=child.state)
 
     value = jnp.where(fresh, end.reward, known_reward)
     finite = jnp.isfinite(value)
@@ -83,7 +98,10 @@ def _simulation(problem, axes, tree, i, memoize):
     failed, invalid = jnp.where(fresh, end.failure, known_failure), jnp.where(fresh, end.invalid, known_invalid)
     bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
     bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
-    kept = Node(walk.node, walk.best.slot, child.reward, child.distance, child.failure, child.invalid, child.state if memoize == "node" else ())
+    state = child.state if memoize == "node" else ()
+    numbers = child.reward, child.distance, child.failure, child.invalid
+    kept = Node(walk.node, walk.best.slot, *numbers, state, source, child.log_prob if recorded else ())
+    trial = tuple(jnp.where(fresh, a, b) for a, b in zip((end.distance, end.log_prob), known_trial, strict=True)) if recorded else ()
     tree = tree._replace(
         edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
         nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
@@ -96,6 +114,8 @@ def _simulation(problem, axes, tree, i, memoize):
         log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
         outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
         alive=tree.alive & ~tree.ended,
+        lead=onward(tree, walk, fresh, child, value, i, taken) if isinstance(tree.lead, Lead) else (),
+        trials=lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0) if recorded else (),
     )
     if not problem.values:
         return tree
@@ -135,13 +155,14 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
         lane = jnp.arange(key.shape[0], dtype=jnp.int32)
     else:
         problem, key, base, first = of_lanes(problem, axes, lane), key[lane], jax.tree.map(lambda a: a[lane], base), first[lane]
-    move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0))
+    move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))
 
     def body(carry):
         level, state = carry
         node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
-        after = move(problem, node_keys(key, node.parent), node.slot, level, state)
+        of = (node.source, fed_of(tree, jnp.maximum(node.source - 1, 0), lane)) if follows(tree) else ((), ())
+        after = move(problem, key, node.parent, node.slot, level, state, *of)
         return level + _one(live), select_lanes(live, after, state)
 
     _, state = lax.while_loop(lambda c: jnp.any(running & (c[0] < depth)), body, (first, base))
@@ -149,18 +170,18 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
     return state, jnp.maximum(depth, chosen) - jnp.maximum(first, chosen)
 
 
-def _child(problem, node_key, slot, level, before):
-    return take(problem, level, before, choose_child(problem, node_key, slot, before.state))
+def _child(problem, tree_key, parent, slot, level, before, source, fed):
+    return take(problem, level, before, choose(problem, tree_key, parent, slot, level, before.state, source, fed))
 
 
-def _rolled(problem, key, tree_key, level, before):
-    return take(problem, level, before, choose_rollout(problem, key, tree_key, level, before.state))
+def _rolled(problem, key, tree_key, level, before, fed):
+    action = choose_rollout(problem, key, tree_key, level, before.state, fed)
+    return take(problem, level, before, action), action[1]
 
 
-def child_state(problem, node_key, slot, level, state):
+def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):
     """One lane: the simulator's state at a node's child."""
-    zero, nothing = jnp.zeros((), accumulator(problem.sim)), jnp.zeros((), bool)
-    return _child(problem, node_key, slot, level, Progress(state, zero, zero, zero, nothing, nothing, nothing)).state
+    return _child(problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed).state
 
 
 def select_lanes(pred, a, b):

@@ -20,13 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast.episode import Progress, advance, begin, random_start
+from jast.episode import advance, begin, blank, conclude, random_start
 from jast.search.guide import rolled
+from jast.search.lead import fed_or, feed_level, follows, lead_of
 from jast.search.records import pack
+from jast.simulator import never
 
 __all__ = [
-    "Node", "Problem", "Settings", "Tree", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "of_lanes", "pages_of",
-    "take", "widths",
+    "Node", "Problem", "Settings", "Tree", "choose", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "of_lanes",
+    "pages_of", "take", "widths",
 ]  # fmt: skip
 
 PAGE = 15
@@ -111,6 +113,10 @@ class Tree(NamedTuple):
     """[S, B] float: reward of the episode of each simulation."""
     outcome: jax.Array
     """[S, B] uint8: bits FAILURE, FRESH (not an end seen before), INVALID, RAN."""
+    lead: Any
+    """`Lead`, the best episode of each tree, or ``()`` where the search makes no use of it."""
+    trials: Any
+    """[S, 2, B] float: miss distance and true log p of the episode of each simulation; ``()`` where they are not recorded."""
 
 
 class Node(NamedTuple):
@@ -126,6 +132,10 @@ class Node(NamedTuple):
     invalid: jax.Array
     state: Any
     """The simulator's state, or ``()`` where states are not kept at nodes."""
+    source: Any = ()
+    """int32: 1 + the simulation whose rollout took the action that led here, 0: it is the slot's own; ``()`` without `Choice.follow`."""
+    log_prob: Any = ()
+    """From the start up to here; ``()`` where trials are not recorded."""
 
 
 def widths(simulations, k, alpha):
@@ -168,10 +178,10 @@ def most_lanes(pages):
     return (2**31 - 1 - ROW) // (pages * ROW)
 
 
-def make(problem, axes, keys, simulations, memoize="node", pages=None):
+def make(problem, axes, keys, simulations, memoize="node", pages=None, record=False):
     """Trees of one root each, with room for ``simulations`` in so many ``pages`` (default: `pages_of`).
 
-    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None).
+    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None). ``record``: `Tree.trials` are wanted.
     """
     (lanes,) = keys.shape
     pages = pages_of(problem, simulations) if pages is None else pages
@@ -181,21 +191,25 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None):
     def origin(problem, key):
         if random_start(problem.sim):
             x0 = problem.choice.actions.draw_start(key, problem.sim.start())  # any state will do: the first level chooses x0
-            first = begin(problem.sim, problem.reward, x0)
-            zero = jnp.zeros((), bool)
-            return Progress(first.state, jnp.zeros_like(first.reward), jnp.zeros_like(first.reward), jnp.full_like(first.distance, jnp.inf), zero, zero, zero)
-        return begin(problem.sim, problem.reward, ())
+            return blank(problem.sim, begin(problem.sim, problem.reward, x0).state)
+        first = begin(problem.sim, problem.reward, ())
+        # an episodic system may be at its end from the start, but a user's evaluation is not called in vain
+        return first if problem.sim.is_terminal.func is never else conclude(problem.sim, problem.reward, first, first.done)
 
     first = jax.vmap(origin, in_axes=(axes, 0))(problem, keys)
     dtype = first.reward.dtype
     count = jnp.zeros((lanes,), jnp.int32)
-    node = Node(count, count, first.reward, first.distance, first.failure, first.invalid, first.state if memoize == "node" else ())
-    record = jax.vmap(pack)(node)
+    lead = lead_of(problem, lanes, levels(problem.sim), simulations, dtype)
+    kept = first.state if memoize == "node" else ()
+    node = Node(
+        count, count, first.reward, first.distance, first.failure, first.invalid, kept, count if problem.choice.follow else (), first.log_prob if record else ()
+    )
+    words = jax.vmap(pack)(node)
     return Tree(
         key=keys,
         edges=jnp.zeros((pages * lanes * ROW,), dtype),
-        nodes=jnp.zeros((simulations + 1, *record.shape), record.dtype).at[0].set(record),
-        desk=jnp.zeros((2, *record.shape), record.dtype),
+        nodes=jnp.zeros((simulations + 1, *words.shape), words.dtype).at[0].set(words),
+        desk=jnp.zeros((2, *words.shape), words.dtype),
         values=jnp.zeros((pages * lanes * (PAGE + 1),), dtype) if problem.values else (),
         pages=count + simulations + 1,
         root=count,
@@ -213,6 +227,8 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None):
         steps=count,
         log=jnp.full((simulations, lanes), -jnp.inf, dtype),
         outcome=jnp.zeros((simulations, lanes), jnp.uint8),
+        lead=lead,
+        trials=jnp.zeros((simulations, 2, lanes), dtype) if record else (),
     )
 
 
@@ -222,7 +238,8 @@ def node_shapes(tree, memoize):
     number, real = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), dtype)
     state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree.origin) if memoize == "node" else ()
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
-    return Node(number, number, real, real, flag, flag, state)
+    recorded = not isinstance(tree.trials, tuple)
+    return Node(number, number, real, real, flag, flag, state, number if follows(tree) else (), real if recorded else ())
 
 
 def choose_child(problem, node_key, slot, state):
@@ -232,8 +249,17 @@ def choose_child(problem, node_key, slot, state):
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
 
-def choose_rollout(problem, key, tree_key, level, state):
-    """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree."""
+def choose(problem, tree_key, parent, slot, level, state, source=(), fed=()):
+    """One lane: (x0, x), the action of the child in this slot of the node ``parent``, or the one of the rollout of simulation ``source`` - 1, fed ``fed``."""
+    own = choose_child(problem, node_keys(tree_key[None], parent[None])[0], slot, state)
+    if not problem.choice.follow:
+        return own
+    taken = choose_rollout(problem, jax.random.fold_in(tree_key, source - 1), tree_key, level, state, fed)
+    return jax.tree.map(lambda a, b: jnp.where(source > 0, a, b), taken, own)
+
+
+def choose_rollout(problem, key, tree_key, level, state, fed=()):
+    """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree, and what it is fed."""
     sim, choice = problem.sim, problem.choice
     simulation, key = key, jax.random.fold_in(key, level)
     x0 = choice.roll(key, tree_key, sim.start(), start=True) if random_start(sim) else ()
@@ -241,6 +267,8 @@ def choose_rollout(problem, key, tree_key, level, state):
     x = choice.roll(key, tree_key, dist)
     if problem.guide != () and problem.guide.heads.policy is not None:
         x = lax.cond(problem.guide.levels > 0, lambda: rolled(problem.guide, sim, choice.actions, simulation, key, level, state, dist, x), lambda: x)
+    if problem.choice.feed:
+        x = fed_or(sim, fed, level == feed_level(sim, int(random_start(sim))), x)
     return x0, x
 
 

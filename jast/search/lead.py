@@ -1,0 +1,99 @@
+"""What a tree does with the best episode that it has seen: grow that episode's path, or feed its action to later rollouts."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jast.episode import _shapes
+from jast.search.records import pack, shapes, unpack, width
+
+__all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onward", "packed"]
+
+
+class Lead(NamedTuple):
+    """The best episode of each of B trees. Without ``follow`` all from ``on`` to ``path`` are ``()``, without ``feed`` ``fed`` is."""
+
+    value: jax.Array
+    """[B] float: its reward; -inf before there is one."""
+    source: jax.Array
+    """[B] int32: 1 + its simulation."""
+    on: Any
+    """[B] bool: the next simulation goes straight to ``node`` and takes there what the best episode took."""
+    node: Any
+    """[B] int32: the last node on the path of that episode."""
+    depth: Any
+    """[B] int32: its level."""
+    reward: Any
+    """[B] float: from the start up to it."""
+    trail: Any
+    """[H + 1, B] int32: nodes from the first root to it."""
+    path: Any
+    """[H, B] int32: edges to it, as places in the tree's edges."""
+    fed: Any
+    """[S + 1, B, words] uint32: what the rollout of each simulation is fed: whether there is anything, and the packed disturbance."""
+
+
+def lead_of(problem, lanes, levels, simulations, dtype):
+    """The `Lead` of trees that have seen nothing, or ``()`` where the search wants none."""
+    follow, feed = problem.choice.follow, problem.choice.feed
+    if not (follow or feed):
+        return ()
+    count, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
+    rows = lambda n: jnp.zeros((n, lanes), jnp.int32)
+    path = (count > 0, count, count, jnp.zeros_like(low), rows(levels + 1), rows(levels)) if follow else ((),) * 6
+    fed = jnp.zeros((simulations + 1, lanes, 1 + width(_like(problem.sim))), jnp.uint32) if feed else ()
+    return Lead(low, count, *path, fed)
+
+
+def follows(tree):
+    """Whether nodes may have taken their action from the best episode."""
+    return isinstance(tree.lead, Lead) and not isinstance(tree.lead.on, tuple)
+
+
+def feed_level(sim, start):
+    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9); ``start``: levels before the first step."""
+    return sim.horizon - sim.horizon // 2 + start
+
+
+def fed_of(tree, simulation, lane):
+    """What the rollouts of these simulations were fed, [..., words]; ``()`` where nothing ever is."""
+    fed = tree.lead.fed if isinstance(tree.lead, Lead) else ()
+    return fed if isinstance(fed, tuple) else fed[simulation, lane]
+
+
+def fed_or(sim, words, here, x):
+    """One lane: the disturbance that is fed, where there is one and ``here``; else ``x``."""
+    there = here & (words[0] > 0)
+    return jax.tree.map(lambda a, b: jnp.where(there, a, b), unpack(words[1:], _like(sim)), x)
+
+
+def onward(tree, walk, fresh, child, value, i, middle):
+    """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B, words]: what their rollouts took at `feed_level`."""
+    lead = tree.lead
+    better = fresh & jnp.isfinite(value) & (value > lead.value)
+    pick = lambda pred, new, old: jnp.where(pred, new, old)
+    if follows(tree):
+        moves = fresh & (better | lead.on)
+        lane, new = jnp.arange(len(value), dtype=jnp.int32), jnp.zeros_like(lead.node) + i + 1
+        lead = lead._replace(
+            on=moves & ~child.done,
+            node=pick(moves, new, lead.node),
+            depth=pick(moves, walk.depth + 1, lead.depth),
+            reward=pick(moves, child.reward, lead.reward),
+            trail=pick(moves[None], walk.trail.at[walk.depth + 1, lane].set(new), lead.trail),
+            path=pick(moves[None], walk.path, lead.path),
+        )
+    if not isinstance(lead.fed, tuple):
+        row = pick((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])  # thesis Algorithm 9: a* after this rollout
+        lead = lead._replace(fed=jax.lax.dynamic_update_slice_in_dim(lead.fed, row[None], i + 1, 0))
+    return lead._replace(value=pick(better, value, lead.value), source=pick(better, jnp.zeros_like(lead.source) + i + 1, lead.source))
+
+
+def packed(there, x):
+    """One lane: a row of ``Lead.fed``."""
+    return jnp.concatenate([there.astype(jnp.uint32)[None], pack(x)])
+
+
+def _like(sim):
+    return shapes(jax.eval_shape(_shapes, sim)[1])
