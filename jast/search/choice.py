@@ -24,7 +24,8 @@ class Choice:
     there it helps on some systems and hurts on others. Off where the disturbance has no mode or is all integers.
 
     ``follow``: as soon as an episode is the best of its tree, the next simulations put its disturbances into the tree, one a simulation, so that it can be
-    varied from any of its steps. ``feed``: with half of the steps to go, a rollout takes what the best episode took there (thesis Algorithm 9).
+    varied from any of its steps. ``feed``: with half of the steps to go, a rollout takes what the best episode took there (thesis Algorithm 9). ``urgent``: a
+    child that was never visited comes before all others (thesis Algorithm 10); else it has Q = 0 (MCFS-AP eq. 3).
     """
 
     actions: Any
@@ -33,6 +34,7 @@ class Choice:
     focused: bool = field(default=True, metadata=dict(static=True))
     follow: bool = field(default=False, metadata=dict(static=True))
     feed: bool = field(default=False, metadata=dict(static=True))
+    urgent: bool = field(default=False, metadata=dict(static=True))
 
     def child(self, key, slot, dist, start=False):
         """The action of a node's child by the node's key and the child's place among its siblings; ``start``: it is an x0."""

@@ -7,18 +7,18 @@ from jast.search.trees import grow_trees, settled
 __all__ = ["MODES", "forest"]
 
 SAMPLES = A.samples()
-PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False)
+PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
 MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
-    "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True),
+    "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
 }
 
 
 def forest(
     key, sim, *, trees=200, prunes=18, simulations=500, heads=None, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None,
-    spread=None, focus=None, follow=None, feed=None, head_settings=None, memoize="auto", top=64, record=False, threads=None, lanes=None, available=None,
-    progress=False, callback=None,
+    spread=None, focus=None, follow=None, feed=None, urgent=None, head_settings=None, memoize="auto", top=64, record=False, threads=None, lanes=None,
+    available=None, progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
 
@@ -52,9 +52,10 @@ def forest(
     Raises ValueError for counts below 1, a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not finite at the start, and
     trees that do not fit into memory, with the numbers.
     """
-    choices = settled("forest", MODES, mode, actions, widening=widening, spread=spread, focus=focus, follow=follow, feed=feed)
+    given = dict(widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent)
     return grow_trees(
-        "forest", key, sim, choices, trees=trees, prunes=prunes, simulations=simulations, heads=heads, head_settings=head_settings,
+        "forest", key, sim, settled("forest", MODES, mode, actions, **given), trees=trees, prunes=prunes, simulations=simulations,
+        heads=heads, head_settings=head_settings,
         reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, record=record, threads=threads, lanes=lanes, available=available,
         progress=progress, callback=callback,
     )  # fmt: skip

@@ -9,13 +9,13 @@ __all__ = ["MODES", "mcts"]
 MODES = {
     "default": PLAIN | dict(widening=(1.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
-    "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True),
+    "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
 }
 
 
 def mcts(
     key, sim, *, trees=1, simulations=9000, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None, spread=None, focus=None,
-    follow=None, feed=None, memoize="auto", top=64, record=False, threads=None, lanes=None, available=None, progress=False, callback=None,
+    follow=None, feed=None, urgent=None, memoize="auto", top=64, record=False, threads=None, lanes=None, available=None, progress=False, callback=None,
 ):  # fmt: skip
     """Grow ``trees`` independent trees of ``simulations`` from their first root: `SearchResult`. The reward is maximised.
 
@@ -23,9 +23,9 @@ def mcts(
     of Moss's thesis for systems that are evaluated at the end of an episode (Algorithms 7 to 11: ``widening`` (10, 0.3), ``feed``), ``"default"`` has
     ``widening`` (1, 0.5).
     """
-    choices = settled("mcts", MODES, mode, actions, widening=widening, spread=spread, focus=focus, follow=follow, feed=feed)
+    given = dict(widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent)
     return grow_trees(
-        "mcts", key, sim, choices, trees=trees, prunes=1, simulations=simulations,
+        "mcts", key, sim, settled("mcts", MODES, mode, actions, **given), trees=trees, prunes=1, simulations=simulations,
         reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, record=record, threads=threads, lanes=lanes, available=available,
         progress=progress, callback=callback,
     )  # fmt: skip

@@ -33,7 +33,7 @@ class Trials(NamedTuple):
     failure: Any
     """bool."""
     ran: Any
-    """bool: there is such an episode; a tree whose root is an episode's end has no more."""
+    """bool: it was simulated; a search tree that comes to an episode's end again has its outcome already."""
 
 
 class SearchResult(NamedTuple):

@@ -97,7 +97,10 @@ def select(problem, tree):
             q = number(guide.q_weight) * q + number(guide.v_weight) * v
         else:
             values = ()
-        score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3
+        if problem.choice.urgent:  # thesis Algorithm 10
+            score = jnp.where(n > 0, q + w.bonus[:, None] / jnp.sqrt(jnp.maximum(n, 1)), jnp.inf)
+        else:
+            score = q + w.bonus[:, None] / jnp.sqrt(1 + n)  # eq. 3
         there = slots < jnp.minimum(w.count - w.offset, PAGE)[:, None]
         if valued and not eager:  # one that was not tried yet stands after those that were
             there &= (slots == 0) | (n > 0) | (jnp.roll(n, 1, axis=1) > 0)

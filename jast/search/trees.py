@@ -23,55 +23,57 @@ from jast.search.tree import FAILURE, FRESH, INVALID, RAN, Problem, Settings, le
 
 __all__ = ["grow_trees", "settled"]
 
-SETTLED = ("widening", "spread", "focus", "follow", "feed")
+SWITCHES = ("spread", "follow", "feed", "urgent")
 LANES = 128  # trees in lockstep in one thread: enough to fill vector units, few enough to stay near the processor
 
 
 def settled(method, modes, mode, actions, **given):
-    """The mode, and what it says of widening, spread, focus, follow and feed where the user does not (None); checked."""
+    """The settings of a mode, those that the user gave (not None) in place of its own, and its name; checked."""
     if mode not in modes:
         raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
-    widening, spread, focus, follow, feed = (modes[mode][name] if given[name] is None else given[name] for name in SETTLED)
-    focus = getattr(actions, "focus", 1.0) if focus is None else focus
+    chosen = modes[mode] | {name: value for name, value in given.items() if value is not None}
+    if chosen["focus"] is None:
+        chosen["focus"] = getattr(actions, "focus", 1.0)
+    widening, focus = chosen["widening"], chosen["focus"]
     traced = lambda *values: any(isinstance(v, jax.core.Tracer) for v in values)
     if not isinstance(widening, tuple | list) or len(widening) != 2 or not (traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
         raise ValueError(f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received {widening!r}")
     if not traced(focus) and not focus > 0:
         raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
-    for name, value in dict(spread=spread, follow=follow, feed=feed).items():
-        if not isinstance(value, bool):
-            raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
-    return mode, widening, spread, focus, follow, feed
+    for name in SWITCHES:
+        if not isinstance(chosen[name], bool):
+            raise ValueError(f"{method}: {name} must be True or False, received {chosen[name]!r}")
+    return dict(mode=mode) | chosen
 
 
 def grow_trees(
-    method, key, sim, choices, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, record, threads, lanes, available, progress,
+    method, key, sim, chosen, *, trees, prunes, simulations, reward, actions, exploration, memoize, top, record, threads, lanes, available, progress,
     callback, heads=None, head_settings=None,
 ):  # fmt: skip
-    """A forest by its settings, all given: what `forest` and `mcts` call. ``choices``: those of `settled`."""
-    mode, widening, spread, focus, follow, feed = choices
+    """A forest by its settings, all given: what `forest` and `mcts` call. ``chosen``: of `settled`."""
+    widening, focus = chosen["widening"], chosen["focus"]
     given = {name: value for name, value in dict(threads=threads, lanes=lanes).items() if value is not None}
     trees, prunes, simulations, top, *_ = whole(method, trees=trees, prunes=prunes, simulations=simulations, top=top, **given)
     if memoize not in ("auto", "node", "root", "none"):
         raise ValueError(f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}')
-    names = dict(mode=mode, trees=trees, simulations=simulations, exploration=exploration, widening=list(widening), spread=spread, focus=focus)
-    names |= dict(follow=follow, feed=feed)
+    names = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen | dict(widening=list(widening))
     reward, settings = prepare(method, key, sim, reward, actions, **names)
     prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:
         raise ValueError(f"{method}: prunes * simulations must be below 2**24, received {prunes} * {simulations}: grow more trees instead")
     table = widths(total, *widening)
-    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=isinstance(focus, jax.core.Tracer) or focus != 1, follow=follow, feed=feed)
+    switches = {name: chosen[name] for name in SWITCHES}
+    choice = Choice(actions, jnp.asarray(focus, jnp.float32), focused=isinstance(focus, jax.core.Tracer) or focus != 1, **switches)
     problem = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)))
     children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
     plan = Plan(prunes, simulations, children, "node" if memoize == "auto" else memoize, record=bool(record) and settings is not None)
     school, at_once = None, trees
     if heads is not None:
-        head_settings = checked(HEAD_MODES[mode] if head_settings is None else head_settings)
+        head_settings = checked(HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"]) if head_settings is None else head_settings)
         school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
-        if follow and school.value is not None:
-            raise ValueError(f"{method}: follow must be False with a value head, which judges a child by the action of its own, received {follow!r}")
+        if chosen["follow"] and school.value is not None:
+            raise ValueError(f"{method}: follow must be False with a value head, which judges a child by the action of its own, received True")
         problem = problem._replace(guide=guide(school.heads, head_settings))
         plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.train and head_settings.edges == "all" and school.value is not None)
         at_once = min(trees, head_settings.round or max(1, min(trees // 5, LANES))) if head_settings.train else trees
@@ -180,7 +182,7 @@ def _result(sim, reward, harvests, settings, top, school):
         failing=fresh_failure.any(0),
         history=_history(value, fresh_failure, failed),
         invalid=int(has(INVALID).sum()),
-        trials=_trials(harvests, value, failed, ran),
+        trials=_trials(harvests, value, failed, has(FRESH)),
         settings=settings,
         roots=roots,
         heads=None if school is None else school.heads,
@@ -188,11 +190,11 @@ def _result(sim, reward, harvests, settings, top, school):
     )
 
 
-def _trials(harvests, value, failed, ran):
+def _trials(harvests, value, failed, fresh):
     if isinstance(harvests[0].trials, tuple):
         return None
     distance, log_prob = np.moveaxis(np.concatenate([h.trials for h in harvests], axis=2), 1, 0)
-    return Trials(value, np.where(ran & np.isfinite(value), distance, np.inf), log_prob, failed, ran)
+    return Trials(value, np.where(fresh & np.isfinite(value), distance, np.inf), log_prob, failed & fresh, fresh)
 
 
 def _distinct(found, tree, simulation, top):
