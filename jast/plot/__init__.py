@@ -3,18 +3,21 @@
 Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns the axes. The colours are Okabe and Ito's, told apart by
 colour-blind readers; what matters is told by shape or words as well.
 
-Of any system: `history`, `disturbances`, `distances`. Of one simulator: `ferry`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
-`convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `failure_fan`, `weights`.
+Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one simulator: `ferry`; `fms`; `colav`, `colav_story`,
+`colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `failure_fan`,
+`weights`.
 """
 
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.ferry import ferry
+from jast.plot.fms import fms
 from jast.plot.general import distances, disturbances, history
 from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
+from jast.plot.trials import trial_distances, trials
 
 __all__ = [
-    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "ferry", "history",
-    "probability", "proposal_contours", "surrogate_samples", "weights",
+    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "ferry", "fms",
+    "history", "probability", "proposal_contours", "surrogate_samples", "trial_distances", "trials", "weights",
 ]  # fmt: skip

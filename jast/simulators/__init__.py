@@ -3,6 +3,7 @@
 from jast.simulators.autoregression import autoregression
 from jast.simulators.colav import colav
 from jast.simulators.ferry import ferry
+from jast.simulators.fms import fms, fms_misses, fms_path
 from jast.simulators.landing import landing, landing_probability
 from jast.simulators.limit_state import limit_state
 from jast.simulators.pendulum import pendulum
@@ -10,5 +11,6 @@ from jast.simulators.ruin import ruin, ruin_probability
 from jast.simulators.walk import walk1d
 
 __all__ = [
-    "autoregression", "colav", "ferry", "landing", "landing_probability", "limit_state", "pendulum", "ruin", "ruin_probability", "walk1d",
+    "autoregression", "colav", "ferry", "fms", "fms_misses", "fms_path", "landing", "landing_probability", "limit_state", "pendulum", "ruin",
+    "ruin_probability", "walk1d",
 ]  # fmt: skip
