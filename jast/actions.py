@@ -47,17 +47,41 @@ class Samples:
 class Quantiles:
     """See `quantiles`."""
 
-    places_start = True  # `place` serves x0 as well
+    proposal: Any = None
     focus = 1.0
+
+    @property
+    def places_start(self):
+        """Whether `place` serves x0 as well: a proposal is one of steps."""
+        return self.proposal is None
+
+    def of(self, dist):
+        """The distribution whose quantiles they are."""
+        return dist if self.proposal is None else self.proposal
 
     def draw(self, key, dist):
         return self.place(_uniform_like(key, dist), dist)
 
+    def draw_start(self, key, dist):
+        return D.quantile(dist, _uniform_like(key, dist))
+
     def place(self, u, dist):
         """The action at the point ``u`` in [0, 1)^d."""
-        return D.quantile(dist, u)
+        return D.quantile(self.of(dist), u)
 
-    draw_start, near, at, locate, log_prob = draw, Samples.near, place, Samples.locate, Samples.log_prob
+    at = place
+
+    def locate(self, x, dist):
+        """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `place`."""
+        return D.cdf(self.of(dist), x)
+
+    def log_prob(self, x, dist):
+        """Log density of `draw` at ``x``."""
+        return self.of(dist).log_prob(x)
+
+    def near(self, x, dist, scale, start=False):
+        """``x`` drawn towards the mode of the distribution, by ``scale``; integers stay."""
+        return _towards_mode(x, dist if start else self.of(dist), scale)
 
 
 @jax.tree_util.register_dataclass
@@ -147,9 +171,15 @@ def samples():
     return Samples()
 
 
-def quantiles():
-    """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform points are draws of p."""
-    return Quantiles()
+def quantiles(proposal=None):
+    """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform points are draws of p.
+
+    ``proposal``: a distribution with a quantile function in place of p(x | s), the same at every step, from which a search is to draw instead. What it
+    chooses is still scored by p(x | s), and a random start is drawn from its own distribution. ValueError where it has no quantile function.
+    """
+    if proposal is not None and not (isinstance(proposal, D.Distribution) and D.has_quantile(proposal)):
+        raise ValueError(f"actions.quantiles: proposal must be a distribution with a quantile function, received {proposal!r}"[:200])
+    return Quantiles(proposal)
 
 
 def uniform(low, high):

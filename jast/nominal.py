@@ -13,6 +13,7 @@ from jast import rewards
 from jast.check import contract
 from jast.episode import Episode, advance, begin, conclude, rollout
 from jast.estimate.intervals import clopper_pearson
+from jast.incidents import incidents, since
 from jast.policy import undisturbed
 
 __all__ = ["Nominal", "nominal"]
@@ -62,7 +63,7 @@ def nominal(key, sim, episodes=100_000):
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
         raise ValueError(f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}")
     contract(sim, observed=False)
-    episodes = int(episodes)
+    episodes, before = int(episodes), incidents(sim)
     quiet = rollout(key, sim, undisturbed(sim)) if _has_undisturbed(sim) else None  # draws nothing
     failures, invalid, mean = jax.device_get(_count(key, sim, jnp.asarray(episodes, jnp.int32), LANES))
     failures, invalid = int(failures), int(invalid)
@@ -71,9 +72,8 @@ def nominal(key, sim, episodes=100_000):
             "the system fails undisturbed: its likeliest disturbances already lead to a failure, so a search for failures has nothing to find out", stacklevel=2
         )
     if invalid:
-        warnings.warn(
-            f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number that is not finite; they count as not failing", stacklevel=2
-        )
+        said = f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number that is not finite; they count as not failing"
+        warnings.warn("\n  ".join([said, *map(str, since(before, incidents(sim)))]), stacklevel=2)
     return Nominal(quiet, failures, episodes, failures / episodes, clopper_pearson(failures, episodes), float(mean), invalid)
 
 

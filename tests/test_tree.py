@@ -26,8 +26,8 @@ SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
 SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
 
 
-def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0, guide=()):
-    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0)
+def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0, guide=(), **switches):
+    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0, **switches)
     parts = T.Problem(sim, reward, choice, T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)), guide)
     return jax.tree.map(jnp.asarray, parts)
 
@@ -129,11 +129,16 @@ class Slot(NamedTuple):
     v: float
 
 
-def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False):
+def plain_search(
+    child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False, follow=False, feed=False, urgent=False
+):  # fmt: skip
     """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation.
 
     With ``value(state, a)``, of ``weights`` (of Q, of v); ``one``: of a node's children that were not visited only the first is to be had. Third: of each node
     the children to be had, (visits, Q, id, v), 0 where there is none; the v of an only child is never asked for.
+
+    ``urgent``: children that were not visited first. ``follow``: after a failure better than all before, its actions are put into the tree one by one.
+    ``feed``: at level 11 of 21 a rollout takes what the best episode's rollout took there (with ``follow``, of the failures).
     """
 
     def step(state, a):
@@ -150,6 +155,15 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, w
 
     children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, 16.0, 0.0, 0.0, None, np.hypot(16, 50))}
     root, ancestors, log, at_prune = 0, [], [], []
+    best, source, way, ahead, fed, feeds = -np.inf, None, (), None, None, {}  # way: the best episode's nodes; ahead: the same while there are more to come
+
+    def rolled(i, level, state):
+        return feeds[i] if feed and level == 11 and feeds[i] is not None else rollout(i, level, state)
+
+    def score(n, bonus):
+        if urgent:
+            return np.inf if n.visits == 0 else n.q + c * bonus / np.sqrt(n.visits)
+        return weights[0] * n.q + weights[1] * n.v + c * bonus / np.sqrt(1 + n.visits)
 
     @functools.cache
     def v(node, slot):
@@ -164,7 +178,9 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, w
 
     for turn in range(prunes):
         for i in range(turn * simulations, (turn + 1) * simulations):
-            node, path = root, list(ancestors)
+            feeds[i] = fed
+            follows, middle = ahead is not None, None
+            node, path = (ahead[-1], ahead[:-1]) if follows else (root, list(ancestors))
             while True:
                 path.append(node)
                 if ends.get(node):
@@ -174,11 +190,12 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, w
                     count[node] += 1
                     children[node].append(None)
                 bonus = np.sqrt(np.log(visits[node]))
-                scores = [weights[0] * n.q + weights[1] * n.v + c * bonus / np.sqrt(1 + n.visits) for n in to_be_had(node)]
+                scores = [score(n, bonus) for n in to_be_had(node)]
                 slot = int(np.argmax(scores))
                 if children[node][slot] is None:
                     new = i + 1
-                    states[new], gains[new], ends[new] = step(states[node], child(node, slot, states[node][4]))
+                    a = rolled(source, len(path) - 1, states[node]) if follows else child(node, slot, states[node][4])
+                    states[new], gains[new], ends[new] = step(states[node], a)
                     children[node][slot], children[new], count[new], visits[new], q[new] = new, [], 0, 0, 0.0
                     path.append(new)
                     node, level, total = new, len(path) - 1, 0.0
@@ -189,8 +206,17 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, w
             else:
                 state, end = states[node], ends[node]
                 while not end:
-                    state, gain, end = step(state, rollout(i, level, state))
+                    a = rolled(i, level, state)
+                    middle = a if level == 11 else middle
+                    state, gain, end = step(state, a)
                     total, level = total + gain, level + 1
+                reward = total + sum(gains[n] for n in path)
+                better = reward > best and (not follow or np.hypot(state[1] - state[0], state[2] - 50) < 5)
+                if better:
+                    best, source, fed = reward, i, fed if middle is None else middle
+                if follow and (better or follows):
+                    way = list(path)
+                    ahead = None if ends[node] else way
             for n in reversed(path):
                 total += gains[n]
                 visits[n] += 1
@@ -199,17 +225,20 @@ def plain_search(child, rollout, prunes, simulations, k, alpha, c, value=None, w
         at_prune.append([visits[n] for n in children[root] if n is not None])
         ancestors.append(root)
         root = max((n for n in children[root] if n is not None), key=visits.get)
+        if root not in way:  # of another branch
+            ahead, best = None, -np.inf if follow else best
     return at_prune, log, {node: to_be_had(node) for node in children}
 
 
-def agree(key, k, alpha, focus=1.0):
+def agree(key, k, alpha, focus=1.0, **switches):
     """Same numbers drawn, same tree: visits of all children of every root, and every simulation's reward."""
     keys = tree_keys(key, 3)
     choices = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
-    tree, _, roots = grown(jast.simulators.ferry(), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices)
+    tree, _, roots = grown(jast.simulators.ferry(), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices, **switches)
+    assert not (switches.get("follow") or switches.get("feed")) or (np.asarray(tree.lead.source) > 0).any()
     draws = drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max())) if focus == 1 else drawn_by_default(keys, 360, focus)
     for lane, (child, rollout) in enumerate(draws):
-        at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0)
+        at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0, **switches)
         for turn, expected in enumerate(at_prune):
             found = roots[turn].visits[lane]
             assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
@@ -223,6 +252,11 @@ def test_builds_the_tree_of_an_independent_search(key, k, alpha):
 
 def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_actions(key):
     agree(key, 2.0, 0.5, focus=0.25)
+
+
+@pytest.mark.parametrize("switches", [("urgent",), ("feed",), ("follow",), ("follow", "feed", "urgent")], ids=" ".join)
+def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key, switches):
+    agree(key, 2.0, 0.5, **dict.fromkeys(switches, True))
 
 
 def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):

@@ -81,10 +81,10 @@ def fit(steps, z, counts, smoothing, floor):
 
 
 def place(actions, dist, z):
-    """The disturbance at z ~ N(0, I): of the box by the uniform number Phi(z), else of ``dist`` by its quantile function."""
+    """The disturbance at z ~ N(0, I): of the box by the uniform number Phi(z), else of ``dist``, or the actions' proposal, by its quantile function."""
     if isinstance(actions, choices.UniformBox):
         return actions.place(jax.tree.map(phi, z), dist)
-    return quantile(dist, z)
+    return quantile(actions.of(dist), z)
 
 
 def quantile(dist, z):

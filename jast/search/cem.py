@@ -18,6 +18,7 @@ from jast.check import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode, _shapes, accumulator, random_start
+from jast.incidents import incidents, since
 from jast.search import episodes as E
 from jast.search import proposals as P
 
@@ -98,6 +99,8 @@ def cem(
         (pool, _), counted = lax.fori_loop(0, iterations, body, (carry, E.nothing(trees)))
         return E.finish_traced(sim, reward, counted, _best(pool), pool.episode.reward[:, 0])
 
+    before = incidents(sim)
+
     def chunk(carry, begin, end):
         carry, counted, best, rows = search(carry, begin)
         return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
@@ -106,7 +109,8 @@ def cem(
     (pool, _), log = E.drive(chunk, carry, ends, trees=trees, progress=progress, callback=callback, name="cem")
     found, tree, number, count = jax.device_get(_archive(pool, top))
     n = int((found.reward > -jnp.inf).sum())
-    return E.finish(sim, reward, log, _best(pool), jax.tree.map(lambda a: a[:n], found), tree[:n], number[:n], count[:n], settings, top)
+    found = E.finish(sim, reward, log, _best(pool), jax.tree.map(lambda a: a[:n], found), tree[:n], number[:n], count[:n], settings, top)
+    return found._replace(incidents=since(before, incidents(sim)))
 
 
 @partial(jax.jit, static_argnums=5)

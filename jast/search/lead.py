@@ -12,7 +12,7 @@ __all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onwa
 
 
 class Lead(NamedTuple):
-    """The best episode of each of B trees. Without ``follow`` all from ``on`` to ``path`` are ``()``, without ``feed`` ``fed`` is."""
+    """The best episode of each of B trees; with ``follow``, the best failure. Without it ``on`` to ``path`` are ``()``, without ``feed`` ``fed`` is."""
 
     value: jax.Array
     """[B] float: its reward; -inf before there is one."""
@@ -68,10 +68,12 @@ def fed_or(sim, words, here, x):
     return jax.tree.map(lambda a, b: jnp.where(there, a, b), unpack(words[1:], _like(sim)), x)
 
 
-def onward(tree, walk, fresh, child, value, i, middle):
+def onward(tree, walk, fresh, child, value, failed, i, middle):
     """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B, words]: what their rollouts took at `feed_level`."""
     lead = tree.lead
     better = fresh & jnp.isfinite(value) & (value > lead.value)
+    if follows(tree):  # of failures only: following every better miss costs more finds than it brings
+        better &= failed
     pick = lambda pred, new, old: jnp.where(pred, new, old)
     if follows(tree):
         moves = fresh & (better | lead.on)

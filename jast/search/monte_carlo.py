@@ -11,6 +11,7 @@ from jast import actions as choices
 from jast import rewards
 from jast.counter import tree_keys
 from jast.episode import accumulator
+from jast.incidents import incidents, since
 from jast.search import episodes as E
 
 __all__ = ["monte_carlo"]
@@ -59,6 +60,8 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
         best = jax.tree.map(lambda a: a[0], _rebuild(key, sim, reward, actions, found.number[None]))
         return E.finish_traced(sim, reward, counted, best, found.reward[None])
 
+    before = incidents(sim)
+
     def chunk(found, begin, end):
         if record:
             found, counted, rows = _block(key, sim, reward, actions, found, begin, end, lanes)
@@ -73,7 +76,8 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
     found, rebuilt = jax.device_get((found, rebuilt))
     n = int((found.top_reward > -jnp.inf).sum())
     best, candidates = jax.tree.map(lambda a: a[0], rebuilt), jax.tree.map(lambda a: a[1 : n + 1], rebuilt)
-    return E.finish(sim, reward, log, best, candidates, [0] * n, found.top_number[:n], found.top_count[:n], settings, top)
+    found = E.finish(sim, reward, log, best, candidates, [0] * n, found.top_number[:n], found.top_count[:n], settings, top)
+    return found._replace(incidents=since(before, incidents(sim)))
 
 
 def _nothing(sim, top):

@@ -114,7 +114,7 @@ def _simulation(problem, axes, tree, i, memoize):
         log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
         outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
         alive=tree.alive & ~tree.ended,
-        lead=onward(tree, walk, fresh, child, value, i, taken) if isinstance(tree.lead, Lead) else (),
+        lead=onward(tree, walk, fresh, child, value, failed, i, taken) if isinstance(tree.lead, Lead) else (),
         trials=lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0) if recorded else (),
     )
     if not problem.values:

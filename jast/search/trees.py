@@ -13,6 +13,7 @@ from jast.failures import collect, identity
 from jast.heads.rounds import enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import checked
+from jast.incidents import incidents, since
 from jast.search import memory
 from jast.search.choice import Choice
 from jast.search.episodes import prepare, whole
@@ -102,7 +103,7 @@ def grow_trees(
             callback(done[0], trees * total)
 
     chunk = max(1, min(simulations, 500))
-    keys, harvests, interrupted = tree_keys(key, trees), [], False
+    keys, harvests, interrupted, before = tree_keys(key, trees), [], False, incidents(sim)
     for first in range(0, trees, at_once):
         new, interrupted = grow_all(
             problem, keys[first : first + at_once], plan, threads=threads, lanes=lanes, chunk=chunk, candidates=max(256, 4 * top), on_chunk=on_chunk,
@@ -124,7 +125,7 @@ def grow_trees(
         settings["interrupted"] = f"after {done[0]} of {trees * total} simulations"
     if not harvests:
         raise KeyboardInterrupt
-    return _result(sim, reward, harvests, settings, top, school)
+    return _result(sim, reward, harvests, settings, top, school)._replace(incidents=since(before, incidents(sim)))
 
 
 def _fit(method, problem, plan, trees, threads, lanes, available, auto):

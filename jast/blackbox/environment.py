@@ -1,0 +1,96 @@
+"""A Gymnasium environment as a system, by its methods ``reset`` and ``step``: nothing is imported for it. Goes to the workers by value."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["Moment", "gymnasium_system"]
+
+
+class Moment(NamedTuple):
+    """What an environment showed last."""
+
+    observation: Any
+    reward: float
+    """Of the last step; 0 after a reset"""
+    total: float
+    """The sum of the rewards so far"""
+    terminated: bool
+    truncated: bool
+    info: dict
+    env: Any
+    """The environment itself, for what it does not show"""
+
+
+class _System(NamedTuple):
+    """Makes the objects of one environment."""
+
+    make: Any
+    agent: Any
+    apply: Any
+    event: Any
+    distance: Any
+    seed: int
+
+    def __call__(self):
+        return _Environment(self)
+
+
+class _Environment:
+    """The methods that `from_python` asks for."""
+
+    def __init__(self, system):
+        self.system, self.env = system, system.make()
+
+    def initialize(self, x0=None):
+        seed = self.system.seed if x0 is None else x0
+        if np.shape(seed) != () or np.asarray(seed).dtype.kind not in "iu":
+            raise ValueError(f"gymnasium_system: x0 is the seed of the environment, a whole number, received {seed!r}")
+        observation, info = self.env.reset(seed=int(seed))
+        self.now = Moment(observation, 0.0, 0.0, False, False, info, self.env)
+
+    def transition(self, x):
+        if self.is_terminal():
+            return
+        s, now = self.system, self.now
+        action = s.agent(now.observation) if s.agent is not None else None
+        action = s.apply(action, x) if s.apply is not None else x
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.now = Moment(observation, float(reward), now.total + float(reward), bool(terminated), bool(truncated), info, self.env)
+
+    def is_event(self):
+        return bool(self.system.event(self.now))
+
+    def miss_distance(self):
+        return self.system.distance(self.now)
+
+    def is_terminal(self):
+        return self.now.terminated or self.now.truncated
+
+    def observe(self):
+        return np.ravel(self.now.observation)
+
+
+def gymnasium_system(make, distance, *, event=None, agent=None, apply=None, seed=0):
+    """A system for `from_python` from a Gymnasium environment: the agent is under test, the disturbances are what happens to its actions.
+
+    ``make``: () -> environment, e.g. ``lambda: gymnasium.make("Pendulum-v1")``. ``distance``: `Moment` -> float, the miss distance; ``event``: `Moment` ->
+    bool, the failure, by default that the environment has terminated. ``agent``: observation -> action, and ``apply``: (action, disturbance) -> action, what
+    is done in its place; with neither of them the disturbance is the action, and without an agent the action that ``apply`` gets is None. The environment is
+    reset with ``seed``, or with x0 where the start is random (``start=jast.distributions.seeds``). Terminated or truncated ends the episode; transitions after
+    that do nothing. Observations that are arrays of numbers are observed.
+
+    Raises ValueError for what is no function, and an agent without ``apply``: no disturbance would reach the environment.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"gymnasium_system: seed must be a whole number of at least 0, received {seed!r}")
+    for name, value, optional in (("make", make, False), ("distance", distance, False), ("event", event, True), ("agent", agent, True), ("apply", apply, True)):
+        if not (callable(value) or optional and value is None):
+            raise ValueError(f"gymnasium_system: {name} must be a function, received {value!r}")
+    if agent is not None and apply is None:
+        raise ValueError("gymnasium_system: an agent needs apply, (action, disturbance) -> action: else no disturbance reaches the environment")
+    return _System(make, agent, apply, _terminated if event is None else event, distance, int(seed))
+
+
+def _terminated(moment):
+    return moment.terminated

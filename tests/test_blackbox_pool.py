@@ -1,0 +1,158 @@
+"""Black boxes in worker processes: what hangs, dies or raises there costs its own row only, and no process outlives its simulator."""
+
+import gc
+import os
+import sys
+import threading
+import time
+
+import blackboxes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from jast import blackbox
+from jast.blackbox.pool import Pool
+from jast.distributions import Normal
+from jast.incidents import incidents
+
+pytest.importorskip("loky")
+LIMIT = 0.3
+
+
+def box(system, **settings):
+    return blackbox.from_python(system, **(dict(horizon=2, disturbance=Normal(0.0, 1.0), workers=2, time_limit=LIMIT) | settings))
+
+
+def ends(sim, first):
+    """Distances of episodes that begin with ``first`` [n], in one batch."""
+    first = jnp.asarray(first, jnp.zeros(()).dtype)
+    n = len(first)
+    rows = jnp.stack([first, jnp.zeros(n)], axis=1)
+    return np.asarray(jax.vmap(sim.evaluate)(blackbox.Record(jnp.ones(n, bool), jnp.full(n, 2, jnp.int32), (), rows))[1])
+
+
+def processes(sim):
+    """The numbers of the processes that run at the moment."""
+    return [pid for w in sim.evaluate.func.host.runner.workers if w.executor is not None for pid in w.executor._processes]
+
+
+def alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as f:
+            return f.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def gone(pids, seconds=10.0):
+    end = time.monotonic() + seconds
+    while any(map(alive, pids)) and time.monotonic() < end:
+        time.sleep(0.05)
+    return not any(map(alive, pids))
+
+
+def test_what_hangs_or_dies_costs_its_own_row_only():
+    sim = box(blackboxes.troubled)
+    first = np.r_[10.0:17.0, 1, 10.0:13.0, 2, 3, 10.0:20.0, 4, 5]
+    started = time.monotonic()
+    distance = ends(sim, first)
+    np.testing.assert_array_equal(distance, np.where(first < 10, np.nan, first))
+    assert time.monotonic() - started < 25
+    found = {(i.kind, i.message): i for i in incidents(sim)}
+    kinds = ["died", "raised", "timed out", "timed out", "wrong answer"]
+    assert sorted(k for k, _ in found) == kinds and all(i.count == 1 for i in found.values())
+    assert found["died", "the process ended: EXIT(3)"].disturbances.tolist() == [4, 0]
+    assert found["timed out", "no answer within 0.3 s"].disturbances.tolist() == [2, 0]
+    assert found["timed out", "no answer within 0.3 s, and could not be interrupted"].disturbances.tolist() == [3, 0]
+    assert blackbox.calls(sim).rows == len(first)
+    # it ends by itself where every row hangs, and works again after that
+    started = time.monotonic()
+    assert np.isnan(ends(sim, [3, 3])).all() and time.monotonic() - started < 20
+    np.testing.assert_array_equal(ends(sim, [8, 9]), [8, 9])
+    # with the simulator its processes go
+    pids = processes(sim)
+    assert pids and all(map(alive, pids))
+    del sim
+    jax.clear_caches()
+    gc.collect()
+    assert gone(pids)
+
+
+def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
+    sim = box(blackboxes.modules, workers=1)
+    np.testing.assert_array_equal(ends(sim, np.zeros(3)), 0)
+    sim, scale = box(lambda x: (blackboxes.time.sleep(0.02), blackboxes.process(x))[1]), 1.0  # a function of this file, by value
+    pids = ends(sim, np.arange(16.0))
+    assert len(set(pids)) == 2 and os.getpid() not in pids
+    assert scale and incidents(sim) == ()
+
+
+def test_a_search_with_workers_is_that_without(key, equal):
+    sims = [box(blackboxes.Walk, episodic=False, horizon=8, workers=n, time_limit=None) for n in (0, 2)]
+    found = [jast.search.monte_carlo(key, sim, episodes=64, top=2) for sim in sims]
+    equal(found[0].best, found[1].best)
+    assert found[0].best.failure and found[0].failing_share == found[1].failing_share
+    ours, theirs = (blackbox.calls(sim) for sim in sims)
+    # rows stay with their workers, and so do the objects: few histories are repeated
+    assert ours.rows == theirs.rows and ours.episodes <= theirs.episodes <= ours.episodes + 10 and theirs.transitions <= ours.transitions + 60
+    assert incidents(sims[1]) == ()
+
+
+def test_threads_may_ask_at_once():
+    sim = box(lambda x: (False, float(x[0])))
+    answers = {}
+    threads = [threading.Thread(target=lambda i=i: answers.update({i: ends(sim, np.arange(10.0 * i, 10.0 * i + 8))})) for i in range(4)]
+    [t.start() for t in threads], [t.join() for t in threads]
+    for i in range(4):
+        np.testing.assert_array_equal(answers[i], np.arange(10.0 * i, 10.0 * i + 8))
+    assert blackbox.calls(sim)[:3] == (4, 32, 32)
+
+
+def test_a_program_is_ended_with_its_children():
+    mark = f"{time.time():.6f}"
+    sim = box(blackbox.program(["sh", "-c", f"sleep 60.{mark[-6:]} & wait"]), workers=1)
+    assert np.isnan(ends(sim, [0.0]))
+    (only,) = incidents(sim)
+    assert only.kind == "timed out"
+    running = [pid for pid in os.listdir("/proc") if pid.isdigit() and f"60.{mark[-6:]}".encode() in _command(pid)]
+    assert gone(running)
+
+
+def _command(pid):
+    try:
+        with open(f"/proc/{pid}/cmdline", "rb") as f:
+            return f.read()
+    except OSError:
+        return b""
+
+
+class Broken(blackboxes.Walk):
+    def initialize(self):
+        os._exit(1)
+
+
+def test_bad_input_is_named(monkeypatch):
+    lock = threading.Lock()
+    with pytest.raises(ValueError, match="system cannot be sent to a worker process: .*lock.*define it at the top of a module"):
+        box(lambda x: (lock.locked(), 1.0))
+    with pytest.raises(ValueError, match="from_python: system: the process ended"):
+        box(Broken, episodic=False)
+    with pytest.raises(ValueError, match="lacks is_event"):
+        box(lambda: type("Mute", (blackboxes.Walk,), {"is_event": None})())
+    monkeypatch.setitem(sys.modules, "loky", None)
+    with pytest.raises(ImportError, match=r"pip install 'jast\[blackbox\]'"):
+        Pool(b"", 1, None)._start([blackbox.pool.Worker(b"")])
+
+
+def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch):
+    (tmp_path / "only_here.py").write_text("def run(x):\n    return False, 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import only_here
+
+    sim = box(only_here.run, workers=1)
+    (tmp_path / "only_here.py").write_text("raise OSError('no licence')\n")
+    with pytest.raises(RuntimeError, match="a worker process could not load the system: OSError: no licence"):
+        ends(sim, [0.0])
