@@ -1,6 +1,6 @@
 """Actions: what a search chooses at a step. An action becomes a disturbance before ``step``; only disturbances are stored."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -47,17 +47,20 @@ class Samples:
 class Quantiles:
     """See `quantiles`."""
 
-    proposal: Any = None
+    numbers: tuple = ()
+    """The leaves of the proposal."""
+    kind: Any = field(default=None, metadata=dict(static=True))
+    """Its structure, or None without one."""
     focus = 1.0
 
     @property
     def places_start(self):
         """Whether `place` serves x0 as well: a proposal is one of steps."""
-        return self.proposal is None
+        return self.kind is None
 
     def of(self, dist):
         """The distribution whose quantiles they are."""
-        return dist if self.proposal is None else self.proposal
+        return dist if self.kind is None else self.kind.unflatten(self.numbers)
 
     def draw(self, key, dist):
         return self.place(_uniform_like(key, dist), dist)
@@ -179,7 +182,9 @@ def quantiles(proposal=None):
     """
     if proposal is not None and not (isinstance(proposal, D.Distribution) and D.has_quantile(proposal)):
         raise ValueError(f"actions.quantiles: proposal must be a distribution with a quantile function, received {proposal!r}"[:200])
-    return Quantiles(proposal)
+    # a distribution itself cannot be mapped over, as searches do with what they are given
+    numbers, kind = jax.tree.flatten(proposal)
+    return Quantiles(tuple(numbers), None if proposal is None else kind)
 
 
 def uniform(low, high):

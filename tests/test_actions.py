@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 import jast
 from jast import actions
@@ -113,3 +114,25 @@ def test_check_says_what_is_wrong_with_the_ends_of_a_box():
         jast.check(sim, actions.uniform({"a": -1.0}, 2.0))
     with pytest.raises(ValueError, match=r"actions.uniform: high has shape \(3,\), expected one that broadcasts to the disturbance's \(\)"):
         jast.check(sim, actions.uniform(0.0, {"a": 1.0, "b": jnp.ones(3)}))
+
+
+# --- a proposal of the search's own ---------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("search", ["monte_carlo", "cem", "mcts"])
+def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
+    """Of landing: drifts from N(.2, .01^2), so that all fail; offsets at the start from the model."""
+    sim, near = jast.simulators.landing(), actions.quantiles(D.Normal(jnp.full((), 0.2), jnp.full((), 0.01)))
+    sizes = dict(monte_carlo=dict(episodes=200), cem=dict(samples=40, elites=10, iterations=2), mcts=dict(simulations=100))[search]
+    found = getattr(jast.search, search)(key, sim, actions=near, **sizes)
+    assert found.failing_share == 1
+    e = found.failures.episodes
+    assert (abs(e.disturbances - 0.2) < 0.06).all() and (abs(e.x0) < 0.5).all()
+    log_p = norm.logpdf(e.x0, 0, 0.1) + norm.logpdf(e.disturbances, 0, 0.03).sum(1)
+    np.testing.assert_allclose(e.log_prob, log_p, rtol=1e-4)
+
+
+def test_a_proposal_without_quantiles_is_refused():
+    for wrong in (D.seeds(), 3.0):
+        with pytest.raises(ValueError, match="actions.quantiles: proposal must be a distribution with a quantile function"):
+            actions.quantiles(wrong)

@@ -124,7 +124,7 @@ def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
 
     flat = lambda a: a.reshape(trees * samples, *a.shape[2:])
     apart = lambda a: a.reshape(trees, samples, *a.shape[1:])
-    draws = (P.drawer(kind, a, f) for kind, a, f in zip(plan.kinds, (None, actions), (actions.draw_start, actions.draw), strict=True))
+    draws = (P.drawer(kind, a, f) for kind, a, f in zip(plan.kinds, (choices.quantiles(), actions), (actions.draw_start, actions.draw), strict=True))
     live = jnp.ones((trees * samples,), bool)
     played = E.play(sim, reward, flat(keys), *draws, live, jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows), record=True)
     tree = jnp.repeat(jnp.arange(trees, dtype=jnp.int32), samples)
