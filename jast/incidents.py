@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jax.tree_util import Partial
 
-__all__ = ["GROUPS", "KINDS", "Incident", "Log", "incidents", "since", "sources"]
+__all__ = ["GROUPS", "KINDS", "Incident", "Log", "hosted", "incidents", "since", "sources"]
 
 GROUPS = 100
 """The most different messages that a `Log` keeps apart."""
@@ -76,6 +76,11 @@ def sources(sim, name) -> Iterator[Any]:
                 if callable(getattr(part.func, name, None)) and id(part.func) not in seen:
                     seen.add(id(part.func))
                     yield part.func
+
+
+def hosted(sim):
+    """Whether the simulator runs on the host: a black box, slow and without gradients."""
+    return any(True for _ in sources(sim, "incidents"))
 
 
 def incidents(sim):

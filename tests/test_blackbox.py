@@ -41,7 +41,7 @@ def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     np.testing.assert_allclose(ours.best.reward, theirs.best.reward, rtol=1e-6)
     n = blackbox.calls(sim)
     assert n.rows == n.episodes == ours.episodes + 1 + 3 and n.transitions == 4 * n.episodes  # the best one and three failures are replayed
-    assert n.calls < 20 and n.seconds > 0 and "ms an outcome" in str(n)
+    assert n.calls < 40 and n.seconds > 0 and "ms an outcome" in str(n)
     assert incidents(sim) == ()
 
 

@@ -458,10 +458,10 @@ def test_a_record_of_nothing_is_empty():
 # --- copies ---------------------------------------------------------------------------------------------------------------------------------------------------
 
 
-def compiled_text(sim, simulations, memoize, **choices):
+def compiled_text(sim, simulations, memoize, record=False, **choices):
     p = problem(sim, simulations, **choices)
     keys = tree_keys(jax.random.key(0), 2)
-    tree = jax.eval_shape(lambda: T.make(p, run._shared(p), keys, simulations, memoize))
+    tree = jax.eval_shape(lambda: T.make(p, run._shared(p), keys, simulations, memoize, record=record))
     return run._grow.lower(p, tree, 0, 100, memoize).compile().as_text()
 
 
@@ -493,6 +493,11 @@ def test_no_array_of_the_tree_is_copied_in_a_loop(memoize):
 def test_nor_with_other_states(name):
     sim, choices = SYSTEMS[name]
     assert not large_copies(compiled_text(sim, 307, "node", **choices), 307)
+
+
+@pytest.mark.parametrize("sim", [FERRY, LANDING], ids=["ferry", "landing"])
+def test_nor_when_the_best_episode_is_followed_and_trials_are_recorded(sim):
+    assert not large_copies(compiled_text(sim, 307, "node", record=True, follow=True, feed=True, urgent=True, **(S0 if sim is FERRY else PLAIN)), 307)
 
 
 def test_the_program_does_not_grow_with_the_simulations():

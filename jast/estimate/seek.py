@@ -16,7 +16,7 @@ from jast.estimate.design_points import design_points, distinct
 from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
 from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore, generator
-from jast.incidents import sources
+from jast.incidents import hosted
 
 __all__ = ["Seeker", "seek"]
 
@@ -79,7 +79,7 @@ class Seeker:
 def seek(key, sim, budget, gradients=True):
     """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was found."""
     s = Seeker(key, sim, budget)
-    parts = _explore(s, gradients and not any(sources(sim, "incidents")))  # a black box has no gradient
+    parts = _explore(s, gradients and not hosted(sim))
     if not parts:
         return s
     if s.populations:

@@ -1,15 +1,17 @@
 """Routes of `jast.simulators.fms`: the path on a map, and the turn that is furthest from what the predictor says of it."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast.plot import style
 from jast.simulators.fms import FIXES, KLAX, KSFO
-from jast.simulators.fms.events import FOOT, extent
+from jast.simulators.fms.events import EVENTS, FOOT, extent
 from jast.simulators.fms.geodesic import direct, inverse
 from jast.simulators.fms.lateral import NMI
-from jast.simulators.fms.system import fms_misses, fms_path
+from jast.simulators.fms.system import fms_path
 
 __all__ = ["fms"]
 
@@ -28,12 +30,11 @@ def fms(sim, episode, axes=None):
     import matplotlib.pyplot as plt
 
     style.one("fms", episode)
-    path, misses = fms_path(sim, episode), fms_misses(sim, episode)
+    path = fms_path(sim, episode)
     model = sim.init.args[0]
-    arcs, built, error, path = jax.device_get((*_arcs(model.build.earth, path), path))
+    arcs, built, error, event, path = jax.device_get((*_arcs(model.build.earth, path, model.event), path))
     path = jax.tree.map(lambda a: a[: _count(path, a)], path)
     n = len(path.waypoints) - 2
-    event = dict(zip(UNITS, misses, strict=True))[model.event]
     with style.styled():
         axes = style.panels("fms", plt.subplots(1, 2, figsize=(11.5, 6.3), layout="constrained")[1] if axes is None else axes, 2, "the map and the turn")[:2]
         worst = None
@@ -54,9 +55,9 @@ def _count(path, a):
     return placed + len(a) - len(path.turn)
 
 
-@jax.jit
-def _arcs(earth, path):
-    """Points on the arcs as their packets say and as they were built, both [T, POINTS, 2]; the errors of their stated lengths [T] (m)."""
+@partial(jax.jit, static_argnums=2)
+def _arcs(earth, path, event):
+    """Points on the arcs as their packets say and as they were built, both [T, POINTS, 2]; errors of their stated lengths [T] (m); the miss distance."""
     angle, radius = extent(earth, path), jnp.abs(path.radius)
     _, at_start, _ = inverse(earth, path.centre, path.start)
     _, at_end, _ = inverse(earth, path.centre, path.end)
@@ -65,7 +66,7 @@ def _arcs(earth, path):
     around = lambda azimuth: direct(earth, centres, azimuth, jnp.broadcast_to(radius[:, None], azimuth.shape))[0]
     flown = around(at_start[:, None] + sense * angle[:, None] * share)
     built = around(at_end[:, None] - sense * jnp.abs(path.turn)[:, None] * (1 - share))
-    return flown, built, jnp.where(path.arc, jnp.abs(path.beta - angle * radius), 0)
+    return flown, built, jnp.where(path.arc, jnp.abs(path.beta - angle * radius), 0), EVENTS[event](earth, path)
 
 
 def _line(path, arcs):

@@ -11,12 +11,13 @@ from jast import actions as choices
 from jast import rewards
 from jast.counter import tree_keys
 from jast.episode import accumulator
-from jast.incidents import incidents, since
+from jast.incidents import hosted, incidents, since
 from jast.search import episodes as E
 
 __all__ = ["monte_carlo"]
 
-LANES = 4096
+LANES, HOSTED = 4096, 64
+"""Episodes in lockstep; of a system on the host, where a chunk takes long, and only between chunks can a search be watched and interrupted."""
 MOMENTS = 200
 """Of the history, about: a moment is at least a block of ``LANES`` episodes."""
 
@@ -43,15 +44,15 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up to chance. A random start is drawn likewise (from its own
     distribution where actions are a box). The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``: distinct failures
     kept, static like ``episodes``. ``record=True`` keeps the numbers of every episode (``result.trials``); without it memory does not grow with ``episodes``.
-    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which there are about 200; KeyboardInterrupt ends the search with
-    the result of the whole chunks, and ``settings["interrupted"]``.
+    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which there are about 200 (a black box has one each 64
+    episodes); KeyboardInterrupt ends the search with the result of the whole chunks, and ``settings["interrupted"]``.
 
     Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or
     the actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
     reward, settings = E.prepare("monte_carlo", key, sim, reward, actions, episodes=episodes)
-    lanes = min(LANES, max(128, 1 << (episodes - 1).bit_length()))
+    lanes = HOSTED if hosted(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
     key = tree_keys(key, 1)[0]
     if settings is None:
         if episodes * sim.horizon >= 2**31:
@@ -69,7 +70,8 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
         found, counted = _chunk(key, sim, reward, actions, found, begin, end, lanes)
         return found, counted, found.reward[None], None
 
-    blocks = 1 if record else max(1, min(-(-episodes // (lanes * MOMENTS)), (2**31 - 1) // (lanes * sim.horizon)))  # the steps of a chunk are counted in int32
+    most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
+    blocks = 1 if record or hosted(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
     ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
     found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback, name="monte_carlo")
     rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))

@@ -13,7 +13,7 @@ from jast.failures import collect, identity
 from jast.heads.rounds import enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import checked
-from jast.incidents import incidents, since
+from jast.incidents import hosted, incidents, since
 from jast.search import memory
 from jast.search.choice import Choice
 from jast.search.episodes import prepare, whole
@@ -102,7 +102,7 @@ def grow_trees(
         if callback is not None:
             callback(done[0], trees * total)
 
-    chunk = max(1, min(simulations, 500))
+    chunk = max(1, min(simulations, 10 if hosted(sim) else 500))
     keys, harvests, interrupted, before = tree_keys(key, trees), [], False, incidents(sim)
     for first in range(0, trees, at_once):
         new, interrupted = grow_all(

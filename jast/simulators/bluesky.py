@@ -1,0 +1,176 @@
+"""BlueSky, the open air traffic simulator of TU Delft (bluesky-simulator 1.1, https://github.com/TUDelft-CNS-ATM/bluesky), as a black box: does its lateral
+navigation fly the route that it was given?
+
+The disturbances are those of the thesis's flight management system (Moss, eq. 3.5; see `jast.simulators.fms`), with fewer and nearer waypoints. One aircraft
+(an A320 at 6000 ft and 210 kt CAS) starts in the direction of the first leg, every waypoint is a fly-by waypoint, LNAV is on; steps of one second until BlueSky
+ends LNAV, at most for twice the time that the route takes.
+
+The failure is a criterion of our own, judged on the flown track alone: **a waypoint is missed**. A fly-by turn cuts its corner, so a waypoint may be passed at
+``R (1 / cos(turn / 2) - 1)``, R the radius of a turn of 25 degrees of bank (BlueSky's own) at the greatest ground speed of the flight; with turns taken as 120
+degrees where they are sharper, as no procedure may ask for a sharper fly-by turn (ICAO Doc 8168 limits it so). Where the turns at both ends of a leg do not fit
+on it, the missing length is allowed too, and then ``tolerance``, 1 nmi as in RNP 1. What is left is no matter of the route: BlueSky leads turns without a
+limit, drops waypoints that it believes passed (its issue #286), and ends LNAV at the last one before it is there (#354).
+"""
+
+import contextlib
+import importlib.metadata
+import io
+import threading
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jast._checks import real, whole
+from jast.blackbox import from_python
+from jast.distributions import Independent, Normal
+
+__all__ = ["MEANS", "SIGMAS", "Flight", "bluesky", "bluesky_flight"]
+
+MEANS = (0.0, 7.0, -88.5, 20.0)
+SIGMAS = (30.0, 2.0, 39.5, 8.0)
+"""Of x: true course (degrees), distance (nmi), wind direction (degrees, blown towards), wind speed (kt)."""
+
+KNOT, FOOT, NMI = 1852 / 3600, 0.3048, 1852.0
+ALTITUDE, CAS, TAS = 6000 * FOOT, 210 * KNOT, 229.0  # m, m/s, and the true air speed that these make (kt)
+BANK, SHARPEST, LEAST = 25.0, 120.0, 0.1  # degrees, degrees, nmi
+ONE = threading.Lock()  # one BlueSky a process
+
+
+class Flight(NamedTuple):
+    """A flown route. NumPy; points are nmi to the north and to the east of the start."""
+
+    route: np.ndarray
+    """[T + 1, 2]: the start and the waypoints"""
+    track: np.ndarray
+    """[n, 2]: where the aircraft was, each second"""
+    turns: np.ndarray
+    """[T]: change of course (degrees) at each waypoint, to the right positive, in [-180, 180); 0 at the last"""
+    nearest: np.ndarray
+    """[T]: how near (nmi) the track came to each waypoint"""
+    allowed: np.ndarray
+    """[T]: how near (nmi) it had to come, without ``tolerance``"""
+    finished: bool
+    """BlueSky ended LNAV within the time"""
+
+
+def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
+    """Routes of ``waypoints`` random waypoints flown by BlueSky, an episodic `Simulator` of as many steps through `jast.blackbox.from_python`.
+
+    x [4], four normals (`MEANS`, `SIGMAS`) that place the next waypoint: true course (degrees) and distance (nmi, at least 0.1) from the last one, wind there:
+    direction (degrees, blown towards) and speed (kt); BlueSky interpolates the wind. Miss distance (nmi): the least over the waypoints of ``allowed +
+    tolerance - nearest`` (see `Flight` and this module), a failure where it is not positive; a flight that does not end in time fails too, with 0 at most.
+    The distance is float64 on the host, and the simulator needs no float64.
+
+    ``workers``, ``time_limit``: as of `from_python`. BlueSky is one a process: with ``workers=0`` it is this process's, and is reset for every episode.
+    The first start (10 s) makes ``~/bluesky`` with a cache, and the settings there are used; later ones take 2 s, a flight about 0.3 s. No network.
+
+    Raises ImportError where BlueSky is not installed, ValueError for settings out of range. Gives the same to the bit for the same disturbances.
+    """
+    waypoints = whole("bluesky", "waypoints", waypoints)
+    tolerance = float(real("bluesky", "tolerance", tolerance, lambda v: 0 <= v < np.inf, "of nmi, at least 0"))
+    _installed()
+    disturbance = Independent(Normal(jnp.asarray(MEANS), jnp.asarray(SIGMAS)), 1)
+    return from_python(partial(Route, tolerance), horizon=waypoints, disturbance=disturbance, workers=workers, time_limit=time_limit)
+
+
+def bluesky_flight(disturbances):
+    """The `Flight` of the disturbances [T, 4] of an episode of `bluesky`, flown by the BlueSky of this process. ImportError, ValueError for another shape."""
+    x = np.asarray(disturbances, np.float64)
+    if x.ndim != 2 or x.shape[1] != 4 or not len(x) or not np.isfinite(x).all():
+        raise ValueError(f"bluesky_flight: disturbances must be finite and [waypoints, 4], received shape {x.shape}")
+    _installed()
+    with ONE:
+        return judged(*fly(x))
+
+
+class Route:
+    """The methods of Table 3.1 of the thesis: a route is collected, then flown."""
+
+    def __init__(self, tolerance):
+        self.tolerance = tolerance
+        with ONE:
+            started()
+
+    def initialize(self):
+        self.rows = []
+
+    def transition(self, x):
+        self.rows.append(x)
+
+    def evaluate(self):
+        with ONE:
+            flight = judged(*fly(np.asarray(self.rows, np.float64)))
+        self.distance = float(np.min(flight.allowed + self.tolerance - flight.nearest))
+        if not flight.finished:
+            self.distance = min(self.distance, 0.0)
+
+    def is_event(self):
+        return self.distance <= 0
+
+    def miss_distance(self):
+        return self.distance
+
+
+def started():
+    """BlueSky, as this process has it."""
+    import bluesky as bs
+
+    if bs.traf is None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            bs.init(mode="sim", detached=True)
+        bs.navdb.reset = lambda: None  # else each reset reads all named waypoints of the world again, which no route here uses
+    return bs
+
+
+def fly(x):
+    """(route [T + 1, 2], track [n, 2], greatest ground speed (kt), whether LNAV came to its end) of disturbances x [T, 4], by `started`."""
+    bs = started()
+    course, length = np.radians(x[:, 0]), np.maximum(x[:, 1], LEAST)
+    route = np.concatenate([np.zeros((1, 2)), np.cumsum(length[:, None] * np.stack([np.cos(course), np.sin(course)], 1), 0)])
+    bs.sim.reset()
+    bs.traf.cre("JAST", "A320", 0.0, 0.0, float(x[0, 0]) % 360, ALTITUDE, CAS)
+    bs.stack.stack("DT 1")
+    for (north, east), (_, _, towards, speed) in zip(route[1:] / 60, x):
+        bs.stack.stack(f"ADDWPT JAST {north:.12f},{east:.12f}")
+        bs.traf.wind.addpoint(north, east, towards + 180, speed * KNOT)
+    bs.stack.stack("LNAV JAST ON")
+    track, fastest, on = [route[0]], 0.0, True
+    for second in range(int(2 * length.sum() / TAS * 3600) + 60):
+        bs.sim.step()
+        track.append((60 * bs.traf.lat[0], 60 * bs.traf.lon[0]))
+        fastest, on = max(fastest, bs.traf.gs[0]), bool(bs.traf.swlnav[0])
+        if second == 0 and (not on or bs.traf.ap.route[0].nwp != len(x)):  # BlueSky prints what is wrong with a command, and goes on
+            raise RuntimeError(f"BlueSky took {bs.traf.ap.route[0].nwp} of {len(x)} waypoints, LNAV {'on' if on else 'off'}")
+        if not on:
+            break
+    return route, np.array(track), fastest / KNOT, not on
+
+
+def judged(route, track, speed, finished):
+    """The `Flight`: what the track came to, and what was asked of it."""
+    legs = np.diff(route, axis=0)
+    course, length = np.degrees(np.arctan2(legs[:, 1], legs[:, 0])), np.hypot(*legs.T)
+    turns = np.append((np.diff(course) + 180) % 360 - 180, 0.0)
+    half = np.radians(np.minimum(np.abs(turns), SHARPEST) / 2)
+    radius = (speed * KNOT) ** 2 / (9.80665 * np.tan(np.radians(BANK))) / NMI
+    lead = radius * np.tan(half)
+    lack = np.maximum(np.append(0.0, lead[:-1]) + lead - length, 0.0)  # of each leg, to have room for the turns at its ends
+    allowed = radius * (1 / np.cos(half) - 1) + lack + np.append(lack[1:], 0.0)
+    return Flight(route, track, turns, nearest(route[1:], track), allowed, finished)
+
+
+def nearest(points, track):
+    """Distances [T] from ``points`` [T, 2] to the line through ``track`` [n, 2]."""
+    a, step = track[:-1], np.diff(track, axis=0)
+    away = points[:, None] - a
+    along = np.clip(np.sum(away * step, -1) / np.maximum(np.sum(step * step, -1), 1e-12), 0, 1)
+    return np.min(np.hypot(*np.moveaxis(away - along[..., None] * step, -1, 0)), axis=1)
+
+
+def _installed():
+    try:
+        importlib.metadata.version("bluesky-simulator")  # not the name of the module, which another project has too
+    except importlib.metadata.PackageNotFoundError:
+        raise ImportError("jast.simulators.bluesky needs BlueSky: pip install 'jast[bluesky]'") from None
