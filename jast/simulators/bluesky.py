@@ -6,10 +6,9 @@ The disturbances are those of the thesis's flight management system (Moss, eq. 3
 ends LNAV, at most for twice the time that the route takes.
 
 The failure is a criterion of our own, judged on the flown track alone: **a waypoint is missed**. A fly-by turn cuts its corner, so a waypoint may be passed at
-``R (1 / cos(turn / 2) - 1)``, R the radius of a turn of 25 degrees of bank (BlueSky's own) at the greatest ground speed of the flight; with turns taken as 120
-degrees where they are sharper, as no procedure may ask for a sharper fly-by turn (ICAO Doc 8168 limits it so). Where the turns at both ends of a leg do not fit
-on it, the missing length is allowed too, and then ``tolerance``, 1 nmi as in RNP 1. What is left is no matter of the route: BlueSky leads turns without a
-limit, drops waypoints that it believes passed (its issue #286), and ends LNAV at the last one before it is there (#354).
+``R (1 / cos(turn / 2) - 1)``, R the radius of a turn of 25 degrees of bank (BlueSky's own) at the greatest ground speed of the flight, but never by more than
+R, which is the corner of a turn of 120 degrees. Where the turns at both ends of a leg do not fit on it, the missing length is allowed too. A waypoint that is
+passed by more than that and another ``tolerance`` (1 nmi, as in RNP 1) is missed.
 """
 
 import contextlib
@@ -34,7 +33,7 @@ SIGMAS = (30.0, 2.0, 39.5, 8.0)
 
 KNOT, FOOT, NMI = 1852 / 3600, 0.3048, 1852.0
 ALTITUDE, CAS, TAS = 6000 * FOOT, 210 * KNOT, 229.0  # m, m/s, and the true air speed that these make (kt)
-BANK, SHARPEST, LEAST = 25.0, 120.0, 0.1  # degrees, degrees, nmi
+BANK, SHARPEST, LEAST, FLOOR = 25.0, 120.0, 0.1, 1e-3  # degrees, degrees, nmi, of the tolerance
 ONE = threading.Lock()  # one BlueSky a process
 
 
@@ -50,7 +49,7 @@ class Flight(NamedTuple):
     nearest: np.ndarray
     """[T]: how near (nmi) the track came to each waypoint"""
     allowed: np.ndarray
-    """[T]: how near (nmi) it had to come, without ``tolerance``"""
+    """[T]: how near (nmi) it had to come, but for ``tolerance``"""
     finished: bool
     """BlueSky ended LNAV within the time"""
 
@@ -59,9 +58,9 @@ def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
     """Routes of ``waypoints`` random waypoints flown by BlueSky, an episodic `Simulator` of as many steps through `jast.blackbox.from_python`.
 
     x [4], four normals (`MEANS`, `SIGMAS`) that place the next waypoint: true course (degrees) and distance (nmi, at least 0.1) from the last one, wind there:
-    direction (degrees, blown towards) and speed (kt); BlueSky interpolates the wind. Miss distance (nmi): the least over the waypoints of ``allowed +
-    tolerance - nearest`` (see `Flight` and this module), a failure where it is not positive; a flight that does not end in time fails too, with 0 at most.
-    The distance is float64 on the host, and the simulator needs no float64.
+    direction (degrees, blown towards) and speed (kt); BlueSky interpolates the wind. Miss distance: ln(``tolerance`` / e), e the greatest ``nearest - allowed``
+    (nmi; see `Flight`) of a waypoint, as in the thesis's eq. 3.4; a failure where it is not positive. e counts as at least ``tolerance`` / 1000, and as
+    ``tolerance`` at least where the flight did not end in time, which thus is a failure. Works in float32 and float64.
 
     ``workers``, ``time_limit``: as of `from_python`. BlueSky is one a process: with ``workers=0`` it is this process's, and is reset for every episode.
     The first start (10 s) makes ``~/bluesky`` with a cache, and the settings there are used; later ones take 2 s, a flight about 0.3 s. No network.
@@ -69,7 +68,7 @@ def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
     Raises ImportError where BlueSky is not installed, ValueError for settings out of range. Gives the same to the bit for the same disturbances.
     """
     waypoints = whole("bluesky", "waypoints", waypoints)
-    tolerance = float(real("bluesky", "tolerance", tolerance, lambda v: 0 <= v < np.inf, "of nmi, at least 0"))
+    tolerance = float(real("bluesky", "tolerance", tolerance, lambda v: 0 < v < np.inf, "of nmi above 0"))
     _installed()
     disturbance = Independent(Normal(jnp.asarray(MEANS), jnp.asarray(SIGMAS)), 1)
     return from_python(partial(Route, tolerance), horizon=waypoints, disturbance=disturbance, workers=workers, time_limit=time_limit)
@@ -102,9 +101,8 @@ class Route:
     def evaluate(self):
         with ONE:
             flight = judged(*fly(np.asarray(self.rows, np.float64)))
-        self.distance = float(np.min(flight.allowed + self.tolerance - flight.nearest))
-        if not flight.finished:
-            self.distance = min(self.distance, 0.0)
+        least = self.tolerance * (FLOOR if flight.finished else 1.0)
+        self.distance = float(np.log(self.tolerance / max(least, *(flight.nearest - flight.allowed))))
 
     def is_event(self):
         return self.distance <= 0
