@@ -39,7 +39,7 @@ def searches(evaluations, seeds):
     mcts = lambda key, sim, **of: jast.search.mcts(key, sim, trees=seeds, simulations=evaluations, record=True, **of)
     cem = dict(samples=evaluations // 10, elites=evaluations // 100, iterations=10, trees=seeds, reward=safe, actions=jast.actions.quantiles(near), record=True)
     deep = dict(mode="episodic", reward=safe, exploration=1000.0)  # a hundredth of what failures earn
-    likely = dict(mode="episodic", reward=jast.rewards.standard(event_bonus=600.0), exploration=10.0)  # among failures log p decides
+    likely = dict(mode="episodic", reward=jast.rewards.standard(event_bonus=600.0), exploration=3.0)  # among failures log p decides
     roots = dict(trees=seeds, prunes=5, simulations=evaluations // 5, record=True)
     return {
         "database": (monte_carlo, dict(database=True)),

@@ -11,6 +11,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast.actions import Quantiles, Samples, UniformBox
+from jast.incidents import incidents, since
 from jast.simulator import Simulator
 
 __all__ = ["OBSERVED", "check", "contract"]
@@ -28,18 +29,19 @@ def check(sim, actions=None):
     Raises ValueError naming the function at fault (its own exception is the ``__cause__``): what `contract` finds; a log density that is not finite on its own
     samples; NaN in the state or a distance that is not finite in the undisturbed first steps, or in more than half of the nominal ones; ``init``, ``step`` or
     ``evaluate`` with another answer the second time; actions that are impossible under p(x | s) in more than half of 64 draws at the start. Only
-    the traced half runs where ``sim`` holds tracers or inside a transformation.
+    the traced half runs where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system, and the first steps of another.
     """
     contract(sim, actions)
     traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((sim, actions)))
     if traced or isinstance(jnp.zeros(()) + 0, jax.core.Tracer):
         return sim
+    before = incidents(sim)
     try:
         found = jax.device_get(_probe(sim, actions))
     except jax.errors.JaxRuntimeError as e:  # a host callback that raised
         raise ValueError(f"check: the first steps raised {_first_line(e)}") from e
     _densities(found)
-    _numbers(found)
+    _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
     if actions is not None and (share := found["actions"]) > 0.5:
         box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]" if isinstance(actions, UniformBox) else ""
@@ -221,7 +223,7 @@ def _densities(found):
         raise ValueError(f"{name}: log_prob is not finite in {density[:, t].sum()} of {LANES} of its own samples{where}")
 
 
-def _numbers(found):
+def _numbers(found, went_wrong):
     def bad(flags):  # [LANES + 1, STEPS + 1] -> the first step at which it is wrong, or None
         steps = np.flatnonzero((flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found["has_mode"])))
         return steps[0] if steps.size else None
@@ -230,7 +232,7 @@ def _numbers(found):
     for t, path in sorted(wrong, key=lambda p: p[0])[:1]:
         raise ValueError(f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN {f'after {t} steps' if t else 'at the start'}, expected a number")
     if (t := bad(found["distance"])) is not None:
-        raise ValueError(f"evaluate: distance is not finite after {t} steps, expected a number")
+        raise ValueError("\n  ".join([f"evaluate: distance is not finite after {t} steps, expected a number", *map(str, went_wrong)]))
 
 
 def _repeats(sim, x0, x, judged):

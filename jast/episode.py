@@ -94,16 +94,17 @@ def advance(sim, reward, progress, x, last):
 def conclude(sim, reward, progress, live=True):
     """The `Progress` with the outcome of an episodic system, whose episode is ``done``; that of any other system stays as it is.
 
-    Here and nowhere else such a system is evaluated. Where not ``live`` the state is replaced by zeros, and the outcome means nothing.
+    Here such a system is evaluated. Where not ``live`` it is shown a state of zeros, and the `Progress` stays as it is.
     """
     if not sim.episodic:
         return progress
-    live = jnp.asarray(live) & ~progress.invalid
+    live = jnp.asarray(live) & progress.done & ~progress.invalid
     event, own = sim.evaluate(jax.tree.map(lambda a: jnp.where(live, a, jnp.zeros((), a.dtype)), progress.state))
     event, own = jnp.asarray(event), jnp.asarray(own).astype(progress.reward.dtype)
     total = _paid(reward, progress.reward, progress.owed, event, own, jnp.ones((), bool), -own)
-    invalid = progress.invalid | ~jnp.isfinite(own) | jnp.isnan(total) | (total == jnp.inf)
-    return progress._replace(owed=jnp.zeros_like(progress.owed), **_outcome(total, own, event, jnp.ones((), bool), invalid))
+    invalid = ~jnp.isfinite(own) | jnp.isnan(total) | (total == jnp.inf)
+    new = dict(owed=jnp.zeros_like(progress.owed)) | _outcome(total, own, event, jnp.ones((), bool), invalid)
+    return progress._replace(**{name: jnp.where(live, value, getattr(progress, name)) for name, value in new.items()})
 
 
 def _arrive(sim, reward, before, state, log_p, last, approach):

@@ -102,6 +102,24 @@ def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
         np.testing.assert_allclose(e.distance, 3 - total, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("limit", [1e9, 1.0, -1.0], ids=["never", "sometimes", "at the start"])
+@pytest.mark.parametrize("search", ["monte_carlo", "mcts", "forest"])
+def test_one_start_and_an_end(key, search, limit):
+    """Ended never, early, or at once: each search has the episodes that it says, and their ends are those of replays."""
+    step, normal = lambda s, x: (s[0] + x, s[1] + 1), lambda s: Normal(jnp.zeros(()), 1.0)
+    init = lambda x0: (jnp.zeros(()), jnp.int32(0))
+    sim = jast.Simulator(init, step, normal, lambda s: (s[0] >= 1, 1 - s[0]), 6, is_terminal=lambda s: s[0] > limit, episodic=True)
+    sizes = dict(monte_carlo=dict(episodes=60), mcts=dict(trees=2, simulations=30), forest=dict(trees=2, prunes=1, simulations=30))[search]
+    r = getattr(jast.search, search)(key, sim, record=True, **sizes)
+    ended = limit < 0
+    assert r.episodes == (2 if ended and search != "monte_carlo" else 60) and (r.simulator_steps == 0) == ended
+    assert r.trials.failure.any() == (not ended)
+    distance = 1 - r.best.disturbances[: r.best.length].sum()
+    np.testing.assert_allclose(r.best.distance, distance, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(r.best_reward_per_tree.max(), r.best.reward, rtol=1e-5)
+    assert (r.failures.episodes.distance <= 0).all() and (limit > 1 or r.best.length <= 6)
+
+
 # --- trials -------------------------------------------------------------------------------------------------------------------------------------------------
 
 
@@ -145,10 +163,10 @@ def needle(half=0.05):
     return jast.Simulator(lambda x0: jnp.full((8, 2), 9.0), step, normal, evaluate, 8, episodic=True, observe=lambda s: s[-1])
 
 
-def test_following_finds_many_failures_where_nothing_points_to_the_first(key):
+def test_following_finds_many_failures_where_nothing_points_to_the_first():
     """Against the same search that does not follow: more trees that make much of what they found."""
     sim, of = needle(0.03), dict(trees=24, simulations=800, reward=jast.rewards.episodic(1.0), record=True, exploration=100.0, mode="episodic")
-    plain, follows = (mcts(key, sim, follow=follow, **of).trials.failure.sum(0) for follow in (False, True))
+    plain, follows = (mcts(jax.random.key(0), sim, follow=follow, **of).trials.failure.sum(0) for follow in (False, True))
     assert (follows > 100).sum() >= (plain > 100).sum() + 5
 
 

@@ -265,7 +265,7 @@ def _is_run(system, random, episodic):
             raise ValueError(f"{NAME}: system must be a class with the methods {', '.join(METHODS)}; {system.__name__} lacks {', '.join(missing)}")
         return False
     if not callable(system):
-        hint = "; give its class, or a function that makes it" if all(hasattr(system, m) for m in METHODS) else ""
+        hint = "; give its class, or a function that makes it" if any(hasattr(system, m) for m in METHODS) else ""
         raise ValueError(f"{NAME}: system must be a function of the disturbances, or a class, received {system!r}{hint}")
     try:
         parameters = inspect.signature(system).parameters.values()

@@ -8,6 +8,7 @@ import inspect
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 import types
@@ -304,8 +305,16 @@ def install(system, spec):
     """Keep the system in this worker process, where calls of `NAME` find it."""
     if hasattr(signal, "SIGINT"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a search that is interrupted ends its workers itself
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     module = types.ModuleType(NAME)
     module.runner = runner = Runner(system, spec)
     module.serve = lambda *rows: tuple(runner(*rows))  # a plain tuple: the class would travel with it
     module.probe, module.configure = runner.probe, runner.configure
     sys.modules[NAME] = module
+
+
+def _end_with(parent):
+    """End this process once ``parent`` has: one that was killed could not end its workers."""
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)

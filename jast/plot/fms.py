@@ -138,7 +138,7 @@ def _turn(ax, path, arcs, built, i, error):
     low, high = shown.min(0), shown.max(0)
     margin = 0.15 * max(*(high - low), 0.1)
     apart = path.legs[i] / FOOT
-    gap = f"{apart:,.0f} ft" if apart < 3000 else f"{path.legs[i] / NMI:,.1f} nmi"
+    gap = f"{apart:,.{0 if apart > 10 else 1}f} ft" if apart < 3000 else f"{path.legs[i] / NMI:,.1f} nmi"
     stated = (
         f"stated length {path.beta[i] / NMI:.3f} nmi, error {error:,.2f} ft" if error < 1e3 else f"stated {path.beta[i] / NMI:.2f} nmi, error {error:,.0f} ft"
     )

@@ -12,6 +12,7 @@ from jast._checks import real, whole
 from jast.check import contract
 from jast.episode import _shapes
 from jast.heads.heads import observed
+from jast.incidents import hosted
 from jast.policies import checkpoints
 from jast.policies import training as T
 from jast.policies.latent import sizes
@@ -42,7 +43,7 @@ class Plan(NamedTuple):
 
 
 def sac(
-    key, sim, *, episodes=12_000, scale="auto", bonus=0.0, alpha=1.0, entropy=-0.1, shaping="steps", widen="auto", components=2,
+    key, sim, *, episodes=12_000, scale="auto", bonus=0.0, alpha=1.0, entropy=-0.1, shaping="auto", widen="auto", components=2,
     lanes=16, hidden=(100, 100), learning_rate=1e-3, batch=256, buffer=100_000, polyak=0.01, updates="auto", progress=False, callback=None, checkpoint=None,
 ):  # fmt: skip
     """Teach a policy to make ``sim`` fail in the likeliest ways: `FailurePolicy`, a `jast.Policy` with its start, for `jast.rollout` and importance sampling.
@@ -59,7 +60,7 @@ def sac(
                         the nominal miss distance (that cost were d normal and linear in z; 64 over a typical distance gone where d does not vary), raised
                         by half after each twentieth of the training in which less than a fifth of the episodes failed, up to three quarters of it
     ``shaping``         "steps": d counts at every state, also of an ``episodic`` system, where it must then mean something on the way (as in `landing`);
-                        "end": only at the end of an episode, a sparse reward
+                        "end": only at the end of an episode, a sparse reward; "auto": "end" for an episodic black box, else "steps"
     ``alpha``           temperature, a number above 0; with 1 the best policy is the disturbances given failure, and V the log of their probability.
                         "auto": such that the mean entropy of a latent is ``entropy`` above that of N(0, 1) (on `landing` 1.1 to 1.2, and no sharper)
     ``components``      of the policy, a mixture of normal distributions of z: so many ways out of one state. Its ``mode`` is the middle of the heaviest
@@ -88,8 +89,10 @@ def sac(
     if not isinstance(hidden, tuple | list) or not hidden:
         raise ValueError(f"sac: hidden must be the widths of one or more layers, received {hidden!r}")
     hidden = tuple(whole("sac", "hidden", width) for width in hidden)
-    if shaping not in ("steps", "end"):
-        raise ValueError(f'sac: shaping must be "steps" or "end", received {shaping!r}')
+    if shaping not in ("auto", "steps", "end"):
+        raise ValueError(f'sac: shaping must be "auto", "steps" or "end", received {shaping!r}')
+    if shaping == "auto":
+        shaping = "end" if sim.episodic and hosted(sim) else "steps"
     positive = lambda name, value: _float(name, value, lambda v: 0 < v < math.inf, "above 0")
     auto_scale, auto_alpha = _auto(scale), _auto(alpha)
     scale, alpha = None if auto_scale else positive("scale", scale), 1.0 if auto_alpha else positive("alpha", alpha)

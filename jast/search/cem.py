@@ -18,7 +18,7 @@ from jast.check import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode, _shapes, accumulator, random_start
-from jast.incidents import incidents, since
+from jast.incidents import hosted, incidents, since
 from jast.search import episodes as E
 from jast.search import proposals as P
 
@@ -106,7 +106,7 @@ def cem(
         return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
 
     ends = [samples * (i + 1) for i in range(iterations)]
-    (pool, _), log = E.drive(chunk, carry, ends, trees=trees, progress=progress, callback=callback, name="cem")
+    (pool, _), log = E.drive(chunk, carry, ends, host=hosted(sim), trees=trees, progress=progress, callback=callback, name="cem")
     found, tree, number, count = jax.device_get(_archive(pool, top))
     n = int((found.reward > -jnp.inf).sum())
     found = E.finish(sim, reward, log, _best(pool), jax.tree.map(lambda a: a[:n], found), tree[:n], number[:n], count[:n], settings, top)

@@ -17,6 +17,7 @@ from jast.check import ACTIONS, contract
 from jast.episode import Episode, advance, begin, conclude, random_start, replay
 from jast.search.records import pack
 from jast.search.result import History, SearchResult, Trials
+from jast.search.threads import apart
 
 __all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "tally", "trials", "whole"]
 
@@ -176,10 +177,10 @@ class Log(NamedTuple):
     trials: Trials | None
 
 
-def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="search"):
+def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=None, name="search"):
     """``(carry, Log)`` after ``carry, tally, best, trials = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
 
-    ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None.
+    ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None. ``host``: the system runs on the host.
     ``callback(done, total)`` after each chunk: the episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised again
     where there is none.
     """
@@ -192,7 +193,8 @@ def drive(chunk, carry, ends, *, trees=1, progress=False, callback=None, name="s
     try:
         for end in ends:
             carry, done, total, moments = kept
-            carry, counted, best, record = jax.block_until_ready(chunk(carry, done, end))
+            run = lambda: jax.block_until_ready(chunk(carry, done, end))  # noqa: B023
+            carry, counted, best, record = apart(run) if host else run()
             counted, best, record = jax.device_get((counted, best, record))
             counted = Tally(*(int(v) for v in counted[:5]), counted.failing)  # Python's ints do not overflow
             if total is not None:

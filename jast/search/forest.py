@@ -12,7 +12,7 @@ MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
     "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
-    "episodic": PLAIN | dict(widening=(10.0, 0.3), spread=True, focus=None, follow=True, urgent=True),
+    "episodic": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None, follow=True, urgent=True),
 }
 
 
@@ -36,11 +36,11 @@ def forest(
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"
     takes "node" where it fits. ``top``: failures kept in the archive; ``record=True`` keeps the numbers of every episode as well (``result.trials``).
 
-    ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of systems that are judged at their end only: ``widening``
-    (10, 0.3), ``urgent``, ``follow``. ``urgent``: a child that was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of
-    its tree, the next simulations grow its path into the tree, an action each, so that every step of it can be varied. ``exploration`` is in the units of the
-    reward: there a hundredth of what a failure earns. ``mode="thesis"`` is Moss's: the same widening, ``urgent``, and
-    ``feed``: with half of its steps to go, a rollout takes the action that the tree's best episode took there (Algorithm 9).
+    ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of systems that are judged at their end only: ``urgent`` and
+    ``follow``. ``urgent``: a child that was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of its tree, the next
+    simulations grow its path into the tree, an action each, so that every step of it can be varied; not with a value head. ``exploration`` is in the units of
+    the reward: there a hundredth of what a failure earns. ``mode="thesis"`` is Moss's: ``widening`` (10, 0.3), ``urgent``, and ``feed``: with half of its steps
+    to go, a rollout takes the action that the tree's best episode took there (Algorithm 9).
 
     Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither changes a result. ``available``: bytes that the trees in
     flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.

@@ -10,7 +10,7 @@ MODES = {
     "default": PLAIN | dict(widening=(1.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
     "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
-    "episodic": PLAIN | dict(widening=(10.0, 0.3), spread=True, focus=None, follow=True, urgent=True),
+    "episodic": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None, follow=True, urgent=True),
 }
 
 

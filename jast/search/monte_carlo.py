@@ -73,7 +73,7 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
     most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
     blocks = 1 if record or hosted(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
     ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
-    found, log = E.drive(chunk, _nothing(sim, top), ends, progress=progress, callback=callback, name="monte_carlo")
+    found, log = E.drive(chunk, _nothing(sim, top), ends, host=hosted(sim), progress=progress, callback=callback, name="monte_carlo")
     rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))
     found, rebuilt = jax.device_get((found, rebuilt))
     n = int((found.top_reward > -jnp.inf).sum())

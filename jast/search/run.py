@@ -1,7 +1,6 @@
 """Running a tree search: trees in groups over threads, in chunks that can be watched and interrupted; or all in one traced program."""
 
 import concurrent.futures
-import contextlib
 import functools
 import threading
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from jast.search import simulate
 from jast.search.edges import edges_of
 from jast.search.prune import prune
 from jast.search.rebuild import rebuild
+from jast.search.threads import handed_on
 from jast.search.tree import FAILURE, FRESH, INVALID, RAN, make
 
 __all__ = ["Plan", "Harvest", "bytes_per_tree", "grow_all", "grow_traced"]
@@ -114,14 +114,12 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
         with lock:
             done[0] += n
 
-    settings = _surroundings()
+    surroundings = handed_on()
 
     def one(group):
         if stop.is_set():
             return None
-        with contextlib.ExitStack() as stack:
-            for setting, value in settings:
-                stack.enter_context(setting(value))
+        with surroundings():
             try:
                 return _one_group(problem, keys[np.resize(group, lanes)], group + first, plan, chunk, candidates, report, stop)
             except BaseException:
@@ -145,19 +143,6 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
                 stop.set()
                 raise
     return [h for h in (f.result() for f in futures) if h is not None], interrupted
-
-
-def _surroundings():
-    """What ``with`` statements around a search have set: JAX keeps it for each thread apart, so the search's own threads must be told."""
-    config = jax.config
-    return (
-        (jax.enable_x64, config.jax_enable_x64),
-        (jax.default_device, config.jax_default_device),
-        (jax.default_matmul_precision, config.jax_default_matmul_precision),
-        (jax.numpy_dtype_promotion, config.jax_numpy_dtype_promotion),
-        (jax.numpy_rank_promotion, config.jax_numpy_rank_promotion),
-        (jax.debug_nans, config.jax_debug_nans),
-    )
 
 
 def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):

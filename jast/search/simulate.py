@@ -176,7 +176,7 @@ def _child(problem, tree_key, parent, slot, level, before, source, fed):
 
 def _rolled(problem, key, tree_key, level, before, fed):
     action = choose_rollout(problem, key, tree_key, level, before.state, fed)
-    return take(problem, level, before, action), action[1]
+    return take(problem, level, before, action, rolling=True), action[1]
 
 
 def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):

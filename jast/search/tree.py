@@ -272,13 +272,13 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
     return x0, x
 
 
-def take(problem, level, before, action):
-    """One lane: the `Progress` that the action leads to."""
+def take(problem, level, before, action, rolling=False):
+    """One lane: the `Progress` that the action leads to; ``rolling``: it is not the start that is chosen."""
     sim, reward = problem.sim, problem.reward
     x0, x = action
     start = int(random_start(sim))
     after = advance(sim, reward, before, x, level + 1 - start >= sim.horizon)
-    if start:
+    if start and not rolling:
         after = jax.tree.map(lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after)
     return after
 

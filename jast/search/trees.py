@@ -74,7 +74,8 @@ def grow_trees(
         head_settings = checked(HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"]) if head_settings is None else head_settings)
         school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
         if chosen["follow"] and school.value is not None:
-            raise ValueError(f"{method}: follow must be False with a value head, which judges a child by the action of its own, received True")
+            mode = chosen["mode"]
+            raise ValueError(f"{method}: follow must be False with a value head, which judges a child by an action of its own, received True (mode={mode!r})")
         problem = problem._replace(guide=guide(school.heads, head_settings))
         plan = plan._replace(pages=pages_of(problem, total), edges=head_settings.train and head_settings.edges == "all" and school.value is not None)
         at_once = min(trees, head_settings.round or max(1, min(trees // 5, LANES))) if head_settings.train else trees

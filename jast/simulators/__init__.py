@@ -1,6 +1,7 @@
 """Simulated systems with a source and a known truth, one file (or folder) each."""
 
 from jast.simulators.autoregression import autoregression
+from jast.simulators.bluesky import bluesky, bluesky_flight
 from jast.simulators.colav import colav
 from jast.simulators.ferry import ferry
 from jast.simulators.fms import fms, fms_misses, fms_path
@@ -11,6 +12,6 @@ from jast.simulators.ruin import ruin, ruin_probability
 from jast.simulators.walk import walk1d
 
 __all__ = [
-    "autoregression", "colav", "ferry", "fms", "fms_misses", "fms_path", "landing", "landing_probability", "limit_state", "pendulum", "ruin",
-    "ruin_probability", "walk1d",
+    "autoregression", "bluesky", "bluesky_flight", "colav", "ferry", "fms", "fms_misses", "fms_path", "landing", "landing_probability", "limit_state",
+    "pendulum", "ruin", "ruin_probability", "walk1d",
 ]  # fmt: skip

@@ -9,6 +9,12 @@ The failure is a criterion of our own, judged on the flown track alone: **a wayp
 ``R (1 / cos(turn / 2) - 1)``, R the radius of a turn of 25 degrees of bank (BlueSky's own) at the greatest ground speed of the flight, but never by more than
 R, which is the corner of a turn of 120 degrees. Where the turns at both ends of a leg do not fit on it, the missing length is allowed too. A waypoint that is
 passed by more than that and another ``tolerance`` (1 nmi, as in RNP 1) is missed.
+
+Measured (defaults, BlueSky 1.1.1): of 400 random routes 2 fail; the miss distance is 6.1 on average. A tree search of 400 episodes found 3 failures, 2 of them
+distinct: no more than chance does. All four are turns of 140 to 161 degrees: BlueSky leads a turn by ``R tan(turn / 2)`` without a limit, up to a whole leg and
+more, and is then at the next waypoint before it has flown to this one (as in its issue #286). That no route should ask for such a turn may be held against the
+criterion; that LNAV says nothing and flies on cannot. With the wind from behind it also turns too late (R without the wind) and ends LNAV beside the last
+waypoint (issue #354): a turn of 119 degrees onto a last leg of 3.5 nmi in 30 kt passes by .8 nmi, within the tolerance.
 """
 
 import contextlib
