@@ -246,7 +246,7 @@ def test_the_temperature_follows_the_entropy():
         ("alpha", 0.0, "alpha must be a number above 0"),
         ("entropy", float("nan"), "entropy must be a number that is finite"),
         ("bonus", float("inf"), "bonus must be a number that is finite"),
-        ("shaping", "never", 'shaping must be "steps" or "end", received \'never\''),
+        ("shaping", "never", 'shaping must be "auto", "steps" or "end", received \'never\''),
         ("widen", 0.5, "widen must be a number of at least 1, received 0.5"),
         ("learning_rate", 0, "learning_rate must be a number above 0"),
         ("updates", 0, "updates must be a whole number of at least 1, received 0"),

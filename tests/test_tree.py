@@ -130,7 +130,7 @@ class Slot(NamedTuple):
 
 
 def plain_search(
-    child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False, follow=False, feed=False, urgent=False
+    child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False, follow=False, feed=False, urgent=False, x=16.0
 ):  # fmt: skip
     """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation.
 
@@ -153,7 +153,7 @@ def plain_search(
             gain += 30.0 if distance < 5 else -nearest
         return (ferry, x, y, heading, a, nearest), gain, end
 
-    children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, 16.0, 0.0, 0.0, None, np.hypot(16, 50))}
+    children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, x, 0.0, 0.0, None, np.hypot(x, 50))}
     root, ancestors, log, at_prune = 0, [], [], []
     best, source, way, ahead, fed, feeds = -np.inf, None, (), None, None, {}  # way: the best episode's nodes; ahead: the same while there are more to come
 
@@ -230,15 +230,15 @@ def plain_search(
     return at_prune, log, {node: to_be_had(node) for node in children}
 
 
-def agree(key, k, alpha, focus=1.0, **switches):
+def agree(key, k, alpha, focus=1.0, x=16.0, **switches):
     """Same numbers drawn, same tree: visits of all children of every root, and every simulation's reward."""
     keys = tree_keys(key, 3)
     choices = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
-    tree, _, roots = grown(jast.simulators.ferry(), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices, **switches)
+    tree, _, roots = grown(jast.simulators.ferry(adversary=(x, 0.0)), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices, **switches)
     assert not (switches.get("follow") or switches.get("feed")) or (np.asarray(tree.lead.source) > 0).any()
     draws = drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max())) if focus == 1 else drawn_by_default(keys, 360, focus)
     for lane, (child, rollout) in enumerate(draws):
-        at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0, **switches)
+        at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0, x=x, **switches)
         for turn, expected in enumerate(at_prune):
             found = roots[turn].visits[lane]
             assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
@@ -256,7 +256,7 @@ def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_action
 
 @pytest.mark.parametrize("switches", [("urgent",), ("feed",), ("follow",), ("follow", "feed", "urgent")], ids=" ".join)
 def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key, switches):
-    agree(key, 2.0, 0.5, **dict.fromkeys(switches, True))
+    agree(key, 2.0, 0.5, x=28.0, **dict.fromkeys(switches, True))  # nearer to a collision
 
 
 def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
