@@ -7,10 +7,11 @@ only: its statistics are tested, but estimators keep the user's own key.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend.random import define_prng_impl
 
-__all__ = ["COUNTER", "coin", "tree_keys"]
+__all__ = ["COUNTER", "coin", "generator", "tree_keys"]
 
 
 def _mix(h):
@@ -69,3 +70,8 @@ def tree_keys(key, n):
     """``n`` counter keys, one a tree, from the user's ``key`` (consumed); the key of tree k does not depend on ``n``."""
     words = jax.vmap(lambda k: jax.random.bits(jax.random.fold_in(key, k), (2,), jnp.uint32))(jnp.arange(n))
     return jax.random.wrap_key_data(words, impl=COUNTER)
+
+
+def generator(key):
+    """A NumPy generator from a JAX key of any kind, for work on the host."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist())

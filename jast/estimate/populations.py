@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
 
+from jast.counter import generator
 from jast.estimate.latent import dimension, log_ratios, normal_numbers, outcomes
 
-__all__ = ["Chain", "Explored", "Population", "cool", "explore", "generator"]
+__all__ = ["Chain", "Explored", "Population", "cool", "explore"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 WIDTHS, FAILING, COLD, COOLING, DRAWS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60, 4
@@ -91,11 +92,6 @@ class Chain:
         if people is None:
             return Explored(np.zeros((0, self.dimension)), np.zeros(0, np.int32), -math.inf, tuple(levels), self.evaluations, self.invalid)
         return Explored(np.asarray(people.z), np.asarray(people.used), log_mean, tuple(levels), self.evaluations, self.invalid)
-
-
-def generator(key):
-    """A NumPy generator from a JAX key."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist())
 
 
 def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):

@@ -5,7 +5,7 @@ colour-blind readers; what matters is told by shape or words as well.
 
 Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one simulator: `ferry`; `fms`; `colav`, `colav_story`,
 `colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `failure_fan`,
-`weights`.
+`weights`. Of weakness recognition: `failures_found`, `roc`, `failure_grid`, `influence`.
 """
 
 from jast.plot.colav import colav, colav_animation, colav_story
@@ -16,8 +16,10 @@ from jast.plot.general import distances, disturbances, history
 from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.trials import trial_distances, trials
+from jast.plot.weakness import failure_grid, failures_found, influence, roc
 
 __all__ = [
-    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "ferry", "fms",
-    "history", "probability", "proposal_contours", "surrogate_samples", "trial_distances", "trials", "weights",
+    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "failure_grid",
+    "failures_found", "ferry", "fms", "history", "influence", "probability", "proposal_contours", "roc", "surrogate_samples", "trial_distances", "trials",
+    "weights",
 ]  # fmt: skip

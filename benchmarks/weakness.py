@@ -1,0 +1,185 @@
+"""Weakness recognition: how many of a classifier's failures are found in so many calls (chapter 4 of Moss's thesis, and reference figures on the same images).
+
+``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the
+published classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that were trained on the first half of
+the images and are validated on the other. Without: scikit-learn's digits, a third to train on and the rest to validate, and three classifiers. Means over
+seeds, +- one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the cross-validated logistic regression on 64
+principal components that needs no call either. Failures found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
+those of the final scores on all inputs, where those that were run are judged by models that have not seen their outcome; candidates: as many as 627 of
+10,000. Seconds are of one validation, the first with compilation.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+from sklearn.decomposition import PCA
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import KFold, cross_val_predict
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.neural_network import MLPClassifier
+
+from jast import weakness
+
+SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
+ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precision")
+
+
+class Answers:
+    """A classifier, run on everything once: ``predict`` looks its answers up and counts how often each input was asked."""
+
+    def __init__(self, inputs, predicted):
+        self.index, self.predicted, self.asked = {x.tobytes(): i for i, x in enumerate(inputs)}, np.asarray(predicted), np.zeros(len(inputs), int)
+
+    def __call__(self, batch):
+        at = np.asarray([self.index[x.tobytes()] for x in batch])
+        self.asked[at] += 1
+        return self.predicted[at]
+
+
+def mnist(folder, quick):
+    """Name -> (inputs, labels, predictions)."""
+    images, labels = weakness.from_idx(folder)
+    flat, half = images.reshape(len(images), -1), len(images) // 2
+    published = Path(folder) / "sut_784x32x10.npz"
+    if published.exists():
+        with np.load(published) as w:
+            out = np.maximum(flat @ w["W1"] + w["b1"], 0) @ w["W2"] + w["b2"]
+        yield "published", images, labels, out.argmax(1)
+    if not quick:
+        for name, model in (("nearest", KNeighborsClassifier(3)), ("forest", RandomForestClassifier(50, random_state=0))):
+            yield name, images[half:], labels[half:], model.fit(flat[:half], labels[:half]).predict(flat[half:])
+
+
+def digits(quick):
+    """The same on scikit-learn's digits."""
+    images, labels = weakness.digits()
+    order = np.random.default_rng(0).permutation(len(images))
+    flat, train, test = images.reshape(len(images), -1), order[:600], order[600:]
+    models = {
+        "logistic": LogisticRegression(C=0.1, max_iter=500),
+        "forest": RandomForestClassifier(30, random_state=0),
+        "network": MLPClassifier((32,), max_iter=2000, random_state=0),
+    }
+    for name, model in list(models.items())[: 1 if quick else 3]:
+        yield name, images[test], labels[test], model.fit(flat[train], labels[train]).predict(flat[test])
+
+
+def mean(values):
+    values = np.asarray(values, float)
+    return {"mean": float(values.mean()), "se": float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None}
+
+
+def ranked(scores, failed):
+    """What a ranking by fixed scores finds."""
+    hits, n = np.cumsum(failed[np.argsort(-scores, kind="stable")]), len(failed)
+    return {
+        "found": [float(hits[int(n * s) - 1] / failed.sum()) for s in SHARES],
+        "auc": weakness.auc(scores, failed),
+        "precision": float(hits[round(CANDIDATES * n) - 1] / round(CANDIDATES * n)),
+    }
+
+
+def pixels(images, labels):
+    """[n]: 1 - p(true label) of a 5-fold cross-validated logistic regression on 64 principal components."""
+    z = PCA(min(64, images[0].size), random_state=0).fit_transform(images.reshape(len(images), -1))
+    p = cross_val_predict(LogisticRegression(max_iter=300), z, labels, cv=KFold(5, shuffle=True, random_state=0), method="predict_proba")
+    return 1 - p[np.arange(len(labels)), labels]
+
+
+def adaptive(images, labels, predicted, selector, seeds):
+    """The row of the default selector or of random choice."""
+    n, failed, rows, difficulty = len(labels), predicted != labels, [], []
+    for seed in range(seeds):
+        system, wall, cpu = Answers(images, predicted), time.perf_counter(), time.process_time()
+        result = weakness.validate(jax.random.key(seed), system, images, labels, budget=int(n * SHARES[-1]), selector=selector, classes=int(labels.max()) + 1)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        assert system.asked.max() <= 1 and system.asked.sum() == result.calls
+        hits = np.cumsum(failed[result.order])
+        judged = weakness.judge(result, failed, top=round(CANDIDATES * n))
+        rows.append(
+            [[hits[int(n * s) - 1] / failed.sum() for s in SHARES], judged.auc[-1], judged.precision[-1], wall, cpu, result.expected, failed.sum() - hits[-1]]
+        )
+        if selector == "default":
+            difficulty.append(ranked(result.state.memory["difficulty"], failed))
+    found, auc, precision, wall, cpu, expected, left = zip(*rows, strict=True)
+    row = dict(found=[mean(c) for c in zip(*found, strict=True)], auc=mean(auc), precision=mean(precision), expected=mean(expected), left=mean(left))
+    row |= dict(seconds_first=wall[0], seconds=mean(wall[1:] or wall), cpu_s=mean(cpu[1:] or cpu))
+    return row, difficulty and {
+        "found": [mean(c) for c in zip(*(d["found"] for d in difficulty), strict=True)],
+        **{k: mean([d[k] for d in difficulty]) for k in ("auc", "precision")},
+    }
+
+
+def thesis(images, labels, predicted, seeds):
+    """The thesis's adversary after each iteration, at its threshold of 0.5, on all inputs."""
+    failed, rows, wall = predicted != labels, [], []
+    for seed in range(seeds):
+        start = time.perf_counter()
+        result = weakness.validate(jax.random.key(seed), Answers(images, predicted), images, labels, selector="thesis", classes=int(labels.max()) + 1)
+        wall.append(time.perf_counter() - start)
+        j, picks = weakness.judge(result, failed), result.history.precision
+        rows.append([j.auc, j.precision[-1], j.recall[-1], j.candidates[-1], result.calls, len(result.failures) / failed.sum(), np.nanmean(picks)])
+    auc, precision, recall, candidates, calls, found, picks = zip(*rows, strict=True)
+    out = dict(precision=precision, recall=recall, candidates=candidates, calls=calls, found=found, sampled_precision=picks)
+    return {
+        "auc": [mean(c) for c in zip(*auc, strict=True)],
+        **{k: mean(v) for k, v in out.items()},
+        "seconds_first": wall[0],
+        "seconds": mean(wall[1:] or wall),
+    }
+
+
+def say(v, digits=3):
+    return f"{v:.{digits}f}" if not isinstance(v, dict) else f"{v['mean']:.{digits}f}" + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+
+
+def line(name, row):
+    text = f"  {name:11} {'  '.join(f'{say(f):>14}' for f in row['found'])}  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
+    if "seconds" not in row:
+        return text
+    times = f"{row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+    return f"{text}  {times}; expected left {say(row['expected'], 1)}, true {say(row['left'], 1)}"
+
+
+def study(images, labels, predicted, seeds, quick):
+    """All rows of one system, printed as they come."""
+    failed = predicted != labels
+    rows = {"inputs": len(labels), "failures": int(failed.sum())}
+    budgets = [f"{int(len(labels) * s)} calls" for s in SHARES]
+    print(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
+    rows["default"], rows["difficulty"] = adaptive(images, labels, predicted, "default", seeds)
+    rows["pixels"], rows["random"] = ranked(pixels(images, labels), failed), adaptive(images, labels, predicted, "random", seeds)[0]
+    for name in ("default", "difficulty", "pixels", "random"):
+        print(line(name, rows[name]), flush=True)
+    if not quick:
+        rows["thesis"] = t = thesis(images, labels, predicted, seeds)
+        print("  thesis      AUC " + " ".join(f"{a['mean']:.3f}" for a in t["auc"]) + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})")
+        print("              at 0.5: " + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS))
+        print(f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True)
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", help="folder with the MNIST test images and the published classifier")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON at the end")
+    parser.add_argument("--quick", action="store_true", help="one system, 2 seeds, without the thesis's mode")
+    parser.add_argument("--seeds", type=int, default=None, help="default 10")
+    given = parser.parse_args()
+    seeds = given.seeds or (2 if given.quick else 10)
+    systems = mnist(given.data, given.quick) if given.data else digits(given.quick)
+    out = {}
+    for name, images, labels, predicted in systems:
+        print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
+        out[name] = study(images, labels, predicted, seeds, given.quick)
+    if given.json:
+        print(json.dumps(out))
+
+
+if __name__ == "__main__":
+    main()

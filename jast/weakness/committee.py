@@ -1,0 +1,100 @@
+"""A committee of small classifiers, each trained without a part of the inputs: what those left out think of every input, in one program."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+__all__ = ["Committee", "folds", "fit", "gradient", "held_out"]
+
+HIDDEN, BATCH, RATE = 32, 256, 3e-3
+STEPS = (300, 8, 1500)  # least; passes over the inputs; most
+
+
+class Committee(NamedTuple):
+    """Weights of M networks, d inputs, ReLU, k classes."""
+
+    first: Any
+    """[d, M, h] float32"""
+    first_bias: Any
+    """[M, h]"""
+    second: Any
+    """[M, h, k]"""
+    second_bias: Any
+    """[M, k]"""
+
+
+def folds(rng, n, parts=5, repeats=4):
+    """[parts * repeats, n] bool: the inputs that each member may learn from; every one leaves out its own part, so that each input is left out ``repeats``
+    times."""
+    rows = []
+    for _ in range(repeats):
+        part = rng.permutation(n) % parts
+        rows += [part != i for i in range(parts)]
+    return np.asarray(rows)
+
+
+def fit(rng, x, targets, weights, classes):
+    """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n] by Adam: (committee, log probabilities [M, n, classes]).
+
+    All members see the same minibatches, so that their first layers are one matrix product.
+    """
+    members, (n, d) = len(weights), x.shape
+    batch = min(BATCH, n)
+    steps = max(STEPS[0], min(STEPS[1] * n // batch, STEPS[2]))
+    passes = -(-steps // (n // batch))
+    order = np.concatenate([rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(passes)])[:steps].astype(np.int32)
+    normal = lambda *shape: rng.standard_normal(shape, np.float32)
+    start = Committee(
+        normal(d, members, HIDDEN) * np.float32(np.sqrt(2 / d)), np.zeros((members, HIDDEN), np.float32),
+        normal(members, HIDDEN, classes) * np.float32(np.sqrt(1 / HIDDEN)), np.zeros((members, classes), np.float32),
+    )  # fmt: skip
+    return _fit(start, x, targets.astype(np.int32), weights.astype(np.float32), order)
+
+
+def held_out(log_probs, weights):
+    """[n, classes]: the mean probability by those members that an input has no weight with. Host."""
+    out = (weights == 0).astype(np.float32)
+    return np.einsum("mnk,mn->nk", np.exp(np.asarray(log_probs)), out) / out.sum(0)[:, None]
+
+
+def logits(committee, x):
+    """[..., M, k] of ``x`` [..., d]."""
+    hidden = jax.nn.relu(jnp.einsum("...d,dmh->...mh", x, committee.first) + committee.first_bias)
+    return jnp.einsum("...mh,mhk->...mk", hidden, committee.second) + committee.second_bias
+
+
+@jax.jit
+def gradient(committee, x, labels):
+    """[m, d]: the gradient at each row of ``x`` of the log odds that its label is not what the committee says."""
+
+    def odds(x, label):
+        each = jax.nn.log_softmax(logits(committee, x))
+        # sums over the members are their mean, but for a constant that both have
+        return jax.nn.logsumexp(jnp.where(jnp.arange(each.shape[1]) == label, -jnp.inf, each)) - jax.nn.logsumexp(each[:, label])
+
+    with jax.numpy_rank_promotion("allow"):
+        return jax.vmap(jax.grad(odds))(x, labels)
+
+
+@jax.jit
+def _fit(start, x, targets, weights, order):
+    import optax
+
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # optax asks for it
+        steps, batch = order.shape
+        adam = optax.adam(lambda i: RATE * (1 - i / steps))
+
+        def loss(committee, rows):
+            out = jax.nn.log_softmax(logits(committee, x[rows]))
+            said = jnp.take_along_axis(out, targets[rows][:, None, None], axis=2)[..., 0]
+            return -jnp.sum(weights[:, rows].T * said) / batch
+
+        def step(carry, rows):
+            committee, state = carry
+            update, state = adam.update(jax.grad(loss)(committee, rows), state)
+            return (optax.apply_updates(committee, update), state), None
+
+        (committee, _), _ = jax.lax.scan(step, (start, adam.init(start)), order)
+        return committee, jnp.swapaxes(jax.nn.log_softmax(logits(committee, x)), 0, 1)

@@ -1,0 +1,77 @@
+"""The default selector: how hard each input is, learned from the labels before any call, and how the system differs, learned from its answers."""
+
+import numpy as np
+
+from jast.counter import generator
+from jast.weakness import committee
+from jast.weakness.blend import logistic, sigmoid
+from jast.weakness.residual import residual
+from jast.weakness.validate import Selector, Step
+from jast.weakness.views import Views, difficulty_of_neighbours, views
+
+__all__ = ["default"]
+
+STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
+# log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision of the prior of b
+PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
+
+
+def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
+    """The `Selector` that `validate` uses unless told otherwise. It needs no knowledge of the system, and works on images and tables.
+
+    Before any call, a committee of small networks is cross-validated on the inputs and their labels: an input that those who have not seen it get wrong is
+    a hard one for most classifiers. After each batch a second committee imitates the system: it learns the system's answers where they are known (each with
+    the weight of ten) and the labels elsewhere, and again each input is judged by members that have not seen it. A logistic regression on the inputs that were
+    run blends these opinions and that of an input's nearest neighbours; a Gaussian process over inputs with the same label adds what they all miss, such as a
+    region of easy inputs that the system gets wrong.
+
+    A batch is the inputs with the highest probability of failure, but for a share that is drawn at random from the others: ``exploration`` over the least
+    probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
+    (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
+    out; each repetition is five networks for each of two views. The scores are probabilities of failure.
+    """
+    settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
+
+    def start(key, data):
+        rng = generator(key)
+        seen_as = views(rng, data)
+        learn = committee.folds(rng, data.size, min(5, data.size), repeats)
+        flat = [_odds(rng, view, data.labels, learn, learn, data) for view in (seen_as.scaled, seen_as.centred)]
+        neighbours = difficulty_of_neighbours(rng, seen_as.close, data.labels, data.classes)
+        difficulty = sum(flat) / len(flat)
+        return seen_as._asdict() | dict(learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty)
+
+    def step(key, data, memory, seen, ask):
+        rng = generator(key)
+        least = max(10, data.size // 200) if first is None else first
+        chosen, likely = _batch(rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration)
+        seen = ask(chosen)
+        tried, seen_as = seen.tried, Views(*(memory[name] for name in Views._fields))
+        answers, weights = np.where(tried, seen.predicted, data.labels), memory["learn"] * np.where(tried, STRENGTH, 1)
+        opinions = [memory["difficulty"]]
+        opinions += [_odds(rng, view, answers, weights, memory["learn"], data) for view in (seen_as.scaled, seen_as.centred)]
+        rows = np.stack([*opinions, memory["neighbours"], np.ones(data.size)], axis=1)
+        odds = rows @ logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
+        suspicion = np.where(tried, odds, odds + residual(rng, seen_as.close, data.labels, odds, seen))
+        scores = sigmoid(suspicion)
+        return Step(memory | dict(suspicion=suspicion), scores, likely, float(scores[~tried].sum()))
+
+    return Selector("default", settings, start, step)
+
+
+def _odds(rng, x, answers, weights, learn, data):
+    """[n] log odds against each input's label, by the members that have not learned from it."""
+    p = committee.held_out(committee.fit(rng, x, answers, weights, data.classes)[1], learn)
+    right = np.clip(p[np.arange(data.size), data.labels].astype(float), 1e-6, 1 - 1e-6)
+    return np.log1p(-right) - np.log(right)
+
+
+def _batch(rng, suspicion, seen, size, exploration):
+    """(inputs to run, those of them that are held for failures): the most suspect, and some of the others at random."""
+    free = np.flatnonzero(~seen.tried)
+    size = min(size, len(free))
+    ranked = free[np.argsort(-suspicion[free], kind="stable")]
+    share = min(exploration / max(sigmoid(suspicion[ranked[size - 1]]), 1e-6), 0.2)
+    random = rng.binomial(size, share) if len(seen.order) else 0  # the first batch tells how the prior was
+    likely = ranked[: size - random]
+    return np.concatenate([likely, rng.permutation(ranked[size - random :])[:random]]), likely

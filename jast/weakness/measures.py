@@ -1,0 +1,82 @@
+"""How well scores tell failures from the rest: ROC curves, the area under them, precision and recall."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
+
+
+class Roc(NamedTuple):
+    """A receiver operating characteristic, from (0, 0) to (1, 1)."""
+
+    false_positive: Any
+    """[m]: share of the inputs that pass whose score is at least the threshold"""
+    true_positive: Any
+    """[m]: share of the failures"""
+    threshold: Any
+    """[m]: falling, from infinity"""
+
+
+class Judgement(NamedTuple):
+    """How good the scores of each iteration are on the whole data set; R iterations."""
+
+    auc: Any
+    """[R]: area under the ROC curve; NaN where all inputs fail or none"""
+    precision: Any
+    """[R]: share of failures among the candidates; NaN without candidates"""
+    recall: Any
+    """[R]: share of all failures that are candidates; NaN without failures"""
+    candidates: Any
+    """[R] int: inputs with a score of at least the threshold, or the ``top``"""
+
+
+def roc(scores, failed):
+    """The `Roc` of ``scores`` [n] (high: suspect) against ``failed`` [n] bool; equal scores are one point. NaN shares where all fail or none.
+
+    ValueError for arrays of other lengths, and scores that are NaN.
+    """
+    scores, failed = _pair("roc", scores, failed)
+    order = np.argsort(-scores, kind="stable")
+    last = np.flatnonzero(np.append(np.diff(scores[order]) != 0, True)) if len(scores) else np.zeros(0, int)
+    hits, count = np.cumsum(failed[order])[last], last + 1
+    share = lambda part, whole: np.append(0.0, part / whole if whole else np.full(len(part), np.nan))
+    return Roc(share(count - hits, np.sum(~failed)), share(hits, np.sum(failed)), np.append(np.inf, scores[order][last]))
+
+
+def auc(scores, failed):
+    """Area under the ROC curve: the chance that a failure has the higher score of a random pair, equal ones count half. NaN where all inputs fail or none."""
+    curve = roc(scores, failed)
+    return float(np.trapezoid(curve.true_positive, curve.false_positive))
+
+
+def judge(result, failed, *, threshold=0.5, top=None):
+    """The `Judgement` of a result's iterations by the truth on all inputs: ``failed`` [n] bool, which only a study knows that has run the system on all.
+
+    Candidates are the inputs with a score of at least ``threshold``, or, with ``top``, the so many with the highest. The scores of inputs that were run are
+    those of models that have not seen their outcomes (the thesis's adversary has: as published).
+    """
+    every = np.asarray(result.history.scores)
+    failed = np.asarray(failed)
+    if failed.shape != every.shape[1:] or failed.dtype != bool:
+        raise ValueError(f"judge: failed must be bool [{every.shape[1]}], received {failed.dtype} of shape {failed.shape}")
+    n = len(failed)
+    if not failed[result.failures].all():
+        raise ValueError("judge: failed must agree with the result, whose failures are not all among them")
+    if top is not None and (isinstance(top, bool) or not isinstance(top, int) or not 1 <= top <= n):
+        raise ValueError(f"judge: top must be an int in 1 ... {n}, received {top!r}")
+    rows = []
+    for scores in every:
+        chosen = scores >= threshold if top is None else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
+        hits, k, all_ = int(np.sum(failed & chosen)), int(np.sum(chosen)), int(np.sum(failed))
+        rows.append((auc(scores, failed), hits / k if k else np.nan, hits / all_ if all_ else np.nan, k))
+    return Judgement(*(np.asarray(column) for column in zip(*rows, strict=True))) if rows else Judgement(*(np.zeros(0) for _ in range(4)))
+
+
+def _pair(function, scores, failed):
+    scores, failed = np.asarray(scores), np.asarray(failed)
+    if scores.ndim != 1 or scores.shape != failed.shape or failed.dtype != bool:
+        raise ValueError(f"{function}: scores and failed must be [n], failed bool, received {scores.shape} and {failed.dtype} of shape {failed.shape}")
+    if np.isnan(scores).any():
+        raise ValueError(f"{function}: scores must not be NaN, {int(np.isnan(scores).sum())} are")
+    return scores, failed

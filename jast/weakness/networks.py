@@ -1,0 +1,152 @@
+"""The networks of adversarial weakness recognition and their training: an autoencoder of the inputs, an adversary that tells failures by the encodings."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.tree_util import Partial
+
+__all__ = ["Network", "adversary", "autoencoder", "fit_adversary", "fit_autoencoder", "logits", "sizes"]
+
+ADVERSARY = (128, 64)
+LEAK = 0.01  # of the autoencoder's leaky ReLU; Flux's default, which the published code takes
+
+
+class Network(NamedTuple):
+    """Pure functions of one Flax module, the same object whenever one of the same sizes is asked for: programs that hold it are not compiled again."""
+
+    init: Any
+    """``init(key) -> params``: weights uniform as Glorot's, biases zero, float32"""
+    apply: Any
+    """``apply(params, x [..., inputs])``: of the autoencoder the reconstruction [..., inputs], of the adversary the logits [...]"""
+    encode: Any
+    """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; None of the adversary"""
+
+
+def sizes(inputs):
+    """The autoencoder's layers for so many numbers: half of them, at most 392, and a quarter, at most 64. The thesis's (392, 64) for its 784 pixels."""
+    return max(1, min(392, inputs // 2)), max(1, min(64, inputs // 4))
+
+
+@functools.cache
+def autoencoder(inputs, hidden):
+    """The `Network` of the thesis's section 4.3.1: dense layers of ``hidden`` widths, the same backwards, leaky ReLU after every one, the last as well."""
+    module = _modules()[0](inputs, hidden)
+    encode = Partial(lambda params, x: module.apply(params, x, method="encode"))
+    return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), encode)
+
+
+@functools.cache
+def adversary(inputs):
+    """The `Network` of section 4.3.2: inputs-128-64-1, ReLU between; the sigmoid that makes its logit a probability is left to whoever asks."""
+    module = _modules()[1](ADVERSARY)
+    return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), None)
+
+
+def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=100, rate=1e-3):
+    """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled each epoch: (codes [n, hidden[-1]], losses [epochs])."""
+    network = autoencoder(rows.shape[1], hidden)
+    first, then = jax.random.split(key)
+    params, losses = _fit(
+        then, network.init(first), rows, rows, np.arange(len(rows), dtype=np.int32), len(rows), epochs, rate, network.apply, _squared, min(batch, len(rows))
+    )
+    return _codes(network.encode, params, rows), losses
+
+
+def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=1, rate=3e-5):
+    """Train an adversary further on the first ``size`` of ``number`` [room] int32, rows of ``codes`` [m, d] that may repeat: (params, losses [epochs]).
+
+    ``failed`` [m] float32: the targets, of the binary cross-entropy. ``size`` is a number, not a shape: other sizes in the same room compile nothing.
+    """
+    return _fit(key, params, codes, failed, number, size, epochs, rate, adversary(codes.shape[1]).apply, _entropy, batch)
+
+
+@jax.jit
+def logits(params, codes):
+    """The adversary's logits [n] of ``codes`` [n, d]."""
+    return adversary(codes.shape[1]).apply(params, codes)
+
+
+@jax.jit
+def _codes(encode, params, rows):
+    return encode(params, rows)
+
+
+def _squared(out, target):
+    return jnp.mean((out - target) ** 2, axis=-1)
+
+
+def _entropy(logit, target):
+    return jax.nn.softplus(logit) - target * logit
+
+
+@functools.partial(jax.jit, static_argnames=("epochs", "loss", "batch"))
+def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, batch):
+    """``epochs`` passes in minibatches over the first ``size`` of the rows' ``number``, by Adam that starts anew: (params, mean loss of each epoch)."""
+    import optax  # here: it takes a while
+
+    optimiser = optax.adam(rate)
+    place = jnp.arange(len(number), dtype=jnp.int32)
+    size = jnp.asarray(size, jnp.int32)
+    steps = (size + batch - 1) // batch
+
+    def mean_loss(params, at, weight):
+        return jnp.sum(weight * loss(apply(params, rows[at]), targets[at])) / jnp.sum(weight)
+
+    def step(i, carry, order):
+        params, state, total = carry
+        now = i * batch + jnp.arange(batch, dtype=jnp.int32)
+        weight = (now < size).astype(jnp.float32)  # the last batch may be smaller
+        value, gradient = jax.value_and_grad(mean_loss)(params, order[jnp.minimum(now, size - 1)], weight)
+        with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+            update, state = optimiser.update(gradient, state)
+            params = optax.apply_updates(params, update)
+        return params, state, total + value * jnp.sum(weight)
+
+    def epoch(carry, key):
+        order = number[jnp.argsort(jnp.where(place < size, jax.random.uniform(key, place.shape), 2.0))]
+        params, state, total = lax.fori_loop(0, steps, functools.partial(step, order=order), (*carry, jnp.zeros((), jnp.float32)))
+        return (params, state), total / size
+
+    (params, _), losses = lax.scan(epoch, (params, optimiser.init(params)), jax.random.split(key, epochs))
+    return params, losses
+
+
+@functools.cache
+def _modules():
+    import flax.linen as nn  # here: it takes a while
+
+    dense = functools.partial(nn.Dense, kernel_init=nn.initializers.glorot_uniform(), param_dtype=jnp.float32)
+
+    class Autoencoder(nn.Module):
+        inputs: int
+        hidden: tuple
+
+        def setup(self):
+            self.encoder = [dense(width) for width in self.hidden]
+            self.decoder = [dense(width) for width in (*self.hidden[-2::-1], self.inputs)]
+
+        def encode(self, x):
+            for layer in self.encoder:
+                x = nn.leaky_relu(layer(x), LEAK)
+            return x
+
+        def __call__(self, x):
+            x = self.encode(x)
+            for layer in self.decoder:
+                x = nn.leaky_relu(layer(x), LEAK)
+            return x
+
+    class Adversary(nn.Module):
+        hidden: tuple
+
+        @nn.compact
+        def __call__(self, x):
+            for width in self.hidden:
+                x = nn.relu(dense(width)(x))
+            return dense(1)(x)[..., 0]
+
+    return Autoencoder, Adversary

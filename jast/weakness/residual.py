@@ -1,0 +1,83 @@
+"""What opinions miss: a Gaussian process over inputs of one label, on top of the log odds that they give, by Laplace's approximation.
+
+Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), algorithms 3.1 and 3.2.
+"""
+
+import numpy as np
+
+from jast.weakness.blend import sigmoid
+from jast.weakness.views import squared_distances
+
+__all__ = ["residual"]
+
+MOST, NEAREST = 500, 5
+VARIANCES, LENGTHS = (1.0, 4.0, 16.0), (1.0, 2.0)
+MARGIN = 1.0  # of log evidence, by which it must be better than nothing
+
+
+def residual(rng, close, labels, odds, seen):
+    """[n]: what to add to ``odds`` [n], the log odds of failure, by what was seen near each input with its label; 0 where there is no evidence for it.
+
+    ``close`` [n, c]: coordinates. One amplitude and one length, in units of the usual distance to a neighbour, for all labels: those of greatest evidence.
+    """
+    out, groups = np.zeros(len(labels)), []
+    for label in np.unique(labels):
+        every = np.flatnonzero(labels == label)
+        known = every[seen.tried[every]]
+        if len(known) > 1:
+            groups.append((every, np.sort(rng.choice(known, MOST, replace=False)) if len(known) > MOST else known))
+    if not groups:
+        return out
+    unit = np.median([_spacing(rng, close[every]) for every, _ in groups])
+    data = [(squared_distances(close[known], close[known]), seen.failed[known].astype(float), odds[known]) for _, known in groups]
+    best, choice = sum(np.sum(t * m - np.logaddexp(0, m)) for _, t, m in data) + MARGIN, None
+    for variance in VARIANCES:
+        for length in LENGTHS:
+            fits = [_laplace(_kernel(d2, unit, variance, length), t, m) for d2, t, m in data]
+            total = sum(evidence for evidence, _ in fits)
+            if total > best:
+                best, choice = total, (variance, length, [slope for _, slope in fits])
+    if choice is not None:
+        for (every, known), slope in zip(groups, choice[2], strict=True):
+            out[every] = _kernel(squared_distances(close[every], close[known]), unit, *choice[:2]) @ slope
+    return out
+
+
+def _spacing(rng, x):
+    """The usual squared distance to the fifth nearest other."""
+    some = x if len(x) <= MOST else x[rng.choice(len(x), MOST, replace=False)]
+    d2 = np.sort(squared_distances(some, x), axis=1)
+    return max(np.median(d2[:, min(NEAREST, d2.shape[1] - 1)]), 1e-12)
+
+
+def _kernel(d2, unit, variance, length):
+    return variance * np.exp(-0.5 * d2 / (unit * length**2))
+
+
+def _laplace(kernel, target, mean):
+    """(log evidence, slope [m]) of failures ``target`` [m] with log odds mean + f, f ~ N(0, kernel): the mode of f at other points is their kernel @ slope."""
+    m = len(target)
+    f, a = np.zeros(m), np.zeros(m)
+    log_posterior = lambda f, a: -0.5 * a @ f + np.sum(target * (mean + f) - np.logaddexp(0, mean + f))
+    now = log_posterior(f, a)
+    for _ in range(50):
+        p = sigmoid(mean + f)
+        w = np.maximum(p * (1 - p), 1e-10)
+        root = np.sqrt(w)
+        b = w * f + target - p
+        aim = b - root * np.linalg.solve(np.eye(m) + root[:, None] * kernel * root, root * (kernel @ b))
+        step = 1.0
+        while True:
+            new_a = a + step * (aim - a)
+            new_f = kernel @ new_a
+            new = log_posterior(new_f, new_a)
+            if new >= now or step < 1e-6:
+                break
+            step /= 2
+        done = abs(new - now) < 1e-6
+        f, a, now = new_f, new_a, new
+        if done:
+            break
+    p = sigmoid(mean + f)
+    root = np.sqrt(np.maximum(p * (1 - p), 1e-10))
+    return now - 0.5 * np.linalg.slogdet(np.eye(m) + root[:, None] * kernel * root)[1], target - p

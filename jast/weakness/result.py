@@ -1,0 +1,106 @@
+"""What a validation returns."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["History", "Result", "Seen", "State"]
+
+
+class Seen(NamedTuple):
+    """What the system under test has been asked so far."""
+
+    order: Any
+    """[calls] int: the inputs it was run on, in order"""
+    predicted: Any
+    """[n] int32: its answers, -1 where it was not run"""
+    labels: Any
+    """[n] int32: the true classes"""
+
+    @property
+    def tried(self):
+        """[n] bool"""
+        return self.predicted >= 0
+
+    @property
+    def failed(self):
+        """[n] bool: run, and wrong"""
+        return self.tried & (self.predicted != self.labels)
+
+
+class History(NamedTuple):
+    """R iterations, each of a batch of calls and what was learned from it."""
+
+    calls: Any
+    """[R] int: calls after each iteration"""
+    found: Any
+    """[R] int: failures found by then"""
+    precision: Any
+    """[R]: share of failures among the iteration's candidates, all of which were run; NaN where there were none"""
+    recall: Any
+    """[R]: failures found, as a share of these and ``expected``; an estimate, as what was not run is not known"""
+    auc: Any
+    """[R]: area under the ROC curve of the iteration's scores on the inputs run so far; NaN where all of them failed or none"""
+    expected: Any
+    """[R]: how many failures the selector expects among the inputs not yet run"""
+    scores: Any
+    """[R, n] float32: the scores after each iteration"""
+
+
+class State(NamedTuple):
+    """All that `validate` needs to go on; for `save` and `load`."""
+
+    selector: str
+    """The selector's name and settings, as text"""
+    data: str
+    """Fingerprint of the inputs and labels"""
+    key: Any
+    """The key's numbers"""
+    memory: dict
+    """What the selector has learned: arrays by name"""
+    order: Any
+    """[calls] int: the inputs that were run"""
+    predicted: Any
+    """[n] int32: the answers"""
+    complete: int
+    """How many of ``order`` belong to whole iterations"""
+    history: History
+    finished: bool
+    """The selector has made all its iterations"""
+
+
+class Result(NamedTuple):
+    """The outcome of a validation of n inputs. NumPy arrays."""
+
+    failures: Any
+    """[found] int: the inputs that the system gets wrong, in the order found"""
+    calls: int
+    """Inputs that the system was run on, each once"""
+    order: Any
+    """[calls] int: those inputs, in order"""
+    predicted: Any
+    """[n] int32: the system's answers, -1 where it was not run"""
+    scores: Any
+    """[n] float32: how suspect each input is now, in [0, 1]; default selector: the probability that it fails, by models that have not seen its outcome"""
+    ranked: Any
+    """[n - calls] int: the inputs not yet run, the most suspect first"""
+    expected: float
+    """How many failures the selector expects among these"""
+    history: History
+    incidents: tuple
+    """Texts: why it ended before its budget was spent, empty if it did not"""
+    state: State
+    """Give it to `validate` again to go on"""
+
+    def __str__(self):
+        h, n = self.history, len(self.scores)
+        rows = zip(h.calls, h.found, h.precision, h.recall, h.auc, h.expected, strict=True)
+        table = "\n".join(f"{i:9d} {c:7d} {f:8d} {_share(p):>10} {_share(r):>9} {_share(a):>7} {e:9.1f}" for i, (c, f, p, r, a, e) in enumerate(rows, 1))
+        left = "" if np.isnan(self.expected) else f"; about {self.expected:.1f} expected among the {n - self.calls} not run"
+        head = f"{len(self.failures)} failures in {self.calls} calls ({n} inputs){left}"
+        names = "iteration   calls failures  precision    recall     AUC  expected\n" if table else ""
+        return "\n".join([head, names + table, *(f"stopped: {i}" for i in self.incidents)]).strip()
+
+
+def _share(value):
+    return "-" if np.isnan(value) else f"{value:.3f}"

@@ -1,0 +1,27 @@
+"""The selectors by name."""
+
+import numpy as np
+
+from jast.counter import generator
+from jast.weakness.default import default
+from jast.weakness.thesis import thesis
+from jast.weakness.validate import Selector, Step
+
+__all__ = ["NAMES", "default", "random", "thesis"]
+
+
+def random(*, batch=None):
+    """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least 10): the baseline, whose failure rate is unbiased."""
+
+    def step(key, data, memory, seen, ask):
+        free = np.flatnonzero(~seen.tried)
+        size = max(10, len(free) // 10) if batch is None else batch
+        chosen = generator(key).permutation(free)[:size]
+        now = ask(chosen)
+        rate = now.failed.sum() / max(len(now.order), 1)
+        return Step(memory, np.full(data.size, 0.5), chosen, rate * (~now.tried).sum())
+
+    return Selector("random", {"batch": batch}, lambda key, data: {}, step)
+
+
+NAMES = {"default": default, "random": random, "thesis": thesis}

@@ -1,0 +1,109 @@
+"""The adversary on encodings: R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford 2021, chapter 4."""
+
+import functools
+
+import jax
+import numpy as np
+
+from jast._checks import real, whole
+from jast.weakness import networks
+
+__all__ = ["thesis"]
+
+ADVERSARY = "adversary/"
+
+
+def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, rate=3e-5, hidden=None, encoder_epochs=20, encoder_rate=1e-3, batch=100):
+    """The selector of Moss's thesis, section 4.3: a failure classifier on what an autoencoder makes of the inputs, without their labels.
+
+    The autoencoder (``hidden`` widths; default: `networks.sizes`, the published 392 and 64 for 784 pixels) is trained on all inputs before any call, for
+    ``encoder_epochs`` by Adam at ``encoder_rate``, in minibatches of ``batch``: 100 as in the published code, 1000 in the text. Each of the ``iterations``
+    draws ``sample`` inputs without replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam at ``rate``, one row at a
+    time, each failure followed by ``copies`` of itself; its weights go on to the next iteration, Adam starts anew. Those of the second half with a score of at
+    least ``threshold`` are the candidates, and are run. What was run before is not run again, but learned from again if drawn again.
+
+    Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's output, on inputs it was trained on too, as published.
+    ``expected``: the failure rate of the random halves, of what was run there first, for every input not yet run.
+    """
+    from jast.weakness.validate import Selector  # here: validate's selectors import this module
+
+    whole_ = functools.partial(whole, "thesis")
+    iterations, sample, epochs, encoder_epochs, batch = (
+        whole_(name, value) for name, value in dict(iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs, batch=batch).items()
+    )
+    copies = whole_("copies", copies, 0)
+    threshold = float(real("thesis", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1"))
+    rate, encoder_rate = (
+        float(real("thesis", name, value, lambda v: 0 < v < np.inf, "above 0")) for name, value in dict(rate=rate, encoder_rate=encoder_rate).items()
+    )
+    hidden = None if hidden is None else tuple(whole_("hidden", width) for width in hidden)
+    if hidden == ():
+        raise ValueError("thesis: hidden must be at least one width, received none")
+    settings = dict(
+        iterations=iterations, sample=sample, threshold=threshold, copies=copies, epochs=epochs, rate=rate, hidden=hidden and list(hidden),
+        encoder_epochs=encoder_epochs, encoder_rate=encoder_rate, batch=batch,
+    )  # fmt: skip
+    start = functools.partial(_start, hidden, encoder_epochs, encoder_rate, batch)
+    return Selector("thesis", settings, start, functools.partial(_step, iterations, sample, threshold, copies, epochs, rate))
+
+
+def _start(hidden, epochs, rate, batch, key, data):
+    first, then = jax.random.split(key)
+    rows = _scaled(data)
+    codes, losses = networks.fit_autoencoder(first, rows, hidden or networks.sizes(rows.shape[1]), epochs=epochs, batch=batch, rate=rate)
+    params = networks.adversary(codes.shape[1]).init(then)
+    counts = {name: np.zeros((), np.int64) for name in ("iteration", "drawn", "failed")}
+    return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(params)}
+
+
+def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory, seen, ask):
+    from jast.weakness.validate import Step
+
+    if memory["iteration"] >= iterations:
+        return None
+    pick, train = jax.random.split(key)
+    drawn = np.asarray(jax.random.permutation(pick, data.size))[:sample]
+    half = (len(drawn) + 1) // 2
+    lesson, rest = drawn[:half], drawn[half:]
+
+    now = ask(lesson)
+    new = ~seen.tried[lesson] & now.tried[lesson]
+    params = _taught(train, _nested(memory), memory["codes"], lesson, now, copies, epochs, rate)
+    scores = np.asarray(jax.nn.sigmoid(networks.logits(params, memory["codes"])))
+
+    candidates = rest[scores[rest] >= threshold]
+    now = ask(candidates)
+    counts = dict(iteration=memory["iteration"] + 1, drawn=memory["drawn"] + new.sum(), failed=memory["failed"] + now.failed[lesson[new]].sum())
+    expected = counts["failed"] / max(counts["drawn"], 1) * np.sum(~now.tried)
+    return Step({**memory, **_flat(params), **{name: np.asarray(count, np.int64) for name, count in counts.items()}}, scores, candidates, float(expected))
+
+
+def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
+    """The adversary after training on those of ``lesson`` that were answered: a budget may end in the midst of it."""
+    answered, failed = seen.tried[lesson], seen.failed[lesson]
+    number = np.repeat(np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered)
+    if len(number) == 0:
+        return params
+    room = np.zeros(len(lesson) * (1 + copies), np.int32)  # of one size, whatever failed: one program for all iterations
+    room[: len(number)] = number
+    return networks.fit_adversary(key, params, codes[lesson], failed.astype(np.float32), room, len(number), epochs=epochs, rate=rate)[0]
+
+
+def _scaled(data):
+    """[n, d] float32 in [0, 1], the inputs as rows: images by their common range, tables by each column's; what does not vary is 0."""
+    rows = data.inputs.reshape(data.size, -1).astype(np.float64)
+    axis = None if data.image else 0
+    least, most = rows.min(axis), rows.max(axis)
+    return ((rows - least) / np.where(most > least, most - least, 1)).astype(np.float32)
+
+
+def _flat(params):
+    from flax.traverse_util import flatten_dict
+
+    return {ADVERSARY + name: np.asarray(array) for name, array in flatten_dict(params, sep="/").items()}
+
+
+def _nested(memory):
+    from flax.traverse_util import unflatten_dict
+
+    return unflatten_dict({name.removeprefix(ADVERSARY): array for name, array in memory.items() if name.startswith(ADVERSARY)}, sep="/")

@@ -1,0 +1,239 @@
+"""The validation loop: which inputs a classifier gets wrong, found with few calls."""
+
+import json
+import os
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast._checks import whole
+from jast.weakness.data import arrays, fingerprint
+from jast.weakness.measures import auc
+from jast.weakness.result import History, Result, Seen, State
+from jast.weakness.storage import load, save
+
+__all__ = ["Selector", "Step", "validate"]
+
+CHUNK = 1024  # inputs of one call of predict
+IDLE = 20  # iterations in a row that ask for nothing new
+
+
+class Step(NamedTuple):
+    """What one iteration of a selector comes to."""
+
+    memory: dict
+    """Arrays by name: what the next iteration needs of this one"""
+    scores: Any
+    """[n] in [0, 1]: how suspect each input is"""
+    candidates: Any
+    """[k] int: the inputs that it ran because it held them for failures; their share of failures is the iteration's precision"""
+    expected: float
+    """Failures that it expects among the inputs not yet run"""
+
+
+class Selector(NamedTuple):
+    """A way of choosing inputs: `default`, `thesis`, `random`, or your own."""
+
+    name: str
+    settings: dict
+    """Plain numbers and texts: a state of other settings is refused"""
+    start: Callable
+    """``start(key, data) -> memory``, before any call"""
+    step: Callable
+    """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do. ``ask(indices)`` runs the system on those of ``indices`` that
+    were not run yet, as far as the budget goes, and returns the new `Seen`."""
+
+
+class _Stop(Exception):
+    """The system did not answer."""
+
+
+def validate(key, predict, inputs, labels, *, budget=None, selector="default", classes=None, state=None, checkpoint=None, progress=False, callback=None):
+    """Find the inputs of a labelled data set that a classifier gets wrong, with at most ``budget`` calls of it: a `Result`.
+
+    ``predict(inputs [m, ...]) -> labels [m]``: the system under test, any Python callable. It is called with up to 1024 inputs at once, in the dtype of
+    ``inputs``, and never twice on one input. ``inputs`` [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns]. ``labels`` [n]: the
+    true classes, whole numbers in 0 ... ``classes`` - 1 (default: the largest and 1), as the predictions must be. ``budget``: calls, those of ``state``
+    included; default: all n.
+
+    ``selector``: "default" learns from the labels how hard each input is, and from each answer where the system differs (`default`); "thesis" is the adversary
+    on encodings of Moss's thesis, chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
+
+    ``state``: of an earlier result of the same data and selector, to go on from there: as if it had not been interrupted. ``checkpoint``: a file to which the
+    state is written after every call of ``predict``, and from which an existing one goes on. ``progress=True`` shows a bar of calls;
+    ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
+
+    Where ``predict`` raises, or answers with something else than m labels in range, or at a KeyboardInterrupt, the search ends, with a RuntimeWarning, and
+    the result so far says so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked again by a run that goes on.
+    ValueError for that at the very first call; for inputs that are not finite, labels out of range, a state or checkpoint of other data or of another selector.
+    """
+    data = arrays("validate", inputs, labels, classes)
+    chosen = _selector(selector)
+    n = data.size
+    if not callable(predict):
+        raise ValueError(f"validate: predict must be callable: inputs [m, ...] -> labels [m], received {predict!r}")
+    budget = n if budget is None else min(whole("validate", "budget", budget), n)
+    if checkpoint is not None and os.path.exists(checkpoint):
+        if state is not None:
+            raise ValueError(f"validate: give state or an existing checkpoint, not both; {checkpoint} exists")
+        state = load(checkpoint)
+    state = _begin(key, data, chosen) if state is None else _fits(state, data, chosen)
+    return _run(state, chosen, data, predict, budget, checkpoint, progress, callback)
+
+
+def _selector(selector):
+    from jast.weakness import selectors
+
+    if isinstance(selector, Selector):
+        return selector
+    if selector not in selectors.NAMES:
+        raise ValueError(f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received {selector!r}")
+    return selectors.NAMES[selector]()
+
+
+def _described(selector):
+    return json.dumps([selector.name, selector.settings], sort_keys=True)
+
+
+def _begin(key, data, selector):
+    n = data.size
+    history = History(*(np.zeros(0, int) for _ in range(2)), *(np.zeros(0) for _ in range(4)), np.zeros((0, n), np.float32))
+    numbers = np.asarray(jax.random.key_data(key))
+    memory = selector.start(_key(numbers, 0), data)
+    return State(_described(selector), fingerprint(data), numbers, memory, np.zeros(0, int), np.full(n, -1, np.int32), 0, history, False)
+
+
+def _key(numbers, iteration):
+    return jax.random.fold_in(jax.random.wrap_key_data(numbers), iteration)
+
+
+def _fits(state, data, selector):
+    if not isinstance(state, State):
+        raise ValueError(f"validate: state must be the state of a Result, received {type(state).__name__}")
+    if state.data != fingerprint(data):
+        raise ValueError("validate: state is of other inputs or labels")
+    if state.selector != _described(selector):
+        raise ValueError(f"validate: state is of the selector {state.selector}, received {_described(selector)}")
+    return state
+
+
+def _run(state, selector, data, predict, budget, checkpoint, progress, callback):
+    answers, answered = state.predicted.copy(), list(state.order)  # all that the system has said
+    seen = _seen(state.order[: state.complete], answers, data.labels)  # what whole iterations have seen of it
+    memory, history, finished, incidents = state.memory, state.history, state.finished, []
+    bar = _bar(progress, budget, len(answered))
+
+    def kept():
+        return State(state.selector, state.data, state.key, memory, np.asarray(answered, int), answers.copy(), len(seen.order), history, finished)
+
+    current = seen
+
+    def ask(indices):
+        nonlocal current
+        new = [i for i in dict.fromkeys(np.asarray(indices).tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
+        fresh = [i for i in new if answers[i] < 0]
+        for at in range(0, len(fresh), CHUNK):
+            batch = np.asarray(fresh[at : at + CHUNK])
+            answers[batch] = _answers(predict, data, batch)
+            answered.extend(batch.tolist())
+            bar.update(len(batch))
+            if checkpoint is not None:
+                save(checkpoint, kept())
+        current = _seen(np.append(current.order, np.asarray(new, int)), answers, data.labels)
+        return current
+
+    idle = 0
+    try:
+        while not finished and len(seen.order) < budget:
+            current = seen
+            step = selector.step(_key(state.key, 1 + len(history.calls)), data, memory, seen, ask)
+            if step is None:
+                finished = True
+                break
+            idle = 0 if len(current.order) > len(seen.order) else idle + 1
+            seen, memory, history = current, step.memory, _row(history, step, current)
+            if callback is not None:
+                callback(len(history.calls), _result(kept(), data, ()))
+            if idle == IDLE:
+                incidents.append(f"the selector asked for nothing new in {IDLE} iterations")
+                break
+    except _Stop as stop:
+        if not answered:
+            raise ValueError(f"validate: {stop}") from stop.__cause__
+        incidents.append(str(stop))
+    except KeyboardInterrupt:
+        if not answered:
+            raise
+        incidents.append("interrupted")
+    finally:
+        bar.close()
+    if checkpoint is not None:
+        save(checkpoint, kept())
+    if incidents:
+        warnings.warn(f"validate: ended after {len(answered)} of {budget} calls: {incidents[0]}", RuntimeWarning, stacklevel=3)
+    return _result(kept(), data, tuple(incidents))
+
+
+def _answers(predict, data, batch):
+    """[m] int32: what the system says about the inputs numbered ``batch``."""
+    where = f"the batch of {len(batch)} inputs [{', '.join(map(str, batch[:4]))}{', ...' if len(batch) > 4 else ''}]"
+    try:
+        given = predict(data.inputs[batch])
+    except Exception as error:
+        raise _Stop(f"predict raised {type(error).__name__}: {error}, on {where}") from error
+    try:
+        said = np.asarray(given)
+    except Exception as error:
+        raise _Stop(f"predict must return labels [{len(batch)}], received {type(given).__name__}, on {where}") from error
+    if said.shape != batch.shape or said.dtype.kind not in "iub":
+        raise _Stop(f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape {said.shape}, on {where}")
+    out = np.flatnonzero((said < 0) | (said >= data.classes))
+    if len(out):
+        raise _Stop(
+            f"predict must return labels in 0 ... {data.classes - 1} (classes={data.classes}), received {said[out[0]]} for input {batch[out[0]]}, on {where}"
+        )
+    return said.astype(np.int32)
+
+
+def _seen(order, answers, labels):
+    predicted = np.full_like(answers, -1)
+    predicted[order] = answers[order]
+    return Seen(np.asarray(order, int), predicted, labels)
+
+
+def _row(history, step, seen):
+    """``history`` and one more iteration."""
+    failed, tried = seen.failed, seen.tried
+    scores = np.asarray(step.scores, np.float32)
+    if scores.shape != tried.shape or not np.isfinite(scores).all():
+        raise ValueError(
+            f"validate: the selector's scores must be finite [{len(tried)}], received shape {scores.shape}, {np.sum(~np.isfinite(scores))} not finite"
+        )
+    ran = np.asarray(step.candidates, int)
+    ran = ran[tried[ran]]
+    found, total = int(failed.sum()), failed.sum() + step.expected
+    new = (
+        len(seen.order), found, failed[ran].mean() if len(ran) else np.nan, found / total if total > 0 else np.nan, auc(scores[tried], failed[tried]),
+        step.expected, scores,
+    )  # fmt: skip
+    return History(*(np.concatenate([old, np.asarray(one, old.dtype)[None]]) for old, one in zip(history, new, strict=True)))
+
+
+def _result(state, data, incidents):
+    seen = Seen(state.order, state.predicted, data.labels)
+    h, left = state.history, np.flatnonzero(~seen.tried)
+    scores = h.scores[-1] if len(h.scores) else np.full(data.size, 0.5, np.float32)
+    ranked = left[np.argsort(-scores[left], kind="stable")]
+    failures = state.order[seen.failed[state.order]]
+    return Result(
+        failures, len(state.order), state.order, state.predicted, scores, ranked, float(h.expected[-1]) if len(h.expected) else np.nan, h, incidents, state
+    )
+
+
+def _bar(progress, budget, at):
+    from tqdm import tqdm
+
+    return tqdm(total=budget, initial=at, unit="call", disable=not progress)

@@ -1,0 +1,79 @@
+"""How networks and neighbourhoods see the inputs: numbers of order 1, and few of them."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["Views", "difficulty_of_neighbours", "scaled", "squared_distances", "views"]
+
+WIDE, KEPT = 2048, 512  # inputs of more numbers than WIDE are seen by their first KEPT principal components
+COMPONENTS, NEIGHBOURS, REFERENCE, ROWS = 64, 15, 20_000, 1024
+
+
+class Views(NamedTuple):
+    """Of n inputs, float32."""
+
+    scaled: Any
+    """[n, d]: from 0 to 1 over the least and the greatest, of all numbers of an image or of each column of a table"""
+    centred: Any
+    """[n, d]: mean 0, a deviation of 0.4, over the same"""
+    close: Any
+    """[n, <= 64]: principal components of ``centred``, in which distances are measured"""
+
+
+def views(rng, data):
+    """The `Views` of a `Data`."""
+    x = scaled(data)
+    centred = x - x.mean(0)
+    deviation = np.sqrt(np.mean(centred**2, axis=None if data.image else 0))
+    # a column that is the same for nearly all inputs must not stand above the others where it is not
+    centred = np.clip(centred / np.where(deviation > 0, deviation, 1), -8, 8).astype(np.float32) * np.float32(0.4)
+    if x.shape[1] > WIDE:
+        wide = _components(rng, centred, KEPT)
+        return Views(wide / np.float32(max(np.abs(wide).max(), 1e-6)), wide * np.float32(0.4 / max(wide.std(), 1e-6)), wide[:, :COMPONENTS])
+    return Views(x, centred.astype(np.float32), _components(rng, centred, COMPONENTS))
+
+
+def scaled(data):
+    """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all images, or of each column of a table."""
+    x = data.inputs.reshape(data.size, -1).astype(np.float32)
+    over = None if data.image else 0
+    low, high = x.min(over), x.max(over)
+    return ((x - low) / np.where(high > low, high - low, 1)).astype(np.float32)
+
+
+def _components(rng, x, k):
+    """[n, k]: the first k principal components; of wide inputs, those of a random subspace that two power iterations turn towards them (Halko, Martinsson and
+    Tropp, 2011)."""
+    k = min(k, x.shape[1])
+    if x.shape[1] > WIDE:
+        basis = np.linalg.qr(rng.standard_normal((x.shape[1], k + 10), np.float32))[0]
+        for _ in range(2):
+            basis = np.linalg.qr(x.T @ (x @ basis))[0]
+        x = x @ basis
+    vectors = np.linalg.eigh((x.T @ x).astype(np.float64))[1]
+    return (x @ vectors[:, ::-1][:, :k].astype(np.float32)).astype(np.float32)
+
+
+def difficulty_of_neighbours(rng, close, labels, classes):
+    """[n]: the log odds against each input's label by its 15 nearest others, weighted by their inverse squared distances."""
+    n = len(close)
+    reference = np.arange(n) if n <= REFERENCE else np.sort(rng.choice(n, REFERENCE, replace=False))
+    k = min(NEIGHBOURS, len(reference) - 1)
+    if k < 1:
+        return np.zeros(n)
+    right = np.zeros(n)
+    for at in range(0, n, ROWS):
+        rows = np.arange(at, min(at + ROWS, n))
+        d2 = squared_distances(close[rows], close[reference])
+        d2[rows[:, None] == reference] = np.inf  # not itself
+        near = np.argpartition(d2, k - 1, axis=1)[:, :k]
+        weight = 1 / (np.take_along_axis(d2, near, 1) + 1e-3)
+        right[rows] = np.sum(weight * (labels[reference[near]] == labels[rows][:, None]), axis=1) / np.sum(weight, axis=1)
+    right = (right * k + 1 / classes) / (k + 1)  # one more, that knows nothing
+    return np.log1p(-right) - np.log(right)
+
+
+def squared_distances(a, b):
+    """[len(a), len(b)]"""
+    return np.maximum(np.sum(a**2, 1)[:, None] + np.sum(b**2, 1) - 2 * a @ b.T, 0)

@@ -1,0 +1,333 @@
+"""The validation loop of jast.weakness: calls are counted and never repeated, nothing that was answered is lost, and scores are judged as scikit-learn does."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import roc_auc_score, roc_curve
+
+from jast import weakness
+from jast.counter import generator
+from jast.weakness import Selector, Step, validate
+
+KEY = jax.random.key(0)
+
+
+def same(a, b):
+    """That two results or states are the same to the bit, NaN and texts included."""
+    assert type(a) is type(b)
+    if isinstance(a, tuple | dict):
+        assert len(a) == len(b)
+        for name in a if isinstance(a, dict) else range(len(a)):
+            same(a[name], b[name])
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    else:
+        assert a == b
+
+
+class System:
+    """Answers from a list, by the first number of an input, which is its index; notes what it was asked."""
+
+    def __init__(self, answers):
+        self.answers, self.batches = np.asarray(answers), []
+
+    def __call__(self, batch):
+        at = np.asarray(batch).reshape(len(batch), -1)[:, 0].astype(int)
+        self.batches.append(at)
+        return self.answers[at]
+
+    @property
+    def asked(self):
+        return np.concatenate(self.batches) if self.batches else np.zeros(0, int)
+
+
+def problem(n, rate=0.2, classes=3, seed=0):
+    """(inputs [n, 2] whose first number is the index, labels, answers of a system that is wrong at ``rate``)."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, classes, n)
+    return np.stack([np.arange(n), rng.normal(size=n)], 1), labels, np.where(rng.random(n) < rate, (labels + 1) % classes, labels)
+
+
+def in_turn(size=7, sets=2):
+    """A selector that asks for the next inputs, ``sets`` times an iteration, and remembers how many it has seen fail."""
+
+    def step(key, data, memory, seen, ask):
+        at = int(memory["at"])
+        for _ in range(sets):
+            now = ask(np.arange(at, min(at + size, data.size)))
+            at += size
+        noise = generator(key).random(data.size, np.float32)
+        return Step({"at": np.asarray(at), "failed": np.asarray(now.failed.sum())}, noise, np.arange(int(memory["at"]), min(at, data.size)), 1.5)
+
+    return Selector("in turn", {"size": size}, lambda key, data: {"at": np.asarray(0), "failed": np.asarray(0)}, step)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(1, 80), st.integers(1, 100), st.floats(0, 1), st.integers(0, 10**6))
+def test_every_input_is_asked_at_most_once_and_every_call_is_counted(n, budget, rate, seed):
+    inputs, labels, answers = problem(n, rate, seed=seed)
+    system = System(answers)
+    result = validate(jax.random.key(seed), system, inputs, labels, budget=budget, selector="random", classes=3)
+    assert result.calls == min(n, budget) == len(system.asked) == len(set(system.asked.tolist()))
+    np.testing.assert_array_equal(result.order, system.asked)
+    np.testing.assert_array_equal(result.failures, [i for i in result.order if answers[i] != labels[i]])
+    np.testing.assert_array_equal(result.predicted, np.where(np.isin(np.arange(n), result.order), answers, -1))
+    assert sorted(result.ranked.tolist() + result.order.tolist()) == list(range(n))
+    assert result.history.calls[-1] == result.calls and result.history.found[-1] == len(result.failures)
+
+
+def test_random_choice_expects_what_its_rate_says():
+    inputs, labels, answers = problem(4000, 0.1)
+    result = validate(KEY, System(answers), inputs, labels, budget=1000, selector="random")
+    left = int(np.sum(answers != labels)) - len(result.failures)
+    # hypergeometric: the standard error of the rate of 1000 of 4000, times the 3000 left; 4 of them
+    assert abs(result.expected - left) < 4 * 4000 * np.sqrt(0.1 * 0.9 / 1000 * 3000 / 4000)
+    assert result.history.recall[-1] == pytest.approx(len(result.failures) / (len(result.failures) + result.expected))
+
+
+def test_rows_of_the_history():
+    inputs, labels, answers = problem(60, 0.3)
+    result = validate(KEY, System(answers), inputs, labels, selector=in_turn())
+    failed = answers != labels
+    ends = np.r_[14:60:14, 60]
+    np.testing.assert_array_equal(result.history.calls, ends)
+    np.testing.assert_array_equal(result.history.found, [failed[:e].sum() for e in ends])
+    np.testing.assert_allclose(result.history.precision, [failed[a:e].mean() for a, e in zip(np.r_[0, ends], ends, strict=False)])
+    np.testing.assert_allclose(result.history.recall, [failed[:e].sum() / (failed[:e].sum() + 1.5) for e in ends])
+    np.testing.assert_allclose(result.history.auc, [roc_auc_score(failed[:e], s[:e]) for e, s in zip(ends, result.history.scores, strict=True)], rtol=1e-6)
+    np.testing.assert_array_equal(result.scores, result.history.scores[-1])
+
+
+def test_the_most_suspect_come_first():
+    inputs, labels, answers = problem(50)
+    result = validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())
+    assert np.all(np.diff(result.scores[result.ranked]) <= 0) and len(result.ranked) == 22
+
+
+def test_large_batches_are_cut(monkeypatch):
+    inputs, labels, answers = problem(3000)
+    system = System(answers)
+    validate(KEY, system, inputs, labels, selector=in_turn(2500, 1))
+    assert [len(b) for b in system.batches] == [1024, 1024, 452, 500]
+
+
+def test_inputs_reach_the_system_as_they_are():
+    seen = []
+    images = np.arange(40, dtype=np.uint8).reshape(10, 2, 2)
+    validate(KEY, lambda x: seen.append(x) or np.zeros(len(x), int), images, np.zeros(10, int), selector=in_turn(10, 1))
+    assert seen[0].dtype == np.uint8 and seen[0].shape == (10, 2, 2)
+
+
+class Flaky(System):
+    """Raises ``error`` when it is asked for input ``at``, once."""
+
+    def __init__(self, answers, at, error):
+        super().__init__(answers)
+        self.at, self.error = at, error
+
+    def __call__(self, batch):
+        if self.error is not None and self.at in batch[:, 0]:
+            error, self.error = self.error, None
+            raise error
+        return super().__call__(batch)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("out of memory"), KeyboardInterrupt()], ids=["raises", "interrupted"])
+@pytest.mark.parametrize("at", [7, 20, 59])
+def test_an_interrupted_validation_goes_on_as_if_it_had_not_been(at, error):
+    inputs, labels, answers = problem(60)
+    whole = validate(KEY, System(answers), inputs, labels, selector=in_turn())
+    system = Flaky(answers, at, error)
+    with pytest.warns(RuntimeWarning, match="ended after"):
+        part = validate(KEY, system, inputs, labels, selector=in_turn())
+    assert len(part.incidents) == 1 and part.calls == len(system.asked) < 60
+    if isinstance(error, RuntimeError):
+        assert "RuntimeError: out of memory" in part.incidents[0] and f"[{at // 7 * 7}, " in part.incidents[0]
+        assert "out of memory" in str(part)
+    rest = validate(jax.random.key(99), system, inputs, labels, selector=in_turn(), state=part.state)
+    same(rest, whole)
+    assert len(system.asked) == 60
+
+
+def test_a_checkpoint_holds_every_answer(tmp_path):
+    inputs, labels, answers = problem(60)
+    path = tmp_path / "validation.npz"
+    whole = validate(KEY, System(answers), inputs, labels, selector=in_turn())
+    system = Flaky(answers, 38, SystemExit())  # what nothing catches
+    with pytest.raises(SystemExit):
+        validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path)
+    assert len(weakness.load(path).order) == 35
+    same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
+    assert len(system.asked) == 60
+    again = validate(KEY, lambda x: pytest.fail("nothing is left to ask"), inputs, labels, selector=in_turn(), checkpoint=path)
+    same(again, whole)
+
+
+def test_a_state_survives_its_file(tmp_path):
+    inputs, labels, answers = problem(60)
+    state = validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn()).state
+    weakness.save(tmp_path / "s.npz", state)
+    same(weakness.load(tmp_path / "s.npz"), state)
+    data = bytearray((tmp_path / "s.npz").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "s.npz").write_bytes(data)
+    with pytest.raises(ValueError, match="load: .* damaged"):
+        weakness.load(tmp_path / "s.npz")
+
+
+def test_a_larger_budget_goes_on():
+    inputs, labels, answers = problem(60)
+    part = validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())
+    same(
+        validate(KEY, System(answers), inputs, labels, budget=60, selector=in_turn(), state=part.state),
+        validate(KEY, System(answers), inputs, labels, selector=in_turn()),
+    )
+
+
+def test_a_selector_that_asks_nothing_is_stopped():
+    inputs, labels, answers = problem(20)
+    idle = Selector("idle", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: Step({}, np.full(20, 0.5), np.zeros(0, int), 0.0))
+    with pytest.warns(RuntimeWarning, match="nothing new"):
+        result = validate(KEY, System(answers), inputs, labels, selector=idle)
+    assert result.calls == 0 and np.isnan(result.history.precision).all()
+
+
+def test_a_selector_may_end_before_the_budget():
+    inputs, labels, answers = problem(20)
+    done = Selector("done", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: None)
+    result = validate(KEY, System(answers), inputs, labels, selector=done)
+    assert result.calls == 0 and result.incidents == () and result.state.finished and len(result.ranked) == 20
+    assert "0 failures in 0 calls" in str(result)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+@pytest.mark.parametrize("selector", ["random", in_turn()], ids=["random", "own"])
+def test_a_system_without_failures_and_one_with_nothing_else(wrong, selector):
+    inputs, labels, _ = problem(30)
+    result = validate(KEY, System((labels + wrong) % 3), inputs, labels, selector=selector)
+    assert len(result.failures) == (30 if wrong else 0) and np.isnan(result.history.auc).all() and str(result)
+    judged = weakness.judge(result, np.full(30, wrong))
+    assert np.isnan(judged.auc).all()
+
+
+def test_progress_and_callback(capsys):
+    inputs, labels, answers = problem(60)
+    calls = []
+    validate(KEY, System(answers), inputs, labels, selector=in_turn(), progress=True, callback=lambda i, r: calls.append((i, r.calls)))
+    assert calls == [(1, 14), (2, 28), (3, 42), (4, 56), (5, 60)] and "60/60" in capsys.readouterr().err
+
+
+def test_results_print_as_a_table():
+    inputs, labels, answers = problem(60)
+    lines = str(validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())).splitlines()
+    assert "failures in 28 calls (60 inputs)" in lines[0] and lines[1].split() == ["iteration", "calls", "failures", "precision", "recall", "AUC", "expected"]
+    assert [line.split()[:2] for line in lines[2:]] == [["1", "14"], ["2", "28"]]
+
+
+GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(inputs=np.zeros(6)), r"inputs must be numbers \[n, ...\].*shape \(6,\)"),
+        (dict(inputs=np.array([["a"] * 2] * 6)), "inputs must be numbers"),
+        (dict(inputs=np.zeros((0, 2)), labels=np.zeros(0, int)), "inputs must be numbers"),
+        (dict(inputs=np.where(np.arange(12).reshape(6, 2) == 5, np.nan, 0.0)), "1 of 6 hold NaN or infinity, the first is number 2"),
+        (dict(inputs=np.where(np.arange(12).reshape(6, 2) > 9, np.inf, 0.0)), "1 of 6 hold NaN or infinity, the first is number 5"),
+        (dict(labels=np.zeros(5, int)), r"labels must be whole numbers \[6\].*shape \(5,\)"),
+        (dict(labels=np.zeros(6)), "labels must be whole numbers.*float64"),
+        (dict(labels=np.array([0, 1, -1, 0, 1, 2])), r"labels must lie in 0 ... 2; 1 do not, the first is number 2: -1"),
+        (dict(classes=2), r"labels must lie in 0 ... 1; 2 do not, the first is number 2: 2"),
+        (dict(classes=1), "classes must be an int of at least 2"),
+        (dict(predict=None), "predict must be callable"),
+        (dict(budget=0), "budget must be a whole number of at least 1"),
+        (dict(selector="best"), "selector must be one of .*received 'best'"),
+        (dict(state=3), "state must be the state of a Result, received int"),
+    ],
+)
+def test_bad_arguments(change, message):
+    given = dict(predict=lambda x: np.zeros(len(x), int), inputs=GOOD[0], labels=GOOD[1], selector="random") | change
+    with pytest.raises(ValueError, match="validate: .*" + message):
+        validate(KEY, given.pop("predict"), given.pop("inputs"), given.pop("labels"), **given)
+
+
+@pytest.mark.parametrize(
+    ("predict", "message"),
+    [
+        (lambda x: 1 / 0, r"raised ZeroDivisionError: division by zero, on the batch of 6 inputs \[\d, \d, \d, \d, ...\]"),
+        (lambda x: np.zeros((len(x), 3), int), r"whole numbers \[6\], received int64 of shape \(6, 3\)"),
+        (lambda x: np.zeros(len(x) - 1, int), r"received int64 of shape \(5,\)"),
+        (lambda x: np.zeros(len(x)), "received float64"),
+        (lambda x: None, "received object"),
+        (lambda x: np.full(len(x), 3), r"labels in 0 ... 2 \(classes=3\), received 3 for input"),
+        (lambda x: np.full(len(x), -1), "received -1"),
+    ],
+)
+def test_a_system_that_does_not_answer_at_all(predict, message):
+    with pytest.raises(ValueError, match="validate: predict .*" + message):
+        validate(KEY, predict, *GOOD, selector="random")
+
+
+def test_a_state_of_something_else_is_refused():
+    inputs, labels, answers = problem(20)
+    state = validate(KEY, System(answers), inputs, labels, budget=10, selector=in_turn()).state
+    with pytest.raises(ValueError, match="state is of other inputs or labels"):
+        validate(KEY, System(answers), inputs + 1, labels, selector=in_turn(), state=state)
+    with pytest.raises(ValueError, match="state is of the selector .*in turn"):
+        validate(KEY, System(answers), inputs, labels, selector="random", state=state)
+    with pytest.raises(ValueError, match="state is of the selector"):
+        validate(KEY, System(answers), inputs, labels, selector=in_turn(8), state=state)
+
+
+def test_answers_may_be_of_jax():
+    inputs, labels, _ = problem(20)
+    assert len(validate(KEY, lambda x: jax.numpy.zeros(len(x), jax.numpy.int32), inputs, labels, selector="random").failures) == np.sum(labels != 0)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.tuples(st.integers(-3, 3), st.booleans()), min_size=1, max_size=40))
+def test_the_roc_curve_is_scikit_learns(pairs):
+    scores, failed = np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs])
+    if failed.all() or not failed.any():
+        assert np.isnan(weakness.auc(scores, failed))
+        return
+    assert weakness.auc(scores, failed) == pytest.approx(roc_auc_score(failed, scores), abs=1e-12)
+    ours, theirs = weakness.roc(scores, failed), roc_curve(failed, scores, drop_intermediate=False)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b)
+    assert weakness.auc(np.exp(scores), failed) == pytest.approx(weakness.auc(scores, failed))
+
+
+def test_judged_by_the_truth():
+    inputs, labels, answers = problem(200, 0.3)
+    result = validate(KEY, System(answers), inputs, labels, budget=140, selector=in_turn(70, 1))
+    failed = answers != labels
+    judged = weakness.judge(result, failed, threshold=0.8)
+    for i, s in enumerate(result.history.scores):
+        picked = s >= 0.8
+        assert judged.candidates[i] == picked.sum() and judged.precision[i] == failed[picked].mean() and judged.recall[i] == failed[picked].sum() / failed.sum()
+        assert judged.auc[i] == pytest.approx(roc_auc_score(failed, s))
+    top = weakness.judge(result, failed, top=20)
+    np.testing.assert_array_equal(top.candidates, [20, 20])
+    assert top.precision[0] == failed[np.argsort(-result.history.scores[0])[:20]].mean()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: weakness.judge(r, np.zeros(5, bool)), r"judge: failed must be bool \[20\]"),
+        (lambda r: weakness.judge(r, np.zeros(20)), "judge: failed must be bool .*float64"),
+        (lambda r: weakness.judge(r, np.zeros(20, bool), top=21), "judge: top must be an int in 1 ... 20"),
+        (lambda r: weakness.roc(np.zeros(3), np.zeros(4, bool)), "roc: scores and failed must be"),
+        (lambda r: weakness.auc(np.array([0.0, np.nan]), np.zeros(2, bool)), "scores must not be NaN, 1 are"),
+    ],
+)
+def test_bad_judgements(call, message):
+    inputs, labels, answers = problem(20)
+    result = validate(KEY, System(answers), inputs, labels, selector=in_turn())
+    with pytest.raises(ValueError, match=message):
+        call(result)
