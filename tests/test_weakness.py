@@ -321,7 +321,8 @@ def test_judged_by_the_truth():
     [
         (lambda r: weakness.judge(r, np.zeros(5, bool)), r"judge: failed must be bool \[20\]"),
         (lambda r: weakness.judge(r, np.zeros(20)), "judge: failed must be bool .*float64"),
-        (lambda r: weakness.judge(r, np.zeros(20, bool), top=21), "judge: top must be an int in 1 ... 20"),
+        (lambda r: weakness.judge(r, np.ones(20, bool), top=21), "judge: top must be an int in 1 ... 20"),
+        (lambda r: weakness.judge(r, np.zeros(20, bool)), "failed must agree with the result"),
         (lambda r: weakness.roc(np.zeros(3), np.zeros(4, bool)), "roc: scores and failed must be"),
         (lambda r: weakness.auc(np.array([0.0, np.nan]), np.zeros(2, bool)), "scores must not be NaN, 1 are"),
     ],

@@ -9,7 +9,7 @@ import numpy as np
 __all__ = ["Committee", "folds", "fit", "gradient", "held_out"]
 
 HIDDEN, BATCH, RATE = 32, 256, 3e-3
-STEPS = (300, 8, 1500)  # least; passes over the inputs; most
+STEPS = (300, 1500)  # least and most
 
 
 class Committee(NamedTuple):
@@ -35,16 +35,16 @@ def folds(rng, n, parts=5, repeats=4):
     return np.asarray(rows)
 
 
-def fit(rng, x, targets, weights, classes):
+def fit(rng, x, targets, weights, classes, passes):
     """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n] by Adam: (committee, log probabilities [M, n, classes]).
 
-    All members see the same minibatches, so that their first layers are one matrix product.
+    All members see the same minibatches, so that their first layers are one matrix product. ``passes``: over the inputs, as long as these are
+    300 to 1500 steps.
     """
     members, (n, d) = len(weights), x.shape
-    batch = min(BATCH, n)
-    steps = max(STEPS[0], min(STEPS[1] * n // batch, STEPS[2]))
-    passes = -(-steps // (n // batch))
-    order = np.concatenate([rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(passes)])[:steps].astype(np.int32)
+    batch = min(BATCH, max(n // 8, min(n, 16)))  # few inputs: small batches, so that they are not passed over too often
+    steps = max(STEPS[0], min(passes * n // batch, STEPS[1]))
+    order = np.concatenate([rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(-(-steps // (n // batch)))])[:steps].astype(np.int32)
     normal = lambda *shape: rng.standard_normal(shape, np.float32)
     start = Committee(
         normal(d, members, HIDDEN) * np.float32(np.sqrt(2 / d)), np.zeros((members, HIDDEN), np.float32),

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jast._checks import real, whole
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.blend import logistic, sigmoid
@@ -11,6 +12,7 @@ from jast.weakness.views import Views, difficulty_of_neighbours, views
 
 __all__ = ["default"]
 
+PASSES = {True: 8, False: 50}  # over images, whose many pixels are soon learned by heart, and over tables
 STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
 # log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision of the prior of b
 PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
@@ -30,6 +32,10 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
     (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
     out; each repetition is five networks for each of two views. The scores are probabilities of failure.
     """
+    first = first if first is None else whole("default", "first", first)
+    repeats = whole("default", "repeats", repeats)
+    growth = float(real("default", "growth", growth, lambda v: 0 <= v < np.inf, "of at least 0"))
+    exploration = float(real("default", "exploration", exploration, lambda v: 0 <= v <= 1, "in 0 ... 1"))
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):
@@ -61,7 +67,7 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
 
 def _odds(rng, x, answers, weights, learn, data):
     """[n] log odds against each input's label, by the members that have not learned from it."""
-    p = committee.held_out(committee.fit(rng, x, answers, weights, data.classes)[1], learn)
+    p = committee.held_out(committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])[1], learn)
     right = np.clip(p[np.arange(data.size), data.labels].astype(float), 1e-6, 1 - 1e-6)
     return np.log1p(-right) - np.log(right)
 

@@ -5,13 +5,13 @@ import numpy as np
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.data import arrays, fingerprint
-from jast.weakness.default import STRENGTH
+from jast.weakness.default import PASSES, STRENGTH
 from jast.weakness.result import Result
-from jast.weakness.views import scaled
+from jast.weakness.views import centred, scaled
 
 __all__ = ["influence"]
 
-MEMBERS = 5
+MEMBERS, EFFORT = 5, 4
 
 
 def influence(key, result, inputs, labels, *, at=None, classes=None):
@@ -34,7 +34,8 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
     at = at.astype(int)
     tried = result.predicted >= 0
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
-    x, rng = scaled(data), generator(key)
-    imitation = committee.fit(rng, x, np.where(tried, result.predicted, data.labels), weights, data.classes)[0]
+    rng = generator(key)
+    x = centred(scaled(data), data.image)
+    imitation = committee.fit(rng, x, np.where(tried, result.predicted, data.labels), weights, data.classes, EFFORT * PASSES[data.image])[0]
     slope = np.asarray(committee.gradient(imitation, x[at], data.labels[at]))
     return (slope * (x[at] - x.mean(0))).reshape(-1, *data.inputs.shape[1:])

@@ -1,4 +1,7 @@
-"""The networks of adversarial weakness recognition and their training: an autoencoder of the inputs, an adversary that tells failures by the encodings."""
+"""The two networks of adversarial weakness recognition and their training: an autoencoder of the inputs, an adversary that tells failures by their codes.
+
+R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford 2021, chapter 4.
+"""
 
 import functools
 from typing import Any, NamedTuple
@@ -33,7 +36,7 @@ def sizes(inputs):
 
 @functools.cache
 def autoencoder(inputs, hidden):
-    """The `Network` of the thesis's section 4.3.1: dense layers of ``hidden`` widths, the same backwards, leaky ReLU after every one, the last as well."""
+    """The `Network` of chapter 4, "Dataset Autoencoder": dense layers of ``hidden`` widths, the same backwards, leaky ReLU after every one, also the last."""
     module = _modules()[0](inputs, hidden)
     encode = Partial(lambda params, x: module.apply(params, x, method="encode"))
     return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), encode)
@@ -41,18 +44,21 @@ def autoencoder(inputs, hidden):
 
 @functools.cache
 def adversary(inputs):
-    """The `Network` of section 4.3.2: inputs-128-64-1, ReLU between; the sigmoid that makes its logit a probability is left to whoever asks."""
+    """The `Network` of chapter 4, "Adversarial Failure Classifier": inputs-128-64-1, ReLU between; its logits, whose sigmoid is the score."""
     module = _modules()[1](ADVERSARY)
     return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), None)
 
 
-def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=100, rate=1e-3):
-    """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled each epoch: (codes [n, hidden[-1]], losses [epochs])."""
+def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
+    """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled each epoch: (codes [n, hidden[-1]], losses [epochs]).
+
+    Minibatches of ``batch``, at most n; the last of an epoch may be smaller.
+    """
     network = autoencoder(rows.shape[1], hidden)
     first, then = jax.random.split(key)
-    params, losses = _fit(
-        then, network.init(first), rows, rows, np.arange(len(rows), dtype=np.int32), len(rows), epochs, rate, network.apply, _squared, min(batch, len(rows))
-    )
+    n = len(rows)
+    number = np.arange(n, dtype=np.int32)
+    params, losses = _fit(then, network.init(first), rows, rows, number, n, epochs, rate, network.apply, _squared, min(batch, n))
     return _codes(network.encode, params, rows), losses
 
 
@@ -107,9 +113,9 @@ def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, ba
         return params, state, total + value * jnp.sum(weight)
 
     def epoch(carry, key):
-        order = number[jnp.argsort(jnp.where(place < size, jax.random.uniform(key, place.shape), 2.0))]
+        order = number[jnp.argsort(jnp.where(place < size, jax.random.uniform(key, place.shape, jnp.float32), 2.0))]
         params, state, total = lax.fori_loop(0, steps, functools.partial(step, order=order), (*carry, jnp.zeros((), jnp.float32)))
-        return (params, state), total / size
+        return (params, state), total / size.astype(jnp.float32)
 
     (params, _), losses = lax.scan(epoch, (params, optimiser.init(params)), jax.random.split(key, epochs))
     return params, losses

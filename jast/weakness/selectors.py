@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jast._checks import whole
 from jast.counter import generator
 from jast.weakness.default import default
 from jast.weakness.thesis import thesis
@@ -12,6 +13,8 @@ __all__ = ["NAMES", "default", "random", "thesis"]
 
 def random(*, batch=None):
     """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least 10): the baseline, whose failure rate is unbiased."""
+
+    batch = batch if batch is None else whole("random", "batch", batch)
 
     def step(key, data, memory, seen, ask):
         free = np.flatnonzero(~seen.tried)

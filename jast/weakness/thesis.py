@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from jast._checks import real, whole
+from jast.counter import generator
 from jast.weakness import networks
 
 __all__ = ["thesis"]
@@ -13,14 +14,15 @@ __all__ = ["thesis"]
 ADVERSARY = "adversary/"
 
 
-def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, rate=3e-5, hidden=None, encoder_epochs=20, encoder_rate=1e-3, batch=100):
-    """The selector of Moss's thesis, section 4.3: a failure classifier on what an autoencoder makes of the inputs, without their labels.
+def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, rate=3e-5, hidden=None, encoder_epochs=20, encoder_rate=1e-3, batch=None):
+    """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes of the inputs, without their labels.
 
     The autoencoder (``hidden`` widths; default: `networks.sizes`, the published 392 and 64 for 784 pixels) is trained on all inputs before any call, for
-    ``encoder_epochs`` by Adam at ``encoder_rate``, in minibatches of ``batch``: 100 as in the published code, 1000 in the text. Each of the ``iterations``
-    draws ``sample`` inputs without replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam at ``rate``, one row at a
-    time, each failure followed by ``copies`` of itself; its weights go on to the next iteration, Adam starts anew. Those of the second half with a score of at
-    least ``threshold`` are the candidates, and are run. What was run before is not run again, but learned from again if drawn again.
+    ``encoder_epochs`` by Adam at ``encoder_rate``, in minibatches of ``batch`` (default: a tenth of the inputs, at most 1000; the text's 1000 for its 10,000).
+    Each of the ``iterations`` draws ``sample`` inputs without replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam
+    at ``rate``, row by row, shuffled each epoch, each failure there and ``copies`` more times; its weights go on to the next iteration, Adam starts anew. Those
+    of the second half with a score of at least ``threshold`` are the candidates, and are run. What was run before is not run again; it is learned from again
+    only if drawn again.
 
     Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's output, on inputs it was trained on too, as published.
     ``expected``: the failure rate of the random halves, of what was run there first, for every input not yet run.
@@ -28,14 +30,14 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     from jast.weakness.validate import Selector  # here: validate's selectors import this module
 
     whole_ = functools.partial(whole, "thesis")
-    iterations, sample, epochs, encoder_epochs, batch = (
-        whole_(name, value) for name, value in dict(iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs, batch=batch).items()
+    iterations, sample, epochs, encoder_epochs = (
+        whole_(name, value) for name, value in dict(iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs).items()
     )
+    batch = None if batch is None else whole_("batch", batch)
     copies = whole_("copies", copies, 0)
-    threshold = float(real("thesis", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1"))
-    rate, encoder_rate = (
-        float(real("thesis", name, value, lambda v: 0 < v < np.inf, "above 0")) for name, value in dict(rate=rate, encoder_rate=encoder_rate).items()
-    )
+    threshold = _number("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
+    rate = _number("rate", rate, lambda v: 0 < v < np.inf, "above 0")
+    encoder_rate = _number("encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
     hidden = None if hidden is None else tuple(whole_("hidden", width) for width in hidden)
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
@@ -47,10 +49,17 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     return Selector("thesis", settings, start, functools.partial(_step, iterations, sample, threshold, copies, epochs, rate))
 
 
+def _number(name, value, holds, expected):
+    real("thesis", name, value, holds, expected)
+    return float(value)  # as given: the array that real makes of it depends on the precision that JAX is set to, a state's settings must not
+
+
 def _start(hidden, epochs, rate, batch, key, data):
     first, then = jax.random.split(key)
     rows = _scaled(data)
-    codes, losses = networks.fit_autoencoder(first, rows, hidden or networks.sizes(rows.shape[1]), epochs=epochs, batch=batch, rate=rate)
+    hidden = hidden or networks.sizes(rows.shape[1])
+    batch = batch or max(1, min(1000, data.size // 10))
+    codes, losses = networks.fit_autoencoder(first, rows, hidden, epochs=epochs, batch=batch, rate=rate)
     params = networks.adversary(codes.shape[1]).init(then)
     counts = {name: np.zeros((), np.int64) for name in ("iteration", "drawn", "failed")}
     return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(params)}
@@ -62,7 +71,7 @@ def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory
     if memory["iteration"] >= iterations:
         return None
     pick, train = jax.random.split(key)
-    drawn = np.asarray(jax.random.permutation(pick, data.size))[:sample]
+    drawn = generator(pick).permutation(data.size)[:sample]
     half = (len(drawn) + 1) // 2
     lesson, rest = drawn[:half], drawn[half:]
 

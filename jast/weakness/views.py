@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Views", "difficulty_of_neighbours", "scaled", "squared_distances", "views"]
+__all__ = ["Views", "centred", "difficulty_of_neighbours", "scaled", "squared_distances", "views"]
 
 WIDE, KEPT = 2048, 512  # inputs of more numbers than WIDE are seen by their first KEPT principal components
 COMPONENTS, NEIGHBOURS, REFERENCE, ROWS = 64, 15, 20_000, 1024
@@ -14,9 +14,9 @@ class Views(NamedTuple):
     """Of n inputs, float32."""
 
     scaled: Any
-    """[n, d]: from 0 to 1 over the least and the greatest, of all numbers of an image or of each column of a table"""
+    """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks within each column, from -0.7 to 0.7"""
     centred: Any
-    """[n, d]: mean 0, a deviation of 0.4, over the same"""
+    """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
     close: Any
     """[n, <= 64]: principal components of ``centred``, in which distances are measured"""
 
@@ -24,14 +24,11 @@ class Views(NamedTuple):
 def views(rng, data):
     """The `Views` of a `Data`."""
     x = scaled(data)
-    centred = x - x.mean(0)
-    deviation = np.sqrt(np.mean(centred**2, axis=None if data.image else 0))
-    # a column that is the same for nearly all inputs must not stand above the others where it is not
-    centred = np.clip(centred / np.where(deviation > 0, deviation, 1), -8, 8).astype(np.float32) * np.float32(0.4)
+    even = centred(x, data.image)
     if x.shape[1] > WIDE:
-        wide = _components(rng, centred, KEPT)
+        wide = _components(rng, even, KEPT)
         return Views(wide / np.float32(max(np.abs(wide).max(), 1e-6)), wide * np.float32(0.4 / max(wide.std(), 1e-6)), wide[:, :COMPONENTS])
-    return Views(x, centred.astype(np.float32), _components(rng, centred, COMPONENTS))
+    return Views(x if data.image else _ranks(x), even, _components(rng, even, COMPONENTS))
 
 
 def scaled(data):
@@ -40,6 +37,23 @@ def scaled(data):
     over = None if data.image else 0
     low, high = x.min(over), x.max(over)
     return ((x - low) / np.where(high > low, high - low, 1)).astype(np.float32)
+
+
+def _ranks(x):
+    """[n, d]: a table's numbers by their place in their column, equal ones by their middle."""
+    out = np.zeros_like(x)
+    for j, column in enumerate(x.T):
+        _, place, count = np.unique(column, return_inverse=True, return_counts=True)
+        out[:, j] = 1.4 * ((np.cumsum(count) - count / 2) / len(x) - 0.5)[place]
+    return out
+
+
+def centred(x, image):
+    """Rows ``x`` [n, d] with mean 0 and a deviation of 0.4: of all numbers of an image together, or of each column of a table."""
+    x = x - x.mean(0)
+    deviation = np.sqrt(np.mean(x**2, axis=None if image else 0))
+    # a column that is the same for nearly all inputs must not stand above the others where it is not
+    return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(np.float32) * np.float32(0.4)
 
 
 def _components(rng, x, k):

@@ -1,0 +1,371 @@
+"""The default selector of jast.weakness and its parts, against NumPy, SciPy and scikit-learn, and on systems whose weakness is known."""
+
+import importlib
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import rankdata
+from sklearn.gaussian_process import GaussianProcessClassifier
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.linear_model import LogisticRegression
+from sklearn.neighbors import NearestNeighbors
+
+from jast import weakness
+from jast.weakness import blend, committee, residual, validate, views
+from jast.weakness.data import Data
+from jast.weakness.result import Seen
+
+selector = importlib.import_module("jast.weakness.default")  # the package's own `default` is the function
+KEY = jax.random.key(0)
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Networks that learn a little only."""
+    monkeypatch.setattr(committee, "STEPS", (20, 20))
+
+
+def table(n=400, seed=0):
+    """(inputs [n, 6], labels of 3 classes by two of the columns, of which the second is a thousand times as large as the others)."""
+    x = np.random.default_rng(seed).normal(size=(n, 6))
+    labels = np.argmax(np.stack([x[:, 0], x[:, 1], -x[:, 0] - x[:, 1]]), axis=0)
+    return x * np.array([1.0, 1000.0, 1.0, 1.0, 1.0, 1.0]), labels
+
+
+def seen_of(order, predicted, labels):
+    answers = np.full(len(labels), -1)
+    answers[order] = predicted[order]
+    return Seen(np.asarray(order), answers, labels)
+
+
+def adam_by_hand(start, x, targets, weights, order, rate):
+    """The committee's training in NumPy, in double: the gradient written out."""
+    p = [np.asarray(a, float) for a in start]
+    first, second = [np.zeros_like(a) for a in p], [np.zeros_like(a) for a in p]
+    for i, rows in enumerate(order):
+        a, b, c, e = p
+        z = np.einsum("nd,dmh->nmh", x[rows], a) + b
+        hidden = np.maximum(z, 0)
+        out = np.einsum("nmh,mhk->nmk", hidden, c) + e
+        q = np.exp(out - out.max(-1, keepdims=True))
+        q /= q.sum(-1, keepdims=True)
+        q[np.arange(len(rows)), :, targets[rows]] -= 1
+        q *= weights[:, rows].T[:, :, None] / len(rows)
+        back = np.einsum("nmk,mhk->nmh", q, c) * (z > 0)
+        slope = [np.einsum("nd,nmh->dmh", x[rows], back), back.sum(0), np.einsum("nmh,nmk->mhk", hidden, q), q.sum(0)]
+        for j in range(4):
+            first[j] = 0.9 * first[j] + 0.1 * slope[j]
+            second[j] = 0.999 * second[j] + 0.001 * slope[j] ** 2
+            step = first[j] / (1 - 0.9 ** (i + 1)) / (np.sqrt(second[j] / (1 - 0.999 ** (i + 1))) + 1e-8)
+            p[j] = p[j] - rate * (1 - i / len(order)) * step
+    return p
+
+
+def test_the_committee_learns_as_adam_by_hand(monkeypatch):
+    monkeypatch.setattr(committee, "STEPS", (30, 30))
+    monkeypatch.setattr(committee, "BATCH", 16)
+    kept = {}
+    real = committee._fit
+    monkeypatch.setattr(committee, "_fit", lambda *a: kept.update(zip(["start", "x", "targets", "weights", "order"], a, strict=True)) or real(*a))
+    rng = np.random.default_rng(0)
+    x, targets = rng.normal(size=(50, 4)).astype(np.float32), rng.integers(0, 3, 50)
+    weights = committee.folds(rng, 50) * rng.uniform(0.5, 3, 50)
+    trained, log_probs = committee.fit(rng, x, targets, weights, 3, 1)
+    assert kept["order"].shape == (30, 16)
+    by_hand = adam_by_hand(**kept, rate=committee.RATE)
+    for ours, theirs in zip(trained, by_hand, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=2e-4)  # float32 through thirty steps of a normalised gradient
+    a, b, c, e = (np.asarray(p, float) for p in trained)
+    out = np.einsum("nmh,mhk->mnk", np.maximum(np.einsum("nd,dmh->nmh", x, a) + b, 0), c) + e[:, None]
+    np.testing.assert_allclose(log_probs, out - np.log(np.exp(out).sum(-1, keepdims=True)), rtol=1e-4, atol=1e-5)
+
+
+def test_every_input_is_left_out_as_often():
+    learn = committee.folds(np.random.default_rng(0), 53, 5, 4)
+    assert learn.shape == (20, 53) and np.all((~learn).sum(0) == 4) and np.all((~learn).reshape(4, 5, 53).sum(1) == 1)
+    log_probs = np.log(np.random.default_rng(1).dirichlet(np.ones(3), (20, 53)))
+    np.testing.assert_allclose(committee.held_out(log_probs, learn)[7], np.exp(log_probs[~learn[:, 7], 7]).mean(0), rtol=1e-6)
+
+
+def test_an_answer_does_not_move_its_own_score():
+    inputs, labels = table(200)
+    x, rng = views.scaled(Data(inputs, labels, 3)), lambda: np.random.default_rng(5)
+    learn, data = committee.folds(rng(), 200), Data(inputs, labels, 3)
+    other = labels.copy()
+    other[17] = (labels[17] + 1) % 3
+    a, b = (selector._odds(rng(), x, answers, learn * 10.0, learn, data) for answers in (labels, other))
+    assert a[17] == b[17] and np.abs(a - b).max() > 0.01
+
+
+def test_the_gradient_is_that_of_the_log_odds():
+    rng = np.random.default_rng(0)
+    x, targets = rng.normal(size=(60, 4)).astype(np.float32), rng.integers(0, 3, 60)
+    trained = committee.fit(rng, x, targets, np.ones((3, 60)), 3, 8)[0]
+    a, b, c, e = (np.asarray(p, float) for p in trained)
+
+    def odds(row, label):
+        out = np.einsum("mh,mhk->mk", np.maximum(np.einsum("d,dmh->mh", row, a) + b, 0), c) + e
+        p = (np.exp(out) / np.exp(out).sum(-1, keepdims=True)).mean(0)[label]
+        return np.log1p(-p) - np.log(p)
+
+    slope = np.asarray(committee.gradient(trained, x[:5], targets[:5].astype(np.int32)))
+    for i in range(5):
+        numbers = [(odds(x[i] + h, targets[i]) - odds(x[i] - h, targets[i])) / 2e-6 for h in 1e-6 * np.eye(4)]
+        np.testing.assert_allclose(slope[i], numbers, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("separable", [False, True])
+def test_the_regression_is_the_most_probable(separable):
+    rng = np.random.default_rng(0)
+    rows = np.c_[rng.normal(size=(80, 2)) * 3, np.ones(80)]
+    failed = rows[:, 0] > 0 if separable else rng.random(80) < blend.sigmoid(rows @ [0.7, -0.2, -1.0])
+    mean, precision = np.array([0.5, 0.0, -0.5]), np.array([4.0, 2.0, 1.0])
+    cost = lambda b: np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
+    found = blend.logistic(rows, failed, mean, precision)
+    np.testing.assert_allclose(found, minimize(cost, mean, tol=1e-12).x, atol=1e-4)
+
+
+def test_nothing_seen_leaves_the_prior():
+    np.testing.assert_array_equal(blend.logistic(np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION), selector.PRIOR)
+
+
+def test_laplace_against_scikit_learn():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(60, 2))
+    failed = rng.random(60) < blend.sigmoid(3 * x[:, 0])
+    kernel = ConstantKernel(4.0, "fixed") * RBF(1.5, "fixed")
+    theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=1000).fit(x, failed)
+    matrix = residual._kernel(views.squared_distances(x, x), 1.5**2, 4.0, 1.0)
+    np.testing.assert_allclose(matrix, kernel(x), rtol=1e-10)
+    evidence, slope = residual._laplace(matrix, failed.astype(float), np.zeros(60))
+    assert evidence == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-3)
+    new = rng.normal(size=(9, 2))
+    latent = kernel(new, x) @ (theirs.base_estimator_.y_train_ - theirs.base_estimator_.pi_)
+    np.testing.assert_allclose(kernel(new, x) @ slope, latent, atol=2e-3)
+
+
+def test_the_mode_on_top_of_given_odds():
+    rng = np.random.default_rng(1)
+    x, mean = rng.normal(size=(40, 2)), rng.normal(size=40) * 3 - 4
+    target = (rng.random(40) < 0.3).astype(float)
+    matrix = residual._kernel(views.squared_distances(x, x), 1.0, 16.0, 1.0)
+    slope = residual._laplace(matrix, target, mean)[1]
+    np.testing.assert_allclose(target - blend.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
+
+
+def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
+    rng = np.random.default_rng(0)
+    close, labels = rng.normal(size=(600, 3)), rng.integers(0, 2, 600)
+    odds = np.full(600, -4.0)
+    region = (labels == 1) & (close[:, 0] > 0.5)
+    order = rng.permutation(600)[:300]
+    found = residual.residual(rng, close, labels, odds, seen_of(order, np.where(region, 0, labels), labels))
+    rest = np.setdiff1d(np.arange(600), order)
+    assert weakness.auc(found[rest], region[rest]) > 0.97
+    assert np.median(found[rest][region[rest]]) > 4 > 0 > np.median(found[rest][~region[rest] & (labels[rest] == 1)])
+    assert found[labels == 0].max() < 1
+    fair = np.where(rng.random(600) < blend.sigmoid(odds), 1 - labels, labels)  # what the odds say, and no more
+    np.testing.assert_array_equal(residual.residual(rng, close, labels, odds, seen_of(order, fair, labels)), 0)
+
+
+def test_views_of_a_table_do_not_depend_on_units():
+    inputs, labels = table(300)
+    inputs = np.c_[inputs, np.full(300, 7.0)]  # a column that never varies
+    a, b = (views.views(np.random.default_rng(0), Data(x, labels, 3)) for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4))
+    np.testing.assert_allclose(a.scaled, b.scaled, atol=1e-5)
+    np.testing.assert_allclose(a.centred, b.centred, atol=1e-4)
+    np.testing.assert_allclose(a.scaled[:, 1], 1.4 * ((rankdata(inputs[:, 1]) - 0.5) / 300 - 0.5), atol=1e-6)
+    assert np.abs(a.scaled[:, 6]).max() == 0
+    np.testing.assert_allclose(a.centred[:, :6].std(0), 0.4, atol=0.01)
+
+
+def test_views_of_images_keep_their_shades():
+    images = np.random.default_rng(0).uniform(0, 255, (40, 5, 5)).astype(np.uint8)
+    images[0, 0, 0], images[0, 0, 1] = 0, 255
+    seen_as = views.views(np.random.default_rng(0), Data(images, np.zeros(40, np.int32), 2))
+    np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
+    assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4) and all(a.dtype == np.float32 for a in seen_as)
+    centred = seen_as.centred.astype(float)
+    distance = np.linalg.norm(centred[3] - centred[9])
+    assert np.linalg.norm(seen_as.close[3].astype(float) - seen_as.close[9]) == pytest.approx(distance, rel=1e-4)  # 25 components are all
+
+
+def test_wide_inputs_are_seen_by_their_components(monkeypatch):
+    monkeypatch.setattr(views, "WIDE", 50)
+    monkeypatch.setattr(views, "KEPT", 4)
+    rng = np.random.default_rng(0)
+    hidden = rng.normal(size=(200, 3)) * [5, 3, 2]
+    wide = (hidden @ rng.normal(size=(3, 400))).reshape(200, 20, 20)
+    seen_as = views.views(np.random.default_rng(1), Data(wide, np.zeros(200, np.int32), 2))
+    assert seen_as.scaled.shape == (200, 4) and np.abs(seen_as.scaled).max() == pytest.approx(1) and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
+    flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
+    true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
+    ours = np.linalg.qr(seen_as.close[:, :3].astype(float))[0]
+    np.testing.assert_allclose(np.linalg.svd(true.T @ ours)[1], 1, atol=1e-3)  # the same subspace
+
+
+@pytest.mark.parametrize("reference", [20_000, 120])
+def test_neighbours_against_scikit_learn(reference, monkeypatch):
+    monkeypatch.setattr(views, "REFERENCE", reference)
+    monkeypatch.setattr(views, "ROWS", 33)
+    rng = np.random.default_rng(0)
+    close, labels = rng.normal(size=(200, 3)).astype(np.float32), rng.integers(0, 3, 200)
+    ours = views.difficulty_of_neighbours(np.random.default_rng(7), close, labels, 3)
+    chosen = np.arange(200) if reference > 200 else np.sort(np.random.default_rng(7).choice(200, 120, replace=False))
+    for i in (0, 5, 199):
+        others = chosen[chosen != i]
+        distance, at = NearestNeighbors(n_neighbors=15).fit(close[others]).kneighbors(close[i : i + 1])
+        weight = 1 / (distance[0] ** 2 + 1e-3)
+        right = (15 * np.sum(weight * (labels[others[at[0]]] == labels[i])) / weight.sum() + 1 / 3) / 16
+        assert ours[i] == pytest.approx(np.log((1 - right) / right), abs=1e-3)
+
+
+def test_a_batch_is_the_most_suspect_and_some_others():
+    rng, suspicion = np.random.default_rng(0), np.linspace(-8, 3, 1000)
+    labels = np.zeros(1000, int)
+    first = selector._batch(rng, suspicion, seen_of([], labels, labels), 50, 0.01)
+    np.testing.assert_array_equal(first[0], np.arange(999, 949, -1))
+    np.testing.assert_array_equal(first[0], first[1])
+    seen = seen_of(first[0], labels, labels)
+    drawn = np.concatenate([(lambda c, likely: np.setdiff1d(c, likely))(*selector._batch(rng, suspicion, seen, 500, 0.01)) for _ in range(40)])
+    # the least likely of the batch has log odds -3.05, thus a fifth of 500 is drawn: 100 of each 500, standard error of the mean of 40 sqrt(80 / 40)
+    assert abs(len(drawn) / 40 - 100) < 4 * np.sqrt(500 * 0.2 * 0.8 / 40)
+    assert drawn.max() < 600 and not set(drawn) & set(first[0])  # from those that are not among the most suspect
+    few = selector._batch(rng, np.linspace(-1, 3, 1000), seen, 500, 0.01)
+    assert len(set(few[0])) == 500 and len(few[0]) - len(few[1]) < 30
+
+
+@pytest.fixture(scope="module")
+def digits():
+    """C -> (inputs, labels, predictions of a logistic regression of that C that was trained on other digits)"""
+    images, labels = weakness.digits()
+
+    def trained(C):
+        model = LogisticRegression(C=C, max_iter=500).fit(images[:600].reshape(600, -1), labels[:600])
+        return images[600:], labels[600:], model.predict(images[600:].reshape(-1, 64))
+
+    return trained
+
+
+def lookup(inputs, predicted):
+    at = {x.tobytes(): p for x, p in zip(inputs, predicted, strict=True)}
+    return lambda batch: np.array([at[x.tobytes()] for x in batch])
+
+
+def test_failures_are_found_early(digits):
+    inputs, labels, predicted = digits(0.02)
+    failed = predicted != labels
+    result = validate(KEY, lookup(inputs, predicted), inputs, labels, budget=len(labels) // 4, selector=weakness.default(repeats=2))
+    hits = np.cumsum(failed[result.order]) / failed.sum()
+    tenth = len(labels) // 10
+    # random choice finds a tenth, with a standard error below sqrt(.09 / failures)
+    assert failed.sum() > 60 and hits[tenth - 1] > 0.55 > 0.1 + 10 * np.sqrt(0.09 / failed.sum())
+    assert hits[-1] > 0.93
+    judged = weakness.judge(result, failed)
+    assert judged.auc[-1] > 0.95 and np.all(np.diff(result.history.found) >= 0)
+    assert result.scores.min() >= 0 and result.scores.max() <= 1 and result.expected == pytest.approx(result.scores[result.ranked].sum(), rel=1e-5)
+    # what was run is judged by models that have not seen its outcome: not all of it is told apart
+    assert 0.5 < result.history.auc[-1] < 1
+
+
+def test_what_failures_teach(digits):
+    """A weakness that no label shows: every bright 3 and 7, well-written ones among them."""
+    inputs, labels, predicted = digits(1.0)
+    bright = np.isin(labels, (3, 7)) & (inputs.sum((1, 2)) > np.quantile(inputs.sum((1, 2)), 0.6))
+    planted = np.where(bright, (labels + 1) % 10, predicted)
+    result = validate(KEY, lookup(inputs, planted), inputs, labels, budget=360, selector=weakness.default(repeats=2))
+    alone = (planted != labels)[np.argsort(-result.state.memory["difficulty"])[:360]].sum()
+    assert len(result.failures) > 1.2 * alone
+    easy = np.flatnonzero(bright & (result.state.memory["difficulty"] < np.median(result.state.memory["difficulty"])))
+    share = 360 / len(labels)  # what random choice finds of these, with a hypergeometric standard error below the binomial one
+    assert len(easy) > 30 and np.isin(easy, result.failures).mean() > share + 3 * np.sqrt(share * (1 - share) / len(easy))
+
+
+def test_a_table_whose_columns_have_units_of_their_own():
+    inputs, labels = table(600)
+    wrong = inputs[:, 2] > 1.2  # a weakness in a column that tells nothing of the label
+    result = validate(KEY, lookup(inputs, np.where(wrong, (labels + 1) % 3, labels)), inputs, labels, budget=200, selector=weakness.default(exploration=0.05))
+    # random choice finds a third, with a hypergeometric standard error
+    total = wrong.sum()
+    assert len(result.failures) > total / 3 + 4 * np.sqrt(total * (1 / 3) * (2 / 3))
+
+
+def test_influence_names_the_column():
+    inputs, labels = table(600)
+    wrong = np.flatnonzero(inputs[:, 2] > 1.2)
+    result = validate(KEY, lookup(inputs, np.where(inputs[:, 2] > 1.2, (labels + 1) % 3, labels)), inputs, labels, selector="random")
+    shown = weakness.influence(KEY, result, inputs, labels)
+    assert shown.shape == (len(wrong), 6) and set(result.failures) == set(wrong)
+    assert shown.mean(0).argmax() == 2 and shown[:, 2].mean() > 3 * np.abs(np.delete(shown, 2, 1).mean(0)).max()
+
+
+def test_an_interruption_changes_nothing(brief, digits):
+    inputs, labels, predicted = digits(0.02)
+    system, asked = lookup(inputs, predicted), []
+
+    def flaky(batch):
+        if len(asked) == 4:
+            asked.append(None)
+            raise OSError("no answer")
+        asked.append(len(batch))
+        return system(batch)
+
+    whole = validate(KEY, system, inputs, labels, budget=150)
+    with pytest.warns(RuntimeWarning, match="OSError: no answer"):
+        part = validate(KEY, flaky, inputs, labels, budget=150)
+    assert 0 < part.calls < 150
+    rest = validate(KEY, flaky, inputs, labels, budget=150, state=part.state)
+    np.testing.assert_array_equal(rest.order, whole.order)
+    np.testing.assert_array_equal(rest.scores, whole.scores)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 12])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_few_inputs(brief, n, wrong):
+    inputs, labels = table(n)
+    result = validate(KEY, lambda x: (labels + wrong)[:0] if not len(x) else lookup(inputs, (labels + wrong) % 3)(x), inputs, labels, classes=3)
+    assert result.calls == n and len(result.failures) == n * wrong and np.isfinite(result.scores).all() and result.expected == 0
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_no_failures_and_nothing_else(brief, wrong):
+    inputs, labels = table(200)
+    result = validate(KEY, lookup(inputs, (labels + wrong) % 3), inputs, labels, budget=120)
+    assert len(result.failures) == 120 * wrong and (result.scores[result.ranked].mean() > 0.5) == wrong
+
+
+def test_inputs_that_are_all_the_same(brief):
+    result = validate(KEY, lambda x: np.zeros(len(x), int), np.ones((40, 3, 3), np.uint8), np.arange(40) % 2)
+    assert len(result.failures) == 20 and np.isfinite(result.scores).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: weakness.default(first=0), "default: first must be a whole number of at least 1"),
+        (lambda: weakness.default(repeats=1.5), "default: repeats must be a whole number"),
+        (lambda: weakness.default(growth=-1.0), "default: growth must be a number"),
+        (lambda: weakness.default(exploration=2.0), "default: exploration must be a number"),
+        (lambda: weakness.random(batch=0), "random: batch must be a whole number of at least 1"),
+    ],
+)
+def test_bad_settings(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_influence_refuses_other_data():
+    inputs, labels = table(30)
+    result = validate(KEY, lookup(inputs, labels), inputs, labels, selector="random", budget=10)
+    assert weakness.influence(KEY, result, inputs, labels).shape == (0, 6)
+    assert weakness.influence(KEY, result, inputs, labels, at=[3, 4]).shape == (2, 6)
+    for change, message in (
+        (dict(inputs=inputs + 1), "inputs and labels are not those"),
+        (dict(at=[30]), r"at must be indices \[k\] in 0 ... 29"),
+        (dict(at=[0.5]), "at must be indices"),
+        (dict(result=3), "result must be a Result"),
+    ):
+        with pytest.raises(ValueError, match=f"influence: {message}"):
+            weakness.influence(KEY, **(dict(result=result, inputs=inputs, labels=labels) | change))
