@@ -173,7 +173,7 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
 def test_views_of_a_table_do_not_depend_on_units():
     inputs, labels = table(300)
     inputs = np.c_[inputs, np.full(300, 7.0)]  # a column that never varies
-    a, b = (views.views(np.random.default_rng(0), Data(x, labels, 3)) for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4))
+    a, b = (views.views(Data(x, labels, 3), np.zeros((300, 0))) for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4))
     np.testing.assert_allclose(a.scaled, b.scaled, atol=1e-5)
     np.testing.assert_allclose(a.centred, b.centred, atol=1e-4)
     np.testing.assert_allclose(a.scaled[:, 1], 1.4 * ((rankdata(inputs[:, 1]) - 0.5) / 300 - 0.5), atol=1e-6)
@@ -184,12 +184,15 @@ def test_views_of_a_table_do_not_depend_on_units():
 def test_views_of_images_keep_their_shades():
     images = np.random.default_rng(0).uniform(0, 255, (40, 5, 5)).astype(np.uint8)
     images[0, 0, 0], images[0, 0, 1] = 0, 255
-    seen_as = views.views(np.random.default_rng(0), Data(images, np.zeros(40, np.int32), 2))
+    data = Data(images, np.zeros(40, np.int32), 2)
+    assert views.reduce(None, data).shape == (40, 0)
+    seen_as = views.views(data, views.reduce(None, data))
     np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
     assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4) and all(a.dtype == np.float32 for a in seen_as)
-    centred = seen_as.centred.astype(float)
+    centred, close = seen_as.centred.astype(float), views.components(None, seen_as.centred, 64).astype(float)
+    assert close.shape == (40, 25)
     distance = np.linalg.norm(centred[3] - centred[9])
-    assert np.linalg.norm(seen_as.close[3].astype(float) - seen_as.close[9]) == pytest.approx(distance, rel=1e-4)  # 25 components are all
+    assert np.linalg.norm(close[3] - close[9]) == pytest.approx(distance, rel=1e-4)  # 25 components are all
 
 
 def test_wide_inputs_are_seen_by_their_components(monkeypatch):
@@ -198,12 +201,21 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
     rng = np.random.default_rng(0)
     hidden = rng.normal(size=(200, 3)) * [5, 3, 2]
     wide = (hidden @ rng.normal(size=(3, 400))).reshape(200, 20, 20)
-    seen_as = views.views(np.random.default_rng(1), Data(wide, np.zeros(200, np.int32), 2))
+    data = Data(wide, np.zeros(200, np.int32), 2)
+    reduced = views.reduce(np.random.default_rng(1), data)
+    seen_as = views.views(data, reduced)
     assert seen_as.scaled.shape == (200, 4) and np.abs(seen_as.scaled).max() == pytest.approx(1) and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
     flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
     true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
-    ours = np.linalg.qr(seen_as.close[:, :3].astype(float))[0]
+    ours = np.linalg.qr(reduced[:, :3].astype(float))[0]
     np.testing.assert_allclose(np.linalg.svd(true.T @ ours)[1], 1, atol=1e-3)  # the same subspace
+
+
+def test_a_validation_of_wide_inputs(brief, monkeypatch):
+    monkeypatch.setattr(views, "WIDE", 50)
+    inputs = np.random.default_rng(0).normal(size=(60, 8, 9))
+    result = validate(KEY, lambda x: (x[:, 0, 0] > 1).astype(int), inputs, (inputs[:, 0, 0] > 0).astype(int), budget=30)
+    assert result.calls == 30 and result.state.memory["reduced"].shape == (60, 72) and result.state.memory["close"].shape == (60, 64)
 
 
 @pytest.mark.parametrize("reference", [20_000, 120])

@@ -8,11 +8,12 @@ from jast.weakness import committee
 from jast.weakness.blend import logistic, sigmoid
 from jast.weakness.residual import residual
 from jast.weakness.validate import Selector, Step
-from jast.weakness.views import Views, difficulty_of_neighbours, views
+from jast.weakness.views import components, difficulty_of_neighbours, reduce, views
 
 __all__ = ["default"]
 
 PASSES = {True: 8, False: 50}  # over images, whose many pixels are soon learned by heart, and over tables
+CLOSE = 64  # principal components in which distances are measured
 STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
 # log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision of the prior of b
 PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
@@ -40,25 +41,25 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
 
     def start(key, data):
         rng = generator(key)
-        seen_as = views(rng, data)
+        reduced = reduce(rng, data)
+        seen_as = views(data, reduced)
+        close = reduced[:, :CLOSE] if reduced.shape[1] else components(rng, seen_as.centred, CLOSE)
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
-        flat = [_odds(rng, view, data.labels, learn, learn, data) for view in (seen_as.scaled, seen_as.centred)]
-        neighbours = difficulty_of_neighbours(rng, seen_as.close, data.labels, data.classes)
-        difficulty = sum(flat) / len(flat)
-        return seen_as._asdict() | dict(learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty)
+        difficulty = sum(_odds(rng, view, data.labels, learn, learn, data) for view in seen_as) / len(seen_as)
+        neighbours = difficulty_of_neighbours(rng, close, data.labels, data.classes)
+        return dict(reduced=reduced, close=close, learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty)
 
     def step(key, data, memory, seen, ask):
         rng = generator(key)
         least = max(10, data.size // 200) if first is None else first
         chosen, likely = _batch(rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration)
         seen = ask(chosen)
-        tried, seen_as = seen.tried, Views(*(memory[name] for name in Views._fields))
+        tried = seen.tried
         answers, weights = np.where(tried, seen.predicted, data.labels), memory["learn"] * np.where(tried, STRENGTH, 1)
-        opinions = [memory["difficulty"]]
-        opinions += [_odds(rng, view, answers, weights, memory["learn"], data) for view in (seen_as.scaled, seen_as.centred)]
-        rows = np.stack([*opinions, memory["neighbours"], np.ones(data.size)], axis=1)
+        imitations = [_odds(rng, view, answers, weights, memory["learn"], data) for view in views(data, memory["reduced"])]
+        rows = np.stack([memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1)
         odds = rows @ logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
-        suspicion = np.where(tried, odds, odds + residual(rng, seen_as.close, data.labels, odds, seen))
+        suspicion = np.where(tried, odds, odds + residual(rng, memory["close"], data.labels, odds, seen))
         scores = sigmoid(suspicion)
         return Step(memory | dict(suspicion=suspicion), scores, likely, float(scores[~tried].sum()))
 

@@ -38,7 +38,7 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     threshold = _number("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
     rate = _number("rate", rate, lambda v: 0 < v < np.inf, "above 0")
     encoder_rate = _number("encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
-    hidden = None if hidden is None else tuple(whole_("hidden", width) for width in hidden)
+    hidden = None if hidden is None else tuple(whole_("hidden", width) for width in np.atleast_1d(hidden).tolist())
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
     settings = dict(

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Views", "centred", "difficulty_of_neighbours", "scaled", "squared_distances", "views"]
+__all__ = ["Views", "centred", "components", "difficulty_of_neighbours", "reduce", "scaled", "squared_distances", "views"]
 
 WIDE, KEPT = 2048, 512  # inputs of more numbers than WIDE are seen by their first KEPT principal components
-COMPONENTS, NEIGHBOURS, REFERENCE, ROWS = 64, 15, 20_000, 1024
+NEIGHBOURS, REFERENCE, ROWS = 15, 20_000, 1024
 
 
 class Views(NamedTuple):
@@ -17,18 +17,21 @@ class Views(NamedTuple):
     """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks within each column, from -0.7 to 0.7"""
     centred: Any
     """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
-    close: Any
-    """[n, <= 64]: principal components of ``centred``, in which distances are measured"""
 
 
-def views(rng, data):
-    """The `Views` of a `Data`."""
+def views(data, reduced):
+    """The `Views` of a `Data`; of its components ``reduced``, of `reduce`, where it has any."""
+    if reduced.shape[1]:
+        return Views(reduced / np.float32(max(np.abs(reduced).max(), 1e-6)), reduced * np.float32(0.4 / max(reduced.std(), 1e-6)))
     x = scaled(data)
-    even = centred(x, data.image)
-    if x.shape[1] > WIDE:
-        wide = _components(rng, even, KEPT)
-        return Views(wide / np.float32(max(np.abs(wide).max(), 1e-6)), wide * np.float32(0.4 / max(wide.std(), 1e-6)), wide[:, :COMPONENTS])
-    return Views(x if data.image else _ranks(x), even, _components(rng, even, COMPONENTS))
+    return Views(x if data.image else _ranks(x), centred(x, data.image))
+
+
+def reduce(rng, data):
+    """[n, 512]: the first principal components of inputs of more than 2048 numbers; [n, 0] of others."""
+    if data.inputs[0].size <= WIDE:
+        return np.zeros((data.size, 0), np.float32)
+    return components(rng, centred(scaled(data), data.image), KEPT)
 
 
 def scaled(data):
@@ -56,7 +59,7 @@ def centred(x, image):
     return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(np.float32) * np.float32(0.4)
 
 
-def _components(rng, x, k):
+def components(rng, x, k):
     """[n, k]: the first k principal components; of wide inputs, those of a random subspace that two power iterations turn towards them (Halko, Martinsson and
     Tropp, 2011)."""
     k = min(k, x.shape[1])
