@@ -178,6 +178,29 @@ def test_a_state_survives_its_file(tmp_path):
         weakness.load(tmp_path / "s.npz")
 
 
+def test_answers_that_an_iteration_does_not_ask_for_again_are_kept():
+    """A selector that changes its mind after an interruption."""
+    inputs, labels, answers = problem(60)
+    system, mind = Flaky(answers, 38, OSError("gone")), []
+
+    def step(key, data, memory, seen, ask):
+        at = len(seen.order)
+        plan = [np.arange(at, min(at + 10, 60)), np.arange(30, 40)] if not mind else [np.flatnonzero(~seen.tried)[-25:]]
+        for part in plan:
+            now = ask(part)
+        return Step({}, np.full(60, 0.5), plan[0], float(len(now.order)))
+
+    changing = Selector("changing", {}, lambda key, data: {}, step)
+    with pytest.warns(RuntimeWarning, match="OSError"):
+        part = validate(KEY, system, inputs, labels, selector=changing, budget=50)
+    assert part.order.tolist() == list(range(10)) and len(part.history.calls) == 0  # asked, but of an iteration that has not ended
+    mind.append(True)
+    result = validate(KEY, system, inputs, labels, selector=changing, budget=50, state=part.state)
+    assert len(system.asked) == len(set(system.asked.tolist())) == result.calls
+    assert result.history.calls.tolist() == [25, 50] and set(range(10)) <= set(result.order.tolist())
+    assert result.state.complete == 50 and sorted(result.ranked.tolist() + result.order.tolist()) == list(range(60))
+
+
 def test_a_larger_budget_goes_on():
     inputs, labels, answers = problem(60)
     part = validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())

@@ -14,8 +14,8 @@ from sklearn.neighbors import NearestNeighbors
 
 from jast import weakness
 from jast.weakness import blend, committee, residual, validate, views
+from jast.weakness.contract import Seen
 from jast.weakness.data import Data
-from jast.weakness.result import Seen
 
 selector = importlib.import_module("jast.weakness.default")  # the package's own `default` is the function
 KEY = jax.random.key(0)

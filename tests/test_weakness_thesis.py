@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jast.weakness import auc, digits, from_idx, judge, load, save, thesis, validate
+from jast.weakness.contract import Seen
 from jast.weakness.data import arrays
 from jast.weakness.networks import _entropy, _fit, adversary, autoencoder, fit_adversary, fit_autoencoder, logits, sizes
-from jast.weakness.result import Seen
-from jast.weakness.thesis import _scaled
+from jast.weakness.views import scaled
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
 QUICK = dict(sample=120, epochs=2, encoder_epochs=2, hidden=(24, 12))
@@ -306,13 +306,13 @@ def test_tables_and_fewer_inputs_than_the_sample(key, n):
 
 def test_scaling():
     images = np.array([[[0, 100], [200, 0]], [[50, 0], [0, 0]]], np.uint8)
-    np.testing.assert_allclose(_scaled(arrays("test", images, [0, 1])), images.reshape(2, 4) / 200)
+    np.testing.assert_allclose(scaled(arrays("test", images, [0, 1])), images.reshape(2, 4) / 200)
     table = np.array([[1.0, -5, 7], [3, 5, 7], [2, 0, 7]])
-    rows = _scaled(arrays("test", table, [0, 1, 0]))
+    rows = scaled(arrays("test", table, [0, 1, 0]))
     assert rows.dtype == np.float32
     np.testing.assert_allclose(rows, [[0, 0, 0], [1, 1, 0], [0.5, 0.5, 0]])
     inputs, labels, _ = problem()
-    np.testing.assert_array_equal(_scaled(arrays("test", inputs, labels)), inputs.reshape(1797, 64))  # as they were
+    np.testing.assert_array_equal(scaled(arrays("test", inputs, labels)), inputs.reshape(1797, 64))  # as they were
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 """Adversarial weakness recognition (Moss's thesis, chapter 4): which inputs of a labelled data set a classifier gets wrong, found with few calls of it."""
 
+from jast.weakness.contract import Seen, Selector, Step
 from jast.weakness.data import Data, digits, from_idx, idx
 from jast.weakness.influence import influence
 from jast.weakness.measures import Judgement, Roc, auc, judge, roc
-from jast.weakness.result import History, Result, Seen, State
+from jast.weakness.result import History, Result, State
 from jast.weakness.selectors import default, random, thesis
 from jast.weakness.storage import load, save
-from jast.weakness.validate import Selector, Step, validate
+from jast.weakness.validate import validate
 
 __all__ = [
     "Data", "History", "Judgement", "Result", "Roc", "Seen", "Selector", "State", "Step", "auc", "default", "digits", "from_idx", "idx", "influence", "judge",

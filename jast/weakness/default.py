@@ -6,8 +6,8 @@ from jast._checks import real, whole
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.blend import logistic, sigmoid
+from jast.weakness.contract import Selector, Step
 from jast.weakness.residual import residual
-from jast.weakness.validate import Selector, Step
 from jast.weakness.views import components, difficulty_of_neighbours, reduce, views
 
 __all__ = ["default"]

@@ -4,28 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["History", "Result", "Seen", "State"]
-
-
-class Seen(NamedTuple):
-    """What the system under test has been asked so far."""
-
-    order: Any
-    """[calls] int: the inputs it was run on, in order"""
-    predicted: Any
-    """[n] int32: its answers, -1 where it was not run"""
-    labels: Any
-    """[n] int32: the true classes"""
-
-    @property
-    def tried(self):
-        """[n] bool"""
-        return self.predicted >= 0
-
-    @property
-    def failed(self):
-        """[n] bool: run, and wrong"""
-        return self.tried & (self.predicted != self.labels)
+__all__ = ["History", "Result", "State"]
 
 
 class History(NamedTuple):

@@ -4,9 +4,9 @@ import numpy as np
 
 from jast._checks import whole
 from jast.counter import generator
+from jast.weakness.contract import Selector, Step
 from jast.weakness.default import default
 from jast.weakness.thesis import thesis
-from jast.weakness.validate import Selector, Step
 
 __all__ = ["NAMES", "default", "random", "thesis"]
 

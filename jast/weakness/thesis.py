@@ -8,6 +8,8 @@ import numpy as np
 from jast._checks import real, whole
 from jast.counter import generator
 from jast.weakness import networks
+from jast.weakness.contract import Selector, Step
+from jast.weakness.views import scaled
 
 __all__ = ["thesis"]
 
@@ -27,8 +29,6 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's output, on inputs it was trained on too, as published.
     ``expected``: the failure rate of the random halves, of what was run there first, for every input not yet run.
     """
-    from jast.weakness.validate import Selector  # here: validate's selectors import this module
-
     whole_ = functools.partial(whole, "thesis")
     iterations, sample, epochs, encoder_epochs = (
         whole_(name, value) for name, value in dict(iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs).items()
@@ -56,7 +56,7 @@ def _number(name, value, holds, expected):
 
 def _start(hidden, epochs, rate, batch, key, data):
     first, then = jax.random.split(key)
-    rows = _scaled(data)
+    rows = scaled(data)
     hidden = hidden or networks.sizes(rows.shape[1])
     batch = batch or max(1, min(1000, data.size // 10))
     codes, losses = networks.fit_autoencoder(first, rows, hidden, epochs=epochs, batch=batch, rate=rate)
@@ -66,8 +66,6 @@ def _start(hidden, epochs, rate, batch, key, data):
 
 
 def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory, seen, ask):
-    from jast.weakness.validate import Step
-
     if memory["iteration"] >= iterations:
         return None
     pick, train = jax.random.split(key)
@@ -96,14 +94,6 @@ def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
     room = np.zeros(len(lesson) * (1 + copies), np.int32)  # of one size, whatever failed: one program for all iterations
     room[: len(number)] = number
     return networks.fit_adversary(key, params, codes[lesson], failed.astype(np.float32), room, len(number), epochs=epochs, rate=rate)[0]
-
-
-def _scaled(data):
-    """[n, d] float32 in [0, 1], the inputs as rows: images by their common range, tables by each column's; what does not vary is 0."""
-    rows = data.inputs.reshape(data.size, -1).astype(np.float64)
-    axis = None if data.image else 0
-    least, most = rows.min(axis), rows.max(axis)
-    return ((rows - least) / np.where(most > least, most - least, 1)).astype(np.float32)
 
 
 def _flat(params):

@@ -3,48 +3,21 @@
 import json
 import os
 import warnings
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jast._checks import whole
+from jast.weakness.contract import Seen, Selector
 from jast.weakness.data import arrays, fingerprint
 from jast.weakness.measures import auc
-from jast.weakness.result import History, Result, Seen, State
+from jast.weakness.result import History, Result, State
 from jast.weakness.storage import load, save
 
-__all__ = ["Selector", "Step", "validate"]
+__all__ = ["validate"]
 
 CHUNK = 1024  # inputs of one call of predict
 IDLE = 20  # iterations in a row that ask for nothing new
-
-
-class Step(NamedTuple):
-    """What one iteration of a selector comes to."""
-
-    memory: dict
-    """Arrays by name: what the next iteration needs of this one"""
-    scores: Any
-    """[n] in [0, 1]: how suspect each input is"""
-    candidates: Any
-    """[k] int: the inputs that it ran because it held them for failures; their share of failures is the iteration's precision"""
-    expected: float
-    """Failures that it expects among the inputs not yet run"""
-
-
-class Selector(NamedTuple):
-    """A way of choosing inputs: `default`, `thesis`, `random`, or your own."""
-
-    name: str
-    settings: dict
-    """Plain numbers and texts: a state of other settings is refused"""
-    start: Callable
-    """``start(key, data) -> memory``, before any call"""
-    step: Callable
-    """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do. ``ask(indices)`` runs the system on those of ``indices`` that
-    were not run yet, as far as the budget goes, and returns the new `Seen`."""
 
 
 class _Stop(Exception):
@@ -127,7 +100,8 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     bar = _bar(progress, budget, len(answered))
 
     def kept():
-        return State(state.selector, state.data, state.key, memory, np.asarray(answered, int), answers.copy(), len(seen.order), history, finished)
+        order, predicted, _ = _seen(answered, answers, data.labels)
+        return State(state.selector, state.data, state.key, memory, order, predicted, len(seen.order), history, finished)
 
     current = seen
 
@@ -154,7 +128,10 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
                 finished = True
                 break
             idle = 0 if len(current.order) > len(seen.order) else idle + 1
-            seen, memory, history = current, step.memory, _row(history, step, current)
+            row = _row(history, step, current)
+            # those that an interrupted iteration had asked for, and this one has not, come last
+            order = current.order.tolist() + np.asarray(answered, int)[~current.tried[answered]].tolist()
+            seen, memory, history, answered = current, step.memory, row, order
             if callback is not None:
                 callback(len(history.calls), _result(kept(), data, ()))
             if idle == IDLE:

@@ -36,7 +36,7 @@ def reduce(rng, data):
 
 def scaled(data):
     """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all images, or of each column of a table."""
-    x = data.inputs.reshape(data.size, -1).astype(np.float32)
+    x = data.inputs.reshape(data.size, -1).astype(np.float32 if data.image else np.float64)  # the small differences of a column may lie on a large mean
     over = None if data.image else 0
     low, high = x.min(over), x.max(over)
     return ((x - low) / np.where(high > low, high - low, 1)).astype(np.float32)

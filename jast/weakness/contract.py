@@ -1,0 +1,53 @@
+"""What stands between the validation loop and a way of choosing inputs: what it is given, and what it answers."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+__all__ = ["Seen", "Selector", "Step"]
+
+
+class Seen(NamedTuple):
+    """What the system under test has been asked so far."""
+
+    order: Any
+    """[calls] int: the inputs it was run on, in order"""
+    predicted: Any
+    """[n] int32: its answers, -1 where it was not run"""
+    labels: Any
+    """[n] int32: the true classes"""
+
+    @property
+    def tried(self):
+        """[n] bool"""
+        return self.predicted >= 0
+
+    @property
+    def failed(self):
+        """[n] bool: run, and wrong"""
+        return self.tried & (self.predicted != self.labels)
+
+
+class Step(NamedTuple):
+    """What one iteration of a selector comes to."""
+
+    memory: dict
+    """Arrays by name: what the next iteration needs of this one"""
+    scores: Any
+    """[n] in [0, 1]: how suspect each input is"""
+    candidates: Any
+    """[k] int: the inputs that it ran because it held them for failures; their share of failures is the iteration's precision"""
+    expected: float
+    """Failures that it expects among the inputs not yet run"""
+
+
+class Selector(NamedTuple):
+    """A way of choosing inputs: `default`, `thesis`, `random`, or your own."""
+
+    name: str
+    settings: dict
+    """Plain numbers and texts: a state of other settings is refused"""
+    start: Callable
+    """``start(key, data) -> memory``, before any call"""
+    step: Callable
+    """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do. ``ask(indices)`` runs the system on those of ``indices`` that
+    were not run yet, as far as the budget goes, and returns the new `Seen`."""
