@@ -108,7 +108,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     def ask(indices):
         nonlocal current
         new = [i for i in dict.fromkeys(np.asarray(indices).tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
-        fresh = [i for i in new if answers[i] < 0]
+        fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
         for at in range(0, len(fresh), CHUNK):
             batch = np.asarray(fresh[at : at + CHUNK])
             answers[batch] = _answers(predict, data, batch)
@@ -116,7 +116,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             bar.update(len(batch))
             if checkpoint is not None:
                 save(checkpoint, kept())
-        current = _seen(np.append(current.order, np.asarray(new, int)), answers, data.labels)
+        current = _seen(current.order.tolist() + [i for i in new if answers[i] >= 0], answers, data.labels)
         return current
 
     idle = 0
