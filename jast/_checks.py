@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["real", "whole"]
+__all__ = ["number", "real", "whole"]
 
 
 def whole(function, name, value, least=1):
@@ -18,6 +18,12 @@ def whole(function, name, value, least=1):
     if number < least:
         raise ValueError(f"{function}: {name} must be a whole number of at least {least}, received {value!r}")
     return number
+
+
+def number(function, name, value, holds, expected):
+    """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number for which ``holds``."""
+    real(function, name, value, holds, expected)
+    return float(value)
 
 
 def real(function, name, value, holds, expected):

@@ -269,6 +269,8 @@ GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
         (dict(predict=None), "predict must be callable"),
         (dict(budget=0), "budget must be a whole number of at least 1"),
         (dict(selector="best"), "selector must be one of .*received 'best'"),
+        (dict(selector=weakness.thesis), r"selector must be one of .*: call it, thesis\(\)"),
+        (dict(selector=["random"]), "selector must be one of"),
         (dict(state=3), "state must be the state of a Result, received int"),
     ],
 )
@@ -298,6 +300,8 @@ def test_a_system_that_does_not_answer_at_all(predict, message):
 def test_a_state_of_something_else_is_refused():
     inputs, labels, answers = problem(20)
     state = validate(KEY, System(answers), inputs, labels, budget=10, selector=in_turn()).state
+    with pytest.raises(ValueError, match="state must be the state of a Result, received Result: give result.state"):
+        validate(KEY, System(answers), inputs, labels, selector=in_turn(), state=validate(KEY, System(answers), inputs, labels, selector=in_turn()))
     with pytest.raises(ValueError, match="state is of other inputs or labels"):
         validate(KEY, System(answers), inputs + 1, labels, selector=in_turn(), state=state)
     with pytest.raises(ValueError, match="state is of the selector .*in turn"):

@@ -368,6 +368,14 @@ def test_bad_settings(call, message):
         call()
 
 
+@pytest.mark.parametrize("make", [weakness.default, weakness.thesis, weakness.random])
+def test_settings_do_not_depend_on_the_precision(make):
+    with jax.enable_x64(True):
+        double = make().settings
+    with jax.enable_x64(False):
+        assert make().settings == double
+
+
 def test_influence_refuses_other_data():
     inputs, labels = table(30)
     result = validate(KEY, lookup(inputs, labels), inputs, labels, selector="random", budget=10)

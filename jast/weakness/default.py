@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jast._checks import real, whole
+from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.blend import logistic, sigmoid
@@ -31,12 +31,14 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
     A batch is the inputs with the highest probability of failure, but for a share that is drawn at random from the others: ``exploration`` over the least
     probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
     (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
-    out; each repetition is five networks for each of two views. The scores are probabilities of failure.
+    out; each repetition is five networks for each of two views. The scores are probabilities of failure. ``expected``, their sum over what was not run, tends
+    to be too high while few easy inputs have been run: suspicious ones teach little about them. A state's ``memory["difficulty"]`` is the committee's word before
+    any call, as log odds.
     """
     first = first if first is None else whole("default", "first", first)
     repeats = whole("default", "repeats", repeats)
-    growth = float(real("default", "growth", growth, lambda v: 0 <= v < np.inf, "of at least 0"))
-    exploration = float(real("default", "exploration", exploration, lambda v: 0 <= v <= 1, "in 0 ... 1"))
+    growth = number("default", "growth", growth, lambda v: 0 <= v < np.inf, "of at least 0")
+    exploration = number("default", "exploration", exploration, lambda v: 0 <= v <= 1, "in 0 ... 1")
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):

@@ -39,14 +39,18 @@ def autoencoder(inputs, hidden):
     """The `Network` of chapter 4, "Dataset Autoencoder": dense layers of ``hidden`` widths, the same backwards, leaky ReLU after every one, also the last."""
     module = _modules()[0](inputs, hidden)
     encode = Partial(lambda params, x: module.apply(params, x, method="encode"))
-    return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), encode)
+    return Network(_init(module, inputs), Partial(module.apply), encode)
 
 
 @functools.cache
 def adversary(inputs):
     """The `Network` of chapter 4, "Adversarial Failure Classifier": inputs-128-64-1, ReLU between; its logits, whose sigmoid is the score."""
     module = _modules()[1](ADVERSARY)
-    return Network(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)), Partial(module.apply), None)
+    return Network(_init(module, inputs), Partial(module.apply), None)
+
+
+def _init(module, inputs):
+    return jax.jit(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)))  # one program, not one a layer
 
 
 def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):

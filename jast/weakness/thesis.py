@@ -5,7 +5,7 @@ import functools
 import jax
 import numpy as np
 
-from jast._checks import real, whole
+from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import networks
 from jast.weakness.contract import Selector, Step
@@ -35,9 +35,9 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     )
     batch = None if batch is None else whole_("batch", batch)
     copies = whole_("copies", copies, 0)
-    threshold = _number("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
-    rate = _number("rate", rate, lambda v: 0 < v < np.inf, "above 0")
-    encoder_rate = _number("encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
+    threshold = number("thesis", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
+    rate = number("thesis", "rate", rate, lambda v: 0 < v < np.inf, "above 0")
+    encoder_rate = number("thesis", "encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
     hidden = None if hidden is None else tuple(whole_("hidden", width) for width in np.atleast_1d(hidden).tolist())
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
@@ -47,11 +47,6 @@ def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, ra
     )  # fmt: skip
     start = functools.partial(_start, hidden, encoder_epochs, encoder_rate, batch)
     return Selector("thesis", settings, start, functools.partial(_step, iterations, sample, threshold, copies, epochs, rate))
-
-
-def _number(name, value, holds, expected):
-    real("thesis", name, value, holds, expected)
-    return float(value)  # as given: the array that real makes of it depends on the precision that JAX is set to, a state's settings must not
 
 
 def _start(hidden, epochs, rate, batch, key, data):

@@ -35,7 +35,8 @@ def validate(key, predict, inputs, labels, *, budget=None, selector="default", c
     ``selector``: "default" learns from the labels how hard each input is, and from each answer where the system differs (`default`); "thesis" is the adversary
     on encodings of Moss's thesis, chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
 
-    ``state``: of an earlier result of the same data and selector, to go on from there: as if it had not been interrupted. ``checkpoint``: a file to which the
+    ``state``: of an earlier result of the same data and selector, to go on from there: after an interruption as if there had been none, after a budget that
+    was spent with new batches. ``checkpoint``: a file to which the
     state is written after every call of ``predict``, and from which an existing one goes on. ``progress=True`` shows a bar of calls;
     ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
 
@@ -62,8 +63,9 @@ def _selector(selector):
 
     if isinstance(selector, Selector):
         return selector
-    if selector not in selectors.NAMES:
-        raise ValueError(f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received {selector!r}")
+    if not isinstance(selector, str) or selector not in selectors.NAMES:
+        hint = f": call it, {selector.__name__}()" if selector in selectors.NAMES.values() else ""
+        raise ValueError(f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received {selector!r}{hint}")
     return selectors.NAMES[selector]()
 
 
@@ -85,11 +87,12 @@ def _key(numbers, iteration):
 
 def _fits(state, data, selector):
     if not isinstance(state, State):
-        raise ValueError(f"validate: state must be the state of a Result, received {type(state).__name__}")
+        hint = ": give result.state" if isinstance(state, Result) else ""
+        raise ValueError(f"validate: state must be the state of a Result, received {type(state).__name__}{hint}")
     if state.data != fingerprint(data):
         raise ValueError("validate: state is of other inputs or labels")
     if state.selector != _described(selector):
-        raise ValueError(f"validate: state is of the selector {state.selector}, received {_described(selector)}")
+        raise ValueError(f"validate: state is of the selector {state.selector}, received {_described(selector)}: give the same again")
     return state
 
 
