@@ -1,10 +1,10 @@
 """Weakness recognition: how many of a classifier's failures are found in so many calls (chapter 4 of Moss's thesis, and reference figures on the same images).
 
-``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the
-published classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that were trained on the first half of
-the images and are validated on the other. Without: scikit-learn's digits, a third to train on and the rest to validate, and three classifiers. Means over
-seeds, +- one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the cross-validated logistic regression on 64
-principal components that needs no call either. Failures found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
+``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N] [--picture FILE]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX
+files) and the published classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that were trained on the
+first half of the images and are validated on the other. Without: scikit-learn's digits, a third to train on and the rest to validate, and three classifiers.
+Means over seeds, +- one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the cross-validated logistic regression on
+64 principal components that needs no call either. Failures found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
 those of the final scores on all inputs, where those that were run are judged by models that have not seen their outcome; candidates: as many as 627 of
 10,000. Seconds are of one validation, the first with compilation.
 """
@@ -23,7 +23,7 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
-from jast import weakness
+from jast import plot, weakness
 
 SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
 ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precision")
@@ -91,47 +91,46 @@ def pixels(images, labels):
     return 1 - p[np.arange(len(labels)), labels]
 
 
-def adaptive(images, labels, predicted, selector, seeds):
-    """The row of the default selector or of random choice."""
-    n, failed, rows, difficulty = len(labels), predicted != labels, [], []
+def runs(images, labels, predicted, selector, seeds, budget=None):
+    """[(result, wall seconds, CPU seconds)], one a seed."""
+    out = []
     for seed in range(seeds):
         system, wall, cpu = Answers(images, predicted), time.perf_counter(), time.process_time()
-        result = weakness.validate(jax.random.key(seed), system, images, labels, budget=int(n * SHARES[-1]), selector=selector, classes=int(labels.max()) + 1)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        assert system.asked.max() <= 1 and system.asked.sum() == result.calls
-        hits = np.cumsum(failed[result.order])
-        judged = weakness.judge(result, failed, top=round(CANDIDATES * n))
-        rows.append(
-            [[hits[int(n * s) - 1] / failed.sum() for s in SHARES], judged.auc[-1], judged.precision[-1], wall, cpu, result.expected, failed.sum() - hits[-1]]
-        )
-        if selector == "default":
-            difficulty.append(ranked(result.state.memory["difficulty"], failed))
-    found, auc, precision, wall, cpu, expected, left = zip(*rows, strict=True)
-    row = dict(found=[mean(c) for c in zip(*found, strict=True)], auc=mean(auc), precision=mean(precision), expected=mean(expected), left=mean(left))
-    row |= dict(seconds_first=wall[0], seconds=mean(wall[1:] or wall), cpu_s=mean(cpu[1:] or cpu))
-    return row, difficulty and {
-        "found": [mean(c) for c in zip(*(d["found"] for d in difficulty), strict=True)],
-        **{k: mean([d[k] for d in difficulty]) for k in ("auc", "precision")},
-    }
+        result = weakness.validate(jax.random.key(seed), system, images, labels, budget=budget, selector=selector, classes=int(labels.max()) + 1)
+        out.append((result, time.perf_counter() - wall, time.process_time() - cpu))
+        if system.asked.max() > 1 or system.asked.sum() != result.calls:
+            raise AssertionError("an input was asked twice, or a call was not counted")
+    return out
 
 
-def thesis(images, labels, predicted, seeds):
-    """The thesis's adversary after each iteration, at its threshold of 0.5, on all inputs."""
-    failed, rows, wall = predicted != labels, [], []
-    for seed in range(seeds):
-        start = time.perf_counter()
-        result = weakness.validate(jax.random.key(seed), Answers(images, predicted), images, labels, selector="thesis", classes=int(labels.max()) + 1)
-        wall.append(time.perf_counter() - start)
-        j, picks = weakness.judge(result, failed), result.history.precision
-        rows.append([j.auc, j.precision[-1], j.recall[-1], j.candidates[-1], result.calls, len(result.failures) / failed.sum(), np.nanmean(picks)])
-    auc, precision, recall, candidates, calls, found, picks = zip(*rows, strict=True)
-    out = dict(precision=precision, recall=recall, candidates=candidates, calls=calls, found=found, sampled_precision=picks)
-    return {
-        "auc": [mean(c) for c in zip(*auc, strict=True)],
-        **{k: mean(v) for k, v in out.items()},
-        "seconds_first": wall[0],
-        "seconds": mean(wall[1:] or wall),
-    }
+def over(rows):
+    """Dicts of numbers and lists of them -> the same of means."""
+    return {k: [mean(c) for c in zip(*(r[k] for r in rows), strict=True)] if isinstance(rows[0][k], list) else mean([r[k] for r in rows]) for k in rows[0]}
+
+
+def seconds(done):
+    first, *rest = done
+    return {"seconds_first": first[1], "seconds": mean([r[1] for r in rest or done]), "cpu_s": mean([r[2] for r in rest or done])}
+
+
+def found(result, failed):
+    """Shares of all failures at the budgets."""
+    hits = np.cumsum(failed[result.order])
+    return [float(hits[int(len(failed) * s) - 1] / failed.sum()) for s in SHARES]
+
+
+def adaptive(result, failed):
+    """A row of the default selector."""
+    judged = weakness.judge(result, failed, top=round(CANDIDATES * len(failed)))
+    left = int(failed.sum()) - len(result.failures)
+    return dict(found=found(result, failed), auc=judged.auc[-1], precision=judged.precision[-1], expected=result.expected, left=left)
+
+
+def thesis(result, failed):
+    """A row of the thesis's adversary: after each iteration, and at its threshold of 0.5 on all inputs at the end."""
+    j, picks = weakness.judge(result, failed), result.history.precision
+    row = dict(auc=list(j.auc), precision=j.precision[-1], recall=j.recall[-1], candidates=j.candidates[-1], calls=result.calls)
+    return row | dict(found=len(result.failures) / failed.sum(), sampled_precision=np.nanmean(picks))
 
 
 def say(v, digits=3):
@@ -139,29 +138,40 @@ def say(v, digits=3):
 
 
 def line(name, row):
-    text = f"  {name:11} {'  '.join(f'{say(f):>14}' for f in row['found'])}  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
-    if "seconds" not in row:
-        return text
-    times = f"{row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
-    return f"{text}  {times}; expected left {say(row['expected'], 1)}, true {say(row['left'], 1)}"
+    text = f"  {name:11} {'  '.join(f'{say(f):>14}' for f in row['found'])}"
+    if "auc" in row:
+        text += f"  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
+    if "expected" in row:
+        text += f"  expected left {say(row['expected'], 1)}, true {say(row['left'], 1)}; {row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+    return text
 
 
-def study(images, labels, predicted, seeds, quick):
+def study(images, labels, predicted, seeds, quick, picture):
     """All rows of one system, printed as they come."""
-    failed = predicted != labels
-    rows = {"inputs": len(labels), "failures": int(failed.sum())}
+    failed, budget = predicted != labels, int(len(labels) * SHARES[-1])
+    system = images, labels, predicted
     budgets = [f"{int(len(labels) * s)} calls" for s in SHARES]
     print(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
-    rows["default"], rows["difficulty"] = adaptive(images, labels, predicted, "default", seeds)
-    rows["pixels"], rows["random"] = ranked(pixels(images, labels), failed), adaptive(images, labels, predicted, "random", seeds)[0]
-    for name in ("default", "difficulty", "pixels", "random"):
-        print(line(name, rows[name]), flush=True)
+    own, chance = runs(*system, "default", seeds, budget), runs(*system, "random", seeds, budget)
+    rows = {
+        "default": over([adaptive(r, failed) for r, *_ in own]) | seconds(own),
+        "difficulty": over([ranked(r.state.memory["difficulty"], failed) for r, *_ in own]),
+        "pixels": ranked(pixels(images, labels), failed),
+        "random": over([{"found": found(r, failed)} for r, *_ in chance]),
+    }
+    for name, row in rows.items():
+        print(line(name, row), flush=True)
+    results = {"default": [r for r, *_ in own], "random": [r for r, *_ in chance]}
     if not quick:
-        rows["thesis"] = t = thesis(images, labels, predicted, seeds)
+        published = runs(*system, "thesis", seeds)
+        rows["thesis"] = t = over([thesis(r, failed) for r, *_ in published]) | seconds(published)
+        results["thesis"] = [r for r, *_ in published]
         print("  thesis      AUC " + " ".join(f"{a['mean']:.3f}" for a in t["auc"]) + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})")
         print("              at 0.5: " + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS))
         print(f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True)
-    return rows
+    if picture:
+        plot.failures_found(results, failed).figure.savefig(picture, dpi=150)
+    return rows | {"inputs": len(labels), "failures": int(failed.sum())}
 
 
 def main():
@@ -170,13 +180,14 @@ def main():
     parser.add_argument("--json", action="store_true", help="print the figures as JSON at the end")
     parser.add_argument("--quick", action="store_true", help="one system, 2 seeds, without the thesis's mode")
     parser.add_argument("--seeds", type=int, default=None, help="default 10")
+    parser.add_argument("--picture", help="draw the first system's failures found against calls into this file")
     given = parser.parse_args()
     seeds = given.seeds or (2 if given.quick else 10)
     systems = mnist(given.data, given.quick) if given.data else digits(given.quick)
     out = {}
     for name, images, labels, predicted in systems:
         print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
-        out[name] = study(images, labels, predicted, seeds, given.quick)
+        out[name] = study(images, labels, predicted, seeds, given.quick, None if out else given.picture)
     if given.json:
         print(json.dumps(out))
 

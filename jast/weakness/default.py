@@ -32,8 +32,8 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
     probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
     (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
     out; each repetition is five networks for each of two views. The scores are probabilities of failure. ``expected``, their sum over what was not run, tends
-    to be too high while few easy inputs have been run: suspicious ones teach little about them. A state's ``memory["difficulty"]`` is the committee's word before
-    any call, as log odds.
+    to be too high while few easy inputs have been run: suspicious ones teach little about them. In a state, ``memory["difficulty"]`` is the committee's word
+    before any call, as log odds.
     """
     first = first if first is None else whole("default", "first", first)
     repeats = whole("default", "repeats", repeats)
