@@ -72,7 +72,7 @@ def gradient(committee, x, labels):
     def odds(x, label):
         each = jax.nn.log_softmax(logits(committee, x))
         # sums over the members are their mean, but for a constant that both have
-        return jax.nn.logsumexp(jnp.where(jnp.arange(each.shape[1]) == label, -jnp.inf, each)) - jax.nn.logsumexp(each[:, label])
+        return jax.nn.logsumexp(jnp.where(jnp.arange(each.shape[1], dtype=label.dtype) == label, -jnp.inf, each)) - jax.nn.logsumexp(each[:, label])
 
     with jax.numpy_rank_promotion("allow"):
         return jax.vmap(jax.grad(odds))(x, labels)
