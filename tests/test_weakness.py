@@ -1,5 +1,7 @@
 """The validation loop of jast.weakness: calls are counted and never repeated, nothing that was answered is lost, and scores are judged as scikit-learn does."""
 
+import importlib
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from jast.counter import generator
 from jast.weakness import Selector, Step, validate
 
 KEY = jax.random.key(0)
+validation = importlib.import_module("jast.weakness.validate")  # the package's own `validate` is the function
 
 
 def same(a, b):
@@ -218,6 +221,105 @@ def test_a_selector_that_asks_nothing_is_stopped():
     assert result.calls == 0 and np.isnan(result.history.precision).all()
 
 
+def test_a_selector_may_pause():
+    """Only so many idle iterations in a row are an end."""
+    inputs, labels, answers = problem(30)
+
+    def step(key, data, memory, seen, ask):
+        turn = int(memory["turn"])
+        now = ask(np.arange(0 if turn % 15 else len(seen.order) + 10)[:30])
+        return Step({"turn": np.asarray(turn + 1)}, np.full(30, 0.5), np.zeros(0, int), float(len(now.order)))
+
+    result = validate(KEY, System(answers), inputs, labels, selector=Selector("pauses", {}, lambda key, data: {"turn": np.asarray(0)}, step))
+    assert result.calls == 30 and len(result.history.calls) == 31 and not result.incidents
+
+
+@pytest.mark.parametrize("wrong", [[-1], [60], [0.5], [[1, 2]]])
+def test_indices_that_are_none(wrong):
+    inputs, labels, answers = problem(60)
+    asks = Selector("odd", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: ask(wrong))
+    with pytest.raises(ValueError, match="the selector odd must ask for indices"):
+        validate(KEY, System(answers), inputs, labels, selector=asks)
+
+
+def boom(*_):
+    raise OSError("disk full")
+
+
+@pytest.mark.parametrize("where", ["callback", "selector", "scores", "checkpoint"])
+def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatch):
+    inputs, labels, answers = problem(60)
+    system, selector = System(answers), in_turn()
+
+    def step(key, data, memory, seen, ask):
+        out = in_turn().step(key, data, memory, seen, ask)
+        return out if len(seen.order) < 28 else boom() if where == "selector" else out._replace(scores=out.scores + 2)
+
+    if where in ("selector", "scores"):
+        selector = selector._replace(step=step)
+    if where == "checkpoint":
+        calls = []
+        real = validation.save
+        monkeypatch.setattr(validation, "save", lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a))
+    at = (lambda i, r: boom() if i == 3 else None) if where == "callback" else None
+    with pytest.warns(RuntimeWarning, match="disk full" if where != "scores" else r"scores must be \[60\] in \[0, 1\]"):
+        part = validate(KEY, system, inputs, labels, selector=selector, callback=at, checkpoint=tmp_path / "c.npz" if where == "checkpoint" else None)
+    assert part.calls == len(system.asked) == 42 and len(part.incidents) == 1
+    assert np.isnan(part.expected) == (where != "callback")  # the third iteration had ended
+    monkeypatch.undo()
+    rest = validate(KEY, system, inputs, labels, selector=in_turn(), state=part.state)
+    same(rest, validate(KEY, System(answers), inputs, labels, selector=in_turn()))
+    assert len(system.asked) == 60
+
+
+def test_a_smaller_budget_ends_what_was_begun():
+    inputs, labels, answers = problem(60)
+    system = Flaky(answers, 35, OSError("gone"))
+    with pytest.warns(RuntimeWarning, match="gone"):
+        part = validate(KEY, system, inputs, labels, selector=in_turn(20))
+    assert part.calls == 20
+    rest = validate(KEY, system, inputs, labels, budget=5, selector=in_turn(20), state=part.state)
+    assert rest.calls == 20 and rest.history.calls.tolist() == [20]
+
+
+def test_the_last_iteration_is_in_the_checkpoint(tmp_path):
+    inputs, labels, answers = problem(60)
+    result = validate(KEY, System(answers), inputs, labels, selector=in_turn(), checkpoint=tmp_path / "c.npz")
+    same(weakness.load(tmp_path / "c.npz"), result.state)
+
+
+def test_more_classes_may_turn_up():
+    inputs, labels, answers = problem(60)
+    answers[45] = 3
+    system = System(answers)
+    with pytest.warns(RuntimeWarning, match=r"0 ... 2 \(classes=3\), received 3 for input 45"):
+        part = validate(KEY, system, inputs, labels, selector=in_turn())
+    rest = validate(KEY, system, inputs, labels, selector=in_turn(), state=part.state, classes=4)
+    assert rest.calls == 60 and 45 in rest.failures
+    assert weakness.influence(KEY, rest, inputs, labels).shape == (len(rest.failures), 2)
+
+
+@pytest.mark.parametrize("key", [jax.random.PRNGKey(3), jax.random.key(3, impl="rbg")], ids=["legacy", "rbg"])
+def test_keys_of_other_kinds(key):
+    inputs, labels, answers = problem(60)
+    part = validate(key, System(answers), inputs, labels, budget=20, selector="random")
+    same(validate(key, System(answers), inputs, labels, budget=20, selector="random"), part)
+    assert validate(KEY, System(answers), inputs, labels, budget=40, selector="random", state=part.state).calls == 40
+
+
+def test_random_choice_is_random():
+    inputs, labels, answers = problem(400)
+    order = validate(KEY, System(answers), inputs, labels, selector="random", budget=100).order
+    # the mean of 100 of 0 ... 399 without replacement has a standard error of 10; they are in no order
+    assert abs(order.mean() - 199.5) < 40 and 30 < np.sum(np.diff(order) > 0) < 70
+
+
+def test_scores_of_any_kind_of_number():
+    assert weakness.auc(np.array([0, 1, 2], np.uint8), np.array([False, False, True])) == 1
+    assert weakness.auc(np.array([-128, 1, 2], np.int8), np.array([True, False, False])) == 0
+    assert weakness.auc(np.array([False, True]), np.array([False, True])) == 1
+
+
 def test_a_selector_may_end_before_the_budget():
     inputs, labels, answers = problem(20)
     done = Selector("done", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: None)
@@ -246,7 +348,8 @@ def test_progress_and_callback(capsys):
 def test_results_print_as_a_table():
     inputs, labels, answers = problem(60)
     lines = str(validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())).splitlines()
-    assert "failures in 28 calls (60 inputs)" in lines[0] and lines[1].split() == ["iteration", "calls", "failures", "precision", "recall", "AUC", "expected"]
+    assert "failures in 28 calls (60 inputs)" in lines[0]
+    assert lines[1].split() == ["iteration", "calls", "failures", "precision", "~recall", "AUC", "run", "~expected"]
     assert [line.split()[:2] for line in lines[2:]] == [["1", "14"], ["2", "28"]]
 
 
@@ -265,7 +368,12 @@ GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
         (dict(labels=np.zeros(6)), "labels must be whole numbers.*float64"),
         (dict(labels=np.array([0, 1, -1, 0, 1, 2])), r"labels must lie in 0 ... 2; 1 do not, the first is number 2: -1"),
         (dict(classes=2), r"labels must lie in 0 ... 1; 2 do not, the first is number 2: 2"),
-        (dict(classes=1), "classes must be an int of at least 2"),
+        (dict(classes=1), "classes must be a whole number of at least 2"),
+        (dict(inputs=GOOD[0] + 1e31), r"inputs must lie within 1e\+30 of 0"),
+        (dict(labels=np.array([0, 1, 2, 0, 1, 2**31])), "there may be 65536 classes, received 2147483649; np.unique"),
+        (dict(labels=np.array(list("abcabc"))), r"labels must be whole numbers.*np.unique\(labels"),
+        (dict(callback=3), "callback must be callable"),
+        (dict(checkpoint="/no/such/folder/file.npz"), "checkpoint must be a file in a folder that exists"),
         (dict(predict=None), "predict must be callable"),
         (dict(budget=0), "budget must be a whole number of at least 1"),
         (dict(selector="best"), "selector must be one of .*received 'best'"),
@@ -285,6 +393,7 @@ def test_bad_arguments(change, message):
     [
         (lambda x: 1 / 0, r"raised ZeroDivisionError: division by zero, on the batch of 6 inputs \[\d, \d, \d, \d, ...\]"),
         (lambda x: np.zeros((len(x), 3), int), r"whole numbers \[6\], received int64 of shape \(6, 3\)"),
+        (lambda x: np.zeros((len(x), 3)), r"received float64 of shape \(6, 3\); give the argmax"),
         (lambda x: np.zeros(len(x) - 1, int), r"received int64 of shape \(5,\)"),
         (lambda x: np.zeros(len(x)), "received float64"),
         (lambda x: None, "received object"),
@@ -348,7 +457,11 @@ def test_judged_by_the_truth():
     [
         (lambda r: weakness.judge(r, np.zeros(5, bool)), r"judge: failed must be bool \[20\]"),
         (lambda r: weakness.judge(r, np.zeros(20)), "judge: failed must be bool .*float64"),
-        (lambda r: weakness.judge(r, np.ones(20, bool), top=21), "judge: top must be an int in 1 ... 20"),
+        (lambda r: weakness.judge(r, np.ones(20, bool), top=21), "judge: top must be at most 20"),
+        (lambda r: weakness.judge(r, np.ones(20, bool), top=0), "judge: top must be a whole number of at least 1"),
+        (lambda r: weakness.judge(r, np.ones(20, bool), threshold="a"), "judge: threshold must be a number"),
+        (lambda r: weakness.judge(3, np.ones(20, bool)), "judge: result must be a Result, received int"),
+        (lambda r: weakness.save("x", r), "save: state must be the state of a Result, received Result"),
         (lambda r: weakness.judge(r, np.zeros(20, bool)), "failed must agree with the result"),
         (lambda r: weakness.roc(np.zeros(3), np.zeros(4, bool)), "roc: scores and failed must be"),
         (lambda r: weakness.auc(np.array([0.0, np.nan]), np.zeros(2, bool)), "scores must not be NaN, 1 are"),

@@ -8,7 +8,7 @@ import numpy as np
 
 __all__ = ["Committee", "folds", "fit", "gradient", "held_out"]
 
-HIDDEN, BATCH, RATE = 32, 256, 3e-3
+HIDDEN, BATCH, ROWS, RATE = 32, 256, 1024, 3e-3
 STEPS = (300, 1500)  # least and most
 
 
@@ -36,7 +36,7 @@ def folds(rng, n, parts=5, repeats=4):
 
 
 def fit(rng, x, targets, weights, classes, passes):
-    """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n] by Adam: (committee, log probabilities [M, n, classes]).
+    """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n] by Adam.
 
     All members see the same minibatches, so that their first layers are one matrix product. ``passes``: over the inputs, as long as these are
     300 to 1500 steps.
@@ -53,10 +53,22 @@ def fit(rng, x, targets, weights, classes, passes):
     return _fit(start, x, targets.astype(np.int32), weights.astype(np.float32), order)
 
 
-def held_out(log_probs, weights):
-    """[n, classes]: the mean probability by those members that an input has no weight with. Host."""
-    out = (weights == 0).astype(np.float32)
-    return np.einsum("mnk,mn->nk", np.exp(np.asarray(log_probs)), out) / out.sum(0)[:, None]
+def held_out(committee, x, labels, learn):
+    """[n]: the mean probability that members who have not learned from an input (``learn`` [M, n] bool) give to its label."""
+    each = np.exp(np.asarray(_label_log_probs(committee, x, labels.astype(np.int32))))
+    out = ~np.asarray(learn).T
+    return np.sum(each * out, axis=1) / out.sum(1)
+
+
+@jax.jit
+def _label_log_probs(committee, x, labels):
+    """[n, M]"""
+
+    def one(row):
+        with jax.numpy_rank_promotion("allow"):
+            return jax.nn.log_softmax(logits(committee, row[0]))[:, row[1]]
+
+    return jax.lax.map(one, (x, labels), batch_size=ROWS)  # in blocks: all logits of many classes would not fit
 
 
 def logits(committee, x):
@@ -96,5 +108,4 @@ def _fit(start, x, targets, weights, order):
             update, state = adam.update(jax.grad(loss)(committee, rows), state)
             return (optax.apply_updates(committee, update), state), None
 
-        (committee, _), _ = jax.lax.scan(step, (start, adam.init(start)), order)
-        return committee, jnp.swapaxes(jax.nn.log_softmax(logits(committee, x)), 0, 1)
+        return jax.lax.scan(step, (start, adam.init(start)), order)[0][0]

@@ -9,9 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._checks import whole
+
 __all__ = ["Data", "arrays", "digits", "fingerprint", "from_idx", "idx"]
 
 TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}  # of IDX files, which are big-endian
+
+
+LARGEST, MOST = 1e30, 65_536  # number among the inputs; classes
 
 
 class Data(NamedTuple):
@@ -45,12 +50,14 @@ def arrays(function, inputs, labels, classes=None):
         bad = np.flatnonzero(~np.isfinite(inputs).reshape(len(inputs), -1).all(1))
         if len(bad):
             raise ValueError(f"{function}: inputs must be finite; {len(bad)} of {len(inputs)} hold NaN or infinity, the first is number {bad[0]}")
+    if max(abs(float(inputs.max())), abs(float(inputs.min()))) > LARGEST:
+        raise ValueError(f"{function}: inputs must lie within {LARGEST:g} of 0, received {inputs.min()} to {inputs.max()}")
     if labels.shape != (len(inputs),) or labels.dtype.kind not in "iub":
-        raise ValueError(f"{function}: labels must be whole numbers [{len(inputs)}], one for each input, received {labels.dtype} of shape {labels.shape}")
-    if classes is None:
-        classes = max(int(labels.max()) + 1, 2)
-    elif isinstance(classes, bool) or not isinstance(classes, int) or classes < 2:
-        raise ValueError(f"{function}: classes must be an int of at least 2, received {classes!r}")
+        hint = "" if labels.dtype.kind in "iub" else "; np.unique(labels, return_inverse=True)[1] makes such numbers"
+        raise ValueError(f"{function}: labels must be whole numbers [{len(inputs)}], one for each input, received {labels.dtype} of shape {labels.shape}{hint}")
+    classes = max(int(labels.max()) + 1, 2) if classes is None else whole(function, "classes", classes, 2)
+    if classes > MOST:
+        raise ValueError(f"{function}: there may be {MOST} classes, received {classes}; np.unique(labels, return_inverse=True)[1] leaves no gaps")
     bad = np.flatnonzero((labels < 0) | (labels >= classes))
     if len(bad):
         raise ValueError(f"{function}: labels must lie in 0 ... {classes - 1}; {len(bad)} do not, the first is number {bad[0]}: {labels[bad[0]]}")
@@ -59,9 +66,9 @@ def arrays(function, inputs, labels, classes=None):
 
 def fingerprint(data):
     """A short text that differs for other inputs or labels."""
-    digest = hashlib.sha256(f"{data.inputs.dtype} {data.inputs.shape} {data.classes}".encode())
-    digest.update(np.ascontiguousarray(data.inputs).tobytes())
-    digest.update(data.labels.tobytes())
+    digest = hashlib.sha256(f"{data.inputs.dtype} {data.inputs.shape}".encode())
+    for array in (data.inputs, data.labels):
+        digest.update(np.ascontiguousarray(array).view(np.uint8).data)
     return digest.hexdigest()[:16]
 
 

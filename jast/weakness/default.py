@@ -15,7 +15,7 @@ __all__ = ["default"]
 PASSES = {True: 8, False: 50}  # over images, whose many pixels are soon learned by heart, and over tables
 CLOSE = 64  # principal components in which distances are measured
 STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
-SURE = 2  # failures that the scores' sum over easy inputs is worth, where random calls correct it
+SURE, ENOUGH = 2, 20  # failures that the scores' sum over easy inputs is worth, where at least so many random calls correct it
 # log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision of the prior of b
 PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
 
@@ -33,8 +33,8 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
     probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
     (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
     out; each repetition is five networks for each of two views. The scores are probabilities of failure. ``expected`` is their sum over what was not run,
-    corrected by how the random calls turned out; it is rough, and mostly too high, while these are few: suspicious inputs teach little about easy ones. In a
-    state, ``memory["difficulty"]`` is the committee's word before any call, as log odds.
+    corrected by how the random calls turned out once there are twenty; before that it is mostly too high, by up to four times as far as measured, as
+    suspicious inputs teach little about easy ones. In a state, ``memory["difficulty"]`` is the committee's word before any call, as log odds.
     """
     first = first if first is None else whole("default", "first", first)
     repeats = whole("default", "repeats", repeats)
@@ -50,8 +50,8 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
         difficulty = sum(_odds(rng, view, data.labels, learn, learn, data) for view in seen_as) / len(seen_as)
         neighbours = difficulty_of_neighbours(rng, close, data.labels, data.classes)
-        drawn = np.zeros(data.size, bool)
-        return dict(reduced=reduced, close=close, learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty, drawn=drawn)
+        drawn, blends = np.zeros(data.size, bool), np.tile(PRIOR, (data.size, 1))
+        return dict(reduced=reduced, close=close, learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty, drawn=drawn, blends=blends)
 
     def step(key, data, memory, seen, ask):
         rng = generator(key)
@@ -62,10 +62,14 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
         answers, weights = np.where(tried, seen.predicted, data.labels), memory["learn"] * np.where(tried, STRENGTH, 1)
         imitations = [_odds(rng, view, answers, weights, memory["learn"], data) for view in views(data, memory["reduced"])]
         rows = np.stack([memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1)
-        odds = rows @ logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
-        suspicion = np.where(tried, odds, odds + residual(rng, memory["close"], data.labels, odds, seen))
+        blend = logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
+        # an input that was run is judged by the blend from before its outcome was known
+        blends = np.where(tried[:, None], memory["blends"], blend)
+        odds = np.sum(rows * blends, axis=1)
+        suspicion = np.where(tried, odds, odds + residual(rng, memory["close"], data.labels, rows @ blend, seen))
         scores, drawn = sigmoid(suspicion), memory["drawn"] | tried & np.isin(np.arange(data.size), np.setdiff1d(chosen, likely))
-        return Step(memory | dict(suspicion=suspicion, drawn=drawn), scores, likely, _expected(scores, seen, drawn))
+        memory = memory | dict(suspicion=suspicion, drawn=drawn, blends=blends)
+        return Step(memory, scores, likely, _expected(scores, seen, drawn))
 
     return Selector("default", settings, start, step)
 
@@ -74,14 +78,14 @@ def _expected(scores, seen, drawn):
     """Failures among what was not run: the sum of the scores, times how many more failures than their scores say were among those ``drawn`` [n] at random."""
     left = scores[~seen.tried]
     alike = drawn & (scores <= left.max(initial=0))  # those that would not have been run by now for their scores
-    # a gamma prior of mean 1, worth SURE failures
-    return float(left.sum() * (SURE + seen.failed[alike].sum()) / (SURE + scores[alike].sum()))
+    more = (SURE + seen.failed[alike].sum()) / (SURE + scores[alike].sum())  # a gamma prior of mean 1, worth SURE failures
+    return float(left.sum() * (more if alike.sum() >= ENOUGH else 1))
 
 
 def _odds(rng, x, answers, weights, learn, data):
     """[n] log odds against each input's label, by the members that have not learned from it."""
-    p = committee.held_out(committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])[1], learn)
-    right = np.clip(p[np.arange(data.size), data.labels].astype(float), 1e-6, 1 - 1e-6)
+    trained = committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])
+    right = np.clip(committee.held_out(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6)
     return np.log1p(-right) - np.log(right)
 
 

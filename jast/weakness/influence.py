@@ -25,6 +25,8 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
     """
     if not isinstance(result, Result):
         raise ValueError(f"influence: result must be a Result, received {type(result).__name__}")
+    if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":
+        classes = max(2, int(np.max(result.predicted)) + 1, int(np.max(labels)) + 1)
     data = arrays("influence", inputs, labels, classes)
     if fingerprint(data) != result.state.data:
         raise ValueError("influence: inputs and labels are not those of the result")
@@ -36,6 +38,6 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
     rng = generator(key)
     x = centred(scaled(data), data.image)
-    imitation = committee.fit(rng, x, np.where(tried, result.predicted, data.labels), weights, data.classes, EFFORT * PASSES[data.image])[0]
+    imitation = committee.fit(rng, x, np.where(tried, result.predicted, data.labels), weights, data.classes, EFFORT * PASSES[data.image])
     slope = np.asarray(committee.gradient(imitation, x[at], data.labels[at]))
     return (slope * (x[at] - x.mean(0))).reshape(-1, *data.inputs.shape[1:])

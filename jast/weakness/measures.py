@@ -4,6 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._checks import number, whole
+from jast.weakness.result import Result
+
 __all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
 
 
@@ -56,6 +59,9 @@ def judge(result, failed, *, threshold=0.5, top=None):
     Candidates are the inputs with a score of at least ``threshold``, or, with ``top``, the so many with the highest. The scores of inputs that were run are
     those of models that have not seen their outcomes (the thesis's adversary has: as published).
     """
+    if not isinstance(result, Result):
+        raise ValueError(f"judge: result must be a Result, received {type(result).__name__}")
+    threshold = number("judge", "threshold", threshold, lambda v: not np.isnan(v), "to compare scores with")
     every = np.asarray(result.history.scores)
     failed = np.asarray(failed)
     if failed.shape != every.shape[1:] or failed.dtype != bool:
@@ -63,8 +69,8 @@ def judge(result, failed, *, threshold=0.5, top=None):
     n = len(failed)
     if not failed[result.failures].all():
         raise ValueError("judge: failed must agree with the result, whose failures are not all among them")
-    if top is not None and (isinstance(top, bool) or not isinstance(top, int) or not 1 <= top <= n):
-        raise ValueError(f"judge: top must be an int in 1 ... {n}, received {top!r}")
+    if top is not None and whole("judge", "top", top) > n:
+        raise ValueError(f"judge: top must be at most {n}, the inputs there are, received {top!r}")
     rows = []
     for scores in every:
         chosen = scores >= threshold if top is None else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
@@ -74,7 +80,7 @@ def judge(result, failed, *, threshold=0.5, top=None):
 
 
 def _pair(function, scores, failed):
-    scores, failed = np.asarray(scores), np.asarray(failed)
+    scores, failed = np.asarray(scores, float), np.asarray(failed)
     if scores.ndim != 1 or scores.shape != failed.shape or failed.dtype != bool:
         raise ValueError(f"{function}: scores and failed must be [n], failed bool, received {scores.shape} and {failed.dtype} of shape {failed.shape}")
     if np.isnan(scores).any():

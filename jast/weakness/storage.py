@@ -13,6 +13,8 @@ PLAIN = ("selector", "data", "complete", "finished")
 
 def save(path, state):
     """Write a `State` to the one file ``path``; an older file of that name stays whole until the new one is."""
+    if not isinstance(state, State):
+        raise ValueError(f"save: state must be the state of a Result, received {type(state).__name__}")
     arrays = {"key": state.key, "order": state.order, "predicted": state.predicted}
     arrays |= {f"memory.{name}": np.asarray(a) for name, a in state.memory.items()} | {f"history.{name}": a for name, a in state.history._asdict().items()}
     archive.write(path, FORMAT, VERSION, {name: getattr(state, name) for name in PLAIN}, arrays)

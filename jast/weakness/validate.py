@@ -2,12 +2,14 @@
 
 import json
 import os
+import traceback
 import warnings
 
 import jax
 import numpy as np
 
 from jast._checks import whole
+from jast.counter import generator
 from jast.weakness.contract import Seen, Selector
 from jast.weakness.data import arrays, fingerprint
 from jast.weakness.measures import auc
@@ -30,7 +32,7 @@ def validate(key, predict, inputs, labels, *, budget=None, selector="default", c
     ``predict(inputs [m, ...]) -> labels [m]``: the system under test, any Python callable. It is called with up to 1024 inputs at once, in the dtype of
     ``inputs``, and never twice on one input. ``inputs`` [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns]. ``labels`` [n]: the
     true classes, whole numbers in 0 ... ``classes`` - 1 (default: the largest and 1), as the predictions must be. ``budget``: calls, those of ``state``
-    included; default: all n.
+    included; default: all n. The iteration in which it is spent is cut short.
 
     ``selector``: "default" learns from the labels how hard each input is, and from each answer where the system differs (`default`); "thesis" is the adversary
     on encodings of Moss's thesis, chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
@@ -41,8 +43,9 @@ def validate(key, predict, inputs, labels, *, budget=None, selector="default", c
     ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
 
     Where ``predict`` raises, or answers with something else than m labels in range, or at a KeyboardInterrupt, the search ends, with a RuntimeWarning, and
-    the result so far says so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked again by a run that goes on.
-    ValueError for that at the very first call; for inputs that are not finite, labels out of range, a state or checkpoint of other data or of another selector.
+    the result so far says so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked again by a run that goes on. So
+    it does where anything else raises after the first answer: ``callback``, the checkpoint's disk, a selector. ValueError for an answer that is none at the
+    very first call; for inputs that are not finite, labels out of range, a state or checkpoint of other data or of another selector.
     """
     data = arrays("validate", inputs, labels, classes)
     chosen = _selector(selector)
@@ -50,12 +53,16 @@ def validate(key, predict, inputs, labels, *, budget=None, selector="default", c
     if not callable(predict):
         raise ValueError(f"validate: predict must be callable: inputs [m, ...] -> labels [m], received {predict!r}")
     budget = n if budget is None else min(whole("validate", "budget", budget), n)
+    if callback is not None and not callable(callback):
+        raise ValueError(f"validate: callback must be callable, (iteration, result), received {callback!r}")
+    if checkpoint is not None and not os.path.isdir(os.path.dirname(os.path.abspath(checkpoint))):
+        raise ValueError(f"validate: checkpoint must be a file in a folder that exists, received {checkpoint}")
     if checkpoint is not None and os.path.exists(checkpoint):
         if state is not None:
             raise ValueError(f"validate: give state or an existing checkpoint, not both; {checkpoint} exists")
         state = load(checkpoint)
     state = _begin(key, data, chosen) if state is None else _fits(state, data, chosen)
-    return _run(state, chosen, data, predict, budget, checkpoint, progress, callback)
+    return _run(state, chosen, data, predict, max(budget, len(state.order)), checkpoint, progress, callback)
 
 
 def _selector(selector):
@@ -77,12 +84,14 @@ def _begin(key, data, selector):
     n = data.size
     history = History(*(np.zeros(0, int) for _ in range(2)), *(np.zeros(0) for _ in range(4)), np.zeros((0, n), np.float32))
     numbers = np.asarray(jax.random.key_data(key))
+    if numbers.shape != (2,):  # of another generator
+        numbers = generator(key).integers(0, 2**32, 2, np.uint32)
     memory = selector.start(_key(numbers, 0), data)
     return State(_described(selector), fingerprint(data), numbers, memory, np.zeros(0, int), np.full(n, -1, np.int32), 0, history, False)
 
 
 def _key(numbers, iteration):
-    return jax.random.fold_in(jax.random.wrap_key_data(numbers), iteration)
+    return jax.random.fold_in(jax.random.wrap_key_data(numbers, impl="threefry2x32"), iteration)
 
 
 def _fits(state, data, selector):
@@ -110,7 +119,10 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
 
     def ask(indices):
         nonlocal current
-        new = [i for i in dict.fromkeys(np.asarray(indices).tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
+        indices = np.asarray(indices)
+        if indices.size and (indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= data.size):
+            raise ValueError(f"validate: the selector {selector.name} must ask for indices [m] in 0 ... {data.size - 1}, received {indices!r}")
+        new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
         fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
         for at in range(0, len(fresh), CHUNK):
             batch = np.asarray(fresh[at : at + CHUNK])
@@ -140,18 +152,23 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             if idle == IDLE:
                 incidents.append(f"the selector asked for nothing new in {IDLE} iterations")
                 break
+        if checkpoint is not None:
+            save(checkpoint, kept())
     except _Stop as stop:
         if not answered:
             raise ValueError(f"validate: {stop}") from stop.__cause__
         incidents.append(str(stop))
+    except Exception as error:
+        if not answered:
+            raise
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        incidents.append(f"{type(error).__name__}: {error} ({os.path.basename(frame.filename)}:{frame.lineno})")
     except KeyboardInterrupt:
         if not answered:
             raise
         incidents.append("interrupted")
     finally:
         bar.close()
-    if checkpoint is not None:
-        save(checkpoint, kept())
     if incidents:
         warnings.warn(f"validate: ended after {len(answered)} of {budget} calls: {incidents[0]}", RuntimeWarning, stacklevel=3)
     return _result(kept(), data, tuple(incidents))
@@ -169,7 +186,8 @@ def _answers(predict, data, batch):
     except Exception as error:
         raise _Stop(f"predict must return labels [{len(batch)}], received {type(given).__name__}, on {where}") from error
     if said.shape != batch.shape or said.dtype.kind not in "iub":
-        raise _Stop(f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape {said.shape}, on {where}")
+        hint = "; give the argmax of scores" if said.dtype.kind == "f" and said.ndim > 1 else "; give them as integers" if said.dtype.kind == "f" else ""
+        raise _Stop(f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape {said.shape}{hint}, on {where}")
     out = np.flatnonzero((said < 0) | (said >= data.classes))
     if len(out):
         raise _Stop(
@@ -188,10 +206,9 @@ def _row(history, step, seen):
     """``history`` and one more iteration."""
     failed, tried = seen.failed, seen.tried
     scores = np.asarray(step.scores, np.float32)
-    if scores.shape != tried.shape or not np.isfinite(scores).all():
-        raise ValueError(
-            f"validate: the selector's scores must be finite [{len(tried)}], received shape {scores.shape}, {np.sum(~np.isfinite(scores))} not finite"
-        )
+    if scores.shape != tried.shape or not np.all((scores >= 0) & (scores <= 1)):
+        bad = "" if scores.shape != tried.shape else f", {np.sum(~((scores >= 0) & (scores <= 1)))} elsewhere"
+        raise ValueError(f"validate: the selector's scores must be [{len(tried)}] in [0, 1], received shape {scores.shape}{bad}")
     ran = np.asarray(step.candidates, int)
     ran = ran[tried[ran]]
     found, total = int(failed.sum()), failed.sum() + step.expected
@@ -208,9 +225,9 @@ def _result(state, data, incidents):
     scores = h.scores[-1] if len(h.scores) else np.full(data.size, 0.5, np.float32)
     ranked = left[np.argsort(-scores[left], kind="stable")]
     failures = state.order[seen.failed[state.order]]
-    return Result(
-        failures, len(state.order), state.order, state.predicted, scores, ranked, float(h.expected[-1]) if len(h.expected) else np.nan, h, incidents, state
-    )
+    # of the last iteration, unless more has been answered since
+    expected = float(h.expected[-1]) if len(h.expected) and state.complete == len(state.order) else np.nan
+    return Result(failures, len(state.order), state.order, state.predicted, scores, ranked, expected, h, incidents, state)
 
 
 def _bar(progress, budget, at):

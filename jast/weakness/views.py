@@ -14,7 +14,8 @@ class Views(NamedTuple):
     """Of n inputs, float32."""
 
     scaled: Any
-    """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks within each column, from -0.7 to 0.7"""
+    """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks within each column, from -0.7 to 0.7; components
+    of wide inputs: by their largest"""
     centred: Any
     """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
 
@@ -24,7 +25,7 @@ def views(data, reduced):
     if reduced.shape[1]:
         return Views(reduced / np.float32(max(np.abs(reduced).max(), 1e-6)), reduced * np.float32(0.4 / max(reduced.std(), 1e-6)))
     x = scaled(data)
-    return Views(x if data.image else _ranks(x), centred(x, data.image))
+    return Views(x if data.image else _ranks(data.inputs), centred(x, data.image))
 
 
 def reduce(rng, data):
@@ -35,16 +36,20 @@ def reduce(rng, data):
 
 
 def scaled(data):
-    """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all images, or of each column of a table."""
-    x = data.inputs.reshape(data.size, -1).astype(np.float32 if data.image else np.float64)  # the small differences of a column may lie on a large mean
-    over = None if data.image else 0
+    """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all images, or of each column of a table, where what lies
+    further out than a column's first and last hundredth, by more than these are apart, is brought in."""
+    wide = data.inputs.dtype.itemsize > 4 or not data.image  # small differences may lie on a large mean
+    x, over = data.inputs.reshape(data.size, -1).astype(np.float64 if wide else np.float32), None if data.image else 0
+    if not data.image:  # a few values far out must not press the others together
+        low, high = np.quantile(x, (0.01, 0.99), axis=0)
+        x = np.where(high > low, np.clip(x, low - (high - low), high + (high - low)), x)
     low, high = x.min(over), x.max(over)
     return ((x - low) / np.where(high > low, high - low, 1)).astype(np.float32)
 
 
 def _ranks(x):
     """[n, d]: a table's numbers by their place in their column, equal ones by their middle."""
-    out = np.zeros_like(x)
+    out = np.zeros(x.shape, np.float32)
     for j, column in enumerate(x.T):
         _, place, count = np.unique(column, return_inverse=True, return_counts=True)
         out[:, j] = 1.4 * ((np.cumsum(count) - count / 2) / len(x) - 0.5)[place]
