@@ -10,13 +10,14 @@ Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distance
 
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
+from jast.plot.failing_inputs import failure_grid, influence
 from jast.plot.ferry import ferry
 from jast.plot.fms import fms
 from jast.plot.general import distances, disturbances, history
 from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.trials import trial_distances, trials
-from jast.plot.weakness import failure_grid, failures_found, influence, roc
+from jast.plot.weakness import failures_found, roc
 
 __all__ = [
     "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "failure_grid",
