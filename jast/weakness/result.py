@@ -21,7 +21,7 @@ class History(NamedTuple):
     auc: Any
     """[R]: area under the ROC curve of the iteration's scores on the inputs run so far, which were chosen (`judge`: on all); NaN where all failed or none"""
     expected: Any
-    """[R]: how many failures the selector expects among the inputs not yet run; rough while few inputs were run at random"""
+    """[R]: how many failures the selector expects among the inputs not yet run: rough, unless all inputs were run at random"""
     scores: Any
     """[R, n] float32: the scores after each iteration"""
 
