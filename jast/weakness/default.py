@@ -33,7 +33,7 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
     probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
     (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
     out; each repetition is five networks for each of two views. The scores are probabilities of failure. ``expected`` is their sum over what was not run,
-    corrected by how the random calls turned out once there are twenty: a rough guide, in the runs measured between a seventh and eight times the truth, as
+    corrected by how the random calls turned out once there are twenty: a rough guide, in the runs measured between a seventh and six times the truth, as
     suspicious inputs teach little about easy ones; random choice expects without bias. In a state, ``memory["difficulty"]`` is the committee's word before
     any call, as log odds.
     """
