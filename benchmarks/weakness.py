@@ -11,7 +11,6 @@ those of the final scores on all inputs, where those that were run are judged by
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 import jax
@@ -23,6 +22,8 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
+from benchmarks.ferry import timed
+from benchmarks.fms import mean
 from jast import plot, weakness
 
 SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
@@ -69,19 +70,10 @@ def digits(quick):
         yield name, images[test], labels[test], model.fit(flat[train], labels[train]).predict(flat[test])
 
 
-def mean(values):
-    values = np.asarray(values, float)
-    return {"mean": float(values.mean()), "se": float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None}
-
-
 def ranked(scores, failed):
     """What a ranking by fixed scores finds."""
-    hits, n = np.cumsum(failed[np.argsort(-scores, kind="stable")]), len(failed)
-    return {
-        "found": [float(hits[int(n * s) - 1] / failed.sum()) for s in SHARES],
-        "auc": weakness.auc(scores, failed),
-        "precision": float(hits[round(CANDIDATES * n) - 1] / round(CANDIDATES * n)),
-    }
+    order, candidates = np.argsort(-scores, kind="stable"), round(CANDIDATES * len(failed))
+    return {"found": found(order, failed), "auc": weakness.auc(scores, failed), "precision": float(failed[order[:candidates]].mean())}
 
 
 def pixels(images, labels):
@@ -92,13 +84,12 @@ def pixels(images, labels):
 
 
 def runs(images, labels, predicted, selector, seeds, budget=None):
-    """[(result, wall seconds, CPU seconds)], one a seed."""
+    """[(result, CPU seconds, wall seconds)], one a seed."""
     out = []
     for seed in range(seeds):
-        system, wall, cpu = Answers(images, predicted), time.perf_counter(), time.process_time()
-        result = weakness.validate(jax.random.key(seed), system, images, labels, budget=budget, selector=selector, classes=int(labels.max()) + 1)
-        out.append((result, time.perf_counter() - wall, time.process_time() - cpu))
-        if system.asked.max() > 1 or system.asked.sum() != result.calls:
+        system, given = Answers(images, predicted), dict(budget=budget, selector=selector, classes=int(labels.max()) + 1)
+        out.append(timed(lambda seed=seed, system=system, given=given: weakness.validate(jax.random.key(seed), system, images, labels, **given)))
+        if system.asked.max() > 1 or system.asked.sum() != out[-1][0].calls:
             raise AssertionError("an input was asked twice, or a call was not counted")
     return out
 
@@ -110,12 +101,12 @@ def over(rows):
 
 def seconds(done):
     first, *rest = done
-    return {"seconds_first": first[1], "seconds": mean([r[1] for r in rest or done]), "cpu_s": mean([r[2] for r in rest or done])}
+    return {"seconds_first": first[2], "seconds": mean([r[2] for r in rest or done]), "cpu_s": mean([r[1] for r in rest or done])}
 
 
-def found(result, failed):
-    """Shares of all failures at the budgets."""
-    hits = np.cumsum(failed[result.order])
+def found(order, failed):
+    """Shares of all failures at the budgets, by the order of the calls."""
+    hits = np.cumsum(failed[order])
     return [float(hits[int(len(failed) * s) - 1] / failed.sum()) for s in SHARES]
 
 
@@ -123,7 +114,7 @@ def adaptive(result, failed):
     """A row of the default selector."""
     judged = weakness.judge(result, failed, top=round(CANDIDATES * len(failed)))
     left = int(failed.sum()) - len(result.failures)
-    return dict(found=found(result, failed), auc=judged.auc[-1], precision=judged.precision[-1], expected=result.expected, left=left)
+    return dict(found=found(result.order, failed), auc=judged.auc[-1], precision=judged.precision[-1], expected=result.expected, left=left)
 
 
 def thesis(result, failed):
@@ -157,7 +148,7 @@ def study(images, labels, predicted, seeds, quick, picture):
         "default": over([adaptive(r, failed) for r, *_ in own]) | seconds(own),
         "difficulty": over([ranked(r.state.memory["difficulty"], failed) for r, *_ in own]),
         "pixels": ranked(pixels(images, labels), failed),
-        "random": over([{"found": found(r, failed)} for r, *_ in chance]),
+        "random": over([{"found": found(r.order, failed)} for r, *_ in chance]),
     }
     for name, row in rows.items():
         print(line(name, row), flush=True)

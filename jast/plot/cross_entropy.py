@@ -1,7 +1,5 @@
 """Runs of `jast.cross_entropy`: how the proposal moves over the objective, where its surrogate looked, and how fast several runs converge."""
 
-from operator import index
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,6 @@ __all__ = ["convergence", "proposal_contours", "surrogate_samples"]
 GRID, LEVELS = 121, 12  # points of a side, shades of the objective
 EDGE, DEVIATIONS = dict(markeredgecolor=style.INK, markeredgewidth=0.7), {1: "-", 2: (0, (4, 2))}
 SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
-MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def proposal_contours(result, objective, axes=None, iterations=None, bounds=None, elites=5):
@@ -37,7 +34,7 @@ def proposal_contours(result, objective, axes=None, iterations=None, bounds=None
         raise ValueError(f"plot.{caller}: elites must be an int of at least 1, received {elites!r}")
     run = len(_sizes(log))
     chosen = np.unique(np.geomspace(1, run, min(4, run)).round().astype(int)) if iterations is None else np.atleast_1d(np.asarray(iterations, object))
-    chosen = [_iteration(caller, "iterations", k, log) for k in chosen]
+    chosen = [style.iteration(caller, "iterations", k, run) for k in chosen]
     if not chosen:
         raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
     boxes = _boxes(caller, bounds, [np.concatenate([log.x[log.iteration == k - 1], _best(log, k, elites)]) for k in chosen])
@@ -76,7 +73,7 @@ def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
     """
     caller = "surrogate_samples"
     log = _log(caller, result)
-    k = _iteration(caller, "iteration", iteration, log)
+    k = style.iteration(caller, "iteration", iteration, len(_sizes(log)))
     judged = np.asarray(result.history.model_x, float)[k - 1]
     judged = judged[np.isfinite(judged).all(1)]
     if not len(judged):
@@ -127,7 +124,8 @@ def convergence(results, optimum=None, axes=None):
             known = result._replace(history=result.history._replace(best_value=np.where(np.isfinite(value), value, np.nan)))
             score = scores(known, np.zeros(d) if optimum is None else optimum)
             evaluations = np.cumsum(np.bincount(np.asarray(result.history.iteration)[0]))
-            look = dict(color=style.COLOURS[i % len(style.COLOURS)], marker=MARKERS[i % len(MARKERS)], markersize=4.5, label=name or f"mean of {runs} runs")
+            colour, marker = style.COLOURS[i % len(style.COLOURS)], style.MARKERS[i % len(style.MARKERS)]
+            look = dict(color=colour, marker=marker, markersize=4.5, label=name or f"mean of {runs} runs")
             quantities = [(score.best_value, score.standard_error)]
             if optimum is not None:
                 distance = np.linalg.norm(np.asarray(result.history.best_x, float) - np.asarray(optimum, float), axis=2)
@@ -174,18 +172,6 @@ def _log(caller, result):
 
 def _sizes(log):
     return np.bincount(log.iteration)
-
-
-def _iteration(caller, name, k, log):
-    """``k`` as an int, or a ValueError where that iteration was not run."""
-    run = len(_sizes(log))
-    try:
-        number = index(k)
-    except TypeError:
-        number = 0
-    if isinstance(k, bool) or not 1 <= number <= run:
-        raise ValueError(f"plot.{caller}: {name} must be in 1 .. {run}, received {k!r}")
-    return number
 
 
 def _best(log, k, count):

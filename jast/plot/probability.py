@@ -10,8 +10,6 @@ from jast.plot import style
 
 __all__ = ["failure_fan", "probability", "weights"]
 
-MARKERS = ("o", "s", "^", "D", "v", "P")
-
 
 def probability(estimates, truth=None, ax=None):
     """Failure probabilities with their intervals on a logarithmic axis, a row each; an UNRELIABLE one is a dashed line and a cross, and named so.
@@ -107,7 +105,7 @@ def weights(traces, ax=None):
             colour, words = style.COLOURS[i % len(style.COLOURS)], f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else "")
             m = min(int(np.ceil(min(n / 5, 3 * np.sqrt(n)))), len(w) - 1)  # the tail that pareto_k looks at
             few = np.unique(np.geomspace(1, min(4 * m, len(w)), 200).astype(int)) - 1  # evenly along the axis
-            look = dict(linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4)
+            look = dict(linestyle="", marker=style.MARKERS[i % len(style.MARKERS)], markersize=4)
             ax.plot(w[few], share[few], color=colour, label=f"{name}: {words}" if name else words, zorder=3, **look)
             if np.isfinite(k) and w[0] > w[m]:
                 x = np.geomspace(w[m], w[0], 100)

@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from io import BytesIO
+from operator import index
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,13 @@ import numpy as np
 from jast.episode import Episode
 
 __all__ = [
-    "BLUE", "COLOURS", "GREEN", "GREY", "INK", "ORANGE", "PURPLE", "SKY", "STYLE", "VERMILION", "WRITERS",
-    "axes", "frugal", "halo", "headline", "one", "panels", "shade", "styled", "writable",
+    "BLUE", "COLOURS", "GREEN", "GREY", "INK", "MARKERS", "ORANGE", "PURPLE", "SKY", "STYLE", "VERMILION", "WRITERS",
+    "axes", "frugal", "halo", "headline", "iteration", "one", "panels", "shade", "styled", "writable",
 ]  # fmt: skip
 
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, GREY = "#222222", "#8A8A8A"
+MARKERS = ("o", "s", "^", "D", "v", "P")
 STYLE = {
     "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left", "axes.titlepad": 10, "axes.labelcolor": INK, "text.color": INK, "axes.edgecolor": GREY,
     "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#E6E6E6", "grid.linewidth": 0.8,
@@ -65,6 +67,17 @@ def one(caller, episode):
         received = type(episode).__name__ + (f" with leading axes {np.shape(episode.length)}" if isinstance(episode, Episode) else "")
         raise ValueError(f"plot.{caller}: episode must be one Episode, received {received}")
     return episode
+
+
+def iteration(caller, name, k, run):
+    """``k``, the argument ``name``, as an int, or a ValueError where that iteration of ``run`` was not run."""
+    try:
+        number = index(k)
+    except TypeError:
+        number = 0
+    if isinstance(k, bool) or not 1 <= number <= run:
+        raise ValueError(f"plot.{caller}: {name} must be in 1 .. {run}, received {k!r}")
+    return number
 
 
 def panels(caller, axes, least, each):

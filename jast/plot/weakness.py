@@ -1,7 +1,5 @@
 """Pictures of `jast.weakness`: failures found against calls, and how well the scores tell them."""
 
-from operator import index
-
 import numpy as np
 
 from jast.plot import style
@@ -10,7 +8,6 @@ from jast.weakness.result import Result
 
 __all__ = ["checked_result", "failures_found", "roc"]
 
-MARKERS = ("o", "s", "^", "D", "v", "P")
 LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
 
@@ -70,7 +67,7 @@ def roc(result, failed, iterations=None, ax=None):
     if not made:
         raise ValueError(f"plot.{caller}: result must have iterations, received none")
     chosen = np.unique(np.linspace(1, made, min(4, made)).round().astype(int)) if iterations is None else np.atleast_1d(np.asarray(iterations, object))
-    chosen = [_iteration(caller, k, made) for k in chosen]
+    chosen = [style.iteration(caller, "iterations", k, made) for k in chosen]
     if not chosen:
         raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
     with style.axes(ax, (4.9, 4.7)) as ax:
@@ -84,7 +81,7 @@ def roc(result, failed, iterations=None, ax=None):
         for k in chosen:
             late = (k - min(chosen)) / (max(chosen) - min(chosen)) if max(chosen) > min(chosen) else 0.5
             curve = measures.roc(result.history.scores[k - 1], truth)
-            areas.append(float(np.trapezoid(curve.true_positive, curve.false_positive)))
+            areas.append(curve.area)
             label = f"iteration {k}:  AUC {'-' if np.isnan(areas[-1]) else f'{areas[-1]:.3f}'}"
             ax.plot(curve.false_positive, curve.true_positive, color=shades(late), linewidth=1.2 + 1.2 * late, label=label, zorder=3 + late)
         if truth.all() or not truth.any():
@@ -129,17 +126,6 @@ def _truth(caller, failed, n):
     return truth
 
 
-def _iteration(caller, k, made):
-    """``k`` as an int, or a ValueError where that iteration was not made."""
-    try:
-        number = index(k)
-    except TypeError:
-        number = 0
-    if isinstance(k, bool) or not 1 <= number <= made:
-        raise ValueError(f"plot.{caller}: iterations must be in 1 .. {made}, received {k!r}")
-    return number
-
-
 def _hits(result):
     """[calls] bool: which calls found a failure."""
     return np.isin(result.order, result.failures)
@@ -147,7 +133,7 @@ def _hits(result):
 
 def _found(ax, name, row, i, marked, total):
     """The curve of one result or the mean of several, and its label: ((height at its end, mean height), text, look)."""
-    look = dict(color=style.COLOURS[i % len(style.COLOURS)]) | (dict(marker=MARKERS[i % len(MARKERS)]) if marked else {})
+    look = dict(color=style.COLOURS[i % len(style.COLOURS)]) | (dict(marker=style.MARKERS[i % len(style.MARKERS)]) if marked else {})
     common = min(map(len, row))
     counts = np.stack([count[:common] for count in row])
     mean, last = counts.mean(0), counts[:, -1].mean()

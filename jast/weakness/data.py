@@ -11,7 +11,7 @@ import numpy as np
 
 from jast._checks import whole
 
-__all__ = ["Data", "arrays", "digits", "fingerprint", "from_idx", "idx"]
+__all__ = ["Data", "arrays", "digits", "fingerprint", "from_idx", "idx", "within"]
 
 TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}  # of IDX files, which are big-endian
 
@@ -62,6 +62,11 @@ def arrays(function, inputs, labels, classes=None):
     if len(bad):
         raise ValueError(f"{function}: labels must lie in 0 ... {classes - 1}; {len(bad)} do not, the first is number {bad[0]}: {labels[bad[0]]}")
     return Data(inputs, labels.astype(np.int32), classes)
+
+
+def within(at, n):
+    """Whether all of the array ``at`` are numbers of inputs, 0 ... ``n`` - 1."""
+    return not at.size or bool(at.dtype.kind in "iu" and at.min() >= 0 and at.max() < n)
 
 
 def fingerprint(data):

@@ -4,7 +4,7 @@ import numpy as np
 
 from jast.counter import generator
 from jast.weakness import committee
-from jast.weakness.data import arrays, fingerprint
+from jast.weakness.data import arrays, fingerprint, within
 from jast.weakness.default import PASSES, STRENGTH
 from jast.weakness.result import Result
 from jast.weakness.views import centred, scaled
@@ -31,7 +31,7 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
     if fingerprint(data) != result.state.data:
         raise ValueError("influence: inputs and labels are not those of the result")
     at = np.asarray(result.failures if at is None else at)
-    if at.ndim != 1 or (at.size and at.dtype.kind not in "iu") or (at.size and (at.min() < 0 or at.max() >= data.size)):
+    if at.ndim != 1 or not within(at, data.size):
         raise ValueError(f"influence: at must be indices [k] in 0 ... {data.size - 1}, received {at!r}")
     at = at.astype(int)
     tried = result.predicted >= 0

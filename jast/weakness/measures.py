@@ -20,6 +20,11 @@ class Roc(NamedTuple):
     threshold: Any
     """[m]: falling, from infinity"""
 
+    @property
+    def area(self):
+        """Under the curve; NaN where all inputs fail or none."""
+        return float(np.trapezoid(self.true_positive, self.false_positive))
+
 
 class Judgement(NamedTuple):
     """How good the scores of each iteration are on the whole data set; R iterations."""
@@ -49,8 +54,7 @@ def roc(scores, failed):
 
 def auc(scores, failed):
     """Area under the ROC curve: the chance that a failure has the higher score of a random pair, equal ones count half. NaN where all inputs fail or none."""
-    curve = roc(scores, failed)
-    return float(np.trapezoid(curve.true_positive, curve.false_positive))
+    return roc(scores, failed).area
 
 
 def judge(result, failed, *, threshold=0.5, top=None):

@@ -83,12 +83,12 @@ def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory
 def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
     """The adversary after training on those of ``lesson`` that were answered: a budget may end in the midst of it."""
     answered, failed = seen.tried[lesson], seen.failed[lesson]
-    number = np.repeat(np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered)
-    if len(number) == 0:
+    rows = np.repeat(np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered)
+    if len(rows) == 0:
         return params
     room = np.zeros(len(lesson) * (1 + copies), np.int32)  # of one size, whatever failed: one program for all iterations
-    room[: len(number)] = number
-    return networks.fit_adversary(key, params, codes[lesson], failed.astype(np.float32), room, len(number), epochs=epochs, rate=rate)[0]
+    room[: len(rows)] = rows
+    return networks.fit_adversary(key, params, codes[lesson], failed.astype(np.float32), room, len(rows), epochs=epochs, rate=rate)[0]
 
 
 def _flat(params):

@@ -11,7 +11,7 @@ import numpy as np
 from jast._checks import whole
 from jast.counter import generator
 from jast.weakness.contract import Seen, Selector
-from jast.weakness.data import arrays, fingerprint
+from jast.weakness.data import arrays, fingerprint, within
 from jast.weakness.measures import auc
 from jast.weakness.result import History, Result, State
 from jast.weakness.storage import load, save
@@ -38,9 +38,9 @@ def validate(key, predict, inputs, labels, *, budget=None, selector="default", c
     on encodings of Moss's thesis, chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
 
     ``state``: of an earlier result of the same data and selector, to go on from there: after an interruption as if there had been none, after a budget that
-    was spent with new batches. ``checkpoint``: a file to which the
-    state is written after every call of ``predict``, and from which an existing one goes on. ``progress=True`` shows a bar of calls;
-    ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
+    was spent with new batches. ``checkpoint``: a file to which the state is written after every call of ``predict``, and from which an existing one goes on.
+    ``progress=True`` shows a bar of calls; ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with
+    its own.
 
     Where ``predict`` raises, or answers with something else than m labels in range, or at a KeyboardInterrupt, the search ends, with a RuntimeWarning, and
     the result so far says so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked again by a run that goes on. So
@@ -120,7 +120,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     def ask(indices):
         nonlocal current
         indices = np.asarray(indices)
-        if indices.size and (indices.ndim != 1 or indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= data.size):
+        if indices.size and indices.ndim != 1 or not within(indices, data.size):
             raise ValueError(f"validate: the selector {selector.name} must ask for indices [m] in 0 ... {data.size - 1}, received {indices!r}")
         new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
         fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
