@@ -1,7 +1,10 @@
-"""What a black box costs beside its own time, and what workers gain: ``python -m benchmarks.blackbox [--json] [--quick]``.
+"""What a black box costs beside its own time, and what workers gain: ``python -m
+benchmarks.blackbox [--json] [--quick]``.
 
-``overhead``: milliseconds of wall time an evaluation of a function that does nothing, in a compiled loop of batches. ``speedup``: wall time with one worker to
-that with two, for a system that waits for 5 ms and one that computes for as long, in batches of 64; repetitions of the two alternate. Medians, with quartiles.
+``overhead``: milliseconds of wall time an evaluation of a function that does nothing, in a compiled
+loop of batches. ``speedup``: wall time with one worker to that with two, for a system that waits
+for 5 ms and one that computes for as long, in batches of 64; repetitions of the two alternate.
+Medians, with quartiles.
 """
 
 import argparse
@@ -42,7 +45,9 @@ def computes(disturbances):
 
 
 def box(system, workers):
-    return blackbox.from_python(system, horizon=HORIZON, disturbance=Normal(0.0, 1.0), workers=workers)
+    return blackbox.from_python(
+        system, horizon=HORIZON, disturbance=Normal(0.0, 1.0), workers=workers
+    )
 
 
 def loop(sim, lanes):
@@ -53,9 +58,16 @@ def loop(sim, lanes):
 
     @jax.jit
     def run(rows, calls):
-        return lax.fori_loop(0, calls, lambda i, total: total + jax.vmap(one)(rows + total[None, None] + 1).sum() / lanes, jnp.zeros(()))
+        return lax.fori_loop(
+            0,
+            calls,
+            lambda i, total: total + jax.vmap(one)(rows + total[None, None] + 1).sum() / lanes,
+            jnp.zeros(()),
+        )
 
-    return lambda seed, calls: float(run(jax.random.normal(jax.random.key(seed), (lanes, HORIZON)), calls))
+    return lambda seed, calls: float(
+        run(jax.random.normal(jax.random.key(seed), (lanes, HORIZON)), calls)
+    )
 
 
 def wall(function, *args):
@@ -76,7 +88,9 @@ def overhead(repeats):
         for lanes, calls in ((1, 200), (64, 50), (1024, 5)):
             run = loop(sim, lanes)
             run(0, 1)
-            out[f"{workers} workers, batch {lanes}"] = middle([wall(run, i + 1, calls) / (calls * lanes) * 1e3 for i in range(repeats)])
+            out[f"{workers} workers, batch {lanes}"] = middle(
+                [wall(run, i + 1, calls) / (calls * lanes) * 1e3 for i in range(repeats)]
+            )
     return out
 
 
@@ -86,17 +100,28 @@ def speedup(repeats, lanes=64):
         runs = [loop(box(system, workers), lanes) for workers in (1, 2)]
         for run in runs:
             run(0, 2)  # the workers start, and the pool learns how long a run takes
-        one, two = zip(*([wall(run, i + 1, 4) / (4 * lanes) * 1e3 for run in runs] for i in range(repeats)))
-        out[system.__name__] = {"ms_one_worker": middle(one), "ms_two_workers": middle(two), "ratio": middle([a / b for a, b in zip(one, two)])}
+        one, two = zip(
+            *([wall(run, i + 1, 4) / (4 * lanes) * 1e3 for run in runs] for i in range(repeats))
+        )
+        out[system.__name__] = {
+            "ms_one_worker": middle(one),
+            "ms_two_workers": middle(two),
+            "ratio": middle([a / b for a, b in zip(one, two)]),
+        }
     return out
 
 
 def bare(repeats):
     """Of 2 n pieces of computing in one process, to n in each of two."""
-    code = f"import time\nfor _ in range(100):\n end = time.perf_counter() + {SECONDS}\n while time.perf_counter() < end: pass"
+    code = (
+        f"import time\nfor _ in range(100):\n end = time.perf_counter() + {SECONDS}\n while"
+        " time.perf_counter() < end: pass"
+    )
 
     def together(count):
-        processes = [subprocess.Popen([sys.executable, "-S", "-E", "-c", code]) for _ in range(count)]
+        processes = [
+            subprocess.Popen([sys.executable, "-S", "-E", "-c", code]) for _ in range(count)
+        ]
         for process in processes:
             process.wait()
 
@@ -104,13 +129,21 @@ def bare(repeats):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.blackbox", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.blackbox", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
     args = parser.parse_args(argv)
     repeats = 3 if args.quick else 15
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    report = {"processors": processors, "overhead_ms": overhead(repeats), "speedup": speedup(repeats) | {"bare": bare(repeats)}}
+    processors = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    )
+    report = {
+        "processors": processors,
+        "overhead_ms": overhead(repeats),
+        "speedup": speedup(repeats) | {"bare": bare(repeats)},
+    }
     if args.json:
         print(json.dumps(report, indent=1))
         return

@@ -1,7 +1,9 @@
-"""Cross-entropy methods over a simulator's disturbances, and their proposals for rare events: ``python -m benchmarks.bridge [--json] [--quick]``.
+"""Cross-entropy methods over a simulator's disturbances, and their proposals for rare events:
+``python -m benchmarks.bridge [--json] [--quick]``.
 
-First, how many runs of 1000 episodes find a collision on the ferry, with quantiles for actions. Then the failure probability that `failure_proposal` leads to:
-by importance sampling with 10,000 new episodes, over the truth, where one is known; each of several seeds with a proposal of its own.
+First, how many runs of 1000 episodes find a collision on the ferry, with quantiles for actions.
+Then the failure probability that `failure_proposal` leads to: by importance sampling with 10,000
+new episodes, over the truth, where one is known; each of several seeds with a proposal of its own.
 """
 
 import argparse
@@ -26,11 +28,21 @@ def found(runs):
     sim, actions = jast.simulators.ferry(), jast.actions.quantiles()
     stress = ce.over(sim, actions=actions)
     searches = {
-        "random search": lambda key: jast.search.monte_carlo(key, sim, episodes=1000, reward=REWARD, actions=actions).failing[0],
-        "search.cem": lambda key: jast.search.cem(key, sim, samples=100, elites=10, iterations=10, reward=REWARD, actions=actions).failing[0],
+        "random search": (
+            lambda key: jast.search.monte_carlo(
+                key, sim, episodes=1000, reward=REWARD, actions=actions
+            ).failing[0]
+        ),
+        "search.cem": (
+            lambda key: jast.search.cem(
+                key, sim, samples=100, elites=10, iterations=10, reward=REWARD, actions=actions
+            ).failing[0]
+        ),
     }
     for name in ("ce_method", "ce_surrogate", "ce_mixture"):
-        searches[name] = lambda key, name=name: getattr(ce, name)(key, stress.objective, stress.proposal, **SIZE).best_value < 0
+        searches[name] = lambda key, name=name: (
+            getattr(ce, name)(key, stress.objective, stress.proposal, **SIZE).best_value < 0
+        )
     out = {}
     for name, search in searches.items():
         n = int(sum(bool(search(key)) for key in jax.random.split(jax.random.key(0), runs)))
@@ -43,8 +55,14 @@ def _hyperplane(beta, x):
 
 
 SYSTEMS = {  # name -> simulator, truth
-    "hyperplane, beta 4, d = 10": (lambda: jast.simulators.limit_state(Partial(_hyperplane, jnp.float32(4)), 10), 3.167124183311992e-5),
-    "hyperplane, beta 6, d = 20": (lambda: jast.simulators.limit_state(Partial(_hyperplane, jnp.float32(6)), 20), 9.865876450376946e-10),
+    "hyperplane, beta 4, d = 10": (
+        lambda: jast.simulators.limit_state(Partial(_hyperplane, jnp.float32(4)), 10),
+        3.167124183311992e-5,
+    ),
+    "hyperplane, beta 6, d = 20": (
+        lambda: jast.simulators.limit_state(Partial(_hyperplane, jnp.float32(6)), 20),
+        9.865876450376946e-10,
+    ),
     "walk1d, one-sided": (lambda: jast.simulators.walk1d("one-sided"), 9.578759495e-4),
     "walk1d, two-sided": (lambda: jast.simulators.walk1d(), 0.1087363323),
     "landing (two modes)": (lambda: jast.simulators.landing(), 4.0236721906842e-13),
@@ -60,24 +78,43 @@ def proposals(name, seeds):
         r = importance(jax.random.key(1000 + seed), sim, proposal.policy, FRESH)
         rows.append((r.mean / truth, r.relative_error, bool(proposal.reached)))
     ratio, error, reached = map(list, zip(*rows, strict=True))
-    return {"truth": truth, "ratio": ratio, "relative_error": error, "reached": reached, "crude": float(np.sqrt((1 - truth) / truth / (FRESH + 20_000)))}
+    return {
+        "truth": truth,
+        "ratio": ratio,
+        "relative_error": error,
+        "reached": reached,
+        "crude": float(np.sqrt((1 - truth) / truth / (FRESH + 20_000))),
+    }
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bridge", description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.bridge", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the report as JSON, and nothing else"
+    )
     parser.add_argument("--quick", action="store_true", help="under two minutes: fewer runs")
     args = parser.parse_args(argv)
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
     report = {"found": found(5 if args.quick else 20), "proposals": {}}
     say("runs of 1000 episodes that find a collision on the ferry")
     for name, r in report["found"].items():
-        say(f"  {name:14} {r['failing']:3d} of {r['runs']}   95 % [{100 * r['share_95'][0]:.0f}, {100 * r['share_95'][1]:.0f}]")
-    say("importance sampling under failure_proposal: estimate / truth by seed; relative standard error, and that of crude Monte Carlo with all 30,000 episodes")
+        say(
+            f"  {name:14} {r['failing']:3d} of {r['runs']}   95 % [{100 * r['share_95'][0]:.0f},"
+            f" {100 * r['share_95'][1]:.0f}]"
+        )
+    say(
+        "importance sampling under failure_proposal: estimate / truth by seed; relative standard"
+        " error, and that of crude Monte Carlo with all 30,000 episodes"
+    )
     for name in SYSTEMS:
         report["proposals"][name] = r = proposals(name, 3 if args.quick else 10)
         ratios = " ".join(f"{v:.3f}" for v in r["ratio"])
-        say(f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to {100 * max(r['relative_error']):.1f} %   (crude {100 * r['crude']:.3g} %)")
+        say(
+            f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to"
+            f" {100 * max(r['relative_error']):.1f} %   (crude {100 * r['crude']:.3g} %)"
+        )
     if args.json:
         print(json.dumps(report))
 

@@ -1,6 +1,7 @@
 """Objectives to minimise, where a search of each starts, and its budget.
 
-They are written once for two array libraries: in NumPy, where they share no code with jast, or with ``np=jax.numpy``. Each takes ``x [..., d]``.
+They are written once for two array libraries: in NumPy, where they share no code with jast, or with
+``np=jax.numpy``. Each takes ``x [..., d]``.
 """
 
 from collections.abc import Callable
@@ -33,14 +34,25 @@ def sierra(x, np=np):
 
 
 def branin(x, np=np):
-    """0.397887 wherever x[0] is pi plus a multiple of 2 pi and x[1] on the parabola: no single minimiser on the whole plane."""
+    """0.397887 wherever x[0] is pi plus a multiple of 2 pi and x[1] on the parabola: no single
+    minimiser on the whole plane.
+    """
     u, v = x[..., 0], x[..., 1]
-    return (v - 5.1 / (4 * np.pi**2) * u**2 + 5 / np.pi * u - 6) ** 2 + 10 * (1 - 1 / (8 * np.pi)) * np.cos(u) + 10
+    return (
+        (v - 5.1 / (4 * np.pi**2) * u**2 + 5 / np.pi * u - 6) ** 2
+        + 10 * (1 - 1 / (8 * np.pi)) * np.cos(u)
+        + 10
+    )
 
 
 def ackley(x, np=np):
     """0 at 0."""
-    return 20 - 20 * np.exp(-0.2 * np.sqrt(np.mean(x**2, -1))) + np.e - np.exp(np.mean(np.cos(2 * np.pi * x), -1))
+    return (
+        20
+        - 20 * np.exp(-0.2 * np.sqrt(np.mean(x**2, -1)))
+        + np.e
+        - np.exp(np.mean(np.cos(2 * np.pi * x), -1))
+    )
 
 
 def paraboloid(x, np=np):
@@ -59,15 +71,29 @@ def rosenbrock(x, np=np):
 
 
 _HEIGHTS = np.array([1.0, 1.2, 3.0, 3.2])
-_RATES = np.array([[10, 3, 17, 3.5, 1.7, 8], [0.05, 10, 17, 0.1, 8, 14], [3, 3.5, 1.7, 10, 17, 8], [17, 8, 0.05, 10, 0.1, 14]])
+_RATES = np.array(
+    [
+        [10, 3, 17, 3.5, 1.7, 8],
+        [0.05, 10, 17, 0.1, 8, 14],
+        [3, 3.5, 1.7, 10, 17, 8],
+        [17, 8, 0.05, 10, 0.1, 14],
+    ]
+)
 _PEAKS = 1e-4 * np.array(
-    [[1312, 1696, 5569, 124, 8283, 5886], [2329, 4135, 8307, 3736, 1004, 9991], [2348, 1451, 3522, 2883, 3047, 6650], [4047, 8828, 8732, 5743, 1091, 381]]
+    [
+        [1312, 1696, 5569, 124, 8283, 5886],
+        [2329, 4135, 8307, 3736, 1004, 9991],
+        [2348, 1451, 3522, 2883, 3047, 6650],
+        [4047, 8828, 8732, 5743, 1091, 381],
+    ]
 )
 _HARTMANN6 = np.array([0.20168952, 0.15001069, 0.47687398, 0.27533243, 0.31165162, 0.65730053])
 
 
 def hartmann6(x, np=np):
-    """-3.322368 in the unit cube; all its stationary points lie in the hull of the four peaks, so the minimum holds without bounds."""
+    """-3.322368 in the unit cube; all its stationary points lie in the hull of the four peaks, so
+    the minimum holds without bounds.
+    """
     return -np.exp(-np.sum(_RATES * (x[..., None, :] - _PEAKS) ** 2, -1)) @ _HEIGHTS
 
 
@@ -76,7 +102,9 @@ def levy(x, np=np):
     w = 1 + (x - 1) / 4
     head, body, last = w[..., 0], w[..., :-1], w[..., -1]
     middle = np.sum((body - 1) ** 2 * (1 + 10 * np.sin(np.pi * body + 1) ** 2), -1)
-    return np.sin(np.pi * head) ** 2 + middle + (last - 1) ** 2 * (1 + np.sin(2 * np.pi * last) ** 2)
+    return (
+        np.sin(np.pi * head) ** 2 + middle + (last - 1) ** 2 * (1 + np.sin(2 * np.pi * last) ** 2)
+    )
 
 
 def _axes(d):
@@ -91,7 +119,9 @@ def ellipsoid(x, np=np, condition=1e4):
 
 
 class Case(NamedTuple):
-    """An objective, where the search starts, what is known of the minimum, and the budget (samples a round, rounds)."""
+    """An objective, where the search starts, what is known of the minimum, and the budget (samples
+    a round, rounds).
+    """
 
     objective: Callable
     dimension: int
@@ -103,7 +133,9 @@ class Case(NamedTuple):
 
 
 def _case(objective, d, mean, sd, minimum, minimiser, budgets):
-    fill = lambda value: None if value is None else np.broadcast_to(np.asarray(value, float), (d,)).copy()
+    fill = lambda value: (
+        None if value is None else np.broadcast_to(np.asarray(value, float), (d,)).copy()
+    )
     return Case(objective, d, fill(mean), fill(sd), minimum, fill(minimiser), budgets)
 
 

@@ -1,8 +1,10 @@
-"""The ferry with collision avoidance: how often it fails by itself, what the searches find, and what keeping its states is worth.
+"""The ferry with collision avoidance: how often it fails by itself, what the searches find, and
+what keeping its states is worth.
 
-``python -m benchmarks.colav [--json] [--quick]``. The searches have 22 roots of 50 simulations, as published for S1. Rates have 95 % Clopper-Pearson intervals.
-The CPU time of a search is that of its one call, compilation included. Those of memoization are of one core, compilation excluded, the best of alternated
-runs (of one with ``--quick``), in a process whose XLA has one thread.
+``python -m benchmarks.colav [--json] [--quick]``. The searches have 22 roots of 50 simulations, as
+published for S1. Rates have 95 % Clopper-Pearson intervals. The CPU time of a search is that of its
+one call, compilation included. Those of memoization are of one core, compilation excluded, the best
+of alternated runs (of one with ``--quick``), in a process whose XLA has one thread.
 """
 
 import argparse
@@ -27,7 +29,9 @@ SUBSTEPS = (1, 3, 10, 30, 100, 300)
 
 
 def published(log_p, event, distance, terminal, approach):
-    """The reward of S1: ten times the log densities, and 200 for a collision or less 50 times the miss distance."""
+    """The reward of S1: ten times the log densities, and 200 for a collision or less 50 times the
+    miss distance.
+    """
     return 10 * log_p + jnp.where(terminal, jnp.where(event, 200.0, -50 * distance), 0)
 
 
@@ -52,99 +56,190 @@ def nominal(scenario, kind, episodes):
 def share(failing):
     """How many of several runs found a collision."""
     found, n = int(np.sum(failing)), len(failing)
-    return {"runs": n, "failing": found, "share": found / n, "share_95": list(clopper_pearson(found, n))}
+    return {
+        "runs": n,
+        "failing": found,
+        "share": found / n,
+        "share_95": list(clopper_pearson(found, n)),
+    }
 
 
 def search(scenario, kind, trees, heads=None):
     """Trees of the default search that find a collision."""
     sim = colav(scenario, kind)
-    grow = lambda: jast.search.forest(jax.random.key(0), sim, trees=trees, prunes=PRUNES, simulations=SIMULATIONS, reward=REWARD, heads=heads)
+    grow = lambda: jast.search.forest(
+        jax.random.key(0),
+        sim,
+        trees=trees,
+        prunes=PRUNES,
+        simulations=SIMULATIONS,
+        reward=REWARD,
+        heads=heads,
+    )
     result, seconds, _ = timed(grow)
     best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
-    return share(result.failing) | best | {"episodes": result.episodes, "steps": result.simulator_steps, "cpu_s": seconds}
+    return (
+        share(result.failing)
+        | best
+        | {
+            "episodes": result.episodes,
+            "steps": result.simulator_steps,
+            "cpu_s": seconds,
+        }
+    )
 
 
 def random_search(scenario, kind, runs):
     """Random searches of as many episodes as a tree has simulations that find a collision."""
     sim = colav(scenario, kind)
-    one = lambda key: jast.search.monte_carlo(key, sim, episodes=PRUNES * SIMULATIONS, reward=REWARD).failing[0]
-    return share(jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs)))
+    one = lambda key: jast.search.monte_carlo(
+        key, sim, episodes=PRUNES * SIMULATIONS, reward=REWARD
+    ).failing[0]
+    return share(
+        jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
+    )
 
 
 def memoization(substeps, mode, simulations, trees, repeats):
-    """CPU microseconds and simulator steps of a simulation, by where states are kept; and of MCTS-SA, one root, whose simulations all begin at the start."""
+    """CPU microseconds and simulator steps of a simulation, by where states are kept; and of
+    MCTS-SA, one root, whose simulations all begin at the start.
+    """
     total = PRUNES * simulations
     sim, reward = colav("sharp turn", substeps=substeps), published if mode == "paper" else REWARD
-    p, keys = problem(total, mode, sim, reward, jast.actions.samples()), tree_keys(jax.random.key(0), trees)
+    p, keys = (
+        problem(total, mode, sim, reward, jast.actions.samples()),
+        tree_keys(jax.random.key(0), trees),
+    )
     children = int(p.settings.widths.max())
-    runs = {name: functools.partial(whole, p, keys, PRUNES, simulations, children, name) for name in ("node", "root", "none")}
+    runs = {
+        name: functools.partial(whole, p, keys, PRUNES, simulations, children, name)
+        for name in ("node", "root", "none")
+    }
     runs["MCTS-SA"] = functools.partial(whole, p, keys, 1, total, children, "none")
-    steps = {name: float(np.mean(jax.device_get(function().steps))) / total for name, function in runs.items()}
+    steps = {
+        name: float(np.mean(jax.device_get(function().steps))) / total
+        for name, function in runs.items()
+    }
     seconds = {name: float("inf") for name in runs}
     for _ in range(repeats):
         for name, function in runs.items():
             seconds[name] = min(seconds[name], cpu(function)[0])
     us = {name: s / total / trees * 1e6 for name, s in seconds.items()}
-    ratios = {f"{a}/{b}": us[a] / us[b] for a, b in (("node", "none"), ("root", "none"), ("node", "MCTS-SA"), ("root", "MCTS-SA"))}
-    return {"mode": mode, "simulations": simulations, "trees": trees, "substeps": substeps, "us": us, "steps": steps, "ratios": ratios}
+    ratios = {
+        f"{a}/{b}": us[a] / us[b]
+        for a, b in (("node", "none"), ("root", "none"), ("node", "MCTS-SA"), ("root", "MCTS-SA"))
+    }
+    return {
+        "mode": mode,
+        "simulations": simulations,
+        "trees": trees,
+        "substeps": substeps,
+        "us": us,
+        "steps": steps,
+        "ratios": ratios,
+    }
 
 
 def picture(rows, path):
     """Figure 5 of the paper, measured: the CPU time of a simulation by the substeps of a step."""
     from jast.plot import style
 
-    labels = {"MCTS-SA": "MCTS-SA, full simulations", "none": "forest, no states", "root": "states at roots", "node": "states at every node"}
+    labels = {
+        "MCTS-SA": "MCTS-SA, full simulations",
+        "none": "forest, no states",
+        "root": "states at roots",
+        "node": "states at every node",
+    }
     with style.axes(None, (6.8, 4.2)) as ax:
-        for (name, label), colour, marker in zip(labels.items(), style.COLOURS, "osD^", strict=False):
-            ax.loglog([r["substeps"] for r in rows], [r["us"][name] for r in rows], color=colour, marker=marker, label=label)
+        for (name, label), colour, marker in zip(
+            labels.items(), style.COLOURS, "osD^", strict=False
+        ):
+            ax.loglog(
+                [r["substeps"] for r in rows],
+                [r["us"][name] for r in rows],
+                color=colour,
+                marker=marker,
+                label=label,
+            )
         ax.set(xlabel="substeps of a search step", ylabel="CPU time of a simulation (µs)")
         ax.legend(loc="upper left")
         ax.figure.savefig(path, dpi=120)
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.colav", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.colav", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--quick", action="store_true", help="fewer episodes, trees and rows: under two minutes")
-    parser.add_argument("--memoization", action="store_true", help="only what keeping states is worth")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer episodes, trees and rows: under two minutes"
+    )
+    parser.add_argument(
+        "--memoization", action="store_true", help="only what keeping states is worth"
+    )
     parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
     args = parser.parse_args(argv)
     say = (lambda *a: None) if args.json else functools.partial(print, flush=True)
-    percent = lambda r, name: f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
+    percent = lambda r, name: (
+        f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
+    )
     report = {"nominal": {}, "searches": {}, "memoization": []}
 
-    say("nominal: least distance undisturbed, and failures when disturbances are drawn from their densities")
+    say(
+        "nominal: least distance undisturbed, and failures when disturbances are drawn from their"
+        " densities"
+    )
     for scenario in () if args.memoization else SCENARIOS:
         for kind in ("delay", "steering") if args.quick else (*ALL, ALL):
             name = f"{scenario}, {kind if isinstance(kind, str) else 'all three'}"
             r = report["nominal"][name] = nominal(scenario, kind, 20_000 if args.quick else 300_000)
             low, high = r["rate_95"]
-            say(f"  {name:26} {r['undisturbed_distance_m']:6.2f} m   {r['failures']:6d} of {r['episodes']}, {r['rate']:.2e} [{low:.1e}, {high:.1e}]")
+            say(
+                f"  {name:26} {r['undisturbed_distance_m']:6.2f} m   {r['failures']:6d} of"
+                f" {r['episodes']}, {r['rate']:.2e} [{low:.1e}, {high:.1e}]"
+            )
 
-    say(f"\ntrees of {PRUNES} x {SIMULATIONS} that find a collision, and random searches of as many episodes")
+    say(
+        f"\ntrees of {PRUNES} x {SIMULATIONS} that find a collision, and random searches of as many"
+        " episodes"
+    )
     rows = [(s, k) for k in ("delay", "steering") for s in SCENARIOS]
     if args.quick:
         rows = [("sharp turn", "delay"), ("head-on", "steering")]
     for scenario, kind in () if args.memoization else rows:
         trees = 64 if args.quick else 200
-        r = {"random": random_search(scenario, kind, trees), "forest": search(scenario, kind, trees)}
+        r = {
+            "random": random_search(scenario, kind, trees),
+            "forest": search(scenario, kind, trees),
+        }
         if not args.quick:
             r["forest, heads"] = search(scenario, kind, trees, heads="both")
         report["searches"][f"{scenario}, {kind}"] = r
         for name, row in r.items():
-            more = f"best {row['best']:8.2f}, {row['best_distance_m']:.2f} m, {row['cpu_s']:.0f} CPU s" if "best" in row else ""
+            more = (
+                f"best {row['best']:8.2f}, {row['best_distance_m']:.2f} m, {row['cpu_s']:.0f} CPU s"
+                if "best" in row
+                else ""
+            )
             say(f"  {scenario + ', ' + kind:26} {name:14} {percent(row, 'share'):24} {more}")
 
     say("\nCPU time of a simulation (us) and its steps, by where states are kept")
     if args.quick:
         calls = [(30, "paper", 20, 64, 1)]
     else:
-        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [(n, "paper", 20, 64, 2) for n in SUBSTEPS]
+        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [
+            (n, "paper", 20, 64, 2) for n in SUBSTEPS
+        ]
     for call in calls:
         report["memoization"].append(r := alone("memoization", *call, module="colav"))
-        cells = ", ".join(f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"])
+        cells = ", ".join(
+            f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"]
+        )
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in r["ratios"].items())
-        say(f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']}, {r['trees']} trees: {cells}; {ratios}")
+        say(
+            f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']},"
+            f" {r['trees']} trees: {cells}; {ratios}"
+        )
     if args.picture:
         picture(report["memoization"][-len(SUBSTEPS) :], args.picture)
     if args.json:

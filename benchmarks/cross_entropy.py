@@ -1,8 +1,11 @@
-"""The cross-entropy methods on sierra and on other objectives, beside their peers: ``python -m benchmarks.cross_entropy [--json] [--quick] [--seeds N]``.
+"""The cross-entropy methods on sierra and on other objectives, beside their peers: ``python -m
+benchmarks.cross_entropy [--json] [--quick] [--seeds N]``.
 
-All in float64, but for the rows that say so. b_v: mean best value of the runs +- its standard error; d: mean distance to the optimum; F: sqrt(50) times the
-root of its mean square, which the thesis's b_d most likely is; hit: share of the runs that end in the global basin (below -0.0165, as no other minimum is). The
-table of the thesis is R. J. Moss's Table 2.1. Peers (`benchmarks.peers`) have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C.
+All in float64, but for the rows that say so. b_v: mean best value of the runs +- its standard
+error; d: mean distance to the optimum; F: sqrt(50) times the root of its mean square, which the
+thesis's b_d most likely is; hit: share of the runs that end in the global basin (below -0.0165, as
+no other minimum is). The table of the thesis is R. J. Moss's Table 2.1. Peers (`benchmarks.peers`)
+have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C.
 """
 
 import argparse
@@ -30,15 +33,33 @@ TABLE = {  # b_v and b_d of the thesis, Table 2.1
     "ce_surrogate": ((-0.0179, 12.23), (-0.0156, 18.24), (-0.0156, 17.23)),
     "ce_mixture": ((-0.0169, 16.87), (-0.0146, 33.30), (-0.0146, 22.17)),
 }
-SCHEDULES = {"uniform": (-0.0193, 8.53), "Geo(0.1)": (-0.0115, 25.35), "Geo(0.2)": (-0.0099, 27.59), "Geo(0.3)": (-0.0089, 30.88)}
+SCHEDULES = {
+    "uniform": (-0.0193, 8.53),
+    "Geo(0.1)": (-0.0115, 25.35),
+    "Geo(0.2)": (-0.0099, 27.59),
+    "Geo(0.3)": (-0.0089, 30.88),
+}
 BASIN = -0.0165
 
 
 @functools.cache
 def program(method, objective, samples, iterations, settings):
-    """Runs of one method on one objective by keys, mean and covariance: a compiled program for all of them."""
-    search = functools.partial(getattr(ce, method), samples=samples, elites=ELITES[samples], iterations=iterations, **dict(settings))
-    return jax.jit(jax.vmap(lambda key, mean, covariance: search(key, objective, (mean, covariance)), (0, None, None)))
+    """Runs of one method on one objective by keys, mean and covariance: a compiled program for all
+    of them.
+    """
+    search = functools.partial(
+        getattr(ce, method),
+        samples=samples,
+        elites=ELITES[samples],
+        iterations=iterations,
+        **dict(settings),
+    )
+    return jax.jit(
+        jax.vmap(
+            lambda key, mean, covariance: search(key, objective, (mean, covariance)),
+            (0, None, None),
+        )
+    )
 
 
 @functools.cache
@@ -50,7 +71,11 @@ def runs(method, case, seeds, seed=0, dtype=np.float64, **settings):
     """A batch of runs of a case, `CEResult`."""
     c = CASES[case]
     run = program(method, objective(c.objective), *c.budgets, tuple(sorted(settings.items())))
-    return run(jax.random.split(jax.random.key(seed), seeds), c.mean.astype(dtype), np.diag(c.sd.astype(dtype) ** 2))
+    return run(
+        jax.random.split(jax.random.key(seed), seeds),
+        c.mean.astype(dtype),
+        np.diag(c.sd.astype(dtype) ** 2),
+    )
 
 
 def row(values, distances=None, sierra=True):
@@ -62,13 +87,19 @@ def row(values, distances=None, sierra=True):
 def ours(method, case, seeds, **settings):
     c = CASES[case]
     result = runs(method, case, seeds, **settings)
-    far = None if c.minimiser is None else np.linalg.norm(np.asarray(result.best_x) - c.minimiser, axis=-1)
+    far = (
+        None
+        if c.minimiser is None
+        else np.linalg.norm(np.asarray(result.best_x) - c.minimiser, axis=-1)
+    )
     return row(result.best_value, far, case in SIERRA) | {"invalid": int(np.sum(result.invalid))}
 
 
 def theirs(peer, case, seeds):
     found = peers.run(peer, case, range(seeds))
-    return row(found["values"], found["distances"], case in SIERRA) | {"cpu_s": float(found["cpu_s"].mean())}
+    return row(found["values"], found["distances"], case in SIERRA) | {
+        "cpu_s": float(found["cpu_s"].mean())
+    }
 
 
 def compiled_for(run, *arguments):
@@ -83,37 +114,72 @@ def speed(seeds):
         run = program(method, ce.sierra(), 10, 10, ())
         c = {case: (CASES[case].mean, np.diag(CASES[case].sd ** 2)) for case in SIERRA[:2]}
         keys = jax.random.split(jax.random.key(1), seeds)
-        compiled, compile_cpu, compile_wall = timed(functools.partial(compiled_for, run, keys, *c["sierra 1A"]))
-        each = {case: min(cpu(functools.partial(compiled, keys, *start))[0] for _ in range(3)) / seeds for case, start in c.items()}
-        out[method] = {"compile_cpu_s": compile_cpu, "compile_wall_s": compile_wall, "cpu_ms_a_seed": {k: 1e3 * v for k, v in each.items()}, "seeds": seeds}
+        compiled, compile_cpu, compile_wall = timed(
+            functools.partial(compiled_for, run, keys, *c["sierra 1A"])
+        )
+        each = {
+            case: min(cpu(functools.partial(compiled, keys, *start))[0] for _ in range(3)) / seeds
+            for case, start in c.items()
+        }
+        out[method] = {
+            "compile_cpu_s": compile_cpu,
+            "compile_wall_s": compile_wall,
+            "cpu_ms_a_seed": {k: 1e3 * v for k, v in each.items()},
+            "seeds": seeds,
+        }
     return out
 
 
 def schedules(seeds):
-    """Experiment 2: 1B with uneven schedules, in both forms of the normaliser, with and without the ratchet of the elites."""
+    """Experiment 2: 1B with uneven schedules, in both forms of the normaliser, with and without the
+    ratchet of the elites.
+    """
     out = {}
-    uneven = [(f"Geo({p}), {form}", ce.schedules.geometric(p, form)(100, 10)) for form in ("before", "after") for p in (0.1, 0.2, 0.3)]
+    uneven = [
+        (f"Geo({p}), {form}", ce.schedules.geometric(p, form)(100, 10))
+        for form in ("before", "after")
+        for p in (0.1, 0.2, 0.3)
+    ]
     for mode in ("thesis", "default"):
         out[f"uniform, {mode}"] = ours("ce_surrogate", "sierra 1B", seeds, mode=mode)
         for name, counts in uneven:
-            out[f"{name}, {mode}"] = ours("ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts)
+            out[f"{name}, {mode}"] = ours(
+                "ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts
+            )
     for name, counts in uneven[:3]:
-        out[f"{name}, thesis with ratchet"] = ours("ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True)
+        out[f"{name}, thesis with ratchet"] = ours(
+            "ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True
+        )
     return out
 
 
 def say_row(name, r, published=None):
     far = f"   d {r['distance']:6.2f}   F {r['F']:6.1f}" if "F" in r else ""
     note = f"   thesis {published[0]:.4f} / {published[1]:.2f}" if published else ""
-    print(f"  {name:34} {r['best']:.4f} +- {r['best_se']:.4f}{far}   hit {r['hit']:.2f}   ({r['seeds']} seeds){note}", flush=True)
+    print(
+        f"  {name:34} {r['best']:.4f} +- {r['best_se']:.4f}{far}   hit {r['hit']:.2f}  "
+        f" ({r['seeds']} seeds){note}",
+        flush=True,
+    )
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.cross_entropy", description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
-    parser.add_argument("--quick", action="store_true", help="under two minutes: 64 seeds, fewer cases and peers")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.cross_entropy", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the report as JSON, and nothing else"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="under two minutes: 64 seeds, fewer cases and peers"
+    )
     parser.add_argument("--seeds", type=int, help="runs of each row; 256, or 64 with --quick")
-    parser.add_argument("--slow-seeds", type=int, default=24, help="runs of the expected-improvement optimiser, 2 to 5 CPU seconds each")
+    parser.add_argument(
+        "--slow-seeds",
+        type=int,
+        default=24,
+        help="runs of the expected-improvement optimiser, 2 to 5 CPU seconds each",
+    )
     parser.add_argument("--picture", metavar="PATH", help="draw the mean best value by evaluations")
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
@@ -124,7 +190,10 @@ def main(argv=None):
     say("speed: CPU seconds to compile, CPU ms of a run")
     for method, s in report["speed"].items():
         each = s["cpu_ms_a_seed"]
-        say(f"  {method:14} compile {s['compile_cpu_s']:.1f} s, 1A {each['sierra 1A']:.2f} ms, 1B by the same program {each['sierra 1B']:.2f} ms")
+        say(
+            f"  {method:14} compile {s['compile_cpu_s']:.1f} s, 1A {each['sierra 1A']:.2f} ms, 1B"
+            f" by the same program {each['sierra 1B']:.2f} ms"
+        )
 
     for i, case in enumerate(SIERRA):
         say(f"\n{case}")
@@ -132,7 +201,9 @@ def main(argv=None):
             for method in METHODS:
                 if args.quick and (method, mode) == ("ce_mixture", "thesis"):
                     continue
-                report["sierra"][f"{case}, {method}, {mode}"] = r = ours(method, case, seeds, mode=mode)
+                report["sierra"][f"{case}, {method}, {mode}"] = r = ours(
+                    method, case, seeds, mode=mode
+                )
                 show(f"{method}, {mode}", r, TABLE[method][i] if mode == "thesis" else None)
         cheap = ("random_search", "cma_es", "differential_evolution", "direct")
         for peer in (*cheap, *(() if args.quick else ("expected_improvement",))):
@@ -141,16 +212,27 @@ def main(argv=None):
             show(peer, r)
 
     if not args.quick:
-        say("\nsierra in float32, default CE-surrogate: the objective itself, and its log (value -exp(-log))")
+        say(
+            "\nsierra in float32, default CE-surrogate: the objective itself, and its log (value"
+            " -exp(-log))"
+        )
         jax.config.update("jax_enable_x64", False)
         for case in SIERRA[:2]:
-            report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours("ce_surrogate", case, seeds, dtype=np.float32)
+            report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours(
+                "ce_surrogate", case, seeds, dtype=np.float32
+            )
             show(f"{case}, float32", r)
             logged = program("ce_surrogate", ce.sierra(log=True), *CASES[case].budgets, ())
             c = CASES[case]
-            found = logged(jax.random.split(jax.random.key(0), seeds), c.mean.astype(np.float32), np.diag(c.sd.astype(np.float32) ** 2))
+            found = logged(
+                jax.random.split(jax.random.key(0), seeds),
+                c.mean.astype(np.float32),
+                np.diag(c.sd.astype(np.float32) ** 2),
+            )
             x = np.asarray(found.best_x, float)
-            report["sierra"][f"{case}, ce_surrogate, float32, log"] = r = row(c.objective(x), np.linalg.norm(x, axis=-1))
+            report["sierra"][f"{case}, ce_surrogate, float32, log"] = r = row(
+                c.objective(x), np.linalg.norm(x, axis=-1)
+            )
             show(f"{case}, float32, log=True", r)
         jax.config.update("jax_enable_x64", True)
         say("\nexperiment 2: schedules, CE-surrogate from 1B")
@@ -161,11 +243,22 @@ def main(argv=None):
     say("\nother objectives: median best value (mean)")
     others = [case for case in CASES if case not in SIERRA]
     for case in ("branin", "ackley 5", "levy 5") if args.quick else others:
-        rows = {method: ours(method, case, seeds) for method in METHODS if not args.quick or method != "ce_mixture"}
-        rows |= {"ce_surrogate, thesis": ours("ce_surrogate", case, seeds, mode="thesis")} if not args.quick else {}
+        rows = {
+            method: ours(method, case, seeds)
+            for method in METHODS
+            if not args.quick or method != "ce_mixture"
+        }
+        rows |= (
+            {"ce_surrogate, thesis": ours("ce_surrogate", case, seeds, mode="thesis")}
+            if not args.quick
+            else {}
+        )
         rows |= {peer: theirs(peer, case, seeds) for peer in cheap}
         report["others"][case] = rows
-        say(f"  {case:13} " + ", ".join(f"{name} {r['median']:.4g} ({r['best']:.4g})" for name, r in rows.items()))
+        say(
+            f"  {case:13} "
+            + ", ".join(f"{name} {r['median']:.4g} ({r['best']:.4g})" for name, r in rows.items())
+        )
     if args.picture:
         picture(args.picture, report)
     if args.json:
@@ -173,19 +266,37 @@ def main(argv=None):
 
 
 def picture(path, report):
-    """Mean best value by evaluations with its 95 % band; where two peers of the same budget end, by a line."""
+    """Mean best value by evaluations with its 95 % band; where two peers of the same budget end, by
+    a line.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     from jast import plot
     from jast.plot import style
 
-    shown = {"CE-method": ("ce_method", "thesis"), "CE-surrogate, thesis": ("ce_surrogate", "thesis"), "CE-surrogate, default": ("ce_surrogate", "default")}
+    shown = {
+        "CE-method": ("ce_method", "thesis"),
+        "CE-surrogate, thesis": ("ce_surrogate", "thesis"),
+        "CE-surrogate, default": ("ce_surrogate", "default"),
+    }
     with style.axes(None, (10.0, 3.7), columns=3, sharey=True) as axes:
         for ax, case in zip(axes, SIERRA, strict=True):
-            plot.convergence({name: runs(method, case, report["seeds"], mode=mode) for name, (method, mode) in shown.items()}, axes=ax)
+            plot.convergence(
+                {
+                    name: runs(method, case, report["seeds"], mode=mode)
+                    for name, (method, mode) in shown.items()
+                },
+                axes=ax,
+            )
             for peer, name, line in (("cma_es", "CMA-ES", "--"), ("direct", "DIRECT", ":")):
-                ax.axhline(report["peers"][f"{case}, {peer}"]["best"], color=style.INK, linestyle=line, linewidth=1.2, label=name)
+                ax.axhline(
+                    report["peers"][f"{case}, {peer}"]["best"],
+                    color=style.INK,
+                    linestyle=line,
+                    linewidth=1.2,
+                    label=name,
+                )
             ax.set_title(case)
             ax.get_legend().remove()
         axes[0].set_ylabel("mean best value")

@@ -1,8 +1,11 @@
-"""Speed of the tree search, in CPU time of this process and as ratios within one run: ``python -m benchmarks.engine [--json] [--quick]``.
+"""Speed of the tree search, in CPU time of this process and as ratios within one run: ``python -m
+benchmarks.engine [--json] [--quick]``.
 
-Rates are simulations (episodes) per CPU second, compilation excluded; each figure is the best of several alternated repetitions, which on a shared machine is
-the least disturbed one. The rates are those of one core: they are measured in a process whose XLA has one thread (``PJRT_NPROC=1``); with more it cuts kernels
-over threads, which wait for each other at the cost of CPU time. The search's own threads, which use all cores, are measured in ``cores``.
+Rates are simulations (episodes) per CPU second, compilation excluded; each figure is the best of
+several alternated repetitions, which on a shared machine is the least disturbed one. The rates are
+those of one core: they are measured in a process whose XLA has one thread (``PJRT_NPROC=1``); with
+more it cuts kernels over threads, which wait for each other at the cost of CPU time. The search's
+own threads, which use all cores, are measured in ``cores``.
 """
 
 import argparse
@@ -40,7 +43,12 @@ def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
     mode, widening, spread, focus = settled("forest", MODES, mode, None, None, None, actions)
     choice = Choice(actions, jnp.float32(focus), spread=spread, focused=focus != 1)
     sim = jast.simulators.ferry() if sim is None else sim
-    return jax.tree.map(jnp.asarray, Problem(sim, as_pytree(reward), choice, Settings(jnp.float32(10.0), widths(total, *widening))))
+    return jax.tree.map(
+        jnp.asarray,
+        Problem(
+            sim, as_pytree(reward), choice, Settings(jnp.float32(10.0), widths(total, *widening))
+        ),
+    )
 
 
 def cpu(function):
@@ -52,7 +60,9 @@ def cpu(function):
 
 @functools.partial(jax.jit, static_argnames="simulations")
 def rollouts(problem, keys, simulations):
-    """Plain random rollouts of the same simulator, reward and random numbers: the best reward of each lane."""
+    """Plain random rollouts of the same simulator, reward and random numbers: the best reward of
+    each lane.
+    """
 
     def one(i, best):
         key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, i)
@@ -60,12 +70,19 @@ def rollouts(problem, keys, simulations):
 
         def roll(carry):
             level, at = carry
-            draw = lambda k, tree_key, t, p: take(problem, t, p, choose_rollout(problem, k, tree_key, t, p.state))
+            draw = lambda k, tree_key, t, p: take(
+                problem, t, p, choose_rollout(problem, k, tree_key, t, p.state)
+            )
             after = jax.vmap(draw)(key, keys, level, at)
-            kept = Progress(after.state, *(jnp.where(at.done, a, b) for a, b in zip(at[1:], after[1:], strict=True)))
+            kept = Progress(
+                after.state,
+                *(jnp.where(at.done, a, b) for a, b in zip(at[1:], after[1:], strict=True)),
+            )
             return level + 1, kept._replace(log_prob=at.log_prob)
 
-        _, end = lax.while_loop(lambda c: jnp.any(~c[1].done), roll, (jnp.zeros(keys.shape, jnp.int32), first))
+        _, end = lax.while_loop(
+            lambda c: jnp.any(~c[1].done), roll, (jnp.zeros(keys.shape, jnp.int32), first)
+        )
         return jnp.maximum(best, end.reward)
 
     return lax.fori_loop(0, simulations, one, jnp.full(keys.shape, -jnp.inf))
@@ -92,10 +109,18 @@ def rates(repeats, lanes=200, prunes=18, simulations=500):
     children = {mode: int(p.settings.widths.max()) for mode, p in problems.items()}
     runs = {
         "rollouts": lambda: rollouts(problems["paper"], keys, 1000),
-        "forest, paper": lambda: whole(problems["paper"], keys, prunes, simulations, children["paper"]),
-        "forest, default": lambda: whole(problems["default"], keys, prunes, simulations, children["default"]),
+        "forest, paper": lambda: whole(
+            problems["paper"], keys, prunes, simulations, children["paper"]
+        ),
+        "forest, default": lambda: whole(
+            problems["default"], keys, prunes, simulations, children["default"]
+        ),
     }
-    episodes = {"rollouts": 1000 * lanes, "forest, paper": total * lanes, "forest, default": total * lanes}
+    episodes = {
+        "rollouts": 1000 * lanes,
+        "forest, paper": total * lanes,
+        "forest, default": total * lanes,
+    }
     best = {name: float("inf") for name in runs}
     ratio = {name: 0.0 for name in runs}
     plain = 0.0
@@ -118,54 +143,99 @@ def rates(repeats, lanes=200, prunes=18, simulations=500):
 
 
 def capacity(repeats, lanes=200):
-    """Cost of the first 500 simulations in trees with room for 10,000, to that in trees with room for 500: 1 where nothing copies the tree."""
+    """Cost of the first 500 simulations in trees with room for 10,000, to that in trees with room
+    for 500: 1 where nothing copies the tree.
+    """
     keys = tree_keys(jax.random.key(0), lanes)
     small, large = problem(500), problem(10_000)
-    pairs = [(first_turn(large, keys, 10_000)[0], first_turn(small, keys, 500)[0]) for _ in range(repeats + 1)][1:]
-    return {"ratio_10000_to_500": min(a for a, _ in pairs) / min(b for _, b in pairs), "us_per_lockstep_500": min(b for _, b in pairs) / 500 * 1e6}
+    pairs = [
+        (first_turn(large, keys, 10_000)[0], first_turn(small, keys, 500)[0])
+        for _ in range(repeats + 1)
+    ][1:]
+    return {
+        "ratio_10000_to_500": min(a for a, _ in pairs) / min(b for _, b in pairs),
+        "us_per_lockstep_500": min(b for _, b in pairs) / 500 * 1e6,
+    }
 
 
 def cores(repeats, trees=200):
     """How many times faster two threads, of half of the trees each, are than one, in wall time."""
     search = lambda threads: jast.search.forest(
-        jax.random.key(0), jast.simulators.ferry(), trees=trees, prunes=6, reward=REWARD, actions=BOX, mode="paper", threads=threads, lanes=trees // 2
+        jax.random.key(0),
+        jast.simulators.ferry(),
+        trees=trees,
+        prunes=6,
+        reward=REWARD,
+        actions=BOX,
+        mode="paper",
+        threads=threads,
+        lanes=trees // 2,
     )
-    pairs = [(cpu(lambda: search(1).best_reward_per_tree)[1], cpu(lambda: search(2).best_reward_per_tree)[1]) for _ in range(repeats + 1)][1:]
+    pairs = [
+        (
+            cpu(lambda: search(1).best_reward_per_tree)[1],
+            cpu(lambda: search(2).best_reward_per_tree)[1],
+        )
+        for _ in range(repeats + 1)
+    ][1:]
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
 
 
 def alone(name, *arguments, module="engine"):
-    """A measurement of this module, or of another benchmark, in a process whose XLA has one thread."""
-    code = f"import json; from benchmarks import {module}; print(json.dumps({module}.{name}(*{arguments!r})))"
+    """A measurement of this module, or of another benchmark, in a process whose XLA has one
+    thread.
+    """
+    code = (
+        f"import json; from benchmarks import {module};"
+        f" print(json.dumps({module}.{name}(*{arguments!r})))"
+    )
     env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
-    return json.loads(subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env).stdout.splitlines()[-1])
+    return json.loads(
+        subprocess.run(
+            [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env
+        ).stdout.splitlines()[-1]
+    )
 
 
 def compile_time():
     """Seconds to trace and compile what a forest on S0 runs, in a fresh process without a cache."""
     code = (
-        "import time, jax, jast; from benchmarks import engine; from jast.search import run; from jast.counter import tree_keys\n"
-        "jax.config.update('jax_enable_compilation_cache', False)\n"
-        "p, keys = engine.problem(9000, 'default'), tree_keys(jax.random.key(0), 100); jax.block_until_ready(p.settings.widths)\n"
-        "c, w = time.process_time(), time.perf_counter(); out = {}\n"
-        "def lap(name):\n"
-        "    global c, w; out[name] = time.perf_counter() - w; c, w = time.process_time(), time.perf_counter()\n"
-        "shapes = jax.eval_shape(lambda: run.make(p, run._shared(p), keys, 9000, 'node')); lap('trace of the arrays')\n"
-        "run._grow.lower(p, shapes, 0, 500, 'node').compile(); lap('grow')\n"
-        "run._make.lower(p, keys, 9000, 'node').compile(); lap('make')\n"
-        "run._prune.lower(p, shapes, 191, 'node').compile(); lap('prune')\n"
-        "import json; print(json.dumps(out))\n"
+        "import time, jax, jast; from benchmarks import engine; from jast.search import run; from"
+        " jast.counter import tree_keys\njax.config.update('jax_enable_compilation_cache',"
+        " False)\np, keys = engine.problem(9000, 'default'), tree_keys(jax.random.key(0), 100);"
+        " jax.block_until_ready(p.settings.widths)\nc, w = time.process_time(),"
+        " time.perf_counter(); out = {}\ndef lap(name):\n    global c, w; out[name] ="
+        " time.perf_counter() - w; c, w = time.process_time(), time.perf_counter()\nshapes ="
+        " jax.eval_shape(lambda: run.make(p, run._shared(p), keys, 9000, 'node')); lap('trace of"
+        " the arrays')\nrun._grow.lower(p, shapes, 0, 500, 'node').compile();"
+        " lap('grow')\nrun._make.lower(p, keys, 9000, 'node').compile();"
+        " lap('make')\nrun._prune.lower(p, shapes, 191, 'node').compile(); lap('prune')\nimport"
+        " json; print(json.dumps(out))\n"
     )
     env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
     env.pop("JAX_COMPILATION_CACHE_DIR", None)
-    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout.splitlines()[-1])
+    return json.loads(
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env
+        ).stdout.splitlines()[-1]
+    )
 
 
 def slow_ferry(substeps):
-    """S0 with a step that takes ``substeps`` times the arithmetic and ends in the same place. One program serves every number of substeps."""
+    """S0 with a step that takes ``substeps`` times the arithmetic and ends in the same place. One
+    program serves every number of substeps.
+    """
     sim = jast.simulators.ferry()
     step = Partial(_slow_step, sim.step, jnp.int32(substeps))
-    return Simulator(sim.init, step, sim.disturbance, sim.evaluate, sim.horizon, is_terminal=sim.is_terminal, observe=sim.observe)
+    return Simulator(
+        sim.init,
+        step,
+        sim.disturbance,
+        sim.evaluate,
+        sim.horizon,
+        is_terminal=sim.is_terminal,
+        observe=sim.observe,
+    )
 
 
 def _slow_step(step, substeps, state, a):
@@ -177,12 +247,17 @@ def _slow_step(step, substeps, state, a):
 
 
 def memoization(lanes, prunes, simulations):
-    """CPU time of the memoization modes, to that with states at every node, on the cheap S0 and one of 200 substeps."""
+    """CPU time of the memoization modes, to that with states at every node, on the cheap S0 and one
+    of 200 substeps.
+    """
     keys, out = tree_keys(jax.random.key(0), lanes), {}
     for name, sim in (("S0", None), ("200 substeps", slow_ferry(200))):
         p = problem(prunes * simulations, sim=sim)
         children = int(p.settings.widths.max())
-        runs = {mode: functools.partial(whole, p, keys, prunes, simulations, children, mode) for mode in ("node", "root", "none")}
+        runs = {
+            mode: functools.partial(whole, p, keys, prunes, simulations, children, mode)
+            for mode in ("node", "root", "none")
+        }
         for function in runs.values():
             cpu(function)
         seconds = {mode: min(cpu(function)[0] for _ in range(2)) for mode, function in runs.items()}
@@ -198,7 +273,9 @@ class At(NamedTuple):
 
 
 def peer(repeats, lanes=200, simulations=500):
-    """Simulations per CPU second of mctx's MuZero policy on S0 with 10 actions and no rollouts, beside the forest's first root with its rollouts."""
+    """Simulations per CPU second of mctx's MuZero policy on S0 with 10 actions and no rollouts,
+    beside the forest's first root with its rollouts.
+    """
     try:
         import mctx
     except ImportError:
@@ -211,37 +288,66 @@ def peer(repeats, lanes=200, simulations=500):
             after = take(p, at.level, at.progress, ((), (a.astype(jnp.float32) + 0.5) / 10))
             gone = at.progress.done
             after = jax.tree.map(lambda x, y: jnp.where(gone, x, y), at.progress, after)
-            return after.reward - jnp.where(gone, after.reward, at.progress.reward), gone, At(at.level + 1, after)
+            return (
+                after.reward - jnp.where(gone, after.reward, at.progress.reward),
+                gone,
+                At(at.level + 1, after),
+            )
 
         reward, gone, after = jax.vmap(one)(action, embedding)
         shape = (*action.shape, 10)
-        return mctx.RecurrentFnOutput(reward=reward, discount=jnp.where(gone, 0.0, 1.0), prior_logits=jnp.zeros(shape), value=jnp.zeros(action.shape)), after
+        return (
+            mctx.RecurrentFnOutput(
+                reward=reward,
+                discount=jnp.where(gone, 0.0, 1.0),
+                prior_logits=jnp.zeros(shape),
+                value=jnp.zeros(action.shape),
+            ),
+            after,
+        )
 
     @jax.jit
     def policy(key):
         start = At(jnp.int32(0), begin(sim, REWARD, ()))
         start = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), start)
-        root = mctx.RootFnOutput(prior_logits=jnp.zeros((lanes, 10)), value=jnp.zeros(lanes), embedding=start)
-        return mctx.muzero_policy((), key, root, recurrent, simulations, dirichlet_fraction=0.0).action
+        root = mctx.RootFnOutput(
+            prior_logits=jnp.zeros((lanes, 10)), value=jnp.zeros(lanes), embedding=start
+        )
+        return mctx.muzero_policy(
+            (), key, root, recurrent, simulations, dirichlet_fraction=0.0
+        ).action
 
     keys = tree_keys(jax.random.key(0), lanes)
-    theirs, ours = lambda: policy(jax.random.key(1)), lambda: first_turn(p, keys, simulations, simulations)
+    theirs, ours = (
+        lambda: policy(jax.random.key(1)),
+        lambda: first_turn(p, keys, simulations, simulations),
+    )
     cpu(theirs), ours()
     pairs = [(cpu(theirs)[0], ours()[0]) for _ in range(repeats)]
     n = lanes * simulations
-    return {"mctx": n / min(a for a, _ in pairs), "jast": n / min(b for _, b in pairs), "ratio": min(a for a, _ in pairs) / min(b for _, b in pairs)}
+    return {
+        "mctx": n / min(a for a, _ in pairs),
+        "jast": n / min(b for _, b in pairs),
+        "ratio": min(a for a, _ in pairs) / min(b for _, b in pairs),
+    }
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.engine", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.engine", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--quick", action="store_true", help="fewer repetitions, smaller memoization runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer repetitions, smaller memoization runs"
+    )
     args = parser.parse_args(argv)
     repeats = 2 if args.quick else 5
     p = problem(9000)
     one = run.bytes_per_tree(p, run.Plan(18, 500, 1, "node"))
     report = {
-        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "processors": (
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        ),
         "bytes_per_tree_of_9000": one,
         "bytes_per_node": one / 9000,
         **alone("rates", repeats),

@@ -1,8 +1,10 @@
-"""The ferry S0: golden episodes, the paper's Table 1 without networks, and what the default search makes of it.
+"""The ferry S0: golden episodes, the paper's Table 1 without networks, and what the default search
+makes of it.
 
-``python -m benchmarks.ferry [--json] [--quick] [--trees N]``. Every tree has 9000 simulations. Rates have 95 % Clopper-Pearson intervals, means
-1.96 standard errors. Published rows: Lytskjold and Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--picture PATH]``: all of that table, networks
-included, and where they pay (`benchmarks.table1`).
+``python -m benchmarks.ferry [--json] [--quick] [--trees N]``. Every tree has 9000 simulations.
+Rates have 95 % Clopper-Pearson intervals, means 1.96 standard errors. Published rows: Lytskjold and
+Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--picture PATH]``: all of that table,
+networks included, and where they pay (`benchmarks.table1`).
 """
 
 import argparse
@@ -36,15 +38,22 @@ def data(name):
 
 
 def golden():
-    """Greatest error of the rewards of the published episodes, in float32 and float64; None where the data is absent."""
+    """Greatest error of the rewards of the published episodes, in float32 and float64; None where
+    the data is absent.
+    """
     if (found := data("golden_episodes.json")) is None:
         return None
     episodes, errors = found["episodes"], {}
     for bits in (32, 64):
         with jax.enable_x64(bits == 64):
             sim = jast.simulators.ferry()
-            found = [float(jast.replay(sim, np.array(e["seeds"]), reward=REWARD).reward) for e in episodes]
-        errors[f"float{bits}"] = float(np.max(np.abs(np.array(found) - [e["reward"] for e in episodes])))
+            found = [
+                float(jast.replay(sim, np.array(e["seeds"]), reward=REWARD).reward)
+                for e in episodes
+            ]
+        errors[f"float{bits}"] = float(
+            np.max(np.abs(np.array(found) - [e["reward"] for e in episodes]))
+        )
     return {"episodes": len(episodes), "greatest_error": errors}
 
 
@@ -90,10 +99,14 @@ def rows(trees, quick):
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
 
     def forest(sim=s0, **settings):
-        return lambda key: jast.search.forest(key, sim, trees=trees, reward=REWARD, actions=BOX, **settings)
+        return lambda key: jast.search.forest(
+            key, sim, trees=trees, reward=REWARD, actions=BOX, **settings
+        )
 
     def mcts(**settings):
-        return lambda key: jast.search.mcts(key, s0, trees=trees, reward=REWARD, actions=BOX, **settings)
+        return lambda key: jast.search.mcts(
+            key, s0, trees=trees, reward=REWARD, actions=BOX, **settings
+        )
 
     table = {
         "forest, paper": forest(mode="paper"),
@@ -102,7 +115,9 @@ def rows(trees, quick):
         "mcts, default": mcts(),
         "forest, S0b, paper": forest(s0b, mode="paper"),
         "forest, S0b, default": forest(s0b),
-        "monte carlo": lambda key: jast.search.monte_carlo(key, s0, episodes=9000 * trees, reward=REWARD, actions=BOX),
+        "monte carlo": lambda key: jast.search.monte_carlo(
+            key, s0, episodes=9000 * trees, reward=REWARD, actions=BOX
+        ),
     }
     if not quick:
         table |= {
@@ -114,14 +129,26 @@ def rows(trees, quick):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--quick", action="store_true", help="100 trees a row; of --table1 also fewer rows")
+    parser.add_argument(
+        "--quick", action="store_true", help="100 trees a row; of --table1 also fewer rows"
+    )
     parser.add_argument("--trees", type=int, help="trees a row (default 1000; of --table1 200)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table1", action="store_true", help="the paper's Table 1 with networks, and where they pay")
-    parser.add_argument("--seeds", type=int, help="of --table1: seeds a row, from --seed on (default 3)")
-    parser.add_argument("--picture", help="of --table1: also measure slower simulators, and draw to this file")
+    parser.add_argument(
+        "--table1",
+        action="store_true",
+        help="the paper's Table 1 with networks, and where they pay",
+    )
+    parser.add_argument(
+        "--seeds", type=int, help="of --table1: seeds a row, from --seed on (default 3)"
+    )
+    parser.add_argument(
+        "--picture", help="of --table1: also measure slower simulators, and draw to this file"
+    )
     args = parser.parse_args(argv)
     if args.table1:
         from benchmarks import table1
@@ -131,7 +158,10 @@ def main(argv=None):
     report = {"golden": golden(), "seed": args.seed, "rows": {}}
     if not args.json:
         print("golden episodes:", report["golden"] or "data not found")
-        print(f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7} {'of 200: least, median':>21} {'CPU s':>7}")
+        print(
+            f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
+            f" {'of 200: least, median':>21} {'CPU s':>7}"
+        )
     for name, search in rows(trees, args.quick).items():
         report["rows"][name] = r = row(search, args.seed)
         if not args.json:
@@ -139,7 +169,8 @@ def main(argv=None):
             of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
             mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
             print(
-                f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f} {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}",
+                f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f}"
+                f" {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}",
                 flush=True,
             )
             if name in PUBLISHED:

@@ -1,8 +1,11 @@
-"""The flight management system's trajectory predictor: what each search finds in 5000 evaluations (Table 3.3 of Moss's thesis, on an open stand-in).
+"""The flight management system's trajectory predictor: what each search finds in 5000 evaluations
+(Table 3.3 of Moss's thesis, on an open stand-in).
 
-``python -m benchmarks.fms [--json] [--quick] [--seeds N]``. Every method has the same number of evaluations and independent seeds (trees). Failures are counted
-once each: a tree that comes to the end of an episode again has evaluated nothing. Means are over seeds, +- is one standard error of that mean. The control is
-the same search on the predictor without its defect. CPU time is that of the one call for all seeds, compilation included.
+``python -m benchmarks.fms [--json] [--quick] [--seeds N]``. Every method has the same number of
+evaluations and independent seeds (trees). Failures are counted once each: a tree that comes to the
+end of an episode again has evaluated nothing. Means are over seeds, +- is one standard error of
+that mean. The control is the same search on the predictor without its defect. CPU time is that of
+the one call for all seeds, compilation included.
 """
 
 import argparse
@@ -19,7 +22,8 @@ from jast.distributions import Independent, Normal
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
 EVALUATIONS = 5000
-PUBLISHED = {  # Table 3.3, one seed: failures, first failure, mean and standard deviation of d, least d
+# Table 3.3, one seed: failures, first failure, mean and standard deviation of d, least d
+PUBLISHED = {
     "database": (0, None, 560.21, 75.09, 410.98),
     "monte carlo": (5, 128, 407.44, 64.85, -1127.7),
     "cross-entropy": (24, 249, 625.65, 97.80, -1077.3),
@@ -34,12 +38,28 @@ def searches(evaluations, seeds):
         warnings.simplefilter("ignore", UserWarning)  # as printed, for the comparison
         printed = jast.rewards.episodic(mode="thesis")
     # the thesis's proposal: distances of 1 nmi, give or take 3
-    near = Independent(Normal(jnp.asarray(MEANS).at[1].set(1.0), jnp.asarray(SIGMAS).at[1].set(3.0)), 1)
-    monte_carlo = lambda key, sim: jast.search.monte_carlo(key, sim, episodes=evaluations * seeds, reward=safe, record=True)
-    mcts = lambda key, sim, **of: jast.search.mcts(key, sim, trees=seeds, simulations=evaluations, record=True, **of)
-    cem = dict(samples=evaluations // 10, elites=evaluations // 100, iterations=10, trees=seeds, reward=safe, actions=jast.actions.quantiles(near), record=True)
-    deep = dict(mode="episodic", reward=safe, exploration=1000.0)  # a hundredth of what failures earn
-    likely = dict(mode="episodic", reward=jast.rewards.standard(event_bonus=600.0), exploration=3.0)  # among failures log p decides
+    near = Independent(
+        Normal(jnp.asarray(MEANS).at[1].set(1.0), jnp.asarray(SIGMAS).at[1].set(3.0)), 1
+    )
+    monte_carlo = lambda key, sim: jast.search.monte_carlo(
+        key, sim, episodes=evaluations * seeds, reward=safe, record=True
+    )
+    mcts = lambda key, sim, **of: jast.search.mcts(
+        key, sim, trees=seeds, simulations=evaluations, record=True, **of
+    )
+    cem = dict(
+        samples=evaluations // 10,
+        elites=evaluations // 100,
+        iterations=10,
+        trees=seeds,
+        reward=safe,
+        actions=jast.actions.quantiles(near),
+        record=True,
+    )
+    # a hundredth of what failures earn
+    deep = dict(mode="episodic", reward=safe, exploration=1000.0)
+    # among failures log p decides
+    likely = dict(mode="episodic", reward=jast.rewards.standard(event_bonus=600.0), exploration=3.0)
     roots = dict(trees=seeds, prunes=5, simulations=evaluations // 5, record=True)
     return {
         "database": (monte_carlo, dict(database=True)),
@@ -57,19 +77,29 @@ def mean(values):
     values = np.asarray([v for v in values if v is not None and np.isfinite(v)], float)
     if not len(values):
         return None
-    return {"mean": float(values.mean()), "se": float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None}
+    return {
+        "mean": float(values.mean()),
+        "se": float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None,
+    }
 
 
 def by_seed(trials, seeds):
     """`Trials` [evaluations, seeds]; Monte Carlo's one tree is cut into seeds."""
-    return trials if trials.reward.shape[1] == seeds else jax.tree.map(lambda a: a.reshape(seeds, -1).T, trials)
+    return (
+        trials
+        if trials.reward.shape[1] == seeds
+        else jax.tree.map(lambda a: a.reshape(seeds, -1).T, trials)
+    )
 
 
 def summary(result, seeds, baseline=None):
     """The table's row of one search; ``baseline``: mean log p of Monte Carlo's failures."""
     t = by_seed(result.trials, seeds)
     lanes = range(seeds)
-    failures, first = t.failure.sum(0), [int(f.argmax()) + 1 if f.any() else None for f in t.failure.T]
+    failures, first = (
+        t.failure.sum(0),
+        [int(f.argmax()) + 1 if f.any() else None for f in t.failure.T],
+    )
     valid = t.ran & np.isfinite(t.distance)
     distances = [t.distance[valid[:, k], k] for k in lanes]
     log_p = [t.log_prob[t.failure[:, k], k] for k in lanes]
@@ -87,7 +117,11 @@ def summary(result, seeds, baseline=None):
         "distance_least": mean([d.min() for d in distances]),
         "log_p_of_failures": mean([p.mean() if len(p) else None for p in log_p]),
         "log_p_greatest": float(every.max()) if len(every) else None,
-        "log_p_less_monte_carlo": None if baseline is None else mean([p.mean() - baseline if len(p) else None for p in log_p]),
+        "log_p_less_monte_carlo": (
+            None
+            if baseline is None
+            else mean([p.mean() - baseline if len(p) else None for p in log_p])
+        ),
         "invalid": int(result.invalid),
     }
 
@@ -95,29 +129,45 @@ def summary(result, seeds, baseline=None):
 def run(evaluations, seeds, control_seeds, key=0):
     """The whole table."""
     keys, out, baseline = jax.random.split(jax.random.key(key), 7), {}, None
-    for k, (name, (search, settings)) in zip(keys, searches(evaluations, seeds).items(), strict=True):
-        result, seconds, _ = timed(lambda search=search, k=k, settings=settings: search(k, fms(**settings)))
+    for k, (name, (search, settings)) in zip(
+        keys, searches(evaluations, seeds).items(), strict=True
+    ):
+        result, seconds, _ = timed(
+            lambda search=search, k=k, settings=settings: search(k, fms(**settings))
+        )
         out[name] = summary(result, seeds, baseline) | {"cpu_s": seconds}
         if name == "monte carlo":
             t = result.trials
             baseline = float(t.log_prob[t.failure].mean())
             out[name] |= {"log_p_less_monte_carlo": mean([0.0])}
         print(line(name, out[name]), flush=True)
-    for k, (name, (search, settings)) in zip(keys, searches(evaluations, control_seeds).items(), strict=True):
+    for k, (name, (search, settings)) in zip(
+        keys, searches(evaluations, control_seeds).items(), strict=True
+    ):
         out[name]["control_failures"] = int(search(k, fms(fixed=True, **settings)).failures.seen)
     return out
 
 
-HEADER = f"{'method':15} {'failures':>16} {'median':>7} {'share':>7} {'first':>7} {'mean d':>16} {'sd d':>6} {'least d':>15} {'log p to MC':>13} {'CPU s':>7}"
+HEADER = (
+    f"{'method':15} {'failures':>16} {'median':>7} {'share':>7} {'first':>7} {'mean d':>16}"
+    f" {'sd d':>6} {'least d':>15} {'log p to MC':>13} {'CPU s':>7}"
+)
 
 
 def line(name, row):
     """A row of the table in words."""
-    of = lambda v, digits=1: "-" if v is None else f"{v['mean']:.{digits}f}" + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+    of = lambda v, digits=1: (
+        "-"
+        if v is None
+        else f"{v['mean']:.{digits}f}"
+        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+    )
     return (
-        f"{name:15} {of(row['failures']):>16} {row['failures_median']:7.0f} {100 * row['share_of_simulations']:6.2f}% {row['first_failure_median']:7.0f} "
-        f"{of(row['distance_mean']):>16} {row['distance_sd']['mean']:6.1f} {of(row['distance_least']):>15} {of(row['log_p_less_monte_carlo']):>13} "
-        f"{row['cpu_s']:7.1f}"
+        f"{name:15} {of(row['failures']):>16} {row['failures_median']:7.0f}"
+        f" {100 * row['share_of_simulations']:6.2f}% {row['first_failure_median']:7.0f}"
+        f" {of(row['distance_mean']):>16} {row['distance_sd']['mean']:6.1f}"
+        f" {of(row['distance_least']):>15} {of(row['log_p_less_monte_carlo']):>13}"
+        f" {row['cpu_s']:7.1f}"
     )
 
 
@@ -126,15 +176,34 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="the figures as JSON, after the table")
     parser.add_argument("--quick", action="store_true", help="10 seeds, in under two minutes")
-    parser.add_argument("--seeds", type=int, default=None, help="independent searches of each method (default 100, with --quick 10)")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        default=None,
+        help="independent searches of each method (default 100, with --quick 10)",
+    )
     options = parser.parse_args(argv)
     seeds = options.seeds or (10 if options.quick else 100)
     print(f"{EVALUATIONS} evaluations, {seeds} seeds\n{HEADER}")
     with jax.enable_x64(True):
         table = run(EVALUATIONS, seeds, min(seeds, 10))
-    print("on the predictor without its defect: " + ", ".join(f"{name} {row['control_failures']}" for name, row in table.items()) + " failures")
+    print(
+        "on the predictor without its defect: "
+        + ", ".join(f"{name} {row['control_failures']}" for name, row in table.items())
+        + " failures"
+    )
     if options.json:
-        print(json.dumps({"evaluations": EVALUATIONS, "seeds": seeds, "published": PUBLISHED, "methods": table}, indent=1))
+        print(
+            json.dumps(
+                {
+                    "evaluations": EVALUATIONS,
+                    "seeds": seeds,
+                    "published": PUBLISHED,
+                    "methods": table,
+                },
+                indent=1,
+            )
+        )
 
 
 if __name__ == "__main__":

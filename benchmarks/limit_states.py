@@ -1,9 +1,12 @@
-"""Rare events of known probability, fixed and drawn by seed, for studies of error and coverage: ``python -m benchmarks.limit_states`` checks the truths.
+"""Rare events of known probability, fixed and drawn by seed, for studies of error and coverage:
+``python -m benchmarks.limit_states`` checks the truths.
 
-``cases()`` lists the fixed ones, ``draw(family, seed)`` gives one of a family of ``FAMILIES``: `Case`, (name, simulator, truth). Truths are closed forms or
-quadratures in float64 (SciPy), with P log-uniform from 1e-12 to 1e-2, so that nothing can be tuned to one number. Parameters are bound by a ``Partial`` and
-dimensions come from small sets: seeds of one family and dimension share a compiled program. A limit state ``g(*parameters, x [..., d], np)`` fails where it
-is <= 0, x ~ N(0, I_d); it is written once for two array libraries.
+``cases()`` lists the fixed ones, ``draw(family, seed)`` gives one of a family of ``FAMILIES``:
+`Case`, (name, simulator, truth). Truths are closed forms or quadratures in float64 (SciPy), with P
+log-uniform from 1e-12 to 1e-2, so that nothing can be tuned to one number. Parameters are bound by
+a ``Partial`` and dimensions come from small sets: seeds of one family and dimension share a
+compiled program. A limit state ``g(*parameters, x [..., d], np)`` fails where it is <= 0, x ~ N(0,
+I_d); it is written once for two array libraries.
 """
 
 import argparse
@@ -42,7 +45,10 @@ class Limit(NamedTuple):
 
     def simulator(self):
         """As `jast.simulators.limit_state`, in JAX's default precision."""
-        return limit_state(Partial(self.g, *(jnp.asarray(np.asarray(p, float)) for p in self.parameters)), self.dimension)
+        return limit_state(
+            Partial(self.g, *(jnp.asarray(np.asarray(p, float)) for p in self.parameters)),
+            self.dimension,
+        )
 
     def batch(self, x):
         """g of x [n, d] in NumPy: [n]."""
@@ -53,7 +59,9 @@ class Limit(NamedTuple):
 
 
 def half_spaces(directions, beta, slope, x, np=jnp):
-    """Fails beyond any of m half-spaces, directions [m, d]; ``slope`` [m] scales the miss distance of each."""
+    """Fails beyond any of m half-spaces, directions [m, d]; ``slope`` [m] scales the miss distance
+    of each.
+    """
     return np.min(slope * (beta - x @ directions.T), axis=-1)
 
 
@@ -63,13 +71,17 @@ def corner(directions, beta, x, np=jnp):
 
 
 def parabola(directions, beta, k, x, np=jnp):
-    """Fails at y0 >= beta + k sum of the squares of the others, y = directions @ x; k > 0: a narrow region, k < 0: a wide one."""
+    """Fails at y0 >= beta + k sum of the squares of the others, y = directions @ x; k > 0: a narrow
+    region, k < 0: a wide one.
+    """
     y = x @ directions.T
     return beta - y[..., 0] + k * np.sum(y[..., 1:] ** 2, axis=-1)
 
 
 def sphere(centre, radius, side, x, np=jnp):
-    """Fails outside (side 1) or inside (side -1) of a sphere; about abs(x - centre) - radius near to it, and smooth."""
+    """Fails outside (side 1) or inside (side -1) of a sphere; about abs(x - centre) - radius near
+    to it, and smooth.
+    """
     return side * (radius**2 - np.sum((x - centre) ** 2, axis=-1)) / (2 * radius)
 
 
@@ -94,28 +106,47 @@ def any_of(p):
 
 def parabola_probability(beta, k, m):
     """By the chi density of the m others."""
-    return _simpson(lambda r: stats.chi.pdf(r, m) * stats.norm.sf(beta + k * r**2), 0.0, m**0.5 + 14)
+    return _simpson(
+        lambda r: stats.chi.pdf(r, m) * stats.norm.sf(beta + k * r**2), 0.0, m**0.5 + 14
+    )
 
 
 def sphere_probability(offset, radius, side, d):
-    """By the coordinate y along the centre, y = offset + radius sin t, and the chi-square of the d - 1 others."""
+    """By the coordinate y along the centre, y = offset + radius sin t, and the chi-square of the d
+    - 1 others.
+    """
     y, rest = lambda t: offset + radius * np.sin(t), stats.chi2.cdf if side < 0 else stats.chi2.sf
-    within = lambda t: stats.norm.pdf(y(t)) * rest((radius * np.cos(t)) ** 2, d - 1) * radius * np.cos(t)
+    within = lambda t: (
+        stats.norm.pdf(y(t)) * rest((radius * np.cos(t)) ** 2, d - 1) * radius * np.cos(t)
+    )
     beyond = stats.norm.sf(offset + radius) + stats.norm.cdf(offset - radius) if side > 0 else 0.0
     return _simpson(within, -np.pi / 2, np.pi / 2) + beyond
 
 
 def four_branch_probability(p, k):
-    """By the coordinate t = (x1 - x2) / sqrt 2: fails beyond p / 2, else where (x1 + x2) / sqrt 2 is beyond k + .2 t^2."""
-    return 2 * stats.norm.sf(p / 2) + _simpson(lambda t: 2 * stats.norm.pdf(t) * stats.norm.sf(k + 0.2 * t**2), -p / 2, p / 2)
+    """By the coordinate t = (x1 - x2) / sqrt 2: fails beyond p / 2, else where (x1 + x2) / sqrt 2
+    is beyond k + .2 t^2.
+    """
+    return 2 * stats.norm.sf(p / 2) + _simpson(
+        lambda t: 2 * stats.norm.pdf(t) * stats.norm.sf(k + 0.2 * t**2), -p / 2, p / 2
+    )
 
 
 def first_passage(decay, spread, threshold, steps, two_sided=False, nodes=300):
-    """P(s or abs(s) >= threshold within ``steps``), s' = decay s + spread N(0, 1) from 0, by Nystrom: the mass that passes is summed step by step."""
-    low = -threshold if two_sided else -9.0 * np.sqrt(spread**2 * np.sum(decay ** (2 * np.arange(steps))))
+    """P(s or abs(s) >= threshold within ``steps``), s' = decay s + spread N(0, 1) from 0, by
+    Nystrom: the mass that passes is summed step by step.
+    """
+    low = (
+        -threshold
+        if two_sided
+        else -9.0 * np.sqrt(spread**2 * np.sum(decay ** (2 * np.arange(steps))))
+    )
     x, w = np.polynomial.legendre.leggauss(nodes)
     x, w = low + (x + 1) * (threshold - low) / 2, w * (threshold - low) / 2
-    passes = lambda s: stats.norm.sf((threshold - decay * s) / spread) + (stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0)
+    passes = lambda s: (
+        stats.norm.sf((threshold - decay * s) / spread)
+        + (stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0)
+    )
     kernel, out = stats.norm.pdf((x[:, None] - decay * x) / spread) / spread * w, w * passes(x)
     density, total = stats.norm.pdf(x / spread) / spread, passes(0.0)
     for _ in range(steps - 1):
@@ -129,7 +160,9 @@ def walk_probability(threshold, steps, two_sided, nodes=300):
 
 
 def autoregression_probability(rate, threshold, steps, nodes=300):
-    return first_passage(np.exp(-rate), np.sqrt(-np.expm1(-2 * rate)), threshold, steps, nodes=nodes)
+    return first_passage(
+        np.exp(-rate), np.sqrt(-np.expm1(-2 * rate)), threshold, steps, nodes=nodes
+    )
 
 
 def ruin_probability(up, start, goal, steps):
@@ -143,22 +176,40 @@ def ruin_probability(up, start, goal, steps):
 
 
 def _solve(probability, target, low, high):
-    """The parameter with this probability, which falls with it; where its range does not contain it, the nearer end."""
+    """The parameter with this probability, which falls with it; where its range does not contain
+    it, the nearer end.
+    """
     gap = lambda v: np.log(max(probability(v), 1e-300)) - np.log(target)
-    return low if gap(low) <= 0 else high if gap(high) >= 0 else float(optimize.brentq(gap, low, high, rtol=1e-4))
+    return (
+        low
+        if gap(low) <= 0
+        else high
+        if gap(high) >= 0
+        else float(optimize.brentq(gap, low, high, rtol=1e-4))
+    )
 
 
 # fixed
 
 
 def _plane(d, beta=5.0):
-    return Limit(half_spaces, (np.full((1, d), d**-0.5), np.array([beta]), np.ones(1)), d, float(stats.norm.sf(beta)))
+    return Limit(
+        half_spaces,
+        (np.full((1, d), d**-0.5), np.array([beta]), np.ones(1)),
+        d,
+        float(stats.norm.sf(beta)),
+    )
 
 
 def _landing_static():
     a = np.append(0.1, np.full(10, 0.03))
     size = np.sqrt(a @ a)
-    return Limit(half_spaces, (np.stack([a, -a]) / size, np.full(2, 1 / size), np.full(2, size)), 11, 4.0236721906842e-13)
+    return Limit(
+        half_spaces,
+        (np.stack([a, -a]) / size, np.full(2, 1 / size), np.full(2, size)),
+        11,
+        4.0236721906842e-13,
+    )
 
 
 LIMITS = {
@@ -167,7 +218,8 @@ LIMITS = {
     "parallel": Limit(corner, (np.eye(2), np.full(2, 3.5)), 2, 5.4116288413e-8),
     "landing, static": _landing_static(),
 }
-DYNAMIC = {  # the truths of the simulators' docstrings; the pendulum's has a standard error of .11 %
+# the truths of the simulators' docstrings; the pendulum's has a standard error of .11 %
+DYNAMIC = {
     "landing": (landing, 4.0236721906842e-13),
     "walk1d one-sided": (functools.partial(walk1d, "one-sided"), 9.578759495e-4),
     "walk1d two-sided": (walk1d, 0.1087363323),
@@ -180,7 +232,9 @@ DYNAMIC = {  # the truths of the simulators' docstrings; the pendulum's has a st
 def cases(names=None):
     """The fixed cases, all or those named: a list of `Case`."""
     make = {name: (l.simulator, l.truth) for name, l in LIMITS.items()} | DYNAMIC
-    return [Case(name, make[name][0](), make[name][1]) for name in (make if names is None else names)]
+    return [
+        Case(name, make[name][0](), make[name][1]) for name in (make if names is None else names)
+    ]
 
 
 # families: (rng, P) -> Limit, or (simulator, truth)
@@ -192,32 +246,57 @@ def _directions(rng, m, d):
 
 def two_sided(rng, P, dimensions=(2, 5, 20), spread=0.0):
     """Two half-spaces, opposite or at a right angle, the second with 2 to 50 % of the mass."""
-    d, opposite, share = int(rng.choice(dimensions)), rng.random() < 0.5, 10 ** rng.uniform(np.log10(0.02), np.log10(0.5))
+    d, opposite, share = (
+        int(rng.choice(dimensions)),
+        rng.random() < 0.5,
+        10 ** rng.uniform(np.log10(0.02), np.log10(0.5)),
+    )
     a, p = _directions(rng, 2, d), P * np.array([1 - share, share])
     if opposite:
         a[1] = -a[0]
-    return Limit(half_spaces, (a, stats.norm.isf(p), 10 ** rng.uniform(-spread, spread, 2)), d, float(p.sum()) if opposite else any_of(p))
+    return Limit(
+        half_spaces,
+        (a, stats.norm.isf(p), 10 ** rng.uniform(-spread, spread, 2)),
+        d,
+        float(p.sum()) if opposite else any_of(p),
+    )
 
 
 def scaled(rng, P):
-    """Two half-spaces with slopes from .03 to 30: the smaller miss distance is not the nearer failure."""
+    """Two half-spaces with slopes from .03 to 30: the smaller miss distance is not the nearer
+    failure.
+    """
     return two_sided(rng, P, spread=1.5)
 
 
 def high_dimensional(rng, P):
-    """A hyperplane (its second side is out of reach) or two opposite ones in 50 to 200 dimensions."""
+    """A hyperplane (its second side is out of reach) or two opposite ones in 50 to 200
+    dimensions.
+    """
     l = two_sided(rng, P, (50, 100, 200))
     a, beta, slope = l.parameters
     if rng.random() < 0.5:
-        return Limit(half_spaces, (np.stack([a[0], -a[0]]), np.array([stats.norm.isf(P), 40.0]), slope), l.dimension, P)
-    return Limit(half_spaces, (np.stack([a[0], -a[0]]), beta, slope), l.dimension, float(stats.norm.sf(beta).sum()))
+        return Limit(
+            half_spaces,
+            (np.stack([a[0], -a[0]]), np.array([stats.norm.isf(P), 40.0]), slope),
+            l.dimension,
+            P,
+        )
+    return Limit(
+        half_spaces,
+        (np.stack([a[0], -a[0]]), beta, slope),
+        l.dimension,
+        float(stats.norm.sf(beta).sum()),
+    )
 
 
 def union(rng, P):
     """2, 4 or 8 orthogonal half-spaces of unequal mass in 10 dimensions."""
     m = int(rng.choice((2, 4, 8)))
     p = P * rng.dirichlet(np.full(m, 2.0))
-    return Limit(half_spaces, (_directions(rng, m, 10), stats.norm.isf(p), np.ones(m)), 10, any_of(p))
+    return Limit(
+        half_spaces, (_directions(rng, m, 10), stats.norm.isf(p), np.ones(m)), 10, any_of(p)
+    )
 
 
 def intersection(rng, P):
@@ -228,24 +307,47 @@ def intersection(rng, P):
 
 
 def curved(rng, P):
-    """A parabola in 1 or 4 of the other coordinates, with k beta from -.35 (a wide region) to 1.5 (a narrow one)."""
-    m, d, c = int(rng.choice((1, 4))), int(rng.choice((5, 20))), rng.uniform(*((-0.35, -0.05) if rng.random() < 0.5 else (0.05, 1.5)))
+    """A parabola in 1 or 4 of the other coordinates, with k beta from -.35 (a wide region) to 1.5
+    (a narrow one).
+    """
+    m, d, c = (
+        int(rng.choice((1, 4))),
+        int(rng.choice((5, 20))),
+        rng.uniform(*((-0.35, -0.05) if rng.random() < 0.5 else (0.05, 1.5))),
+    )
     beta = _solve(lambda b: parabola_probability(b, c / b, m), P, 0.5, 9.0)
-    return Limit(parabola, (_directions(rng, 1 + m, d), beta, c / beta), d, parabola_probability(beta, c / beta, m))
+    return Limit(
+        parabola,
+        (_directions(rng, 1 + m, d), beta, c / beta),
+        d,
+        parabola_probability(beta, c / beta, m),
+    )
 
 
 def outside(rng, P):
-    """Outside of a sphere around the origin (no design point: all directions are alike) or around a centre up to 2 away."""
+    """Outside of a sphere around the origin (no design point: all directions are alike) or around a
+    centre up to 2 away.
+    """
     d, offset = int(rng.choice((2, 5, 10))), rng.uniform(0.2, 2) * (rng.random() < 0.5)
     radius = _solve(lambda r: sphere_probability(offset, r, 1, d), P, 0.5, 14.0)
-    return Limit(sphere, (offset * _directions(rng, 1, d)[0], radius, 1.0), d, sphere_probability(offset, radius, 1, d))
+    return Limit(
+        sphere,
+        (offset * _directions(rng, 1, d)[0], radius, 1.0),
+        d,
+        sphere_probability(offset, radius, 1, d),
+    )
 
 
 def inside(rng, P):
     """Inside of a sphere of radius 1 to 4."""
     d, radius = int(rng.choice((2, 5))), rng.uniform(1, 4)
     offset = _solve(lambda c: sphere_probability(c, radius, -1, d), P, 0.0, 14.0)
-    return Limit(sphere, (offset * _directions(rng, 1, d)[0], radius, -1.0), d, sphere_probability(offset, radius, -1, d))
+    return Limit(
+        sphere,
+        (offset * _directions(rng, 1, d)[0], radius, -1.0),
+        d,
+        sphere_probability(offset, radius, -1, d),
+    )
 
 
 def branches(rng, P):
@@ -267,7 +369,9 @@ def walks(rng, P):
     form = str(rng.choice(("one-sided", "two-sided")))
     steps = walk1d(form).horizon
     threshold = _solve(lambda c: walk_probability(c, steps, form == "two-sided", 150), P, 0.5, 60.0)
-    return walk1d(form, threshold=threshold), walk_probability(threshold, steps, form == "two-sided")
+    return walk1d(form, threshold=threshold), walk_probability(
+        threshold, steps, form == "two-sided"
+    )
 
 
 def autoregressions(rng, P):
@@ -278,7 +382,9 @@ def autoregressions(rng, P):
 
 
 def ruins(rng, P):
-    """Ruin from 1 to 5, with drawn odds, in 200 steps; the goal is the one of nearest probability."""
+    """Ruin from 1 to 5, with drawn odds, in 200 steps; the goal is the one of nearest
+    probability.
+    """
     up, start = rng.uniform(0.3, 0.48), int(rng.integers(1, 6))
     p = {goal: ruin_probability(up, start, goal, 200) for goal in range(start + 2, 60, 2)}
     goal = min(p, key=lambda goal: abs(np.log(p[goal]) - np.log(P)))
@@ -287,12 +393,28 @@ def ruins(rng, P):
 
 FAMILIES = {
     f.__name__: f
-    for f in (two_sided, scaled, high_dimensional, union, intersection, curved, outside, inside, branches, landings, walks, autoregressions, ruins)
+    for f in (
+        two_sided,
+        scaled,
+        high_dimensional,
+        union,
+        intersection,
+        curved,
+        outside,
+        inside,
+        branches,
+        landings,
+        walks,
+        autoregressions,
+        ruins,
+    )
 }
 
 
 def limit(family, seed, log10=(-12.0, -2.0)):
-    """What the family draws: a `Limit`, or (simulator, truth) of one of several steps. ``log10``: range of log10 P."""
+    """What the family draws: a `Limit`, or (simulator, truth) of one of several steps. ``log10``:
+    range of log10 P.
+    """
     rng = np.random.default_rng([zlib.crc32(family.encode()), seed])
     return FAMILIES[family](rng, 10 ** rng.uniform(*log10))
 
@@ -305,35 +427,59 @@ def draw(family, seed, log10=(-12.0, -2.0)):
 
 
 def check(family, seed, n=400_000):
-    """Standard errors between truth and sampling: one number at P of 3 to 30 % (plain Monte Carlo), where a simple sampler can, a second at its own P.
+    """Standard errors between truth and sampling: one number at P of 3 to 30 % (plain Monte Carlo),
+    where a simple sampler can, a second at its own P.
 
-    Limit states are sampled in NumPy, the second time with weights from N(0, 2.5^2 I), d <= 5, or at the corner; systems of several steps are simulated.
+    Limit states are sampled in NumPy, the second time with weights from N(0, 2.5^2 I), d <= 5, or
+    at the corner; systems of several steps are simulated.
     """
     easy, rng = limit(family, seed, (-1.5, -0.5)), np.random.default_rng(seed)
     if not isinstance(easy, Limit):
         rate, truth = jast.nominal(jax.random.key(seed), easy[0], n).rate, easy[1]
         return [(rate - truth) / np.sqrt(truth * (1 - truth) / n)]
-    rate = np.mean([easy.batch(rng.standard_normal((10_000, easy.dimension))) <= 0 for _ in range(n // 10_000)])
-    scores, rare = [(rate - easy.truth) / np.sqrt(easy.truth * (1 - easy.truth) / n)], limit(family, seed)
+    rate = np.mean(
+        [easy.batch(rng.standard_normal((10_000, easy.dimension))) <= 0 for _ in range(n // 10_000)]
+    )
+    scores, rare = (
+        [(rate - easy.truth) / np.sqrt(easy.truth * (1 - easy.truth) / n)],
+        limit(family, seed),
+    )
     at_corner = rare.g is corner
     if rare.dimension <= 5 or at_corner:
         centre, spread = (rare.parameters[1] @ rare.parameters[0], 1.0) if at_corner else (0.0, 2.5)
         z = rng.standard_normal((n, rare.dimension))
         x = centre + spread * z
-        weights = (rare.batch(x) <= 0) * np.exp(rare.dimension * np.log(spread) + 0.5 * np.sum(z**2 - x**2, -1))
+        weights = (rare.batch(x) <= 0) * np.exp(
+            rare.dimension * np.log(spread) + 0.5 * np.sum(z**2 - x**2, -1)
+        )
         scores.append((weights.mean() - rare.truth) / (weights.std() / n**0.5))
     return scores
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.limit_states", description="Check the truths of the families by sampling.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.limit_states",
+        description="Check the truths of the families by sampling.",
+    )
     parser.add_argument("--seeds", type=int, default=8)
     args = parser.parse_args(argv)
     for family in FAMILIES:
         scores = [check(family, seed) for seed in range(args.seeds)]
-        easy, rare = np.array([s[0] for s in scores]), np.array([s[1] for s in scores if len(s) > 1])
-        note = f", rare: rms {np.sqrt(np.mean(rare**2)):.2f}, greatest {np.abs(rare).max():.2f} ({len(rare)} seeds)" if len(rare) else ""
-        print(f"{family:18} standard errors: rms {np.sqrt(np.mean(easy**2)):.2f}, greatest {np.abs(easy).max():.2f}{note}", flush=True)
+        easy, rare = (
+            np.array([s[0] for s in scores]),
+            np.array([s[1] for s in scores if len(s) > 1]),
+        )
+        note = (
+            f", rare: rms {np.sqrt(np.mean(rare**2)):.2f}, greatest {np.abs(rare).max():.2f}"
+            f" ({len(rare)} seeds)"
+            if len(rare)
+            else ""
+        )
+        print(
+            f"{family:18} standard errors: rms {np.sqrt(np.mean(easy**2)):.2f}, greatest"
+            f" {np.abs(easy).max():.2f}{note}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Peers of jast's cross-entropy optimisers on the same budgets, in NumPy and float64: ``python -m benchmarks.peers --seeds 64 [--cases ...] [--peers ...]``.
+"""Peers of jast's cross-entropy optimisers on the same budgets, in NumPy and float64: ``python -m
+benchmarks.peers --seeds 64 [--cases ...] [--peers ...]``.
 
-A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every true evaluation in order, ``(x [n, d], value [n])`` with ``n <= budget``. Methods that
-start from a distribution get N(mean, diag sd^2), methods on a box mean +- 2 sd. Needs scipy 1.15 and,
-for their peers, cma and bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
+A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every true evaluation in order, ``(x
+[n, d], value [n])`` with ``n <= budget``. Methods that start from a distribution get N(mean, diag
+sd^2), methods on a box mean +- 2 sd. Needs scipy 1.15 and, for their peers, cma and
+bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
 """
 
 import argparse
@@ -52,9 +54,11 @@ def random_search(seed, objective, mean, sd, budget):
 
 
 def cma_es(seed, objective, mean, sd, budget):
-    """CMA-ES (cma), population 4 + 3 ln d. The first run starts at the mean, each restart, after it has converged, at a draw from the start distribution.
+    """CMA-ES (cma), population 4 + 3 ln d. The first run starts at the mean, each restart, after it
+    has converged, at a draw from the start distribution.
 
-    ``tolfun`` and ``tolfunhist`` (1e-11, absolute) are off: in sierra's flat far field they end a run after one generation, on 1B five times a seed.
+    ``tolfun`` and ``tolfunhist`` (1e-11, absolute) are off: in sierra's flat far field they end a
+    run after one generation, on 1B five times a seed.
     """
     import cma
 
@@ -82,7 +86,9 @@ def cma_es(seed, objective, mean, sd, budget):
 
 
 def differential_evolution(seed, objective, mean, sd, budget):
-    """Differential evolution (scipy, its defaults, no polish) with 5 d individuals in the box; started anew should the population become equal."""
+    """Differential evolution (scipy, its defaults, no polish) with 5 d individuals in the box;
+    started anew should the population become equal.
+    """
     from scipy import optimize
 
     rng = np.random.default_rng(seed)
@@ -90,27 +96,35 @@ def differential_evolution(seed, objective, mean, sd, budget):
 
     def search(evaluate):
         while True:
-            optimize.differential_evolution(evaluate, bounds, popsize=5, maxiter=budget, tol=0, polish=False, rng=rng)
+            optimize.differential_evolution(
+                evaluate, bounds, popsize=5, maxiter=budget, tol=0, polish=False, rng=rng
+            )
 
     return _record(objective, budget, len(mean), search)
 
 
 def direct(seed, objective, mean, sd, budget, jitter=0.25):
-    """DIRECT (scipy, locally biased). It is deterministic, so the seed shifts the box by a uniform draw of up to +- ``jitter`` sd in each coordinate."""
+    """DIRECT (scipy, locally biased). It is deterministic, so the seed shifts the box by a uniform
+    draw of up to +- ``jitter`` sd in each coordinate.
+    """
     from scipy import optimize
 
     centre = mean + jitter * sd * np.random.default_rng(seed).uniform(-1, 1, len(mean))
     bounds = list(zip(centre - 2 * sd, centre + 2 * sd))
-    search = lambda evaluate: optimize.direct(evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0)
+    search = lambda evaluate: optimize.direct(
+        evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0
+    )
     return _record(objective, budget, len(mean), search)
 
 
 def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=10_000, n_smart=10):
-    """Sequential Gaussian process with expected improvement (bayesian-optimization), Matern 5/2 in units of sd, y standardised at every step.
+    """Sequential Gaussian process with expected improvement (bayesian-optimization), Matern 5/2 in
+    units of sd, y standardised at every step.
 
-    The ``first`` points are draws from the start distribution, the others maximise the acquisition in the box: ``n_random`` candidates, the best ``n_smart``
-    of them improved by L-BFGS-B. One lengthscale for all coordinates, of the greatest likelihood of six starts. All this is the library's default, only
-    xi is 0.
+    The ``first`` points are draws from the start distribution, the others maximise the acquisition
+    in the box: ``n_random`` candidates, the best ``n_smart`` of them improved by L-BFGS-B. One
+    lengthscale for all coordinates, of the greatest likelihood of six starts. All this is the
+    library's default, only xi is 0.
     """
     from bayes_opt.acquisition import ExpectedImprovement
     from bayes_opt.target_space import TargetSpace
@@ -120,7 +134,9 @@ def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=1
     rng = np.random.default_rng(seed)
     state = np.random.RandomState(rng.integers(2**32))
     bounds = {f"x{i}": (-2.0, 2.0) for i in range(len(mean))}
-    gp = GaussianProcessRegressor(Matern(nu=2.5), alpha=1e-6, normalize_y=True, n_restarts_optimizer=5, random_state=state)
+    gp = GaussianProcessRegressor(
+        Matern(nu=2.5), alpha=1e-6, normalize_y=True, n_restarts_optimizer=5, random_state=state
+    )
     acquisition = ExpectedImprovement(xi=0.0)
 
     def search(evaluate):
@@ -129,19 +145,29 @@ def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=1
         while True:
             y = np.array(value)
             space = TargetSpace(None, bounds, allow_duplicate_points=True)
-            for point, target in zip(z, (y.mean() - y) / (y.std() or 1.0)):  # it maximises; EI in these units, or L-BFGS-B finds it flat
+            # it maximises; EI in these units, or L-BFGS-B finds it flat
+            for point, target in zip(z, (y.mean() - y) / (y.std() or 1.0)):
                 space.register(point, target)
-            z.append(acquisition.suggest(gp, space, n_random=n_random, n_smart=n_smart, random_state=state))
+            z.append(
+                acquisition.suggest(
+                    gp, space, n_random=n_random, n_smart=n_smart, random_state=state
+                )
+            )
             value.append(evaluate(mean + sd * z[-1]))
 
     return _record(objective, budget, len(mean), search)
 
 
-PEERS = {f.__name__: f for f in (random_search, cma_es, differential_evolution, direct, expected_improvement)}
+PEERS = {
+    f.__name__: f
+    for f in (random_search, cma_es, differential_evolution, direct, expected_improvement)
+}
 
 
 def run(peer, case, seeds):
-    """One run a seed: best ``values``, ``distances`` of the best point to the minimiser (None where there is none) and ``cpu_s``, each [seeds]."""
+    """One run a seed: best ``values``, ``distances`` of the best point to the minimiser (None where
+    there is none) and ``cpu_s``, each [seeds].
+    """
     peer, case = PEERS.get(peer, peer), CASES[case] if isinstance(case, str) else case
     budget = case.budgets[0] * case.budgets[1]
     values, points, seconds = [], [], []
@@ -153,19 +179,35 @@ def run(peer, case, seeds):
         best = np.argmin(value)
         values.append(value[best])
         points.append(x[best])
-    distances = None if case.minimiser is None else np.linalg.norm(np.array(points) - case.minimiser, axis=-1)
+    distances = (
+        None
+        if case.minimiser is None
+        else np.linalg.norm(np.array(points) - case.minimiser, axis=-1)
+    )
     return {"values": np.array(values), "distances": distances, "cpu_s": np.array(seconds)}
 
 
 def summary(values, distances=None):
-    """Means and standard errors of several runs; ``F`` is sqrt(50) times the root of the mean square distance, ``rms``."""
+    """Means and standard errors of several runs; ``F`` is sqrt(50) times the root of the mean
+    square distance, ``rms``.
+    """
     values, n = np.asarray(values, float), len(values)
     se = lambda sample: float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
-    report = {"seeds": n, "best": float(values.mean()), "best_se": se(values), "median": float(np.median(values))}
+    report = {
+        "seeds": n,
+        "best": float(values.mean()),
+        "best_se": se(values),
+        "median": float(np.median(values)),
+    }
     if distances is not None:
         d = np.asarray(distances, float)
         rms = float(np.mean(d**2) ** 0.5)
-        report |= {"distance": float(d.mean()), "distance_se": se(d), "rms": rms, "F": 50**0.5 * rms}
+        report |= {
+            "distance": float(d.mean()),
+            "distance_se": se(d),
+            "rms": rms,
+            "F": 50**0.5 * rms,
+        }
     return report
 
 
@@ -177,22 +219,50 @@ def _version(package):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.peers", description=__doc__.splitlines()[0]
+    )
     parser.add_argument("--seeds", type=int, default=64)
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help=", ".join(CASES))
-    parser.add_argument("--peers", nargs="+", choices=PEERS, default=[p for p in PEERS if p != "expected_improvement"], metavar="PEER", help=", ".join(PEERS))
+    parser.add_argument(
+        "--cases",
+        nargs="+",
+        choices=CASES,
+        default=list(CASES),
+        metavar="CASE",
+        help=", ".join(CASES),
+    )
+    parser.add_argument(
+        "--peers",
+        nargs="+",
+        choices=PEERS,
+        default=[p for p in PEERS if p != "expected_improvement"],
+        metavar="PEER",
+        help=", ".join(PEERS),
+    )
     parser.add_argument("--json", metavar="FILE", help="write every run to this file")
     args = parser.parse_args(argv)
     packages = ("numpy", "scipy", "scikit-learn", "cma", "bayesian-optimization")
     report = {"versions": {p: _version(p) for p in packages}, "results": []}
-    print(f"{'case':14}{'peer':24}{'mean best':>12}{'se':>10}{'median':>12}{'distance':>10}{'se':>8}{'F':>8}{'CPU s':>9}")
+    print(
+        f"{'case':14}{'peer':24}{'mean best':>12}{'se':>10}{'median':>12}{'distance':>10}"
+        f"{'se':>8}{'F':>8}{'CPU s':>9}"
+    )
     for name in args.cases:
         for peer in args.peers:
             result = run(peer, name, range(args.first, args.first + args.seeds))
-            s = summary(result["values"], result["distances"]) | {"cpu_s": float(result["cpu_s"].mean())}
-            where = f"{s['distance']:10.3f}{s['distance_se']:8.3f}{s['F']:8.1f}" if "F" in s else f"{'-':>10}{'-':>8}{'-':>8}"
-            print(f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}{s['cpu_s']:9.4f}", flush=True)
+            s = summary(result["values"], result["distances"]) | {
+                "cpu_s": float(result["cpu_s"].mean())
+            }
+            where = (
+                f"{s['distance']:10.3f}{s['distance_se']:8.3f}{s['F']:8.1f}"
+                if "F" in s
+                else f"{'-':>10}{'-':>8}{'-':>8}"
+            )
+            print(
+                f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}{s['cpu_s']:9.4f}",
+                flush=True,
+            )
             raw = {k: None if v is None else v.tolist() for k, v in result.items()}
             report["results"].append({"case": name, "peer": peer, **s, "runs": raw})
             if args.json:

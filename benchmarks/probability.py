@@ -1,9 +1,13 @@
-"""Failure probabilities: error, coverage and cost of jast's estimators, ``python -m benchmarks.probability [--json] [--quick] [--only PART ...]``.
+"""Failure probabilities: error, coverage and cost of jast's estimators, ``python -m
+benchmarks.probability [--json] [--quick] [--only PART ...]``.
 
-``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the published Algorithm 2, traces a second; ``range``: log P to
-1e-100 in float32; ``policy``: learned failure policies, with compilation; ``default``: `failure_probability` over seeds, with and without gradients, beside
-OpenTURNS on the same limit states and evaluations; ``cases``: the fixed cases; ``coverage``: problems drawn by seed (benchmarks.limit_states), how often the
-95 % interval covers, how often an estimate is flagged, and how often an interval misses without a flag. Float32 throughout.
+``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the
+published Algorithm 2, traces a second; ``range``: log P to 1e-100 in float32; ``policy``: learned
+failure policies, with compilation; ``default``: `failure_probability` over seeds, with and without
+gradients, beside OpenTURNS on the same limit states and evaluations; ``cases``: the fixed cases;
+``coverage``: problems drawn by seed (benchmarks.limit_states), how often the 95 % interval covers,
+how often an estimate is flagged, and how often an interval misses without a flag. Float32
+throughout.
 """
 
 import argparse
@@ -20,7 +24,13 @@ import jast
 from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
 from jast.distributions import Normal
-from jast.estimate import clopper_pearson, failure_probability, importance, policy_proposal, trace_proposal
+from jast.estimate import (
+    clopper_pearson,
+    failure_probability,
+    importance,
+    policy_proposal,
+    trace_proposal,
+)
 from jast.estimate.blend import blend
 from jast.policy import Policy
 
@@ -31,13 +41,23 @@ PARTS = ("landing", "range", "policy", "default", "cases", "coverage")
 def both_traces(b=1.0):
     """The landing and its two design points as a proposal."""
     sim = jast.simulators.landing(b=b)
-    traces = [jast.replay(sim, jnp.full(10, side * b * 1.001 * 0.0009 / 0.019), jnp.float32(side * b * 1.001 * 0.01 / 0.019)) for side in (1, -1)]
+    traces = [
+        jast.replay(
+            sim,
+            jnp.full(10, side * b * 1.001 * 0.0009 / 0.019),
+            jnp.float32(side * b * 1.001 * 0.01 / 0.019),
+        )
+        for side in (1, -1)
+    ]
     return sim, trace_proposal(sim, traces)
 
 
 def _to_the_edge(s, t):
     """The best deterministic policy: the rest of the way in equal steps."""
-    return Normal((jnp.where(s.x2 >= 0, 1.0, -1.0) - s.x2) / (10 - t).astype(s.x2.dtype), jnp.ones_like(s.x2) * 0.03)
+    return Normal(
+        (jnp.where(s.x2 >= 0, 1.0, -1.0) - s.x2) / (10 - t).astype(s.x2.dtype),
+        jnp.ones_like(s.x2) * 0.03,
+    )
 
 
 def _two_starts(s0):
@@ -58,23 +78,37 @@ def landing(seeds, samples=100_000):
         cpu, wall = time.process_time(), time.perf_counter()
         importance(jax.random.key(seeds), sim, proposal, 2_000_000)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-        out[name] = summary([(r, LANDING) for r in runs]) | {"traces_per_cpu_s": 2e6 / cpu, "traces_per_s": 2e6 / wall}
+        out[name] = summary([(r, LANDING) for r in runs]) | {
+            "traces_per_cpu_s": 2e6 / cpu,
+            "traces_per_s": 2e6 / wall,
+        }
     return out
 
 
 def to_small(samples=262_144):
-    """log10 P, the error of the estimate and its relative standard error, by the width of the runway."""
+    """log10 P, the error of the estimate and its relative standard error, by the width of the
+    runway.
+    """
     rows = []
     for b in (1.0, 1.5, 2.0, 2.5, 2.92):
         sim, proposal = both_traces(b)
         r = importance(jax.random.key(1), sim, proposal, samples)
         log_p = float(np.log(2) + stats.norm.logsf(b / np.sqrt(0.019)))
-        rows.append({"b": b, "log10_P": log_p / np.log(10), "error": float(np.expm1(r.log_mean - log_p)), "relative_error": r.relative_error})
+        rows.append(
+            {
+                "b": b,
+                "log10_P": log_p / np.log(10),
+                "error": float(np.expm1(r.log_mean - log_p)),
+                "relative_error": r.relative_error,
+            }
+        )
     return rows
 
 
 def policies(seeds):
-    """Learned policies on the landing: training and estimation from nothing, compilation included in the first."""
+    """Learned policies on the landing: training and estimation from nothing, compilation included
+    in the first.
+    """
     sim, runs, clocks = jast.simulators.landing(), [], []
     for seed in range(seeds):
         jax.clear_caches()
@@ -82,11 +116,21 @@ def policies(seeds):
         policy = jast.policies.sac(jax.random.key(seed), sim)
         r = importance(jax.random.key(100 + seed), sim, policy_proposal(sim, policy), 100_000)
         clocks.append((time.perf_counter() - wall, time.process_time() - cpu))
-        samples = jast.estimate.failure_samples(jax.random.key(200 + seed), sim, policy_proposal(sim, policy), 500, moves=0).episodes
+        samples = jast.estimate.failure_samples(
+            jax.random.key(200 + seed), sim, policy_proposal(sim, policy), 500, moves=0
+        ).episodes
         upper = float(np.mean(samples.x0 + samples.disturbances.sum(axis=1) > 0))
         runs.append((r, LANDING, upper))
-    good = sum(abs(r.mean / LANDING - 1) <= 0.1 and r.relative_error <= 0.02 and 0.2 < upper < 0.8 for r, _, upper in runs)
-    extra = {"good": good, "upper_mode": [upper for *_, upper in runs], "wall_s": [w for w, _ in clocks], "cpu_s": [c for _, c in clocks]}
+    good = sum(
+        abs(r.mean / LANDING - 1) <= 0.1 and r.relative_error <= 0.02 and 0.2 < upper < 0.8
+        for r, _, upper in runs
+    )
+    extra = {
+        "good": good,
+        "upper_mode": [upper for *_, upper in runs],
+        "wall_s": [w for w, _ in clocks],
+        "cpu_s": [c for _, c in clocks],
+    }
     return summary([run[:2] for run in runs]) | extra
 
 
@@ -101,7 +145,9 @@ def default(seeds, peers, budget=100_000):
             out[f"{case}, {name}"] = ours([(sim, truth)] * seeds, budget, gradients=gradients)
         for method in peers:
             if (case, method) != ("hyperplane 20", "nais"):  # minutes a run
-                out[f"{case}, {method}"] = reliability.row(method, names.get(case, case), budget, min(seeds, 20))
+                out[f"{case}, {method}"] = reliability.row(
+                    method, names.get(case, case), budget, min(seeds, 20)
+                )
     return out
 
 
@@ -109,7 +155,9 @@ def ours(problems, budget, **settings):
     """The summary of `failure_probability` on (simulator, truth), a seed each."""
     cpu, runs = time.process_time(), []
     for seed, (sim, truth) in enumerate(problems):
-        runs.append((failure_probability(jax.random.key(10_000 + seed), sim, budget, **settings), truth))
+        runs.append(
+            (failure_probability(jax.random.key(10_000 + seed), sim, budget, **settings), truth)
+        )
     return summary(runs) | {"cpu_s": (time.process_time() - cpu) / len(runs)}
 
 
@@ -119,30 +167,65 @@ def summary(runs):
     covers = np.array([r.interval[0] <= truth <= r.interval[1] for r, truth in runs])
     reliable = np.array([r.reliable for r, _ in runs])
     return {
-        "seeds": len(runs), "rms": float(np.mean(error**2) ** 0.5), "greatest": float(np.abs(error).max()), "beyond_20": float(np.mean(np.abs(error) > 0.2)),
-        "relative_error": float(np.nanmedian([r.relative_error for r, _ in runs])), "covers": int(covers.sum()), "flagged": int((~reliable).sum()),
-        "covers_of_reliable": int((covers & reliable).sum()), "misses_unflagged": int((~covers & reliable).sum()),
-        "evaluations": float(np.median([r.evaluations for r, _ in runs])), "estimates": [r.mean / truth for r, truth in runs],
-        "standard_errors_off": [(r.mean / truth - 1) / r.relative_error if r.failures_seen else None for r, truth in runs],
-    }  # fmt: skip
+        "seeds": len(runs),
+        "rms": float(np.mean(error**2) ** 0.5),
+        "greatest": float(np.abs(error).max()),
+        "beyond_20": float(np.mean(np.abs(error) > 0.2)),
+        "relative_error": float(np.nanmedian([r.relative_error for r, _ in runs])),
+        "covers": int(covers.sum()),
+        "flagged": int((~reliable).sum()),
+        "covers_of_reliable": int((covers & reliable).sum()),
+        "misses_unflagged": int((~covers & reliable).sum()),
+        "evaluations": float(np.median([r.evaluations for r, _ in runs])),
+        "estimates": [r.mean / truth for r, truth in runs],
+        "standard_errors_off": [
+            (r.mean / truth - 1) / r.relative_error if r.failures_seen else None
+            for r, truth in runs
+        ],
+    }
 
 
 def line(name, r):
-    text = f"  {name:42} rms {100 * r['rms']:7.2f} %  greatest {100 * r['greatest']:6.1f} %  SE {100 * r['relative_error']:6.2f} %"
-    text += f"  covers {r['covers']:3d}, flagged {r['flagged']:3d}, misses unflagged {r['misses_unflagged']:2d} of {r['seeds']}"
+    text = (
+        f"  {name:42} rms {100 * r['rms']:7.2f} %  greatest {100 * r['greatest']:6.1f} %  SE"
+        f" {100 * r['relative_error']:6.2f} %"
+    )
+    text += (
+        f"  covers {r['covers']:3d}, flagged {r['flagged']:3d}, misses unflagged"
+        f" {r['misses_unflagged']:2d} of {r['seeds']}"
+    )
     return text + (f"  CPU {r['cpu_s']:.1f} s" if isinstance(r.get("cpu_s"), float) else "")
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.probability", description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
-    parser.add_argument("--quick", action="store_true", help="under two minutes: few seeds, no learned policies, two families")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.probability", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the report as JSON, and nothing else"
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="under two minutes: few seeds, no learned policies, two families",
+    )
     parser.add_argument("--only", nargs="+", choices=PARTS, help="parts to run; default: all")
-    parser.add_argument("--seeds", type=int, help="seeds of each family in coverage (20), and of default (50)")
-    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="FAMILY", help=", ".join(FAMILIES))
+    parser.add_argument(
+        "--seeds", type=int, help="seeds of each family in coverage (20), and of default (50)"
+    )
+    parser.add_argument(
+        "--families",
+        nargs="+",
+        choices=FAMILIES,
+        default=list(FAMILIES),
+        metavar="FAMILY",
+        help=", ".join(FAMILIES),
+    )
     parser.add_argument("--budget", type=int, default=100_000)
     args = parser.parse_args(argv)
-    parts = args.only or [part for part in PARTS if not (args.quick and part in ("policy", "cases"))]
+    parts = args.only or [
+        part for part in PARTS if not (args.quick and part in ("policy", "cases"))
+    ]
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
     report, quick = {"budget": args.budget}, args.quick
 
@@ -150,11 +233,17 @@ def main(argv=None):
         report["landing"] = landing(5 if quick else 200)
         say("importance resampling on the landing, 1e5 traces")
         for name, r in report["landing"].items():
-            say(line(name, r) + f"  {r['traces_per_cpu_s'] / 1e6:.2f} M traces a CPU s, {r['traces_per_s'] / 1e6:.2f} M a s")
+            say(
+                line(name, r) + f"  {r['traces_per_cpu_s'] / 1e6:.2f} M traces a CPU s,"
+                f" {r['traces_per_s'] / 1e6:.2f} M a s"
+            )
     if "range" in parts:
         report["range"] = to_small()
         for r in report["range"]:
-            say(f"  log10 P {r['log10_P']:8.2f}  error {100 * r['error']:6.2f} %  SE {100 * r['relative_error']:.2f} %")
+            say(
+                f"  log10 P {r['log10_P']:8.2f}  error {100 * r['error']:6.2f} %  SE"
+                f" {100 * r['relative_error']:.2f} %"
+            )
     if "policy" in parts:
         report["policy"] = r = policies(2 if quick else 10)
         say(
@@ -171,7 +260,10 @@ def main(argv=None):
             if "covers" in r:
                 say(line(name, r))
             else:
-                say(f"  {name:42} rms {100 * r['rms']:7.2f} %  beyond 20 %: {100 * r['beyond_20']:.0f} %  reported {100 * (r['cov'] or np.nan):.2f} %")
+                say(
+                    f"  {name:42} rms {100 * r['rms']:7.2f} %  beyond 20 %:"
+                    f" {100 * r['beyond_20']:.0f} %  reported {100 * (r['cov'] or np.nan):.2f} %"
+                )
     if "cases" in parts:
         report["cases"] = {}
         for c in cases():
@@ -180,14 +272,29 @@ def main(argv=None):
     if "coverage" in parts:
         report["coverage"], total = {}, []
         for family in ("two_sided", "branches") if quick else args.families:
-            problems = [draw(family, 50_000 + seed)[1:] for seed in range(args.seeds or (3 if quick else 20))]
+            problems = [
+                draw(family, 50_000 + seed)[1:]
+                for seed in range(args.seeds or (3 if quick else 20))
+            ]
             report["coverage"][family] = r = ours(problems, args.budget)
             total.append(r)
             say(line(family, r))
-        n, flagged, covers, missed = (sum(r[k] for r in total) for k in ("seeds", "flagged", "covers_of_reliable", "misses_unflagged"))
+        n, flagged, covers, missed = (
+            sum(r[k] for r in total)
+            for k in ("seeds", "flagged", "covers_of_reliable", "misses_unflagged")
+        )
         interval = clopper_pearson(covers, n - flagged) if n > flagged else (0.0, 1.0)
-        report["coverage_total"] = {"problems": n, "flagged": flagged, "covers": covers, "misses_unflagged": missed, "coverage_95": list(interval)}
-        say(f"  all: {covers} of {n - flagged} unflagged intervals cover [{interval[0]:.3f}, {interval[1]:.3f}]; {flagged} of {n} flagged")
+        report["coverage_total"] = {
+            "problems": n,
+            "flagged": flagged,
+            "covers": covers,
+            "misses_unflagged": missed,
+            "coverage_95": list(interval),
+        }
+        say(
+            f"  all: {covers} of {n - flagged} unflagged intervals cover [{interval[0]:.3f},"
+            f" {interval[1]:.3f}]; {flagged} of {n} flagged"
+        )
     if args.json:
         print(json.dumps(report))
 

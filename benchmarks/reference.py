@@ -1,7 +1,9 @@
-"""MCFS-AP and MCTS-SA on the S0 ferry in plain Python: the baseline of speed and of results that the JAX engine is compared with.
+"""MCFS-AP and MCTS-SA on the S0 ferry in plain Python: the baseline of speed and of results that
+the JAX engine is compared with.
 
-Algorithm 1 of Lytskjold and Mengshoel (MCFS-AP) without networks, with their settings: one tree is 18 roots of 500 simulations each; MCTS-SA is the same
-code with one root of 9000. Only the standard library is used; states are kept in the tree, so a simulation never steps through its prefix again.
+Algorithm 1 of Lytskjold and Mengshoel (MCFS-AP) without networks, with their settings: one tree is
+18 roots of 500 simulations each; MCTS-SA is the same code with one root of 9000. Only the standard
+library is used; states are kept in the tree, so a simulation never steps through its prefix again.
 
     python -m benchmarks.reference --trees 60 [--sa] [--json]
 
@@ -22,15 +24,34 @@ TURN = pi / 100
 
 
 class Node:
-    """A visited state. ``values`` and ``bonuses`` hold a child's mean reward and 10 / sqrt(1 + N), side by side for a fast choice."""
+    """A visited state. ``values`` and ``bonuses`` hold a child's mean reward and 10 / sqrt(1 + N),
+    side by side for a fast choice.
+    """
 
-    __slots__ = ("parent", "index", "step", "x", "y", "heading", "seed", "nearest", "log_p", "ending", "visits", "seeds", "children", "values", "bonuses")
+    __slots__ = (
+        "parent",
+        "index",
+        "step",
+        "x",
+        "y",
+        "heading",
+        "seed",
+        "nearest",
+        "log_p",
+        "ending",
+        "visits",
+        "seeds",
+        "children",
+        "values",
+        "bonuses",
+    )
 
     def __init__(self, parent, index, step, x, y, heading, seed, nearest, log_p, ending):
         self.parent, self.index, self.step = parent, index, step
         self.x, self.y, self.heading, self.seed = x, y, heading, seed
         self.nearest = nearest  # squared closest approach so far
-        self.log_p, self.ending = log_p, ending  # of the step into this state; reward of the episode's end here, or None
+        # of the step into this state; reward of the episode's end here, or None
+        self.log_p, self.ending = log_p, ending
         self.visits = 0
         self.seeds, self.children, self.values, self.bonuses = [], [], [], []
 
@@ -38,8 +59,9 @@ class Node:
 def forest(seed, prunes=18, simulations=500, k=0.5, alpha=0.6, exploration=10.0):
     """Grow one tree: ``(best reward, simulations done, simulator steps)``.
 
-    Each of ``prunes`` roots gets ``simulations``; then its most visited child becomes the root. A node gains a child while it has no more than
-    ``k N**alpha``. ``prunes=1, simulations=9000`` is MCTS-SA. A reward above 0 is a collision.
+    Each of ``prunes`` roots gets ``simulations``; then its most visited child becomes the root. A
+    node gains a child while it has no more than ``k N**alpha``. ``prunes=1, simulations=9000`` is
+    MCTS-SA. A reward above 0 is a collision.
     """
     uniform = random.Random(seed).random
     most = prunes * simulations + 2
@@ -77,7 +99,8 @@ def forest(seed, prunes=18, simulations=500, k=0.5, alpha=0.6, exploration=10.0)
                 reward = node.ending
             done += 1
 
-            # the mean reward from each node on, up to the original root: the ancestors of a pruned root learn too
+            # the mean reward from each node on, up to the original root: the ancestors of a pruned
+            # root learn too
             parent = node.parent
             while parent is not None:
                 reward += node.log_p
@@ -111,7 +134,14 @@ def _first_visit(node, index):
 
 def _rollout(node, uniform):
     """Random seeds from ``node`` to the end: the reward after ``node``, and the steps taken."""
-    x, y, heading, last, nearest, likelihood = node.x, node.y, node.heading, node.seed, node.nearest, 1.0
+    x, y, heading, last, nearest, likelihood = (
+        node.x,
+        node.y,
+        node.heading,
+        node.seed,
+        node.nearest,
+        1.0,
+    )
     for step in range(node.step + 1, STEPS + 1):
         seed = uniform()
         likelihood *= 1 - abs(seed - last)
@@ -130,7 +160,10 @@ def _rollout(node, uniform):
 def interval(successes, n, z=1.959963984540054):
     """Wilson's score interval of a share, 95 % by default: ``(low, high)``."""
     share, square = successes / n, z * z
-    middle, half = share + square / (2 * n), z * sqrt(share * (1 - share) / n + square / (4 * n * n))
+    middle, half = (
+        share + square / (2 * n),
+        z * sqrt(share * (1 - share) / n + square / (4 * n * n)),
+    )
     return (middle - half) / (1 + square / n), (middle + half) / (1 + square / n)
 
 
@@ -151,15 +184,30 @@ def main(arguments=None):
     failing = sum(b > 0 for b in best)
     low, high = interval(failing, len(best))
     report = dict(
-        method="MCTS-SA" if args.sa else "MCFS-AP", seed=args.seed, trees=len(best), failing=failing, rate=failing / len(best), interval=[low, high],
-        mean_best=sum(best) / len(best), best=max(best), simulations=sum(done), steps=sum(steps), cpu_seconds=seconds,
+        method="MCTS-SA" if args.sa else "MCFS-AP",
+        seed=args.seed,
+        trees=len(best),
+        failing=failing,
+        rate=failing / len(best),
+        interval=[low, high],
+        mean_best=sum(best) / len(best),
+        best=max(best),
+        simulations=sum(done),
+        steps=sum(steps),
+        cpu_seconds=seconds,
         simulations_per_second=sum(done) / seconds,
-    )  # fmt: skip
+    )
     if args.json:
         print(json.dumps(report))
     else:
-        print(f"{report['method']}, plain Python, {len(best)} trees: {failing} fail, {100 * failing / len(best):.1f} % [{100 * low:.1f}, {100 * high:.1f}]")
-        print(f"mean best {report['mean_best']:.2f}, best {max(best):.3f}; {sum(done)} simulations, {sum(steps)} steps")
+        print(
+            f"{report['method']}, plain Python, {len(best)} trees: {failing} fail,"
+            f" {100 * failing / len(best):.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+        )
+        print(
+            f"mean best {report['mean_best']:.2f}, best {max(best):.3f}; {sum(done)} simulations,"
+            f" {sum(steps)} steps"
+        )
         print(f"{seconds:.1f} CPU s: {report['simulations_per_second']:.0f} simulations a second")
 
 

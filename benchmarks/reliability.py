@@ -1,8 +1,11 @@
-"""Peers that estimate rare events, from OpenTURNS, on limit states of known probability: ``python -m benchmarks.reliability [--json] [--quick] [--seeds N]``.
+"""Peers that estimate rare events, from OpenTURNS, on limit states of known probability: ``python
+-m benchmarks.reliability [--json] [--quick] [--seeds N]``.
 
-``run(method, g_batch, dimension, budget, seed)`` estimates P(g(x) <= 0), x ~ N(0, I). Evaluations are counted in ``g_batch``, those of finite-difference
-gradients too. The table is over seeds: rms relative error, median of the reported coefficient of variation, evaluations, share of the runs that are off by
-more than 20 %, CPU time. What a method is told beyond g stands in its docstring. Needs openturns; set ``OPENBLAS_NUM_THREADS=1``.
+``run(method, g_batch, dimension, budget, seed)`` estimates P(g(x) <= 0), x ~ N(0, I). Evaluations
+are counted in ``g_batch``, those of finite-difference gradients too. The table is over seeds: rms
+relative error, median of the reported coefficient of variation, evaluations, share of the runs that
+are off by more than 20 %, CPU time. What a method is told beyond g stands in its docstring. Needs
+openturns; set ``OPENBLAS_NUM_THREADS=1``.
 """
 
 import argparse
@@ -18,9 +21,17 @@ from benchmarks.limit_states import LIMITS  # noqa: E402
 
 __all__ = ["METHODS", "run"]
 
-CASES = {  # starts of FORM, one a mode, as a user who knows the modes would give them; levels that subset simulation and NAIS take
-    "landing, static": ([s * LIMITS["landing, static"].parameters[0][0] for s in (3, -3)], {"subset": 13, "nais": 5}),
-    "four-branch": ([np.array(s) for s in ((2.0, 2.0), (-2.0, -2.0), (2.0, -2.0), (-2.0, 2.0))], {"subset": 3, "nais": 3}),
+# starts of FORM, one a mode, as a user who knows the modes would give them; levels that subset
+# simulation and NAIS take
+CASES = {
+    "landing, static": (
+        [s * LIMITS["landing, static"].parameters[0][0] for s in (3, -3)],
+        {"subset": 13, "nais": 5},
+    ),
+    "four-branch": (
+        [np.array(s) for s in ((2.0, 2.0), (-2.0, -2.0), (2.0, -2.0), (-2.0, 2.0))],
+        {"subset": 3, "nais": 3},
+    ),
     "hyperplane 20": ([np.ones(20)], {"subset": 7, "nais": 4}),
     "parallel": ([np.array([2.0, 2.0])], {"subset": 8, "nais": 7}),
 }
@@ -39,7 +50,11 @@ class Counted:
             return np.asarray(g_batch(np.asarray(x)), float)[:, None]
 
         function = ot.PythonFunction(dimension, 1, func_sample=batch)
-        self.event = ot.ThresholdEvent(ot.CompositeRandomVector(function, ot.RandomVector(ot.Normal(dimension))), ot.LessOrEqual(), 0.0)
+        self.event = ot.ThresholdEvent(
+            ot.CompositeRandomVector(function, ot.RandomVector(ot.Normal(dimension))),
+            ot.LessOrEqual(),
+            0.0,
+        )
 
 
 def _sized(algorithm, n):
@@ -52,17 +67,23 @@ def _sized(algorithm, n):
 
 
 def subset(ot, event, budget, levels):
-    """Subset simulation, its defaults (a tenth survives a level). ``levels``: how many it will take, which splits the budget; it is told."""
+    """Subset simulation, its defaults (a tenth survives a level). ``levels``: how many it will
+    take, which splits the budget; it is told.
+    """
     return _sized(ot.SubsetSampling(event), budget // levels)
 
 
 def nais(ot, event, budget, levels):
-    """Nonparametric adaptive importance sampling, quantile .1; ``levels`` as in `subset`. Its time grows with the square of the points a level."""
+    """Nonparametric adaptive importance sampling, quantile .1; ``levels`` as in `subset`. Its time
+    grows with the square of the points a level.
+    """
     return _sized(ot.NAIS(event, 0.1), budget // levels)
 
 
 def _form(ot, event, budget, count, search, starts):
-    """``search`` (FORM or MultiFORM) from each start, then importance sampling from an equal mixture of N(design point, I); 0 where none was found."""
+    """``search`` (FORM or MultiFORM) from each start, then importance sampling from an equal
+    mixture of N(design point, I); 0 where none was found.
+    """
     parts = []
     for start in starts:
         solver = ot.AbdoRackwitz()
@@ -70,14 +91,22 @@ def _form(ot, event, budget, count, search, starts):
         algorithm = search(solver, event)
         try:
             algorithm.run()
-        except (TypeError, RuntimeError):  # OpenTURNS's own: no convergence, or a point that is not on the limit state
+        except (
+            TypeError,
+            RuntimeError,
+        ):  # OpenTURNS's own: no convergence, or a point that is not on the limit state
             continue
         found = algorithm.getResult()
         found = found.getFORMResultCollection() if search is ot.MultiFORM else [found]
-        parts += [ot.Normal(f.getStandardSpaceDesignPoint(), ot.CovarianceMatrix(len(start))) for f in found]
+        parts += [
+            ot.Normal(f.getStandardSpaceDesignPoint(), ot.CovarianceMatrix(len(start)))
+            for f in found
+        ]
     if not parts:
         return 0.0, float("nan")
-    sampling = ot.ProbabilitySimulationAlgorithm(event, ot.ImportanceSamplingExperiment(parts[0] if len(parts) == 1 else ot.Mixture(parts)))
+    sampling = ot.ProbabilitySimulationAlgorithm(
+        event, ot.ImportanceSamplingExperiment(parts[0] if len(parts) == 1 else ot.Mixture(parts))
+    )
     sampling.setMaximumCoefficientOfVariation(0.0)  # to the end of the budget
     return _sized(sampling, budget - count())
 
@@ -88,17 +117,23 @@ def form_one(ot, event, budget, count, starts, random):
 
 
 def form_16(ot, event, budget, count, starts, random):
-    """FORM from 16 random starts and importance sampling at all the points found: no routine of OpenTURNS, but what a careful user would do with it."""
+    """FORM from 16 random starts and importance sampling at all the points found: no routine of
+    OpenTURNS, but what a careful user would do with it.
+    """
     return _form(ot, event, budget, count, ot.FORM, random)
 
 
 def form_by_hand(ot, event, budget, count, starts, random):
-    """FORM from ``starts``, given by hand for each mode, and importance sampling at all the points found."""
+    """FORM from ``starts``, given by hand for each mode, and importance sampling at all the points
+    found.
+    """
     return _form(ot, event, budget, count, ot.FORM, starts)
 
 
 def multi_form(ot, event, budget, count, starts, random):
-    """MultiFORM, its defaults, from a random start, and importance sampling at all the points found."""
+    """MultiFORM, its defaults, from a random start, and importance sampling at all the points
+    found.
+    """
     return _form(ot, event, budget, count, ot.MultiFORM, random[:1])
 
 
@@ -110,7 +145,8 @@ METHODS = LEVELS | FORM
 def run(method, g_batch, dimension, budget, seed, levels=13, starts=()):
     """One estimate: a dict of ``estimate``, ``evaluations`` and ``reported_cov``.
 
-    ``g_batch``: x [n, dimension] -> [n], float64; ``method``: one of ``METHODS``; ``levels`` is read by `subset` and `nais`, ``starts`` by `form_by_hand`.
+    ``g_batch``: x [n, dimension] -> [n], float64; ``method``: one of ``METHODS``; ``levels`` is
+    read by `subset` and `nais`, ``starts`` by `form_by_hand`.
     """
     import openturns as ot
 
@@ -121,43 +157,89 @@ def run(method, g_batch, dimension, budget, seed, levels=13, starts=()):
         estimate, cov = METHODS[method](ot, counted.event, budget, levels)
     else:
         random = np.random.default_rng(seed).standard_normal((16, dimension))
-        estimate, cov = METHODS[method](ot, counted.event, budget, lambda: counted.evaluations, starts, random)
-    return {"estimate": float(estimate), "evaluations": counted.evaluations, "reported_cov": float(cov)}
+        estimate, cov = METHODS[method](
+            ot, counted.event, budget, lambda: counted.evaluations, starts, random
+        )
+    return {
+        "estimate": float(estimate),
+        "evaluations": counted.evaluations,
+        "reported_cov": float(cov),
+    }
 
 
 def row(method, case, budget, seeds):
     """The report of several seeds."""
     limit, (starts, levels), cpu = LIMITS[case], CASES[case], time.process_time()
-    runs = [run(method, limit.batch, limit.dimension, budget, seed, levels.get(method), starts) for seed in range(seeds)]
+    runs = [
+        run(method, limit.batch, limit.dimension, budget, seed, levels.get(method), starts)
+        for seed in range(seeds)
+    ]
     cpu = (time.process_time() - cpu) / seeds
     error = np.array([r["estimate"] for r in runs]) / limit.truth - 1
-    cov = [r["reported_cov"] for r in runs if r["reported_cov"] >= 0]  # none where nothing was found
+    # none where nothing was found
+    cov = [r["reported_cov"] for r in runs if r["reported_cov"] >= 0]
     return {
-        "rms": float(np.mean(error**2) ** 0.5), "median_error": float(np.median(np.abs(error))), "cov": float(np.median(cov)) if cov else None,
-        "beyond_20": float(np.mean(~(np.abs(error) < 0.2))), "evaluations": float(np.median([r["evaluations"] for r in runs])), "cpu_s": cpu, "seeds": seeds,
-    }  # fmt: skip
+        "rms": float(np.mean(error**2) ** 0.5),
+        "median_error": float(np.median(np.abs(error))),
+        "cov": float(np.median(cov)) if cov else None,
+        "beyond_20": float(np.mean(~(np.abs(error) < 0.2))),
+        "evaluations": float(np.median([r["evaluations"] for r in runs])),
+        "cpu_s": cpu,
+        "seeds": seeds,
+    }
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.reliability", description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
-    parser.add_argument("--quick", action="store_true", help="4 seeds, and no NAIS in 20 dimensions, which takes minutes")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.reliability", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the report as JSON, and nothing else"
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="4 seeds, and no NAIS in 20 dimensions, which takes minutes",
+    )
     parser.add_argument("--seeds", type=int, help="runs of each row; 20, or 4 with --quick")
     parser.add_argument("--budget", type=int, default=100_000, help="evaluations of a run")
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help=", ".join(CASES))
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD", help=", ".join(METHODS))
+    parser.add_argument(
+        "--cases",
+        nargs="+",
+        choices=CASES,
+        default=list(CASES),
+        metavar="CASE",
+        help=", ".join(CASES),
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        choices=METHODS,
+        default=list(METHODS),
+        metavar="METHOD",
+        help=", ".join(METHODS),
+    )
     args = parser.parse_args(argv)
     seeds = args.seeds or (4 if args.quick else 20)
     report = {"budget": args.budget, "seeds": seeds, "results": {}}
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    say(f"{'case':17}{'method':14}{'rms':>10}{'median':>10}{'reported':>10}{'> 20 %':>9}{'evaluations':>13}{'CPU s':>8}")
+    say(
+        f"{'case':17}{'method':14}{'rms':>10}{'median':>10}{'reported':>10}{'> 20 %':>9}"
+        f"{'evaluations':>13}{'CPU s':>8}"
+    )
     for case in args.cases:
         for method in args.methods:
             if args.quick and (case, method) == ("hyperplane 20", "nais"):
                 continue
             report["results"][f"{case}, {method}"] = r = row(method, case, args.budget, seeds)
-            errors = "".join(f"{'-':>10}" if r[name] is None else f"{100 * r[name]:8.2f} %" for name in ("rms", "median_error", "cov"))
-            say(f"{case:17}{method:14}{errors}{100 * r['beyond_20']:7.0f} %{r['evaluations']:13.0f}{r['cpu_s']:8.2f}")
+            errors = "".join(
+                f"{'-':>10}" if r[name] is None else f"{100 * r[name]:8.2f} %"
+                for name in ("rms", "median_error", "cov")
+            )
+            say(
+                f"{case:17}{method:14}{errors}{100 * r['beyond_20']:7.0f}"
+                f" %{r['evaluations']:13.0f}{r['cpu_s']:8.2f}"
+            )
     if args.json:
         print(json.dumps(report))
 

@@ -1,7 +1,9 @@
-"""Table 1 of the MCFS-AP paper with its networks, and where heads pay: ``python -m benchmarks.ferry --table1``.
+"""Table 1 of the MCFS-AP paper with its networks, and where heads pay: ``python -m benchmarks.ferry
+--table1``.
 
-A row pools the trees of some seeds. Its interval takes them as independent; those of one seed share their heads, so the seeds' own rates stand beside it.
-Speeds are of whole calls, training and result included, without compilation: a call before each row (`warm_up`) compiles the same programs.
+A row pools the trees of some seeds. Its interval takes them as independent; those of one seed share
+their heads, so the seeds' own rates stand beside it. Speeds are of whole calls, training and result
+included, without compilation: a call before each row (`warm_up`) compiles the same programs.
 """
 
 import functools
@@ -20,7 +22,8 @@ from jast.search.trees import LANES
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}
-SPEED = {"-/-": 14_000, "MCTS-SA": 10_700, "RP/-": 663, "-/VN": 535, "RP/VN": 239}  # simulations per CPU second of the published code, on cores like these
+# simulations per CPU second of the published code, on cores like these
+SPEED = {"-/-": 14_000, "MCTS-SA": 10_700, "RP/-": 663, "-/VN": 535, "RP/VN": 239}
 
 
 class Sizes(NamedTuple):
@@ -54,7 +57,13 @@ COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "rate %": (6, lambda r: f"{100 * r['rate']:.1f}"),
     "95 %": (12, lambda r: "{:.1f} to {:.1f}".format(*(100 * v for v in r["rate_95"]))),
     "of each seed": (15, lambda r: " ".join(f"{100 * v:.1f}" for v in r["rates"])),
-    "mean best": (14, lambda r: f"{r['mean_best']:.2f}" + (f" +- {r['mean_best_95']:.2f}" if "mean_best_95" in r else "")),
+    "mean best": (
+        14,
+        lambda r: (
+            f"{r['mean_best']:.2f}"
+            + (f" +- {r['mean_best_95']:.2f}" if "mean_best_95" in r else "")
+        ),
+    ),
     "failing": (7, lambda r: f"{r['mean_best_failing']:.2f}"),
     "best of each": (17, lambda r: " ".join(f"{v:.2f}" for v in r.get("bests", [r["best"]]))),
     "Fisher": (6, lambda r: f"{r['tests']['fisher']:.2g}"),
@@ -63,58 +72,97 @@ COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "cost": (5, lambda r: f"{r['cpu_ratio']:.2f}"),
     "factor": (6, lambda r: f"{r['factor']:.0f}"),
     "compile": (7, lambda r: f"{r['warm_up_cpu_s']:.1f}"),
-    "failing/s": (20, lambda r: "{:.3g} ({:.3g} to {:.3g})".format(r["failing_trees_per_cpu_s"], *r["failing_trees_per_cpu_s_95"])),
+    "failing/s": (
+        20,
+        lambda r: "{:.3g} ({:.3g} to {:.3g})".format(
+            r["failing_trees_per_cpu_s"], *r["failing_trees_per_cpu_s_95"]
+        ),
+    ),
 }
-LEGEND = """B: trees between two trainings, - where nothing is learned. failing: mean best of failing trees. Fisher, M-W: p of Fisher's exact test of the
-failing trees and of the Mann-Whitney U test of the best rewards, both two-sided, against the published trees. sims/s: simulations per CPU second, without
-compilation; cost: CPU time of one, to that of the block's first row; factor: sims/s over the published code's; compile: CPU s of the call before, which
-compiles what no row above it did; failing/s: failing trees per CPU second, with the interval of the rate."""
+LEGEND = """B: trees between two trainings, - where nothing is learned. failing: mean best of
+failing trees. Fisher, M-W: p of Fisher's exact test of the failing trees and of the Mann-Whitney
+U test of the best rewards, both two-sided, against the published trees. sims/s: simulations per
+CPU second, without compilation; cost: CPU time of one, to that of the block's first row; factor:
+sims/s over the published code's; compile: CPU s of the call before, which compiles what no row
+above it did; failing/s: failing trees per CPU second, with the interval of the rate."""
 
 
 def forest(sim, heads=None, mode="default", trees=200, simulations=500, **settings):
-    """A search by its key. The round of its heads has the default length, but by number, so that `warm_up` can have the same with fewer trees."""
+    """A search by its key. The round of its heads has the default length, but by number, so that
+    `warm_up` can have the same with fewer trees.
+    """
     settings = dict(round=max(1, min(trees // 5, LANES))) | settings
-    more = {} if heads is None else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
-    return functools.partial(jast.search.forest, sim=sim, trees=trees, simulations=simulations, mode=mode, reward=REWARD, actions=BOX, **more)
+    more = (
+        {}
+        if heads is None
+        else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
+    )
+    return functools.partial(
+        jast.search.forest,
+        sim=sim,
+        trees=trees,
+        simulations=simulations,
+        mode=mode,
+        reward=REWARD,
+        actions=BOX,
+        **more,
+    )
 
 
 def variant(name, mode, sizes):
     """A row of Table 1."""
     s0, heads = jast.simulators.ferry(), VARIANTS[name]
     if name == "MCTS-SA":
-        return functools.partial(jast.search.mcts, sim=s0, trees=sizes.trees, mode=mode, reward=REWARD, actions=BOX)
-    published = dict(train=False) if heads == "value" else dict(round=sizes.round)  # alone, the paper's value network is not trained
+        return functools.partial(
+            jast.search.mcts, sim=s0, trees=sizes.trees, mode=mode, reward=REWARD, actions=BOX
+        )
+    # alone, the paper's value network is not trained
+    published = dict(train=False) if heads == "value" else dict(round=sizes.round)
     trees = sizes.taught_trees if mode == "paper" and name.startswith("RP") else sizes.trees
     return forest(s0, heads, mode, trees, **(published if mode == "paper" else {}))
 
 
 def warm_up(search):
-    """CPU seconds of compiling what a search runs: it is ended at its first news or, where heads learn, has one round of trees and one step of training."""
+    """CPU seconds of compiling what a search runs: it is ended at its first news or, where heads
+    learn, has one round of trees and one step of training.
+    """
 
     def end(done, total):
         raise KeyboardInterrupt
 
     heads, trees = search.keywords.get("head_settings"), search.keywords["trees"]
     learns = heads is not None and heads.train
-    more = dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1))) if learns else dict(callback=end)
+    more = (
+        dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1)))
+        if learns
+        else dict(callback=end)
+    )
     tree_keys(jax.random.key(0), trees)[: more.get("trees")]
     return timed(lambda: search(jax.random.key(0), **more))[1]
 
 
 def settled(search, seed):
-    """`timed`; a short call is made twice and the second one counts, as some small programs depend on what was found."""
+    """`timed`; a short call is made twice and the second one counts, as some small programs depend
+    on what was found.
+    """
     first = timed(lambda: search(jax.random.key(seed)))
     return timed(lambda: search(jax.random.key(seed))) if first[1] < 2 else first
 
 
 def measure(searches, seeds, published=None):
-    """The row of a search, given for each seed; ``published``: the best rewards of the paper's trees."""
+    """The row of a search, given for each seed; ``published``: the best rewards of the paper's
+    trees.
+    """
     warm = warm_up(searches[0])
     runs = [settled(search, seed) for search, seed in zip(searches, seeds, strict=True)]
     results, cpu, wall = zip(*runs, strict=True)
     bests = [np.asarray(r.best_reward_per_tree, np.float64) for r in results]
     row = outcome(np.concatenate(bests))
-    heads, episodes, a_second = searches[0].keywords.get("head_settings"), sum(r.episodes for r in results), row["trees"] / sum(cpu)
+    heads, episodes, a_second = (
+        searches[0].keywords.get("head_settings"),
+        sum(r.episodes for r in results),
+        row["trees"] / sum(cpu),
+    )
     return row | {
         "B": heads.round if heads is not None and heads.train else None,
         "rates": [float((b > 0).mean()) for b in bests],
@@ -133,21 +181,34 @@ def measure(searches, seeds, published=None):
 
 
 def compare(best, published):
-    """p-values of two-sample tests of the trees' best rewards against the published ones; None without those."""
+    """p-values of two-sample tests of the trees' best rewards against the published ones; None
+    without those.
+    """
     if published is None:
         return None
     from scipy import stats
 
     counts = [[int(np.sum(b > 0)), int(np.sum(b <= 0))] for b in (best, published)]
-    return {"fisher": float(stats.fisher_exact(counts).pvalue), "mann_whitney": float(stats.mannwhitneyu(best, published).pvalue)}
+    return {
+        "fisher": float(stats.fisher_exact(counts).pvalue),
+        "mann_whitney": float(stats.mannwhitneyu(best, published).pvalue),
+    }
 
 
 def published():
-    """Variant -> the paper's row, and variant -> the best rewards of its trees, which is empty where the data is absent."""
+    """Variant -> the paper's row, and variant -> the best rewards of its trees, which is empty
+    where the data is absent.
+    """
     if (found := data("table1_per_tree.json")) is not None:
         bests = {name: np.array(found["best_reward_per_tree"][name]) for name in VARIANTS}
         return {name: outcome(best) for name, best in bests.items()}, bests
-    row = lambda rate, mean, best: dict(trees=200, rate=rate / 100, rate_95=list(clopper_pearson(round(2 * rate), 200)), mean_best=mean, best=best)
+    row = lambda rate, mean, best: dict(
+        trees=200,
+        rate=rate / 100,
+        rate_95=list(clopper_pearson(round(2 * rate), 200)),
+        mean_best=mean,
+        best=best,
+    )
     return {name: row(*TABLE[name]) for name in VARIANTS}, {}
 
 
@@ -162,11 +223,17 @@ def line(name, row):
 
 
 def block(title, searches, seeds, say, bests=None):
-    """Name -> row, measured and said one by one; a search, or a list of one for each seed. The first is what the others' cost is compared with."""
+    """Name -> row, measured and said one by one; a search, or a list of one for each seed. The
+    first is what the others' cost is compared with.
+    """
     say(f"\n{title}")
     rows = {}
     for name, search in searches.items():
-        row = measure(search if isinstance(search, list) else [search] * len(seeds), seeds, (bests or {}).get(name))
+        row = measure(
+            search if isinstance(search, list) else [search] * len(seeds),
+            seeds,
+            (bests or {}).get(name),
+        )
         plain = next(iter(rows.values()), row)
         row["cpu_ratio"] = plain["simulations_per_cpu_s"] / row["simulations_per_cpu_s"]
         if bests is not None:
@@ -183,14 +250,29 @@ def kinds(names, sim, **settings):
 
 def warm_start(sizes, seeds, say):
     """System -> rows of small searches that start with heads learned on S0, or without."""
-    learn = forest(jast.simulators.ferry(), "both", trees=sizes.trees, simulations=sizes.simulations)
+    learn = forest(
+        jast.simulators.ferry(), "both", trees=sizes.trees, simulations=sizes.simulations
+    )
     taught = f"{sizes.trees} trees of 18 x {sizes.simulations} on S0"
     heads = [learn(jax.random.key(seed)).heads for seed in seeds]
     later, out = [seed + 1000 for seed in seeds], {}
     for x in sizes.starts:
-        search = functools.partial(forest, jast.simulators.ferry(adversary=(x, 0.0)), trees=sizes.warm_trees, simulations=50)
-        rows = {"none": search(), "cold": search("both"), "warm": [search(h) for h in heads], "frozen": [search(h, train=False) for h in heads]}
-        title = f"start at ({x:g}, 0), 18 x 50: heads that start cold, or warm from {taught} (not counted), or stay as those are (frozen)"
+        search = functools.partial(
+            forest,
+            jast.simulators.ferry(adversary=(x, 0.0)),
+            trees=sizes.warm_trees,
+            simulations=50,
+        )
+        rows = {
+            "none": search(),
+            "cold": search("both"),
+            "warm": [search(h) for h in heads],
+            "frozen": [search(h, train=False) for h in heads],
+        }
+        title = (
+            f"start at ({x:g}, 0), 18 x 50: heads that start cold, or warm from {taught} (not"
+            " counted), or stay as those are (frozen)"
+        )
         out[f"({x:g}, 0)"] = block(title, rows, later, say)
     return out
 
@@ -198,7 +280,11 @@ def warm_start(sizes, seeds, say):
 def episode_cost(sim, simulations):
     """CPU microseconds of one random episode, of 200 in lockstep."""
     problem, keys = engine.problem(9000, sim=sim), tree_keys(jax.random.key(0), 200)
-    return min(engine.cpu(lambda: engine.rollouts(problem, keys, simulations))[0] for _ in range(3)) / (simulations * 200) * 1e6
+    return (
+        min(engine.cpu(lambda: engine.rollouts(problem, keys, simulations))[0] for _ in range(3))
+        / (simulations * 200)
+        * 1e6
+    )
 
 
 def slowed(sizes, seeds, say):
@@ -207,7 +293,12 @@ def slowed(sizes, seeds, say):
     for n in sizes.substeps:
         sim = engine.slow_ferry(n)
         cost = episode_cost(sim, max(4, 1000 // (3 + n)))
-        rows = block(f"{n} substeps, 18 x 50: {cost:.2f} us an episode", kinds(("none", "rollout", "both"), sim, trees=sizes.trees, simulations=50), seeds, say)
+        rows = block(
+            f"{n} substeps, 18 x 50: {cost:.2f} us an episode",
+            kinds(("none", "rollout", "both"), sim, trees=sizes.trees, simulations=50),
+            seeds,
+            say,
+        )
         out.append({"substeps": n, "episode_cpu_us": cost, "rows": rows})
     return out
 
@@ -224,17 +315,45 @@ def draw(out, path):
     with styled():
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")
         for colour, marker, name in zip(COLOURS, "os^", ("none", "rollout", "both"), strict=False):
-            style = dict(color=colour, marker=marker, markersize=5, capsize=2.5, label={"none": "no heads", "both": "both heads"}.get(name, "rollout head"))
+            style = dict(
+                color=colour,
+                marker=marker,
+                markersize=5,
+                capsize=2.5,
+                label={"none": "no heads", "both": "both heads"}.get(name, "rollout head"),
+            )
             points = [(p["episode_cpu_us"], p["rows"][name]) for p in out["slow_simulator"]]
-            bars(left, [(x, r["failing_trees_per_cpu_s"], r["failing_trees_per_cpu_s_95"]) for x, r in points], style)
-            points = [(18 * n, rows[name]) for n, rows in out["equal_cpu_time"].items() if name in rows]
-            bars(right, [(x, 100 * r["rate"], [100 * v for v in r["rate_95"]]) for x, r in points], style)
-        left.set(xscale="log", yscale="log", xlabel="CPU time of a simulator's episode, microseconds", ylabel="failing trees per CPU second")
+            bars(
+                left,
+                [
+                    (x, r["failing_trees_per_cpu_s"], r["failing_trees_per_cpu_s_95"])
+                    for x, r in points
+                ],
+                style,
+            )
+            points = [
+                (18 * n, rows[name]) for n, rows in out["equal_cpu_time"].items() if name in rows
+            ]
+            bars(
+                right,
+                [(x, 100 * r["rate"], [100 * v for v in r["rate_95"]]) for x, r in points],
+                style,
+            )
+        left.set(
+            xscale="log",
+            yscale="log",
+            xlabel="CPU time of a simulator's episode, microseconds",
+            ylabel="failing trees per CPU second",
+        )
         left.set_title("Trees of 18 x 50 simulations")
         for axis in (left.xaxis, left.yaxis):
             axis.set_major_formatter("{x:g}")
-        right.set(xscale="log", ylim=(0, 102), xlabel="simulations a tree", ylabel="failing trees, %")
-        right.set_xticks([18 * n for n in out["equal_cpu_time"]], [str(18 * n) for n in out["equal_cpu_time"]])
+        right.set(
+            xscale="log", ylim=(0, 102), xlabel="simulations a tree", ylabel="failing trees, %"
+        )
+        right.set_xticks(
+            [18 * n for n in out["equal_cpu_time"]], [str(18 * n) for n in out["equal_cpu_time"]]
+        )
         right.minorticks_off()
         right.set_title("Trees of 18 roots on S0")
         left.legend(loc="lower left")
@@ -253,24 +372,61 @@ def report(args):
     """Measure, print and draw what the arguments of `benchmarks.ferry` ask for."""
     sizes = QUICK if args.quick else Sizes()
     if args.trees:
-        sizes = sizes._replace(trees=args.trees, taught_trees=args.trees, budget_trees=args.trees, warm_trees=max(1, args.trees // 5))
+        sizes = sizes._replace(
+            trees=args.trees,
+            taught_trees=args.trees,
+            budget_trees=args.trees,
+            warm_trees=max(1, args.trees // 5),
+        )
     seeds = range(args.seed, args.seed + (args.seeds or sizes.seeds))
     say = (lambda text: None) if args.json else functools.partial(print, flush=True)
     rows, bests = published()
     out = {"golden": golden(), "seeds": list(seeds), "sizes": sizes._asdict(), "published": rows}
     say(f"golden episodes: {out['golden'] or 'data not found'}\n{LEGEND}\n")
     say(f"{'':9}" + "".join(f" {name:>{width}}" for name, (width, _) in COLUMNS.items()))
-    say("published" + ("" if bests else ", as printed: the data of its trees was not found, so nothing is tested against them"))
+    say(
+        "published"
+        + (
+            ""
+            if bests
+            else (
+                ", as printed: the data of its trees was not found, so nothing is tested against"
+                " them"
+            )
+        )
+    )
     for name, row in rows.items():
         say(line(name, row))
     for mode in ("paper", "default"):
-        out[mode] = block(f"S0, {mode} mode", {name: variant(name, mode, sizes) for name in VARIANTS}, seeds, say, bests)
+        out[mode] = block(
+            f"S0, {mode} mode",
+            {name: variant(name, mode, sizes) for name in VARIANTS},
+            seeds,
+            say,
+            bests,
+        )
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
-    out["S0b"] = block(f"S0b, default mode, 18 x {sizes.simulations}", kinds(sizes.heads, s0b, trees=sizes.trees, simulations=sizes.simulations), seeds, say)
-    out["small"] = block("S0, default mode, 18 x 50", kinds(sizes.heads, s0, trees=sizes.trees, simulations=50), seeds, say)
+    out["S0b"] = block(
+        f"S0b, default mode, 18 x {sizes.simulations}",
+        kinds(sizes.heads, s0b, trees=sizes.trees, simulations=sizes.simulations),
+        seeds,
+        say,
+    )
+    out["small"] = block(
+        "S0, default mode, 18 x 50",
+        kinds(sizes.heads, s0, trees=sizes.trees, simulations=50),
+        seeds,
+        say,
+    )
     names, trees = [name for name in sizes.heads if name != "value"], sizes.budget_trees
     out["equal_cpu_time"] = {
-        n: block(f"S0, default mode, 18 x {n}, {trees} trees", kinds(names, s0, trees=trees, simulations=n), seeds, say) for n in sizes.budgets
+        n: block(
+            f"S0, default mode, 18 x {n}, {trees} trees",
+            kinds(names, s0, trees=trees, simulations=n),
+            seeds,
+            say,
+        )
+        for n in sizes.budgets
     }
     out["warm_start"] = warm_start(sizes, seeds, say)
     if args.picture:

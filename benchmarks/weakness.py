@@ -1,12 +1,17 @@
-"""Weakness recognition: how many of a classifier's failures are found in so many calls (chapter 4 of Moss's thesis, and reference figures on the same images).
+"""Weakness recognition: how many of a classifier's failures are found in so many calls (chapter 4
+of Moss's thesis, and reference figures on the same images).
 
-``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N] [--picture FILE]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX
-files) and the published classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that were trained on the
-first half of the images and are validated on the other. Without: scikit-learn's digits, a third to train on and the rest to validate, and three classifiers.
-Means over seeds, +- one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the cross-validated logistic regression on
-64 principal components that needs no call either. Failures found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
-those of the final scores on all inputs, where those that were run are judged by models that have not seen their outcome; candidates: as many as 627 of
-10,000. Seconds are of one validation, the first with compilation.
+``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N] [--picture FILE]``.
+With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the published classifier in
+it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that
+were trained on the first half of the images and are validated on the other. Without: scikit-learn's
+digits, a third to train on and the rest to validate, and three classifiers. Means over seeds, +-
+one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the
+cross-validated logistic regression on 64 principal components that needs no call either. Failures
+found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
+those of the final scores on all inputs, where those that were run are judged by models that have
+not seen their outcome; candidates: as many as 627 of 10,000. Seconds are of one validation, the
+first with compilation.
 """
 
 import argparse
@@ -31,10 +36,16 @@ ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precisio
 
 
 class Answers:
-    """A classifier, run on everything once: ``predict`` looks its answers up and counts how often each input was asked."""
+    """A classifier, run on everything once: ``predict`` looks its answers up and counts how often
+    each input was asked.
+    """
 
     def __init__(self, inputs, predicted):
-        self.index, self.predicted, self.asked = {x.tobytes(): i for i, x in enumerate(inputs)}, np.asarray(predicted), np.zeros(len(inputs), int)
+        self.index, self.predicted, self.asked = (
+            {x.tobytes(): i for i, x in enumerate(inputs)},
+            np.asarray(predicted),
+            np.zeros(len(inputs), int),
+        )
 
     def __call__(self, batch):
         at = np.asarray([self.index[x.tobytes()] for x in batch])
@@ -52,8 +63,16 @@ def mnist(folder, quick):
             out = np.maximum(flat @ w["W1"] + w["b1"], 0) @ w["W2"] + w["b2"]
         yield "published", images, labels, out.argmax(1)
     if not quick:
-        for name, model in (("nearest", KNeighborsClassifier(3)), ("forest", RandomForestClassifier(50, random_state=0))):
-            yield name, images[half:], labels[half:], model.fit(flat[:half], labels[:half]).predict(flat[half:])
+        for name, model in (
+            ("nearest", KNeighborsClassifier(3)),
+            ("forest", RandomForestClassifier(50, random_state=0)),
+        ):
+            yield (
+                name,
+                images[half:],
+                labels[half:],
+                model.fit(flat[:half], labels[:half]).predict(flat[half:]),
+            )
 
 
 def digits(quick):
@@ -67,19 +86,36 @@ def digits(quick):
         "network": MLPClassifier((32,), max_iter=2000, random_state=0),
     }
     for name, model in list(models.items())[: 1 if quick else 3]:
-        yield name, images[test], labels[test], model.fit(flat[train], labels[train]).predict(flat[test])
+        yield (
+            name,
+            images[test],
+            labels[test],
+            model.fit(flat[train], labels[train]).predict(flat[test]),
+        )
 
 
 def ranked(scores, failed):
     """What a ranking by fixed scores finds."""
     order, candidates = np.argsort(-scores, kind="stable"), round(CANDIDATES * len(failed))
-    return {"found": found(order, failed), "auc": weakness.auc(scores, failed), "precision": float(failed[order[:candidates]].mean())}
+    return {
+        "found": found(order, failed),
+        "auc": weakness.auc(scores, failed),
+        "precision": float(failed[order[:candidates]].mean()),
+    }
 
 
 def pixels(images, labels):
-    """[n]: 1 - p(true label) of a 5-fold cross-validated logistic regression on 64 principal components."""
+    """[n]: 1 - p(true label) of a 5-fold cross-validated logistic regression on 64 principal
+    components.
+    """
     z = PCA(min(64, images[0].size), random_state=0).fit_transform(images.reshape(len(images), -1))
-    p = cross_val_predict(LogisticRegression(max_iter=300), z, labels, cv=KFold(5, shuffle=True, random_state=0), method="predict_proba")
+    p = cross_val_predict(
+        LogisticRegression(max_iter=300),
+        z,
+        labels,
+        cv=KFold(5, shuffle=True, random_state=0),
+        method="predict_proba",
+    )
     return 1 - p[np.arange(len(labels)), labels]
 
 
@@ -87,8 +123,17 @@ def runs(images, labels, predicted, selector, seeds, budget=None):
     """[(result, CPU seconds, wall seconds)], one a seed."""
     out = []
     for seed in range(seeds):
-        system, given = Answers(images, predicted), dict(budget=budget, selector=selector, classes=int(labels.max()) + 1)
-        out.append(timed(lambda seed=seed, system=system, given=given: weakness.validate(jax.random.key(seed), system, images, labels, **given)))
+        system, given = (
+            Answers(images, predicted),
+            dict(budget=budget, selector=selector, classes=int(labels.max()) + 1),
+        )
+        out.append(
+            timed(
+                lambda seed=seed, system=system, given=given: weakness.validate(
+                    jax.random.key(seed), system, images, labels, **given
+                )
+            )
+        )
         if system.asked.max() > 1 or system.asked.sum() != out[-1][0].calls:
             raise AssertionError("an input was asked twice, or a call was not counted")
     return out
@@ -96,12 +141,23 @@ def runs(images, labels, predicted, selector, seeds, budget=None):
 
 def over(rows):
     """Dicts of numbers and lists of them -> the same of means."""
-    return {k: [mean(c) for c in zip(*(r[k] for r in rows), strict=True)] if isinstance(rows[0][k], list) else mean([r[k] for r in rows]) for k in rows[0]}
+    return {
+        k: (
+            [mean(c) for c in zip(*(r[k] for r in rows), strict=True)]
+            if isinstance(rows[0][k], list)
+            else mean([r[k] for r in rows])
+        )
+        for k in rows[0]
+    }
 
 
 def seconds(done):
     first, *rest = done
-    return {"seconds_first": first[2], "seconds": mean([r[2] for r in rest or done]), "cpu_s": mean([r[1] for r in rest or done])}
+    return {
+        "seconds_first": first[2],
+        "seconds": mean([r[2] for r in rest or done]),
+        "cpu_s": mean([r[1] for r in rest or done]),
+    }
 
 
 def found(order, failed):
@@ -114,18 +170,39 @@ def adaptive(result, failed):
     """A row of the default selector."""
     judged = weakness.judge(result, failed, top=round(CANDIDATES * len(failed)))
     left = int(failed.sum()) - len(result.failures)
-    return dict(found=found(result.order, failed), auc=judged.auc[-1], precision=judged.precision[-1], expected=result.expected, left=left)
+    return dict(
+        found=found(result.order, failed),
+        auc=judged.auc[-1],
+        precision=judged.precision[-1],
+        expected=result.expected,
+        left=left,
+    )
 
 
 def thesis(result, failed):
-    """A row of the thesis's adversary: after each iteration, and at its threshold of 0.5 on all inputs at the end."""
+    """A row of the thesis's adversary: after each iteration, and at its threshold of 0.5 on all
+    inputs at the end.
+    """
     j, picks = weakness.judge(result, failed), result.history.precision
-    row = dict(auc=list(j.auc), precision=j.precision[-1], recall=j.recall[-1], candidates=j.candidates[-1], calls=result.calls)
-    return row | dict(found=len(result.failures) / failed.sum(), sampled_precision=np.nanmean(picks))
+    row = dict(
+        auc=list(j.auc),
+        precision=j.precision[-1],
+        recall=j.recall[-1],
+        candidates=j.candidates[-1],
+        calls=result.calls,
+    )
+    return row | dict(
+        found=len(result.failures) / failed.sum(), sampled_precision=np.nanmean(picks)
+    )
 
 
 def say(v, digits=3):
-    return f"{v:.{digits}f}" if not isinstance(v, dict) else f"{v['mean']:.{digits}f}" + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+    return (
+        f"{v:.{digits}f}"
+        if not isinstance(v, dict)
+        else f"{v['mean']:.{digits}f}"
+        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+    )
 
 
 def line(name, row):
@@ -133,7 +210,10 @@ def line(name, row):
     if "auc" in row:
         text += f"  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
     if "expected" in row:
-        text += f"  expected left {say(row['expected'], 1)}, true {say(row['left'], 1)}; {row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+        text += (
+            f"  expected left {say(row['expected'], 1)}, true {say(row['left'], 1)};"
+            f" {row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+        )
     return text
 
 
@@ -157,9 +237,18 @@ def study(images, labels, predicted, seeds, quick, picture):
         published = runs(*system, "thesis", seeds)
         rows["thesis"] = t = over([thesis(r, failed) for r, *_ in published]) | seconds(published)
         results["thesis"] = [r for r, *_ in published]
-        print("  thesis      AUC " + " ".join(f"{a['mean']:.3f}" for a in t["auc"]) + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})")
-        print("              at 0.5: " + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS))
-        print(f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True)
+        print(
+            "  thesis      AUC "
+            + " ".join(f"{a['mean']:.3f}" for a in t["auc"])
+            + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})"
+        )
+        print(
+            "              at 0.5: "
+            + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS)
+        )
+        print(
+            f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True
+        )
     if picture:
         plot.failures_found(results, failed).figure.savefig(picture, dpi=150)
     return rows | {"inputs": len(labels), "failures": int(failed.sum())}
@@ -167,18 +256,26 @@ def study(images, labels, predicted, seeds, quick, picture):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", help="folder with the MNIST test images and the published classifier")
+    parser.add_argument(
+        "--data", help="folder with the MNIST test images and the published classifier"
+    )
     parser.add_argument("--json", action="store_true", help="print the figures as JSON at the end")
-    parser.add_argument("--quick", action="store_true", help="one system, 2 seeds, without the thesis's mode")
+    parser.add_argument(
+        "--quick", action="store_true", help="one system, 2 seeds, without the thesis's mode"
+    )
     parser.add_argument("--seeds", type=int, default=None, help="default 10")
-    parser.add_argument("--picture", help="draw the first system's failures found against calls into this file")
+    parser.add_argument(
+        "--picture", help="draw the first system's failures found against calls into this file"
+    )
     given = parser.parse_args()
     seeds = given.seeds or (2 if given.quick else 10)
     systems = mnist(given.data, given.quick) if given.data else digits(given.quick)
     out = {}
     for name, images, labels, predicted in systems:
         print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
-        out[name] = study(images, labels, predicted, seeds, given.quick, None if out else given.picture)
+        out[name] = study(
+            images, labels, predicted, seeds, given.quick, None if out else given.picture
+        )
     if given.json:
         print(json.dumps(out))
 

@@ -1,6 +1,22 @@
-"""jast: find the likeliest failures of a simulated system, explain them, and put an honest probability on them."""
+"""jast: find the likeliest failures of a simulated system, explain them, and put an honest
+probability on them.
+"""
 
-from jast import actions, blackbox, cross_entropy, distributions, estimate, failures, heads, incidents, policies, rewards, search, simulators, weakness
+from jast import (
+    actions,
+    blackbox,
+    cross_entropy,
+    distributions,
+    estimate,
+    failures,
+    heads,
+    incidents,
+    policies,
+    rewards,
+    search,
+    simulators,
+    weakness,
+)
 from jast.check import check
 from jast.episode import Episode, replay, rollout
 from jast.nominal import nominal
@@ -10,6 +26,24 @@ from jast.simulator import Simulator
 __version__ = "0.1.0"
 
 __all__ = [
-    "Episode", "Policy", "Simulator", "actions", "blackbox", "check", "cross_entropy", "distributions", "estimate", "failures", "heads", "incidents", "nominal",
-    "policies", "replay", "rewards", "rollout", "search", "simulators", "weakness",
-]  # fmt: skip
+    "Episode",
+    "Policy",
+    "Simulator",
+    "actions",
+    "blackbox",
+    "check",
+    "cross_entropy",
+    "distributions",
+    "estimate",
+    "failures",
+    "heads",
+    "incidents",
+    "nominal",
+    "policies",
+    "replay",
+    "rewards",
+    "rollout",
+    "search",
+    "simulators",
+    "weakness",
+]

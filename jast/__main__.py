@@ -1,4 +1,6 @@
-"""``python -m jast``: search one of the built-in systems for its likeliest failure, beside a Monte Carlo baseline of as many simulations."""
+"""``python -m jast``: search one of the built-in systems for its likeliest failure, beside a Monte
+Carlo baseline of as many simulations.
+"""
 
 import argparse
 import contextlib
@@ -20,16 +22,30 @@ from jast.search.result import table
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
     "ferry": (simulators.ferry, STANDARD, actions.uniform(0.0, 1.0)),
-    "ferry-b": (lambda: simulators.ferry(adversary=(17.0, 0.0)), STANDARD, actions.uniform(0.0, 1.0)),
+    "ferry-b": (
+        lambda: simulators.ferry(adversary=(17.0, 0.0)),
+        STANDARD,
+        actions.uniform(0.0, 1.0),
+    ),
     "walk1d": (simulators.walk1d, STANDARD, actions.uniform(-1.0, 1.0)),
-    "colav": (simulators.colav, rewards.standard(event_bonus=200.0, density="mode"), actions.samples()),
-    "landing": (simulators.landing, rewards.shaped(100.0, event_bonus=30.0, density="mode"), actions.uniform(-0.15, 0.15)),
+    "colav": (
+        simulators.colav,
+        rewards.standard(event_bonus=200.0, density="mode"),
+        actions.samples(),
+    ),
+    "landing": (
+        simulators.landing,
+        rewards.shaped(100.0, event_bonus=30.0, density="mode"),
+        actions.uniform(-0.15, 0.15),
+    ),
 }
 ITERATIONS = 10  # of the cross-entropy method, which keeps a tenth of the samples of each
 
 
 def main(argv=None):
-    """Run the command line ``argv`` (default: the process's) and print what was found; returns the exit status."""
+    """Run the command line ``argv`` (default: the process's) and print what was found; returns the
+    exit status.
+    """
     parser = _parser()
     options = parser.parse_args(argv)
     if options.prunes is not None and options.method != "forest":
@@ -37,7 +53,9 @@ def main(argv=None):
     if options.heads and options.method != "forest":
         parser.error(f"argument --heads: only of --method forest, not of {options.method}")
     if options.paper and options.method not in ("forest", "mcts"):
-        parser.error(f"argument --paper: only with --method forest or mcts, not with {options.method}")
+        parser.error(
+            f"argument --paper: only with --method forest or mcts, not with {options.method}"
+        )
     try:
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -45,7 +63,8 @@ def main(argv=None):
     try:
         return _run(options)
     except ValueError as e:
-        if not str(e).startswith(f"{options.method.replace('-', '_')}: "):  # a count that the search refuses
+        # a count that the search refuses
+        if not str(e).startswith(f"{options.method.replace('-', '_')}: "):
             raise
         parser.error(str(e))
     except KeyboardInterrupt:
@@ -54,22 +73,56 @@ def main(argv=None):
 
 
 def _parser():
-    parser = argparse.ArgumentParser("python -m jast", description="Find the likeliest failure of a built-in system, with Monte Carlo as the baseline.")
+    parser = argparse.ArgumentParser(
+        "python -m jast",
+        description=(
+            "Find the likeliest failure of a built-in system, with Monte Carlo as the baseline."
+        ),
+    )
     add = parser.add_argument
     add(
         "--simulator",
         choices=SYSTEMS,
         default="ferry",
-        help="system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids collisions with late sensors)",
+        help=(
+            "system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids"
+            " collisions with late sensors)"
+        ),
     )
-    add("--method", choices=["forest", "mcts", "cem", "monte-carlo"], default="forest", help="search (default: forest)")
-    add("--trees", type=_count, default=200, metavar="N", help="independent searches (default: 200)")
-    add("--simulations", type=_count, metavar="N", help="simulations per root (forest, default: 500) or per tree (the others, default: 9000)")
+    add(
+        "--method",
+        choices=["forest", "mcts", "cem", "monte-carlo"],
+        default="forest",
+        help="search (default: forest)",
+    )
+    add(
+        "--trees", type=_count, default=200, metavar="N", help="independent searches (default: 200)"
+    )
+    add(
+        "--simulations",
+        type=_count,
+        metavar="N",
+        help="simulations per root (forest, default: 500) or per tree (the others, default: 9000)",
+    )
     add("--prunes", type=_count, metavar="N", help="roots of a tree of the forest (default: 18)")
     add("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
-    add("--output", type=Path, default=Path("jast-output"), metavar="FOLDER", help="folder for the archive and the pictures (default: jast-output)")
-    add("--paper", action="store_true", help="forest and mcts: the published widening in place of the better-tuned one")
-    add("--heads", choices=["rollout", "value", "both"], help="forest: networks that learn from the trees before (default: none)")
+    add(
+        "--output",
+        type=Path,
+        default=Path("jast-output"),
+        metavar="FOLDER",
+        help="folder for the archive and the pictures (default: jast-output)",
+    )
+    add(
+        "--paper",
+        action="store_true",
+        help="forest and mcts: the published widening in place of the better-tuned one",
+    )
+    add(
+        "--heads",
+        choices=["rollout", "value", "both"],
+        help="forest: networks that learn from the trees before (default: none)",
+    )
     add("--quiet", action="store_true", help="no progress bars")
     return parser
 
@@ -84,7 +137,11 @@ def _run(options):
     make, reward, chosen = SYSTEMS[options.simulator]
     sim = check(make(), chosen)
     keys = jax.random.split(jax.random.key(options.seed), 3)
-    print(f"{options.simulator}, seed {options.seed}: as it is, without a search\n{nominal(keys[0], sim, episodes=100_000)}\n", flush=True)
+    print(
+        f"{options.simulator}, seed {options.seed}: as it is, without a"
+        f" search\n{nominal(keys[0], sim, episodes=100_000)}\n",
+        flush=True,
+    )
 
     common = dict(reward=reward, actions=chosen, progress=not options.quiet)
     found = _search(keys[1], sim, options, common)
@@ -106,25 +163,55 @@ def _run(options):
 
 
 def _search(key, sim, options, common):
-    trees, each = options.trees, options.simulations or (500 if options.method == "forest" else 9000)
+    trees, each = (
+        options.trees,
+        options.simulations or (500 if options.method == "forest" else 9000),
+    )
     mode = "paper" if options.paper else "default"
     if options.method == "forest":
-        return forest(key, sim, trees=trees, prunes=options.prunes or 18, simulations=each, mode=mode, heads=options.heads, **common)
+        return forest(
+            key,
+            sim,
+            trees=trees,
+            prunes=options.prunes or 18,
+            simulations=each,
+            mode=mode,
+            heads=options.heads,
+            **common,
+        )
     if options.method == "mcts":
         return mcts(key, sim, trees=trees, simulations=each, mode=mode, **common)
     if options.method == "monte-carlo":
         return monte_carlo(key, sim, episodes=trees * each, **common)
     samples = -(-each // ITERATIONS)
-    return cem(key, sim, samples=samples, elites=-(-samples // 10), iterations=ITERATIONS, trees=trees, **common)
+    return cem(
+        key,
+        sim,
+        samples=samples,
+        elites=-(-samples // 10),
+        iterations=ITERATIONS,
+        trees=trees,
+        **common,
+    )
 
 
 def _shares(results):
-    """What is counted of independent trials, with its interval: trees, and the episodes of Monte Carlo. Those of a tree depend on each other."""
+    """What is counted of independent trials, with its interval: trees, and the episodes of Monte
+    Carlo. Those of a tree depend on each other.
+    """
     lines = []
     for name, r in results.items():
-        k, n, what = (r.failures.seen, r.episodes, "episodes") if name == "monte-carlo" else (int(r.failing.sum()), len(r.failing), "trees")
+        k, n, what = (
+            (r.failures.seen, r.episodes, "episodes")
+            if name == "monte-carlo"
+            else (int(r.failing.sum()), len(r.failing), "trees")
+        )
         low, high = clopper_pearson(k, n)
-        interval = "no interval: they share heads" if r.heads is not None else f"95 % [{100 * low:.4g}, {100 * high:.4g}]"
+        interval = (
+            "no interval: they share heads"
+            if r.heads is not None
+            else f"95 % [{100 * low:.4g}, {100 * high:.4g}]"
+        )
         lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, {interval}")
     return "\n".join(lines)
 
@@ -133,10 +220,24 @@ def _episode(episode):
     """The episode in numbers: what happened, and the disturbances that brought it about."""
     title = "likeliest failure" if episode.failure else "no failure was found; the best episode"
     numbers = dict(reward=episode.reward, log_p=episode.log_prob, distance=episode.distance)
-    lines = [f"{title}: " + ", ".join(f"{name.replace('_', ' ')} {float(v):.4f}" for name, v in numbers.items()) + f", {int(episode.length)} steps"]
-    parts = {"x0": episode.x0, "x": jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances)}
+    lines = [
+        f"{title}: "
+        + ", ".join(f"{name.replace('_', ' ')} {float(v):.4f}" for name, v in numbers.items())
+        + f", {int(episode.length)} steps"
+    ]
+    parts = {
+        "x0": episode.x0,
+        "x": jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances),
+    }
     for path, a in jax.tree_util.tree_leaves_with_path(parts):
-        text = np.array2string(np.asarray(a), precision=4, max_line_width=120, suppress_small=True, threshold=300, prefix="    ")
+        text = np.array2string(
+            np.asarray(a),
+            precision=4,
+            max_line_width=120,
+            suppress_small=True,
+            threshold=300,
+            prefix="    ",
+        )
         lines.append(f"  {path[0].key}{jax.tree_util.keystr(path[1:])}: {text}")
     return "\n".join(lines)
 
@@ -151,7 +252,11 @@ def _draw(options, sim, results):
     from matplotlib import pyplot as plt
 
     best = results[options.method].best
-    draw = {"ferry": plot.ferry, "ferry-b": plot.ferry, "colav": lambda *of: plot.colav(*of)[0]}.get(options.simulator)
+    draw = {
+        "ferry": plot.ferry,
+        "ferry-b": plot.ferry,
+        "colav": lambda *of: plot.colav(*of)[0],
+    }.get(options.simulator)
     first = plot.disturbances(best)[0] if draw is None else draw(best, sim)
     for name, ax in dict(episode=first, history=plot.history(results, total=True)).items():
         path = options.output / f"{name}.png"

@@ -1,4 +1,6 @@
-"""Checks of settings, each with a ValueError that names the function and the setting, what was expected and what came."""
+"""Checks of settings, each with a ValueError that names the function and the setting, what was
+expected and what came.
+"""
 
 import operator
 
@@ -16,21 +18,31 @@ def whole(function, name, value, least=1):
     except (TypeError, jax.errors.JAXTypeError):
         number = least - 1
     if number < least:
-        raise ValueError(f"{function}: {name} must be a whole number of at least {least}, received {value!r}")
+        raise ValueError(
+            f"{function}: {name} must be a whole number of at least {least}, received {value!r}"
+        )
     return number
 
 
 def number(function, name, value, holds, expected):
-    """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number for which ``holds``."""
+    """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number
+    for which ``holds``.
+    """
     real(function, name, value, holds, expected)
     return float(value)
 
 
 def real(function, name, value, holds, expected):
-    """``value`` as a float array []; one that is not traced must be a number for which ``holds``."""
+    """``value`` as a float array []; one that is not traced must be a number for which
+    ``holds``.
+    """
     if not isinstance(value, jax.core.Tracer):
         try:
-            good = not isinstance(value, str | bool) and np.shape(value) == () and bool(holds(float(value)))
+            good = (
+                not isinstance(value, str | bool)
+                and np.shape(value) == ()
+                and bool(holds(float(value)))
+            )
         except (TypeError, ValueError):
             good = False
         if not good:

@@ -1,4 +1,6 @@
-"""Actions: what a search chooses at a step. An action becomes a disturbance before ``step``; only disturbances are stored."""
+"""Actions: what a search chooses at a step. An action becomes a disturbance before ``step``; only
+disturbances are stored.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +22,9 @@ class Samples:
     focus = 1.0  # draws of the model are near its mode already
 
     def draw(self, key, dist):
-        """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the state."""
+        """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
+        state.
+        """
         return D.sample(dist, key)
 
     draw_start = draw
@@ -130,7 +134,9 @@ class UniformBox:
         return jax.tree.map(shrink, x, D.mode(dist), *self.ends(x))
 
     def place(self, u, dist):
-        """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to ``high``, both included."""
+        """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to
+        ``high``, both included.
+        """
 
         def place(u, s, low, high):
             low, high = _as(u.dtype, low, high)
@@ -143,7 +149,9 @@ class UniformBox:
     at = place
 
     def locate(self, x, dist):
-        """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box nearest to it. Integers: the middle of the cell."""
+        """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box
+        nearest to it. Integers: the middle of the cell.
+        """
 
         def locate(x, low, high):
             dtype = D.float_dtype(x.dtype)
@@ -155,7 +163,9 @@ class UniformBox:
         return jax.tree.map(locate, x, *self.ends(x))
 
     def ends(self, x):
-        """``low`` and ``high`` as pytrees like ``x``: each is one already, or an array that serves every one of ``x``. ValueError where it is neither."""
+        """``low`` and ``high`` as pytrees like ``x``: each is one already, or an array that serves
+        every one of ``x``. ValueError where it is neither.
+        """
         return [self._like(x, side) for side in ("low", "high")]
 
     def _like(self, x, side):
@@ -165,30 +175,41 @@ class UniformBox:
         try:
             array = jnp.asarray(end)
         except (TypeError, ValueError):
-            raise ValueError(f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or what the disturbance is, {like}") from None
+            raise ValueError(
+                f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or what"
+                f" the disturbance is, {like}"
+            ) from None
         return jax.tree.map(lambda _: array, x)
 
 
 def samples():
-    """Disturbances drawn from the model p(x | s): always possible, also where the density is unknown (`jast.distributions.seeds`)."""
+    """Disturbances drawn from the model p(x | s): always possible, also where the density is
+    unknown (`jast.distributions.seeds`).
+    """
     return Samples()
 
 
 def quantiles(proposal=None):
-    """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform points are draws of p.
+    """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform
+    points are draws of p.
 
-    ``proposal``: a distribution with a quantile function in place of p(x | s), the same at every step, from which a search is to draw instead. What it
-    chooses is still scored by p(x | s), and a random start is drawn from its own distribution. ValueError where it has no quantile function.
+    ``proposal``: a distribution with a quantile function in place of p(x | s), the same at every
+    step, from which a search is to draw instead. What it chooses is still scored by p(x | s), and a
+    random start is drawn from its own distribution. ValueError where it has no quantile function.
     """
-    if proposal is not None and not (isinstance(proposal, D.Distribution) and D.has_quantile(proposal)):
-        raise ValueError(f"actions.quantiles: proposal must be a distribution with a quantile function, received {proposal!r}"[:200])
+    if proposal is not None and not (
+        isinstance(proposal, D.Distribution) and D.has_quantile(proposal)
+    ):
+        expected = "proposal must be a distribution with a quantile function"
+        raise ValueError(f"actions.quantiles: {expected}, received {proposal!r}"[:200])
     # a distribution itself cannot be mapped over, as searches do with what they are given
     numbers, kind = jax.tree.flatten(proposal)
     return Quantiles(tuple(numbers), None if proposal is None else kind)
 
 
 def uniform(low, high):
-    """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or pytrees of them where x is one.
+    """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or
+    pytrees of them where x is one.
 
     The ferry's published actions are ``uniform(0., 1.)``.
     """
@@ -200,15 +221,26 @@ def _as(dtype, *values):
 
 
 def _uniform_like(key, dist):
-    """Uniform numbers in [0, 1) in the shape of a value of ``dist``, one independent stream a leaf."""
+    """Uniform numbers in [0, 1) in the shape of a value of ``dist``, one independent stream a
+    leaf.
+    """
     event = D.event_like(dist)
     leaves, treedef = jax.tree.flatten(event)
     keys = [key] if len(leaves) == 1 else [jax.random.fold_in(key, i) for i in range(len(leaves))]
-    return treedef.unflatten([jax.random.uniform(k, s.shape, D.float_dtype(s.dtype)) for k, s in zip(keys, leaves, strict=True)])
+    return treedef.unflatten(
+        [
+            jax.random.uniform(k, s.shape, D.float_dtype(s.dtype))
+            for k, s in zip(keys, leaves, strict=True)
+        ]
+    )
 
 
 def _towards_mode(x, dist, scale):
     def shrink(x, m):
-        return m + jnp.asarray(scale, x.dtype) * (x - m) if jnp.issubdtype(x.dtype, jnp.floating) else x
+        return (
+            m + jnp.asarray(scale, x.dtype) * (x - m)
+            if jnp.issubdtype(x.dtype, jnp.floating)
+            else x
+        )
 
     return jax.tree.map(shrink, x, D.mode(dist))

@@ -1,6 +1,8 @@
-"""Files of arrays: an npz that `numpy.load` opens without pickle, whose entry ``header`` is JSON with a format, a version and a checksum.
+"""Files of arrays: an npz that `numpy.load` opens without pickle, whose entry ``header`` is JSON
+with a format, a version and a checksum.
 
-What all of jast's files have in common. All arrays are NumPy's: they keep their dtype whatever the precision that JAX is set to.
+What all of jast's files have in common. All arrays are NumPy's: they keep their dtype whatever the
+precision that JAX is set to.
 """
 
 import hashlib
@@ -17,7 +19,8 @@ __all__ = ["arrays_of", "check_array", "check_structure", "describe", "named", "
 
 
 def write(path, format, version, header, arrays):
-    """Write ``arrays``, a dict of NumPy arrays, and ``header``, a dict that JSON can hold, to the one file ``path``.
+    """Write ``arrays``, a dict of NumPy arrays, and ``header``, a dict that JSON can hold, to the
+    one file ``path``.
 
     An older file of that name stays whole until the new one is.
     """
@@ -29,11 +32,16 @@ def write(path, format, version, header, arrays):
 
     path = os.fspath(path)
     # extended floats have no NumPy name in a file, so they are stored as bits
-    bits = {name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a for name, a in arrays.items()}
+    bits = {
+        name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a
+        for name, a in arrays.items()
+    }
     part = f"{path}.{os.getpid()}.part"
     try:
         with open(part, "wb") as file:
-            np.savez_compressed(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
+            np.savez_compressed(
+                file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits
+            )
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
@@ -43,9 +51,11 @@ def write(path, format, version, header, arrays):
 
 
 def read(path, format, version, kind):
-    """Read a file of `write`: ``(header, arrays)``, with ``package``, the jast that wrote it, in the header.
+    """Read a file of `write`: ``(header, arrays)``, with ``package``, the jast that wrote it, in
+    the header.
 
-    ValueError says why a file is refused: not ``kind`` (which is of this ``format``), a version other than ``version``, or damaged.
+    ValueError says why a file is refused: not ``kind`` (which is of this ``format``), a version
+    other than ``version``, or damaged.
     """
     with open(path, "rb") as file:
         data = file.read()
@@ -53,20 +63,38 @@ def read(path, format, version, kind):
         raise ValueError(f"load: {path} is not {kind}")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as pack:
-            arrays = {name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(pack.read(name)), allow_pickle=False) for name in pack.namelist()}
+            arrays = {
+                name.removesuffix(".npy"): np.lib.format.read_array(
+                    io.BytesIO(pack.read(name)), allow_pickle=False
+                )
+                for name in pack.namelist()
+            }
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else {}
     except Exception as error:  # a damaged zip fails in many ways
-        raise ValueError(f"load: {path} is damaged or truncated ({type(error).__name__}: {error})") from None
+        raise ValueError(
+            f"load: {path} is damaged or truncated ({type(error).__name__}: {error})"
+        ) from None
     if not isinstance(header, dict) or header.get("format") != format:
         raise ValueError(f"load: {path} is not {kind}")
     if header.get("version") != version:
         raise ValueError(
-            f"load: {path} has version {header.get('version')!r}; this jast reads version {version}: use the jast that wrote it, {header.get('package')}"
+            f"load: {path} has version {header.get('version')!r}; this jast reads version"
+            f" {version}: use the jast that wrote it, {header.get('package')}"
         )
     dtypes = header.get("dtypes", {})
     if set(dtypes) != set(arrays):
-        raise ValueError(f"load: {path} is damaged: the arrays {sorted(set(dtypes) ^ set(arrays))} are missing or too many")
-    arrays = {name: arrays[name].view(jnp.dtype(dtype)) if arrays[name].dtype.name != dtype else arrays[name] for name, dtype in dtypes.items()}
+        raise ValueError(
+            f"load: {path} is damaged: the arrays {sorted(set(dtypes) ^ set(arrays))} are missing"
+            " or too many"
+        )
+    arrays = {
+        name: (
+            arrays[name].view(jnp.dtype(dtype))
+            if arrays[name].dtype.name != dtype
+            else arrays[name]
+        )
+        for name, dtype in dtypes.items()
+    }
     if header.pop("sha256", None) != _checksum(header, arrays):
         raise ValueError(f"load: {path} is damaged: its checksum does not match")
     return header, arrays
@@ -74,7 +102,11 @@ def read(path, format, version, kind):
 
 def named(parts):
     """The arrays of a dict of pytrees, by the names "part.0", "part.1" ..."""
-    return {f"{name}.{i}": np.asarray(leaf) for name, part in parts.items() for i, leaf in enumerate(jax.tree.leaves(part))}
+    return {
+        f"{name}.{i}": np.asarray(leaf)
+        for name, part in parts.items()
+        for i, leaf in enumerate(jax.tree.leaves(part))
+    }
 
 
 def arrays_of(arrays, name):
@@ -89,28 +121,63 @@ def describe(tree):
     below, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda node: node is not tree)
     if len(below) == 1 and below[0][1] is tree:
         return "array"
-    plain = type(tree) in (tuple, list) or (type(tree) is dict and all(isinstance(key, str) for key in tree))
-    names = sorted(tree) if plain and isinstance(tree, dict) else [] if plain else [jax.tree_util.keystr(path) for path, _ in below]
-    return [type(tree).__name__ if plain else f"the class {type(tree).__name__}", names, [describe(child) for _, child in below]]
+    plain = type(tree) in (tuple, list) or (
+        type(tree) is dict and all(isinstance(key, str) for key in tree)
+    )
+    names = (
+        sorted(tree)
+        if plain and isinstance(tree, dict)
+        else []
+        if plain
+        else [jax.tree_util.keystr(path) for path, _ in below]
+    )
+    return [
+        type(tree).__name__ if plain else f"the class {type(tree).__name__}",
+        names,
+        [describe(child) for _, child in below],
+    ]
 
 
 def check_structure(path, other, name, structure, like):
-    """ValueError unless ``structure``, of `describe`, is that of the pytree ``like``. ``other`` is the argument that must fit, ``name`` a part of the file."""
+    """ValueError unless ``structure``, of `describe`, is that of the pytree ``like``. ``other`` is
+    the argument that must fit, ``name`` a part of the file.
+    """
     expected = describe(like)
     if structure != expected:
-        raise ValueError(f"load: {path} does not fit {other}: {name} has the structure {structure}, expected {expected}")
+        raise ValueError(
+            f"load: {path} does not fit {other}: {name} has the structure {structure}, expected"
+            f" {expected}"
+        )
 
 
 def check_array(path, other, name, a, like, axes=0):
-    """ValueError unless ``a``, without its first ``axes``, has the shape and the kind of number of ``like``; the precision may differ."""
-    kinds = [next((k for k in (jnp.floating, jnp.signedinteger, jnp.unsignedinteger) if jnp.issubdtype(d, k)), d) for d in (a.dtype, like.dtype)]
+    """ValueError unless ``a``, without its first ``axes``, has the shape and the kind of number of
+    ``like``; the precision may differ.
+    """
+    kinds = [
+        next(
+            (
+                k
+                for k in (jnp.floating, jnp.signedinteger, jnp.unsignedinteger)
+                if jnp.issubdtype(d, k)
+            ),
+            d,
+        )
+        for d in (a.dtype, like.dtype)
+    ]
     shape = a.shape[axes:]
     if shape != like.shape or kinds[0] != kinds[1]:
-        raise ValueError(f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected {like.dtype.name}{list(like.shape)}")
+        raise ValueError(
+            f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected"
+            f" {like.dtype.name}{list(like.shape)}"
+        )
 
 
 def _checksum(header, arrays):
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode() + np.ascontiguousarray(arrays[name]).tobytes())
+        digest.update(
+            f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode()
+            + np.ascontiguousarray(arrays[name]).tobytes()
+        )
     return digest.hexdigest()

@@ -1,7 +1,9 @@
 """check: whether a simulator's functions fit together, said in terms of the function that does not.
 
-Two halves. `contract` traces the functions, for structure, shapes and dtypes: cheap, and possible while the simulator holds tracers, so searches call it as
-they are traced. `check` also runs a handful of steps, for what only numbers show: NaN, densities of zero, randomness that is not a disturbance.
+Two halves. `contract` traces the functions, for structure, shapes and dtypes: cheap, and possible
+while the simulator holds tracers, so searches call it as they are traced. `check` also runs a
+handful of steps, for what only numbers show: NaN, densities of zero, randomness that is not a
+disturbance.
 """
 
 import jax
@@ -20,16 +22,24 @@ OBSERVED = 64
 """The most numbers that ``observe`` may return."""
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LANES, STEPS, DRAWS = 32, 8, 64
-ACTIONS = {Samples: "actions.samples", Quantiles: "actions.quantiles", UniformBox: "actions.uniform"}
+ACTIONS = {
+    Samples: "actions.samples",
+    Quantiles: "actions.quantiles",
+    UniformBox: "actions.uniform",
+}
 
 
 def check(sim, actions=None):
-    """``sim`` itself, once every function was traced and a few steps were run; with ``actions`` (of `jast.actions`), whether they suit it.
+    """``sim`` itself, once every function was traced and a few steps were run; with ``actions`` (of
+    `jast.actions`), whether they suit it.
 
-    Raises ValueError naming the function at fault (its own exception is the ``__cause__``): what `contract` finds; a log density that is not finite on its own
-    samples; NaN in the state or a distance that is not finite in the undisturbed first steps, or in more than half of the nominal ones; ``init``, ``step`` or
-    ``evaluate`` with another answer the second time; actions that are impossible under p(x | s) in more than half of 64 draws at the start. Only
-    the traced half runs where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system, and the first steps of another.
+    Raises ValueError naming the function at fault (its own exception is the ``__cause__``): what
+    `contract` finds; a log density that is not finite on its own samples; NaN in the state or a
+    distance that is not finite in the undisturbed first steps, or in more than half of the nominal
+    ones; ``init``, ``step`` or ``evaluate`` with another answer the second time; actions that are
+    impossible under p(x | s) in more than half of 64 draws at the start. Only the traced half runs
+    where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system,
+    and the first steps of another.
     """
     contract(sim, actions)
     traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((sim, actions)))
@@ -44,19 +54,25 @@ def check(sim, actions=None):
     _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
     if actions is not None and (share := found["actions"]) > 0.5:
-        box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]" if isinstance(actions, UniformBox) else ""
+        box = (
+            f" on the box [{_show(actions.low)}, {_show(actions.high)}]"
+            if isinstance(actions, UniformBox)
+            else ""
+        )
         raise ValueError(
-            f"{_name(actions)}: expected disturbances inside the support of p(x | s), received log densities that are not finite in "
-            f"{share:.0%} of {DRAWS} draws at the start{box}"
+            f"{_name(actions)}: expected disturbances inside the support of p(x | s), received log"
+            f" densities that are not finite in {share:.0%} of {DRAWS} draws at the start{box}"
         )
     return sim
 
 
 def contract(sim, actions=None, observed=True):
-    """The traced half of `check`: structure, shapes and dtypes of what the functions return; returns ``sim``, also under jit and vmap.
+    """The traced half of `check`: structure, shapes and dtypes of what the functions return;
+    returns ``sim``, also under jit and vmap.
 
-    ``observed=False`` leaves out ``observe``, for what looks at no observation. Raises ValueError naming the function at fault, in the order start, init,
-    disturbance, evaluate, is_terminal, observe, step, actions.
+    ``observed=False`` leaves out ``observe``, for what looks at no observation. Raises ValueError
+    naming the function at fault, in the order start, init, disturbance, evaluate, is_terminal,
+    observe, step, actions.
     """
     if not isinstance(sim, Simulator):
         raise ValueError(f"check: sim must be a jast.Simulator, received {type(sim).__name__}")
@@ -80,10 +96,16 @@ def _trace(sim, actions, observed):
     _scalar("is_terminal", _call("is_terminal", sim.is_terminal, state), bool)
     if observed:
         seen = _call("observe", sim.observe, state)
-        if not isinstance(seen, ARRAYS) or jnp.ndim(seen) != 1 or not jnp.issubdtype(jnp.result_type(seen), jnp.floating):
+        if (
+            not isinstance(seen, ARRAYS)
+            or jnp.ndim(seen) != 1
+            or not jnp.issubdtype(jnp.result_type(seen), jnp.floating)
+        ):
             raise ValueError(f"observe: returns {_kind(seen)}, expected a float vector")
         if jnp.size(seen) > OBSERVED:
-            raise ValueError(f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}")
+            raise ValueError(
+                f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}"
+            )
     _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state)
     if actions is not None:
         name = _name(actions)
@@ -93,7 +115,9 @@ def _trace(sim, actions, observed):
             _box(actions, x)
         _same(f"{name}: disturbance", _call(name, actions.draw, jax.random.key(0), dist), x)
         if jax.tree.leaves(x0):
-            _same(f"{name}: x0", _call(name, actions.draw_start, jax.random.key(0), sim.start()), x0)
+            _same(
+                f"{name}: x0", _call(name, actions.draw_start, jax.random.key(0), sim.start()), x0
+            )
 
 
 def _call(name, function, *args):
@@ -106,11 +130,17 @@ def _call(name, function, *args):
 def _draw(name, dist):
     """One traced value of ``dist``, which must be a distribution with a scalar log density."""
     if not (callable(getattr(dist, "sample", None)) and callable(getattr(dist, "log_prob", None))):
-        raise ValueError(f"{name}: expected a distribution (with sample and log_prob), received {_kind(dist)}")
-    x = _arrays(f"{name}: sample", _call(f"{name}: sample", lambda: D.sample(dist, jax.random.key(0))))
+        raise ValueError(
+            f"{name}: expected a distribution (with sample and log_prob), received {_kind(dist)}"
+        )
+    x = _arrays(
+        f"{name}: sample", _call(f"{name}: sample", lambda: D.sample(dist, jax.random.key(0)))
+    )
     log_p = _call(f"{name}: log_prob", dist.log_prob, x)
     if isinstance(log_p, ARRAYS) and jnp.shape(log_p):
-        raise ValueError(f"{name}: log_prob has shape {jnp.shape(log_p)}, expected (); wrap it in Independent")
+        raise ValueError(
+            f"{name}: log_prob has shape {jnp.shape(log_p)}, expected (); wrap it in Independent"
+        )
     _scalar(f"{name}: log_prob", log_p, float)
     return x
 
@@ -119,8 +149,13 @@ def _arrays(name, tree):
     """``tree`` with leaves of explicit dtype; ValueError for a leaf that is not numbers."""
 
     def array(path, leaf):
-        if not isinstance(leaf, ARRAYS) or jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.extended):
-            raise ValueError(f"{name}: leaf {_path(path)} is {_kind(leaf)}, expected an array of numbers or booleans")
+        if not isinstance(leaf, ARRAYS) or jnp.issubdtype(
+            jnp.result_type(leaf), jax.dtypes.extended
+        ):
+            raise ValueError(
+                f"{name}: leaf {_path(path)} is {_kind(leaf)}, expected an array of numbers or"
+                " booleans"
+            )
         return lax.convert_element_type(leaf, jnp.result_type(leaf))
 
     return jax.tree_util.tree_map_with_path(array, tree)
@@ -133,47 +168,73 @@ def _scalar(what, value, kind):
     if shape != ():
         raise ValueError(f"{what} has shape {shape}, expected (): a {kind.__name__} scalar")
     if not (dtype == jnp.bool_ if kind is bool else jnp.issubdtype(dtype, jnp.floating)):
-        raise ValueError(f"{what} has dtype {dtype}, expected {'bool' if kind is bool else 'a float'}")
+        raise ValueError(
+            f"{what} has dtype {dtype}, expected {'bool' if kind is bool else 'a float'}"
+        )
 
 
 def _same(what, new, old):
     """ValueError unless ``new`` has the tree structure, shapes and dtypes of ``old``."""
     if jax.tree.structure(new) != jax.tree.structure(old):
-        raise ValueError(f"{what} has structure {jax.tree.structure(new)}, expected {jax.tree.structure(old)}")
-    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(new), jax.tree.leaves(old), strict=True):
-        for part, x, y in (("shape", jnp.shape(a), jnp.shape(b)), ("dtype", jnp.result_type(a), jnp.result_type(b))):
+        raise ValueError(
+            f"{what} has structure {jax.tree.structure(new)}, expected {jax.tree.structure(old)}"
+        )
+    for (path, a), b in zip(
+        jax.tree_util.tree_leaves_with_path(new), jax.tree.leaves(old), strict=True
+    ):
+        for part, x, y in (
+            ("shape", jnp.shape(a), jnp.shape(b)),
+            ("dtype", jnp.result_type(a), jnp.result_type(b)),
+        ):
             if x != y:
                 raise ValueError(f"{what} leaf {_path(path)} has {part} {x}, expected {y}")
 
 
 def _box(box, x):
     for side, end in zip(("low", "high"), box.ends(x), strict=True):
-        for leaf, shape in zip(jax.tree.leaves(x), map(jnp.shape, jax.tree.leaves(end)), strict=True):
+        for leaf, shape in zip(
+            jax.tree.leaves(x), map(jnp.shape, jax.tree.leaves(end)), strict=True
+        ):
             try:
                 fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
             except ValueError:
                 fits = False
             if not fits:
-                raise ValueError(f"actions.uniform: {side} has shape {shape}, expected one that broadcasts to the disturbance's {leaf.shape}")
+                raise ValueError(
+                    f"actions.uniform: {side} has shape {shape}, expected one that broadcasts to"
+                    f" the disturbance's {leaf.shape}"
+                )
 
 
 @jax.jit
 def _probe(sim, actions):
-    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps of each (all, of an episodic system)."""
-    has_mode = D.has_mode(sim.start()) and D.has_mode(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
+    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps
+    of each (all, of an episodic system).
+    """
+    has_mode = D.has_mode(sim.start()) and D.has_mode(
+        sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))
+    )
 
     def episode(key, undisturbed):
         def choose(dist, key):
             drawn = D.sample(dist, key)
             if not has_mode:
                 return drawn
-            return jax.tree.map(lambda a, b: jnp.where(undisturbed, jnp.asarray(a, b.dtype), b), D.mode(dist), drawn)
+            return jax.tree.map(
+                lambda a, b: jnp.where(undisturbed, jnp.asarray(a, b.dtype), b), D.mode(dist), drawn
+            )
 
         def seen(state):
             if sim.episodic:  # judged at its end, below
-                return jnp.asarray(sim.is_terminal(state)), (jax.tree.map(_any_nan, state), jnp.zeros((), bool))
+                return jnp.asarray(sim.is_terminal(state)), (
+                    jax.tree.map(_any_nan, state),
+                    jnp.zeros((), bool),
+                )
             event, distance = sim.evaluate(state)
-            return jnp.asarray(event) | jnp.asarray(sim.is_terminal(state)), (jax.tree.map(_any_nan, state), ~jnp.isfinite(distance))
+            return jnp.asarray(event) | jnp.asarray(sim.is_terminal(state)), (
+                jax.tree.map(_any_nan, state),
+                ~jnp.isfinite(distance),
+            )
 
         def step(carry, t):
             state, done = carry
@@ -191,11 +252,22 @@ def _probe(sim, actions):
         first = _arrays("init", sim.init(x0))
         done, flags = seen(first)
         steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
-        (last, _), (later, xs) = lax.scan(step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32))
-        density, state, distance = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), (~jnp.isfinite(start.log_prob(x0)), *flags), later)
+        (last, _), (later, xs) = lax.scan(
+            step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32)
+        )
+        density, state, distance = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[None], b]),
+            (~jnp.isfinite(start.log_prob(x0)), *flags),
+            later,
+        )
         if sim.episodic:
             distance = distance.at[-1].set(~jnp.isfinite(sim.evaluate(last)[1]))
-        return (density, state, distance), x0, jax.tree.map(lambda a: a[0], xs), last if sim.episodic else first
+        return (
+            (density, state, distance),
+            x0,
+            jax.tree.map(lambda a: a[0], xs),
+            last if sim.episodic else first,
+        )
 
     keys = jax.random.split(jax.random.key(0), LANES + 1)
     flags, *of = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
@@ -208,8 +280,19 @@ def _probe(sim, actions):
             dist = sim.disturbance(_arrays("init", sim.init(here)))
             return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
 
-        share = jnp.mean(jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS)), dtype=jnp.float32)
-    return dict(has_mode=has_mode, density=density, state=state, distance=distance, x0=here, x=x, judged=judged, actions=share)
+        share = jnp.mean(
+            jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS)), dtype=jnp.float32
+        )
+    return dict(
+        has_mode=has_mode,
+        density=density,
+        state=state,
+        distance=distance,
+        x0=here,
+        x=x,
+        judged=judged,
+        actions=share,
+    )
 
 
 def _any_nan(a):
@@ -217,26 +300,48 @@ def _any_nan(a):
 
 
 def _densities(found):
-    density = found["density"][:LANES]  # the undisturbed lane is at the modes, where a density may be infinite
+    # the undisturbed lane is at the modes, where a density may be infinite
+    density = found["density"][:LANES]
     for t in np.flatnonzero(density.any(axis=0))[:1]:
         name, where = ("start", "") if t == 0 else ("disturbance", f" at step {t}")
-        raise ValueError(f"{name}: log_prob is not finite in {density[:, t].sum()} of {LANES} of its own samples{where}")
+        raise ValueError(
+            f"{name}: log_prob is not finite in {density[:, t].sum()} of {LANES} of its own"
+            f" samples{where}"
+        )
 
 
 def _numbers(found, went_wrong):
     def bad(flags):  # [LANES + 1, STEPS + 1] -> the first step at which it is wrong, or None
-        steps = np.flatnonzero((flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found["has_mode"])))
+        steps = np.flatnonzero(
+            (flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found["has_mode"]))
+        )
         return steps[0] if steps.size else None
 
-    wrong = [(t, path) for path, flags in jax.tree_util.tree_leaves_with_path(found["state"]) if (t := bad(flags)) is not None]
+    wrong = [
+        (t, path)
+        for path, flags in jax.tree_util.tree_leaves_with_path(found["state"])
+        if (t := bad(flags)) is not None
+    ]
     for t, path in sorted(wrong, key=lambda p: p[0])[:1]:
-        raise ValueError(f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN {f'after {t} steps' if t else 'at the start'}, expected a number")
+        raise ValueError(
+            f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN"
+            f" {f'after {t} steps' if t else 'at the start'}, expected a number"
+        )
     if (t := bad(found["distance"])) is not None:
-        raise ValueError("\n  ".join([f"evaluate: distance is not finite after {t} steps, expected a number", *map(str, went_wrong)]))
+        raise ValueError(
+            "\n  ".join(
+                [
+                    f"evaluate: distance is not finite after {t} steps, expected a number",
+                    *map(str, went_wrong),
+                ]
+            )
+        )
 
 
 def _repeats(sim, x0, x, judged):
-    """ValueError unless init, evaluate (at ``judged``) and step, run twice outside of jit, agree to the bit."""
+    """ValueError unless init, evaluate (at ``judged``) and step, run twice outside of jit, agree to
+    the bit.
+    """
     x0, x, judged = jax.tree.map(jnp.asarray, (x0, x, judged))
     state = _twice("init", sim.init, x0)
     _twice("evaluate", sim.evaluate, judged)
@@ -245,9 +350,14 @@ def _repeats(sim, x0, x, judged):
 
 def _twice(name, function, *args):
     first, second = (_arrays(name, _call(name, function, *args)) for _ in range(2))
-    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(first), jax.tree.leaves(second), strict=True):
+    for (path, a), b in zip(
+        jax.tree_util.tree_leaves_with_path(first), jax.tree.leaves(second), strict=True
+    ):
         if np.asarray(a).tobytes() != np.asarray(b).tobytes():
-            raise ValueError(f"{name}: leaf {_path(path)} differs between two runs on the same input; randomness belongs into disturbance or start")
+            raise ValueError(
+                f"{name}: leaf {_path(path)} differs between two runs on the same input; randomness"
+                " belongs into disturbance or start"
+            )
     return first
 
 
@@ -264,7 +374,11 @@ def _path(path):
 
 
 def _kind(value):
-    return f"{jnp.result_type(value)}{list(jnp.shape(value))}" if isinstance(value, ARRAYS) else f"{type(value).__name__} {value!r}"[:120]
+    return (
+        f"{jnp.result_type(value)}{list(jnp.shape(value))}"
+        if isinstance(value, ARRAYS)
+        else f"{type(value).__name__} {value!r}"[:120]
+    )
 
 
 def _show(value):

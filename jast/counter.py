@@ -1,8 +1,10 @@
-"""A counter-based hash as a JAX key implementation: random numbers that are addressed, not threaded.
+"""A counter-based hash as a JAX key implementation: random numbers that are addressed, not
+threaded.
 
-A simulation of a search draws its disturbance x_t with a key folded from (tree key, simulation, t), so that any simulation can be rebuilt from its number.
-Threefry spends most of a cheap simulator's time on that; two rounds of a 32-bit finaliser (the one of MurmurHash3) per word do not. It serves search
-only: its statistics are tested, but estimators keep the user's own key.
+A simulation of a search draws its disturbance x_t with a key folded from (tree key, simulation, t),
+so that any simulation can be rebuilt from its number. Threefry spends most of a cheap simulator's
+time on that; two rounds of a 32-bit finaliser (the one of MurmurHash3) per word do not. It serves
+search only: its statistics are tested, but estimators keep the user's own key.
 """
 
 import jax
@@ -15,7 +17,9 @@ __all__ = ["COUNTER", "coin", "generator", "tree_keys"]
 
 
 def _mix(h):
-    """MurmurHash3's 32-bit finaliser: a bijection in which every input bit moves every output bit."""
+    """MurmurHash3's 32-bit finaliser: a bijection in which every input bit moves every output
+    bit.
+    """
     h = (h ^ (h >> 16)) * jnp.uint32(0x85EBCA6B)
     h = (h ^ (h >> 13)) * jnp.uint32(0xC2B2AE35)
     return h ^ (h >> 16)
@@ -58,7 +62,15 @@ def _size(shape):
     return size
 
 
-COUNTER = define_prng_impl(key_shape=(2,), seed=_seed, split=_split, random_bits=_random_bits, fold_in=_fold_in, name="jast_counter", tag="cnt")
+COUNTER = define_prng_impl(
+    key_shape=(2,),
+    seed=_seed,
+    split=_split,
+    random_bits=_random_bits,
+    fold_in=_fold_in,
+    name="jast_counter",
+    tag="cnt",
+)
 
 
 def coin(key):
@@ -67,11 +79,17 @@ def coin(key):
 
 
 def tree_keys(key, n):
-    """``n`` counter keys, one a tree, from the user's ``key`` (consumed); the key of tree k does not depend on ``n``."""
-    words = jax.vmap(lambda k: jax.random.bits(jax.random.fold_in(key, k), (2,), jnp.uint32))(jnp.arange(n))
+    """``n`` counter keys, one a tree, from the user's ``key`` (consumed); the key of tree k does
+    not depend on ``n``.
+    """
+    words = jax.vmap(lambda k: jax.random.bits(jax.random.fold_in(key, k), (2,), jnp.uint32))(
+        jnp.arange(n)
+    )
     return jax.random.wrap_key_data(words, impl=COUNTER)
 
 
 def generator(key):
     """A NumPy generator from a JAX key of any kind, for work on the host."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist())
+    return np.random.default_rng(
+        np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist()
+    )

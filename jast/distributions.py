@@ -1,7 +1,8 @@
 """Distributions: distrax's, and what stress testing needs beside them.
 
-A disturbance model returns any object with ``sample(seed=key)``, ``log_prob(x)`` and, where it exists, ``mode()``: distrax's distributions do, and so do
-those made here. This is the only module that imports distrax.
+A disturbance model returns any object with ``sample(seed=key)``, ``log_prob(x)`` and, where it
+exists, ``mode()``: distrax's distributions do, and so do those made here. This is the only module
+that imports distrax.
 """
 
 import warnings
@@ -12,7 +13,8 @@ from jax import lax
 from jax.scipy import special
 from jax.scipy.linalg import solve_triangular
 
-with warnings.catch_warnings():  # tensorflow-probability, below distrax, touches deprecated names of jax
+# tensorflow-probability, below distrax, touches deprecated names of jax
+with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from distrax import (
         Bernoulli,
@@ -34,10 +36,42 @@ with warnings.catch_warnings():  # tensorflow-probability, below distrax, touche
     Normal(0.0, 1.0).name  # noqa: B018  (the deprecated names are touched lazily, so touch them here)
 
 __all__ = [
-    "Bernoulli", "Beta", "Categorical", "Deterministic", "Distribution", "Fixed", "Gamma", "Independent", "Joint", "Laplace", "Logistic",
-    "MultivariateNormalDiag", "MultivariateNormalTri", "Normal", "Seeds", "Tent", "Transformed", "Uniform", "Where", "cdf", "event_like", "float_dtype",
-    "fraction", "has_cdf", "has_mode", "has_quantile", "log_density", "log_mode", "mode", "quantile", "sample", "seeds", "sum_parts", "tent", "where",
-]  # fmt: skip
+    "Bernoulli",
+    "Beta",
+    "Categorical",
+    "Deterministic",
+    "Distribution",
+    "Fixed",
+    "Gamma",
+    "Independent",
+    "Joint",
+    "Laplace",
+    "Logistic",
+    "MultivariateNormalDiag",
+    "MultivariateNormalTri",
+    "Normal",
+    "Seeds",
+    "Tent",
+    "Transformed",
+    "Uniform",
+    "Where",
+    "cdf",
+    "event_like",
+    "float_dtype",
+    "fraction",
+    "has_cdf",
+    "has_mode",
+    "has_quantile",
+    "log_density",
+    "log_mode",
+    "mode",
+    "quantile",
+    "sample",
+    "seeds",
+    "sum_parts",
+    "tent",
+    "where",
+]
 
 
 class Fixed(Distribution):
@@ -61,7 +95,9 @@ class Fixed(Distribution):
 
 
 class Deterministic(Distribution):
-    """All mass on ``value``, a pytree of arrays: a recorded disturbance. ``log_prob`` is 0: it is a point, not a density."""
+    """All mass on ``value``, a pytree of arrays: a recorded disturbance. ``log_prob`` is 0: it is a
+    point, not a density.
+    """
 
     def __init__(self, value):
         super().__init__()
@@ -85,7 +121,9 @@ class Deterministic(Distribution):
 
 
 class Seeds(Distribution):
-    """Random seeds of ``shape``, uint32, for a system whose disturbance density is unknown: ``log_prob`` is 0 and there is no mode."""
+    """Random seeds of ``shape``, uint32, for a system whose disturbance density is unknown:
+    ``log_prob`` is 0 and there is no mode.
+    """
 
     def __init__(self, shape=()):
         super().__init__()
@@ -103,15 +141,19 @@ class Seeds(Distribution):
 
 
 class Tent(Distribution):
-    """Density proportional to ``1 - |x - center| / width`` on ``[low, high]`` (elementwise over ``center``), zero elsewhere.
+    """Density proportional to ``1 - |x - center| / width`` on ``[low, high]`` (elementwise over
+    ``center``), zero elsewhere.
 
-    With ``width=1`` on [0, 1] its mode-normalised log density is ``ln(1 - |x - center|)``, the step reward of the MCFS-AP paper (eq. 1 as a sum of logs).
+    With ``width=1`` on [0, 1] its mode-normalised log density is ``ln(1 - |x - center|)``, the step
+    reward of the MCFS-AP paper (eq. 1 as a sum of logs).
     """
 
     def __init__(self, center, width=1.0, low=0.0, high=1.0):
         super().__init__()
         center = jnp.asarray(center)
-        self._center, self._width, self._low, self._high = (jnp.asarray(v, center.dtype) for v in (center, width, low, high))
+        self._center, self._width, self._low, self._high = (
+            jnp.asarray(v, center.dtype) for v in (center, width, low, high)
+        )
 
     @property
     def event_shape(self):
@@ -122,7 +164,9 @@ class Tent(Distribution):
         return self._center.shape
 
     def _masses(self):
-        """Unnormalised masses left of the start of the support, and its whole span, of the full tent of mass ``width``."""
+        """Unnormalised masses left of the start of the support, and its whole span, of the full
+        tent of mass ``width``.
+        """
         lower, upper = self._cdf_full(self._low), self._cdf_full(self._high)
         return lower, upper - lower
 
@@ -131,7 +175,9 @@ class Tent(Distribution):
         return self._width * jnp.where(z < 0, 0.5 * (1 + z) ** 2, 1 - 0.5 * (1 - z) ** 2)
 
     def log_prob_from_mode(self, x):
-        """Log density less the log density of the mode, without the normaliser: exactly ``log(1 - |x - center| / width)``."""
+        """Log density less the log density of the mode, without the normaliser: exactly ``log(1 -
+        |x - center| / width)``.
+        """
         inside = (x >= self._low) & (x <= self._high)
         height = jnp.where(inside, 1 - jnp.abs(x - self._center) / self._width, 0.0)
         return jnp.where(height > 0, jnp.log(jnp.where(height > 0, height, 1.0)), -jnp.inf)
@@ -142,7 +188,9 @@ class Tent(Distribution):
     def quantile(self, u):
         lower, span = self._masses()
         mass = (lower + u * span) / self._width  # of the full tent of unit mass
-        z = jnp.where(mass < 0.5, jnp.sqrt(2 * mass) - 1, 1 - jnp.sqrt(jnp.maximum(2 - 2 * mass, 0)))
+        z = jnp.where(
+            mass < 0.5, jnp.sqrt(2 * mass) - 1, 1 - jnp.sqrt(jnp.maximum(2 - 2 * mass, 0))
+        )
         return jnp.clip(self._center + self._width * z, self._low, self._high)
 
     def cdf(self, value):
@@ -156,7 +204,9 @@ class Tent(Distribution):
 
 
 class Where(Distribution):
-    """``a`` where the scalar ``pred`` holds, else ``b``: two classes of distribution over the same kind of value."""
+    """``a`` where the scalar ``pred`` holds, else ``b``: two classes of distribution over the same
+    kind of value.
+    """
 
     def __init__(self, pred, a, b):
         super().__init__()
@@ -167,10 +217,13 @@ class Where(Distribution):
         return self._a.event_shape
 
     def _select(self, a, b):
-        return jax.tree.map(lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b)
+        return jax.tree.map(
+            lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
+        )
 
     def sample(self, *, seed, sample_shape=()):
-        # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of reused keys that it is meant
+        # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
+        # reused keys that it is meant
         other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
         return self._select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
 
@@ -181,7 +234,9 @@ class Where(Distribution):
         return self._select(self._a.log_prob(value), self._b.log_prob(value))
 
     def log_prob_from_mode(self, value):
-        return self._select(log_density(self._a, value, "mode"), log_density(self._b, value, "mode"))
+        return self._select(
+            log_density(self._a, value, "mode"), log_density(self._b, value, "mode")
+        )
 
     def mode(self):
         return self._select(mode(self._a), mode(self._b))
@@ -194,17 +249,23 @@ class Where(Distribution):
 
 
 def tent(center, width=1.0, low=0.0, high=1.0):
-    """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero ``width`` away, cut to ``[low, high]``."""
+    """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero
+    ``width`` away, cut to ``[low, high]``.
+    """
     return Tent(center, width, low, high)
 
 
 def seeds(shape=()):
-    """`Seeds` of ``shape``, uint32: the density of the disturbance is unknown (log p = 0), only its seed is chosen."""
+    """`Seeds` of ``shape``, uint32: the density of the disturbance is unknown (log p = 0), only its
+    seed is chosen.
+    """
     return Seeds(shape)
 
 
 def where(pred, a, b):
-    """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of one shape and dtype."""
+    """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of
+    one shape and dtype.
+    """
     return Where(pred, a, b)
 
 
@@ -214,7 +275,9 @@ def sample(d, key):
 
 
 def mode(d):
-    """The likeliest value of ``d``; its median where distrax names no mode. ValueError if there is neither."""
+    """The likeliest value of ``d``; its median where distrax names no mode. ValueError if there is
+    neither.
+    """
     if isinstance(d, Uniform):
         return (d.low + d.high) / 2  # any point is a mode; the middle is the undisturbed one
     if isinstance(d, Joint):
@@ -229,7 +292,10 @@ def mode(d):
     try:
         return quantile(d, half)
     except ValueError:
-        raise ValueError(f"{type(d).__name__} has neither a mode nor a median: the undisturbed system is not defined") from None
+        raise ValueError(
+            f"{type(d).__name__} has neither a mode nor a median: the undisturbed system is not"
+            " defined"
+        ) from None
 
 
 def has_mode(d):
@@ -263,13 +329,17 @@ def log_mode(d):
 
 
 def log_density(d, x, density="raw"):
-    """Log density of ``x``: ``"raw"``, or ``"mode"``: less that of the mode, so that the likeliest value has 0."""
+    """Log density of ``x``: ``"raw"``, or ``"mode"``: less that of the mode, so that the likeliest
+    value has 0.
+    """
     if density == "raw":
         return d.log_prob(x)
     if isinstance(d, (Fixed, Seeds, Deterministic)):
         return d.log_prob(x)
     if isinstance(d, Joint):
-        parts = jax.tree.map(lambda e, v: log_density(e, v, "mode"), d.distributions, x, is_leaf=_is_distribution)
+        parts = jax.tree.map(
+            lambda e, v: log_density(e, v, "mode"), d.distributions, x, is_leaf=_is_distribution
+        )
         return sum_parts(parts)
     if isinstance(d, Independent):
         inner = log_density(d.distribution, x, "mode")
@@ -280,9 +350,11 @@ def log_density(d, x, density="raw"):
 
 
 def quantile(d, u):
-    """The value of ``d`` at the quantile ``u`` in [0, 1] (a pytree like a value of ``d``, floats), so that ``u ~ U(0, 1)`` gives a draw of ``d``.
+    """The value of ``d`` at the quantile ``u`` in [0, 1] (a pytree like a value of ``d``, floats),
+    so that ``u ~ U(0, 1)`` gives a draw of ``d``.
 
-    Vectors are taken coordinate by coordinate; integers by the inverse of their distribution function. ValueError names a distribution that cannot.
+    Vectors are taken coordinate by coordinate; integers by the inverse of their distribution
+    function. ValueError names a distribution that cannot.
     """
     if hasattr(d, "quantile"):
         return d.quantile(u)
@@ -311,20 +383,28 @@ def quantile(d, u):
     if isinstance(d, Joint):
         return jax.tree.map(quantile, d.distributions, u, is_leaf=_is_distribution)
     if _of_scalars(d):
-        x0, x1 = (d.bijector.forward(quantile(d.distribution, jnp.full_like(u, q))) for q in (0.25, 0.75))
+        x0, x1 = (
+            d.bijector.forward(quantile(d.distribution, jnp.full_like(u, q))) for q in (0.25, 0.75)
+        )
         return d.bijector.forward(quantile(d.distribution, jnp.where(x1 >= x0, u, 1 - u)))
-    raise ValueError(f"quantile: {type(d).__name__} has no quantile function here; use jast.actions.samples()")
+    raise ValueError(
+        f"quantile: {type(d).__name__} has no quantile function here; use jast.actions.samples()"
+    )
 
 
 def cdf(d, x):
-    """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
+    """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with
+    ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
 
-    An integer has the middle of the interval of ``u`` that gives it. Outside of the support: 0 or 1. ValueError names a distribution that cannot.
+    An integer has the middle of the interval of ``u`` that gives it. Outside of the support: 0 or
+    1. ValueError names a distribution that cannot.
     """
     if hasattr(d, "quantile"):
         if _inverts(d):
             return d.cdf(x)
-        raise ValueError(f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it")
+        raise ValueError(
+            f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it"
+        )
     if isinstance(d, Fixed):
         return ()
     if isinstance(d, Uniform):
@@ -335,7 +415,9 @@ def cdf(d, x):
         return special.ndtr(_standard(x - d.loc, d.scale_diag))
     if isinstance(d, MultivariateNormalTri):
         far = jnp.sqrt(jnp.finfo(d.loc.dtype).max)  # an infinite one would make others NaN
-        return special.ndtr(solve_triangular(d.scale_tri, jnp.clip(x - d.loc, -far, far), lower=d.is_lower))
+        return special.ndtr(
+            solve_triangular(d.scale_tri, jnp.clip(x - d.loc, -far, far), lower=d.is_lower)
+        )
     if isinstance(d, Logistic):
         return special.expit(_standard(x - d.loc, d.scale))
     if isinstance(d, Laplace):
@@ -351,7 +433,9 @@ def cdf(d, x):
     if isinstance(d, Joint):
         return jax.tree.map(cdf, d.distributions, x, is_leaf=_is_distribution)
     if _of_scalars(d):
-        x0, x1 = (d.bijector.forward(quantile(d.distribution, jnp.full_like(x, q))) for q in (0.25, 0.75))
+        x0, x1 = (
+            d.bijector.forward(quantile(d.distribution, jnp.full_like(x, q))) for q in (0.25, 0.75)
+        )
         try:
             u = cdf(d.distribution, d.bijector.inverse(x))
         except NotImplementedError:
@@ -363,19 +447,27 @@ def cdf(d, x):
 
 
 def fraction(x, low, high):
-    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is no way."""
+    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is
+    no way.
+    """
     none = high == low
     return jnp.where(none, 0.5, jnp.clip((x - low) / jnp.where(none, 1, high - low), 0, 1))
 
 
 def _inverts(d):
-    """Whether the ``cdf`` of ``d`` is of the class that defines its ``quantile``, or of one below: distrax's may be another function."""
+    """Whether the ``cdf`` of ``d`` is of the class that defines its ``quantile``, or of one below:
+    distrax's may be another function.
+    """
     first = next((c for c in type(d).__mro__ if {"cdf", "quantile"} & vars(c).keys()), None)
     return hasattr(d, "cdf") and (first is None or "cdf" in vars(first))
 
 
 def _of_scalars(d):
-    return isinstance(d, Transformed) and d.bijector.event_ndims_in == 0 and d.bijector.event_ndims_out == 0
+    return (
+        isinstance(d, Transformed)
+        and d.bijector.event_ndims_in == 0
+        and d.bijector.event_ndims_out == 0
+    )
 
 
 def _standard(gap, scale):
@@ -384,7 +476,9 @@ def _standard(gap, scale):
 
 
 def _cell(x, inner):
-    """Middle of the ``x``-th of the intervals of [0, 1] that begin at 0 and at each of ``inner`` (on the last axis); 0 or 1 where there is none."""
+    """Middle of the ``x``-th of the intervals of [0, 1] that begin at 0 and at each of ``inner``
+    (on the last axis); 0 or 1 where there is none.
+    """
     end = jnp.zeros((*inner.shape[:-1], 1), inner.dtype)
     starts, last = jnp.concatenate([end, inner, end + 1], axis=-1), inner.shape[-1]
     v = jnp.asarray(x).astype(inner.dtype)
@@ -392,7 +486,9 @@ def _cell(x, inner):
     low, high = (jnp.take_along_axis(starts, j, axis=-1)[..., 0] for j in (i, i + 1))
     middle = (low + high) / 2
     middle = jnp.where(middle < high, middle, low)  # an interval holds its start alone
-    return jnp.clip(jnp.where((v < 0) | (v > last), v, middle), 0, 1).astype(float_dtype(jnp.result_type(x)))
+    return jnp.clip(jnp.where((v < 0) | (v > last), v, middle), 0, 1).astype(
+        float_dtype(jnp.result_type(x))
+    )
 
 
 def _half(d):
@@ -424,4 +520,7 @@ def sum_parts(parts):
     """The sum of a pytree of scalars, in the widest of their dtypes."""
     leaves = jax.tree.leaves(parts)
     dtype = jnp.result_type(*leaves)
-    return sum((lax.convert_element_type(v, dtype) for v in leaves[1:]), lax.convert_element_type(leaves[0], dtype))
+    return sum(
+        (lax.convert_element_type(v, dtype) for v in leaves[1:]),
+        lax.convert_element_type(leaves[0], dtype),
+    )

@@ -1,7 +1,9 @@
-"""The archive of failures: the best distinct ones that a search found, each exactly replayable, in memory and in one file.
+"""The archive of failures: the best distinct ones that a search found, each exactly replayable, in
+memory and in one file.
 
-An archived episode went through `jast.replay` once and carries its numbers, so that every later replay on the same platform agrees with them to the bit.
-All arrays are NumPy's: they keep their dtype whatever the precision that JAX is set to.
+An archived episode went through `jast.replay` once and carries its numbers, so that every later
+replay on the same platform agrees with them to the bit. All arrays are NumPy's: they keep their
+dtype whatever the precision that JAX is set to.
 """
 
 import json
@@ -20,7 +22,9 @@ SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 
 
 class Failures(NamedTuple):
-    """The n best distinct failures, by falling reward. ``failures[i]`` is the i-th field, as in any tuple; an episode is ``failures.episode(i)``."""
+    """The n best distinct failures, by falling reward. ``failures[i]`` is the i-th field, as in any
+    tuple; an episode is ``failures.episode(i)``.
+    """
 
     episodes: Episode
     """Leading axis [n]; ``states`` is None (`jast.replay` gives them)."""
@@ -33,7 +37,9 @@ class Failures(NamedTuple):
     seen: int
     """Failing episodes simulated in all, repetitions and those beyond the best n included."""
     dropped: int
-    """Candidates that did not replay to a failure: a knife edge on which compiled programs differ in the last digit."""
+    """Candidates that did not replay to a failure: a knife edge on which compiled programs differ
+    in the last digit.
+    """
 
     @property
     def size(self):
@@ -46,9 +52,13 @@ class Failures(NamedTuple):
         return self.episode(0) if self.size else None
 
     def episode(self, i):
-        """The i-th best `Episode`, unbatched; negative ``i`` counts from the end. IndexError outside the archive."""
+        """The i-th best `Episode`, unbatched; negative ``i`` counts from the end. IndexError
+        outside the archive.
+        """
         if not -self.size <= i < self.size:
-            raise IndexError(f"Failures.episode: i must be within the {self.size} episodes held, received {i}")
+            raise IndexError(
+                f"Failures.episode: i must be within the {self.size} episodes held, received {i}"
+            )
         return _take(self.episodes, i)
 
     def __str__(self):
@@ -58,11 +68,17 @@ class Failures(NamedTuple):
         if not self.size:
             return "no failure was found" + (f" ({found})" if self.seen or self.dropped else "")
         lines = [f"{self.size} distinct failure{'s' * (self.size > 1)} ({found})"]
-        lines.append(f"{'rank':>4} {'reward':>11} {'log p':>11} {'distance':>11} {'length':>6} {'found':>6} {'tree':>6} {'simulation':>10}")
+        lines.append(
+            f"{'rank':>4} {'reward':>11} {'log p':>11} {'distance':>11} {'length':>6} {'found':>6}"
+            f" {'tree':>6} {'simulation':>10}"
+        )
         e = self.episodes
         for i in range(min(self.size, 10)):
             numbers = " ".join(f"{float(v[i]):11.6g}" for v in (e.reward, e.log_prob, e.distance))
-            lines.append(f"{i + 1:4d} {numbers} {int(e.length[i]):6d} {self.counts[i]:6d} {self.tree[i]:6d} {self.simulation[i]:10d}")
+            lines.append(
+                f"{i + 1:4d} {numbers} {int(e.length[i]):6d} {self.counts[i]:6d} {self.tree[i]:6d}"
+                f" {self.simulation[i]:10d}"
+            )
         if self.size > 10:
             lines.append(f"... and {self.size - 10} more")
         return "\n".join(lines)
@@ -72,28 +88,40 @@ def empty(sim):
     """`Failures` with n = 0, of the shapes and dtypes of ``sim``."""
     x0, x = jax.eval_shape(_shapes, sim)
     zero = np.zeros(0, accumulator(sim))
-    x0, x = jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), x0), jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), x)
+    x0, x = (
+        jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), x0),
+        jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), x),
+    )
     none = np.zeros(0, np.int32)
-    return Failures(Episode(x0, x, zero, zero, np.zeros(0, bool), none, zero), none, none, none, 0, 0)
+    return Failures(
+        Episode(x0, x, zero, zero, np.zeros(0, bool), none, zero), none, none, none, 0, 0
+    )
 
 
 def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64):
-    """The ``top`` best distinct failures among candidate ``episodes`` (an `Episode` with a leading axis [m], NumPy or JAX): `Failures`.
+    """The ``top`` best distinct failures among candidate ``episodes`` (an `Episode` with a leading
+    axis [m], NumPy or JAX): `Failures`.
 
-    Every candidate whose ``failure`` holds is replayed; one that no longer fails is dropped and counted. Episodes with the same bytes of x0 and of the first
-    ``length`` disturbances are one failure, their counts added. ``tree`` and ``simulation`` [m]: where each was found (default: tree 0, its position);
-    ``seen``: failing episodes simulated, where more than the candidates were (default: the failing candidates). Ranked by ``reward``, of which more is
-    better. ValueError for axes that disagree, ``top`` below 1, or disturbances that do not fit ``sim``.
+    Every candidate whose ``failure`` holds is replayed; one that no longer fails is dropped and
+    counted. Episodes with the same bytes of x0 and of the first ``length`` disturbances are one
+    failure, their counts added. ``tree`` and ``simulation`` [m]: where each was found (default:
+    tree 0, its position); ``seen``: failing episodes simulated, where more than the candidates were
+    (default: the failing candidates). Ranked by ``reward``, of which more is better. ValueError for
+    axes that disagree, ``top`` below 1, or disturbances that do not fit ``sim``.
     """
     episodes = jax.device_get(episodes._replace(states=None))
     m = np.shape(episodes.length)[0] if np.ndim(episodes.length) == 1 else None
     if m is None or any(np.shape(leaf)[:1] != (m,) for leaf in jax.tree.leaves(episodes)):
-        raise ValueError(f"collect: episodes must share one leading axis, received the shapes {jax.tree.map(np.shape, episodes)}")
+        raise ValueError(
+            "collect: episodes must share one leading axis, received the shapes"
+            f" {jax.tree.map(np.shape, episodes)}"
+        )
     tree = _numbers("tree", np.zeros(m, np.int32) if tree is None else tree, m)
     simulation = _numbers("simulation", np.arange(m) if simulation is None else simulation, m)
     failing = np.flatnonzero(episodes.failure)
 
-    rows, dropped, known = [], 0, {}  # known: bytes of a candidate -> its row, None where it was dropped
+    # known: bytes of a candidate -> its row, None where it was dropped
+    rows, dropped, known = [], 0, {}
     for i in failing:
         candidate = _take(episodes, i)
         name = identity(candidate)
@@ -110,34 +138,59 @@ def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64
     if rows:
         kept = jax.tree.map(lambda *leaves: np.stack(leaves), *(row for row, _ in rows))
         first = np.array([min(found, key=lambda i: (simulation[i], tree[i])) for _, found in rows])
-        archive = Failures(kept, np.array([len(found) for _, found in rows], np.int32), tree[first], simulation[first], 0, 0)
-    return _best("collect", archive, top)._replace(seen=len(failing) if seen is None else int(seen), dropped=dropped)
+        archive = Failures(
+            kept,
+            np.array([len(found) for _, found in rows], np.int32),
+            tree[first],
+            simulation[first],
+            0,
+            0,
+        )
+    return _best("collect", archive, top)._replace(
+        seen=len(failing) if seen is None else int(seen), dropped=dropped
+    )
 
 
 def merge(a, b, top=64):
-    """The ``top`` best distinct failures of two archives of one simulator and one reward: `Failures`; ``seen`` and ``dropped`` are added.
+    """The ``top`` best distinct failures of two archives of one simulator and one reward:
+    `Failures`; ``seen`` and ``dropped`` are added.
 
     ValueError where the shapes of the two disagree or ``top`` is below 1.
     """
-    outline = [(jax.tree.structure(f.episodes), [np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)]) for f in (a, b)]
+    outline = [
+        (
+            jax.tree.structure(f.episodes),
+            [np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)],
+        )
+        for f in (a, b)
+    ]
     if outline[0] != outline[1]:
-        raise ValueError(f"merge: both archives must be of one simulator, received episodes of shapes {outline[0][1]} and {outline[1][1]}")
+        raise ValueError(
+            "merge: both archives must be of one simulator, received episodes of shapes"
+            f" {outline[0][1]} and {outline[1][1]}"
+        )
     arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), a[:4], b[:4])
-    return _best("merge", Failures(*arrays, 0, 0), top)._replace(seen=a.seen + b.seen, dropped=a.dropped + b.dropped)
+    return _best("merge", Failures(*arrays, 0, 0), top)._replace(
+        seen=a.seen + b.seen, dropped=a.dropped + b.dropped
+    )
 
 
 def save(path, failures, settings=None):
-    """Write ``failures`` and ``settings`` (a dict that JSON can hold: method, seed, counts ...) to the one file ``path``.
+    """Write ``failures`` and ``settings`` (a dict that JSON can hold: method, seed, counts ...) to
+    the one file ``path``.
 
-    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON: format, version, settings, the structure of x0 and x, and a checksum.
-    An older file of that name stays whole until the new one is. ValueError for settings that JSON cannot hold.
+    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON: format, version,
+    settings, the structure of x0 and x, and a checksum. An older file of that name stays whole
+    until the new one is. ValueError for settings that JSON cannot hold.
     """
     try:
         settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
     except (TypeError, ValueError) as error:
         raise ValueError(f"save: settings must be a dict that JSON can hold: {error}") from None
     e = failures.episodes
-    parts = {"x0": e.x0, "disturbances": e.disturbances} | {name: getattr(e, name) for name in SCALARS}
+    parts = {"x0": e.x0, "disturbances": e.disturbances} | {
+        name: getattr(e, name) for name in SCALARS
+    }
     parts |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
     header = dict(settings=settings, seen=int(failures.seen), dropped=int(failures.dropped))
     header["structure"] = {name: describe(getattr(e, name)) for name in ("x0", "disturbances")}
@@ -147,9 +200,10 @@ def save(path, failures, settings=None):
 def load(path, sim=None):
     """Read a file of `save`: ``(Failures, settings)``. Arrays keep the dtypes they were saved with.
 
-    ``sim``, where given, must fit the archive (horizon, structure, shapes, kinds of number; the float precision may differ). It is needed where x0 or x is
-    another structure than dicts, lists, tuples and None. ValueError says why a file is refused: no jast archive, a version unknown here, damaged, or no
-    fit to ``sim``.
+    ``sim``, where given, must fit the archive (horizon, structure, shapes, kinds of number; the
+    float precision may differ). It is needed where x0 or x is another structure than dicts, lists,
+    tuples and None. ValueError says why a file is refused: no jast archive, a version unknown here,
+    damaged, or no fit to ``sim``.
     """
     header, arrays = read(path, FORMAT, VERSION, KIND)
     x0, x = (arrays_of(arrays, name) for name in ("x0", "disturbances"))
@@ -160,9 +214,18 @@ def load(path, sim=None):
         _fits(path, "disturbances", structure["disturbances"], x, like_x, (sim.horizon,))
         x0, x = jax.tree.structure(like_x0).unflatten(x0), jax.tree.structure(like_x).unflatten(x)
     else:
-        x0, x = _rebuild(path, structure["x0"], iter(x0)), _rebuild(path, structure["disturbances"], iter(x))
-    scalars, places = ([arrays[f"{name}.0"] for name in names] for names in (SCALARS, ("counts", "tree", "simulation")))
-    return Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"]), header["settings"]
+        x0, x = (
+            _rebuild(path, structure["x0"], iter(x0)),
+            _rebuild(path, structure["disturbances"], iter(x)),
+        )
+    scalars, places = (
+        [arrays[f"{name}.0"] for name in names]
+        for names in (SCALARS, ("counts", "tree", "simulation"))
+    )
+    return (
+        Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"]),
+        header["settings"],
+    )
 
 
 def _take(episodes, i):
@@ -172,30 +235,48 @@ def _take(episodes, i):
 def _numbers(name, values, m):
     values = np.asarray(values)
     if values.shape != (m,):
-        raise ValueError(f"collect: {name} must have the shape {(m,)}, one number an episode, received {values.shape}")
+        raise ValueError(
+            f"collect: {name} must have the shape {(m,)}, one number an episode, received"
+            f" {values.shape}"
+        )
     return values.astype(np.int32)
 
 
 def identity(episode):
     """What makes two failures one: the bytes of x0 and of the disturbances that were used."""
-    leaves = jax.tree.leaves(episode.x0) + [a[: int(episode.length)] for a in jax.tree.leaves(episode.disturbances)]
+    leaves = jax.tree.leaves(episode.x0) + [
+        a[: int(episode.length)] for a in jax.tree.leaves(episode.disturbances)
+    ]
     return int(episode.length), *(np.ascontiguousarray(a).tobytes() for a in leaves)
 
 
 def _best(caller, failures, top):
-    """The best ``top``, with equal ones put together; ``seen`` and ``dropped`` are left to the caller."""
+    """The best ``top``, with equal ones put together; ``seen`` and ``dropped`` are left to the
+    caller.
+    """
     if isinstance(top, bool) or not isinstance(top, int | np.integer) or top < 1:
         raise ValueError(f"{caller}: top must be an int of at least 1, received {top!r}")
-    # equal rewards are ordered by when they were found, so that the order of the candidates does not matter
+    # equal rewards are ordered by when they were found, so that the order of the candidates does
+    # not matter
     order = np.lexsort((failures.tree, failures.simulation, -failures.episodes.reward))
     groups = {}
     for i in order:
         groups.setdefault(identity(_take(failures.episodes, i)), []).append(i)
     groups = list(groups.values())[:top]
     kept = np.array([found[0] for found in groups], np.int64)
-    first = np.array([min(found, key=lambda i: (failures.simulation[i], failures.tree[i])) for found in groups], np.int64)
+    first = np.array(
+        [min(found, key=lambda i: (failures.simulation[i], failures.tree[i])) for found in groups],
+        np.int64,
+    )
     counts = np.array([failures.counts[found].sum() for found in groups], np.int32)
-    return Failures(_take(failures.episodes, kept), counts, failures.tree[first], failures.simulation[first], 0, 0)
+    return Failures(
+        _take(failures.episodes, kept),
+        counts,
+        failures.tree[first],
+        failures.simulation[first],
+        0,
+        0,
+    )
 
 
 def _plain(value):
@@ -210,9 +291,17 @@ def _rebuild(path, structure, leaves):
         return next(leaves)
     kind, names, below = structure
     if kind.startswith("the class"):
-        raise ValueError(f"load: {path} holds values of {kind}, which only its simulator can restore: load(path, sim)")
+        raise ValueError(
+            f"load: {path} holds values of {kind}, which only its simulator can restore: load(path,"
+            " sim)"
+        )
     below = [_rebuild(path, child, leaves) for child in below]
-    return {"None": lambda: None, "tuple": lambda: tuple(below), "list": lambda: below, "dict": lambda: dict(zip(names, below, strict=True))}[kind]()
+    return {
+        "None": lambda: None,
+        "tuple": lambda: tuple(below),
+        "list": lambda: below,
+        "dict": lambda: dict(zip(names, below, strict=True)),
+    }[kind]()
 
 
 def _fits(path, name, structure, arrays, like, rows):

@@ -1,4 +1,6 @@
-"""What went wrong inside a system that runs on the host: kept with an example and counted, never raised, so that a search goes on."""
+"""What went wrong inside a system that runs on the host: kept with an example and counted, never
+raised, so that a search goes on.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -13,11 +15,22 @@ GROUPS = 100
 """The most different messages that a `Log` keeps apart."""
 KINDS = {
     "raised": "run the system on the example's disturbances to see it again",
-    "timed out": "raise time_limit if the system is only slow; else the example's disturbances make it hang",
-    "died": "the process of the system ended: run it on the example's disturbances outside of this process",
+    "timed out": (
+        "raise time_limit if the system is only slow; else the example's disturbances make it hang"
+    ),
+    "died": (
+        "the process of the system ended: run it on the example's disturbances outside of this"
+        " process"
+    ),
     "wrong answer": "return (event, distance): a bool and one number",
-    "NaN": "return a finite number for every input; an episode without one is no failure and has reward -inf",
-    "not deterministic": "seed every random number generator at the start of a run, or make what it draws a disturbance",
+    "NaN": (
+        "return a finite number for every input; an episode without one is no failure and has"
+        " reward -inf"
+    ),
+    "not deterministic": (
+        "seed every random number generator at the start of a run, or make what it draws a"
+        " disturbance"
+    ),
     "other": "mend those listed first: their examples say how",
 }
 """The kinds of incidents, and what to do."""
@@ -33,12 +46,16 @@ class Incident(NamedTuple):
     count: int
     """How often, the example included"""
     x0: Any
-    """Initial disturbance of the example, ``()`` where the start is fixed; None where there is no example"""
+    """Initial disturbance of the example, ``()`` where the start is fixed; None where there is no
+    example
+    """
     disturbances: Any
     """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one"""
 
     def __str__(self):
-        said = self.message if self.message.startswith(self.kind) else f"{self.kind}: {self.message}"
+        said = (
+            self.message if self.message.startswith(self.kind) else f"{self.kind}: {self.message}"
+        )
         return f"{self.count} x {said}; {KINDS[self.kind]}"
 
 
@@ -49,16 +66,25 @@ class Log:
         self._groups, self._lock = {}, threading.Lock()
 
     def add(self, kind, message, example):
-        """Count one more; ``example``: () -> (x0, disturbances), called for the first of a group only."""
+        """Count one more; ``example``: () -> (x0, disturbances), called for the first of a group
+        only.
+        """
         with self._lock:
             group = (kind, message)
             if group not in self._groups and len(self._groups) >= GROUPS:
-                group = ("other", f"more than {GROUPS} different messages; the last one: {kind}: {message}"[:200])
+                group = (
+                    "other",
+                    f"more than {GROUPS} different messages; the last one: {kind}: {message}"[:200],
+                )
                 old = next((g for g in self._groups if g[0] == "other"), None)
                 if old is not None:
                     group = old
             known = self._groups.get(group)
-            self._groups[group] = Incident(*group, 1, *example()) if known is None else known._replace(count=known.count + 1)
+            self._groups[group] = (
+                Incident(*group, 1, *example())
+                if known is None
+                else known._replace(count=known.count + 1)
+            )
 
     def all(self):
         """tuple of `Incident`, in the order of their first examples."""
@@ -67,7 +93,9 @@ class Log:
 
 
 def sources(sim, name) -> Iterator[Any]:
-    """The functions behind a simulator's fields that have a method ``name``, each once; also those bound by another function's arguments."""
+    """The functions behind a simulator's fields that have a method ``name``, each once; also those
+    bound by another function's arguments.
+    """
     seen, left = set(), [sim]
     while left:
         for part in jax.tree.leaves(left.pop(), is_leaf=lambda p: isinstance(p, Partial)):
@@ -84,7 +112,9 @@ def hosted(sim):
 
 
 def incidents(sim):
-    """What has gone wrong so far in the host code behind ``sim``, by kind and message: a tuple of `Incident`; ``()`` for a simulator in JAX."""
+    """What has gone wrong so far in the host code behind ``sim``, by kind and message: a tuple of
+    `Incident`; ``()`` for a simulator in JAX.
+    """
     return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
 
 

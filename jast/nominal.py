@@ -1,4 +1,6 @@
-"""nominal: what the system does when nobody searches. The baseline that every search and estimate is compared with."""
+"""nominal: what the system does when nobody searches. The baseline that every search and estimate
+is compared with.
+"""
 
 import warnings
 from functools import partial
@@ -25,7 +27,9 @@ class Nominal(NamedTuple):
     """What `nominal` found: Python numbers and one `Episode`."""
 
     undisturbed: Episode | None
-    """The episode of every disturbance at its mode, else its median; None where a distribution has neither."""
+    """The episode of every disturbance at its mode, else its median; None where a distribution has
+    neither.
+    """
     failures: int
     """Episodes that failed."""
     episodes: int
@@ -37,12 +41,17 @@ class Nominal(NamedTuple):
     mean_distance: float
     """Mean miss distance over the valid episodes; NaN where there are none."""
     invalid: int
-    """Episodes in which the simulator returned a number that is not finite; they count as not failing."""
+    """Episodes in which the simulator returned a number that is not finite; they count as not
+    failing.
+    """
 
     def __str__(self):
         quiet = "not defined: a disturbance has neither a mode nor a median"
         if self.undisturbed is not None:
-            quiet = f"{'FAILS' if self.undisturbed.failure else 'no failure'}, distance {self.undisturbed.distance:.4g}, {self.undisturbed.length} steps"
+            quiet = (
+                f"{'FAILS' if self.undisturbed.failure else 'no failure'}, distance"
+                f" {self.undisturbed.distance:.4g}, {self.undisturbed.length} steps"
+            )
         low, high = self.interval
         rows = [
             ("undisturbed", quiet),
@@ -55,31 +64,53 @@ class Nominal(NamedTuple):
 
 
 def nominal(key, sim, episodes=100_000):
-    """Simulate the system under its own disturbance model: `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
+    """Simulate the system under its own disturbance model: `Nominal`, the undisturbed outcome and
+    the failure rate with its exact interval.
 
-    The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not grow with ``episodes``. Warns (UserWarning) where the system
-    fails undisturbed and where episodes are invalid. Raises ValueError for ``episodes`` below 1 and where the simulator's functions do not fit together.
+    The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not
+    grow with ``episodes``. Warns (UserWarning) where the system fails undisturbed and where
+    episodes are invalid. Raises ValueError for ``episodes`` below 1 and where the simulator's
+    functions do not fit together.
     """
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
-        raise ValueError(f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}")
+        raise ValueError(
+            f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
+        )
     contract(sim, observed=False)
     episodes, before = int(episodes), incidents(sim)
     quiet = rollout(key, sim, undisturbed(sim)) if _has_undisturbed(sim) else None  # draws nothing
-    failures, invalid, mean = jax.device_get(_count(key, sim, jnp.asarray(episodes, jnp.int32), LANES))
+    failures, invalid, mean = jax.device_get(
+        _count(key, sim, jnp.asarray(episodes, jnp.int32), LANES)
+    )
     failures, invalid = int(failures), int(invalid)
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
-            "the system fails undisturbed: its likeliest disturbances already lead to a failure, so a search for failures has nothing to find out", stacklevel=2
+            "the system fails undisturbed: its likeliest disturbances already lead to a failure, so"
+            " a search for failures has nothing to find out",
+            stacklevel=2,
         )
     if invalid:
-        said = f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number that is not finite; they count as not failing"
+        said = (
+            f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number"
+            " that is not finite; they count as not failing"
+        )
         warnings.warn("\n  ".join([said, *map(str, since(before, incidents(sim)))]), stacklevel=2)
-    return Nominal(quiet, failures, episodes, failures / episodes, clopper_pearson(failures, episodes), float(mean), invalid)
+    return Nominal(
+        quiet,
+        failures,
+        episodes,
+        failures / episodes,
+        clopper_pearson(failures, episodes),
+        float(mean),
+        invalid,
+    )
 
 
 @partial(jax.jit, static_argnums=3)
 def _count(key, sim, episodes, lanes):
-    """Failures, invalid episodes and the mean distance of the valid ones, ``lanes`` episodes at a time."""
+    """Failures, invalid episodes and the mean distance of the valid ones, ``lanes`` episodes at a
+    time.
+    """
 
     def chunk(i, carry):
         failures, invalid, mean = carry
@@ -91,24 +122,39 @@ def _count(key, sim, episodes, lanes):
         count = jnp.sum(valid, dtype=jnp.int32)
         total = jnp.sum(jnp.where(valid, last.distance, 0))
         # a running mean: a running sum would lose digits in float32
-        mean = jnp.where(count > 0, mean + (total - count.astype(mean.dtype) * mean) / jnp.maximum(before + count.astype(mean.dtype), 1), mean)
-        return failures + jnp.sum(live & last.failure, dtype=jnp.int32), invalid + jnp.sum(live & last.invalid, dtype=jnp.int32), mean
+        mean = jnp.where(
+            count > 0,
+            mean
+            + (total - count.astype(mean.dtype) * mean)
+            / jnp.maximum(before + count.astype(mean.dtype), 1),
+            mean,
+        )
+        return (
+            failures + jnp.sum(live & last.failure, dtype=jnp.int32),
+            invalid + jnp.sum(live & last.invalid, dtype=jnp.int32),
+            mean,
+        )
 
     zero = jnp.zeros((), jnp.int32)
     distance = jax.eval_shape(lambda: _outcome(key, sim, True).distance)
-    failures, invalid, mean = lax.fori_loop(0, (episodes - 1) // lanes + 1, chunk, (zero, zero, jnp.zeros((), distance.dtype)))
+    failures, invalid, mean = lax.fori_loop(
+        0, (episodes - 1) // lanes + 1, chunk, (zero, zero, jnp.zeros((), distance.dtype))
+    )
     return failures, invalid, jnp.where(invalid < episodes, mean, jnp.nan)
 
 
 def _outcome(key, sim, live):
-    """The end of the episode that `rollout` plays with ``key``, without its rows; not played where ``live`` is False."""
+    """The end of the episode that `rollout` plays with ``key``, without its rows; not played where
+    ``live`` is False.
+    """
     reward = rewards.standard()
     keys = jax.random.split(key, sim.horizon + 1)
     first = begin(sim, reward, D.sample(sim.start(), keys[0]))
 
     def step(carry):
         progress, t = carry
-        x = D.sample(sim.disturbance(progress.state), jax.random.clone(keys[t + 1]))  # each once: JAX's check of reused keys cannot see that
+        # each once: JAX's check of reused keys cannot see that
+        x = D.sample(sim.disturbance(progress.state), jax.random.clone(keys[t + 1]))
         return advance(sim, reward, progress, x, t + 1 >= sim.horizon), t + 1
 
     first = first._replace(done=first.done | ~jnp.asarray(live))
@@ -119,7 +165,9 @@ def _outcome(key, sim, live):
 def _has_undisturbed(sim):
     def has():
         start = sim.start()
-        return D.has_mode(start) and D.has_mode(sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))
+        return D.has_mode(start) and D.has_mode(
+            sim.disturbance(sim.init(D.sample(start, jax.random.key(0))))
+        )
 
     found = []
     jax.eval_shape(lambda: found.append(has()))

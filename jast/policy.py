@@ -1,4 +1,6 @@
-"""Policies: who chooses the disturbances. One protocol for the nominal model, a box, a recording and a learned failure policy."""
+"""Policies: who chooses the disturbances. One protocol for the nominal model, a box, a recording
+and a learned failure policy.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -16,7 +18,9 @@ __all__ = ["Policy", "nominal_policy", "recorded", "undisturbed"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:
-    """Chooses disturbances: ``start() -> Distribution`` over x0 and ``disturbance(state, t) -> Distribution`` over x_t, t = 0, 1, ...; a pytree."""
+    """Chooses disturbances: ``start() -> Distribution`` over x0 and ``disturbance(state, t) ->
+    Distribution`` over x_t, t = 0, 1, ...; a pytree.
+    """
 
     start: Callable[[], Any]
     disturbance: Callable[[Any, Any], Any]
@@ -39,9 +43,14 @@ def undisturbed(sim):
 
 
 def recorded(disturbances, x0=()):
-    """Plays back ``disturbances`` [T, ...] from the start ``x0``; the last row is repeated beyond T."""
+    """Plays back ``disturbances`` [T, ...] from the start ``x0``; the last row is repeated beyond
+    T.
+    """
     disturbances, x0 = jax.tree.map(jnp.asarray, (disturbances, x0))
-    return Policy(Partial(D.Deterministic, x0) if jax.tree.leaves(x0) else D.Fixed, Partial(_row, disturbances))
+    return Policy(
+        Partial(D.Deterministic, x0) if jax.tree.leaves(x0) else D.Fixed,
+        Partial(_row, disturbances),
+    )
 
 
 def _nominal(disturbance, state, t):

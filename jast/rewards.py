@@ -1,19 +1,22 @@
 """Rewards: what a search maximises, step by step; an episode's reward is the sum over s0..sT.
 
-A reward is any function ``(log_p, event, distance, terminal, approach) -> float`` of one arrival at a state:
+A reward is any function ``(log_p, event, distance, terminal, approach) -> float`` of one arrival at
+a state:
 
-=============  ==================================================================================================================
+=============  ===================================================================================
 ``log_p``      log density of the disturbance that led here; of x0 at the start
 ``event``      a failure was reached here (paid once: the episode ends)
 ``distance``   miss distance of the episode so far: the least, or the last one of an episodic system
 ``terminal``   the episode ends here, in a failure or otherwise
 ``approach``   by how much the last step reduced the state's own miss distance: d(s) - d(s')
-=============  ==================================================================================================================
+=============  ===================================================================================
 
-Its attribute ``density`` ("raw" where absent) says whether ``log_p`` is the log density or that less its value at the mode. With an attribute ``once`` that is
-true it is a reward of whole episodes: ``log_p`` is their sum, and what it returns at the end is all that the episode is paid.
+Its attribute ``density`` ("raw" where absent) says whether ``log_p`` is the log density or that
+less its value at the mode. With an attribute ``once`` that is true it is a reward of whole
+episodes: ``log_p`` is their sum, and what it returns at the end is all that the episode is paid.
 
-An episodic system has no distance before its end: there ``distance`` and ``approach`` are 0, and at the end ``approach`` is -d.
+An episodic system has no distance before its end: there ``distance`` and ``approach`` are 0, and at
+the end ``approach`` is -d.
 """
 
 import warnings
@@ -24,7 +27,17 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-__all__ = ["Episodic", "Shaped", "Standard", "as_pytree", "density_of", "episodic", "once", "shaped", "standard"]
+__all__ = [
+    "Episodic",
+    "Shaped",
+    "Standard",
+    "as_pytree",
+    "density_of",
+    "episodic",
+    "once",
+    "shaped",
+    "standard",
+]
 
 _density = dict(default="raw", metadata=dict(static=True))
 
@@ -38,7 +51,9 @@ class Standard:
     density: str = field(**_density)
 
     def __call__(self, log_p, event, distance, terminal, approach=0.0):
-        return log_p + jnp.where(terminal, jnp.where(event, _like(self.event_bonus, log_p), -distance), 0)
+        return log_p + jnp.where(
+            terminal, jnp.where(event, _like(self.event_bonus, log_p), -distance), 0
+        )
 
 
 @jax.tree_util.register_dataclass
@@ -72,39 +87,52 @@ class Shaped:
     density: str = field(**_density)
 
     def __call__(self, log_p, event, distance, terminal, approach=0.0):
-        return log_p + _like(self.scale, log_p) * approach + jnp.where(event, _like(self.event_bonus, log_p), 0)
+        return (
+            log_p
+            + _like(self.scale, log_p) * approach
+            + jnp.where(event, _like(self.event_bonus, log_p), 0)
+        )
 
 
 def standard(event_bonus=0.0, density="raw"):
-    """Sum of every step's log p, plus ``event_bonus`` at a failure or less the miss distance at another end.
+    """Sum of every step's log p, plus ``event_bonus`` at a failure or less the miss distance at
+    another end.
 
-    Thesis of Moss eq. 3.1, Lipkis and Agogino eq. 3, MCFS-AP eq. 1 as a sum of logs; unlike the first two as printed, the last step's log p counts.
-    ``density="mode"`` counts log p less its value at the mode. The published ferry reward is ``standard(event_bonus=30., density="mode")``.
+    Thesis of Moss eq. 3.1, Lipkis and Agogino eq. 3, MCFS-AP eq. 1 as a sum of logs; unlike the
+    first two as printed, the last step's log p counts. ``density="mode"`` counts log p less its
+    value at the mode. The published ferry reward is ``standard(event_bonus=30., density="mode")``.
     """
     return Standard(event_bonus, _checked("standard", density))
 
 
 def episodic(bonus=100.0, density="raw", mode="default"):
-    """log p - d at a non-failing end; at a failure log p - d + (bonus - 1) max(-d, 0): thesis eq. 3.2, ``(log p - d) bonus``, made monotone.
+    """log p - d at a non-failing end; at a failure log p - d + (bonus - 1) max(-d, 0): thesis eq.
+    3.2, ``(log p - d) bonus``, made monotone.
 
-    As printed (``mode="thesis"``) the equation multiplies log p < 0 by the bonus as well, so a failure less deep than -log p scores far below a miss, and
-    searches turn away from it; here only the depth of the failure (a negative miss distance) is multiplied. Warns (UserWarning) of that mode.
+    As printed (``mode="thesis"``) the equation multiplies log p < 0 by the bonus as well, so a
+    failure less deep than -log p scores far below a miss, and searches turn away from it; here only
+    the depth of the failure (a negative miss distance) is multiplied. Warns (UserWarning) of that
+    mode.
     """
     if mode not in ("default", "thesis"):
         raise ValueError(f'rewards.episodic: mode must be "default" or "thesis", received {mode!r}')
     if mode == "thesis":
         warnings.warn(
-            "rewards.episodic: eq. 3.2 as printed scores a failure below a miss unless its miss distance is below log p; "
-            'use mode="default" for anything but a comparison with the thesis', stacklevel=2,
-        )  # fmt: skip
+            "rewards.episodic: eq. 3.2 as printed scores a failure below a miss unless its miss"
+            ' distance is below log p; use mode="default" for anything but a comparison with the'
+            " thesis",
+            stacklevel=2,
+        )
     return Episodic(bonus, density=_checked("episodic", density), mode=mode)
 
 
 def shaped(scale, event_bonus=0.0, density="raw"):
-    """log p + scale (d(s) - d(s')) at every step, plus ``event_bonus`` on arrival at a failure: Lipkis and Agogino eq. 21, paid once.
+    """log p + scale (d(s) - d(s')) at every step, plus ``event_bonus`` on arrival at a failure:
+    Lipkis and Agogino eq. 21, paid once.
 
-    The shaping telescopes to scale (d(s0) - d(sT)), so it moves no optimum between episodes of equal start and end distance; for an episodic system, whose
-    distance means nothing before its end, to -scale d(sT).
+    The shaping telescopes to scale (d(s0) - d(sT)), so it moves no optimum between episodes of
+    equal start and end distance; for an episodic system, whose distance means nothing before its
+    end, to -scale d(sT).
     """
     return Shaped(scale, event_bonus, _checked("shaped", density))
 
@@ -115,12 +143,16 @@ def density_of(reward):
 
 
 def once(reward):
-    """Whether ``reward`` is of whole episodes: called with the sum of their log p, and what it returns at the end is the episode's reward."""
+    """Whether ``reward`` is of whole episodes: called with the sum of their log p, and what it
+    returns at the end is the episode's reward.
+    """
     return getattr(getattr(reward, "func", reward), "once", False)
 
 
 def as_pytree(reward):
-    """``reward`` as what `jax.jit` takes: a plain function becomes a `jax.tree_util.Partial`, static by identity."""
+    """``reward`` as what `jax.jit` takes: a plain function becomes a `jax.tree_util.Partial`,
+    static by identity.
+    """
     return Partial(reward) if jax.tree_util.all_leaves([reward]) and callable(reward) else reward
 
 

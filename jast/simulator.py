@@ -36,24 +36,33 @@ def ravel(state):
 class Simulator:
     """A system under test in its environment, as pure functions of pytrees; itself a pytree.
 
-    All randomness is the disturbances (x0, x1, ..., xT), each with its density, so an episode is its disturbances. The functions are wrapped in
-    `jax.tree_util.Partial`: arguments bound by a ``Partial`` are traced, so simulators that differ only in them share one compiled program and
-    `jax.vmap` over a batch of them is a parameter sweep. Plain functions and lambdas are static, by identity: define them once.
+    All randomness is the disturbances (x0, x1, ..., xT), each with its density, so an episode is
+    its disturbances. The functions are wrapped in `jax.tree_util.Partial`: arguments bound by a
+    ``Partial`` are traced, so simulators that differ only in them share one compiled program and
+    `jax.vmap` over a batch of them is a parameter sweep. Plain functions and lambdas are static, by
+    identity: define them once.
 
-    At a state, in this order: a failure ends the episode, then ``is_terminal``, then the horizon. The miss distance of an episode is the least over s0..sT;
-    of an ``episodic`` one, the last state's, and only there the failure event counts.
+    At a state, in this order: a failure ends the episode, then ``is_terminal``, then the horizon.
+    The miss distance of an episode is the least over s0..sT; of an ``episodic`` one, the last
+    state's, and only there the failure event counts.
 
-    Raises ValueError for a horizon below 1 or a field that is no function. `jast.check` says whether the functions fit together.
+    Raises ValueError for a horizon below 1 or a field that is no function. `jast.check` says
+    whether the functions fit together.
     """
 
     init: Callable[[Any], Any]
-    """x0 -> state: the state that the initial disturbance puts the system in (x0 is ``()`` with the default ``start``)."""
+    """x0 -> state: the state that the initial disturbance puts the system in (x0 is ``()`` with the
+    default ``start``).
+    """
     step: Callable[[Any, Any], Any]
     """(state, x) -> state: one deterministic transition; same shapes and dtypes as its input."""
     disturbance: Callable[[Any], Any]
-    """state -> Distribution p(x | state): scalar ``log_prob``; x is an array or a pytree of arrays."""
+    """state -> Distribution p(x | state): scalar ``log_prob``; x is an array or a pytree of arrays.
+    """
     evaluate: Callable[[Any], tuple]
-    """state -> (failure event: bool scalar, miss distance: float scalar, smaller is nearer to a failure)."""
+    """state -> (failure event: bool scalar, miss distance: float scalar, smaller is nearer to a
+    failure).
+    """
     horizon: int = field(metadata=dict(static=True))
     """Greatest number of steps of an episode, at least 1; static."""
     start: Callable[[], Any] = fixed
@@ -77,6 +86,10 @@ class Simulator:
             elif value is None or isinstance(value, str | int | float | tuple | list | dict):
                 raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
-            raise ValueError(f"Simulator: horizon must be an int of at least 1, received {self.horizon!r}")
+            raise ValueError(
+                f"Simulator: horizon must be an int of at least 1, received {self.horizon!r}"
+            )
         if not isinstance(self.episodic, bool):
-            raise ValueError(f"Simulator: episodic must be True or False, received {self.episodic!r}")
+            raise ValueError(
+                f"Simulator: episodic must be True or False, received {self.episodic!r}"
+            )

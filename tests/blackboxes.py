@@ -1,4 +1,6 @@
-"""Small systems in plain Python that the tests run on the host. Neither jast nor JAX is imported, so that worker processes need neither."""
+"""Small systems in plain Python that the tests run on the host. Neither jast nor JAX is imported,
+so that worker processes need neither.
+"""
 
 import os
 import signal
@@ -27,7 +29,9 @@ def branches(disturbances):
 
 
 def troubled(disturbances):
-    """What goes wrong is decided by the first number: 1 raises, 2 waits, 3 waits where nothing interrupts, 4 ends the process, 5, 6, 7 answer nonsense."""
+    """What goes wrong is decided by the first number: 1 raises, 2 waits, 3 waits where nothing
+    interrupts, 4 ends the process, 5, 6, 7 answer nonsense.
+    """
     trouble = int(round(float(disturbances[0])))
     if trouble == 1:
         return True, 1.0 / 0
@@ -38,7 +42,9 @@ def troubled(disturbances):
         time.sleep(60)
     if trouble == 4:
         os._exit(3)
-    return {5: (True, np.zeros(2)), 6: (True, np.nan), 7: False}.get(trouble, (False, float(disturbances[0])))
+    return {5: (True, np.zeros(2)), 6: (True, np.nan), 7: False}.get(
+        trouble, (False, float(disturbances[0]))
+    )
 
 
 def modules(disturbances):
@@ -52,7 +58,9 @@ def process(disturbances):
 
 
 class Walk:
-    """`walk` as an object that is looked at after every disturbance; it ends, without a failure, below -4."""
+    """`walk` as an object that is looked at after every disturbance; it ends, without a failure,
+    below -4.
+    """
 
     def initialize(self, x0=0.0):
         self.s = float(x0)

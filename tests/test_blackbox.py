@@ -1,4 +1,6 @@
-"""Black boxes in this process: the same answers as the system in JAX, exact counts, and every way in which a system can go wrong."""
+"""Black boxes in this process: the same answers as the system in JAX, exact counts, and every way
+in which a system can go wrong.
+"""
 
 import sys
 
@@ -21,46 +23,70 @@ def box(system, horizon=2, disturbance=NORMAL, **settings):
 
 
 def ends(sim, rows):
-    """Event and distance of episodes whose disturbances are ``rows`` [n, horizon, ...], in one batch."""
+    """Event and distance of episodes whose disturbances are ``rows`` [n, horizon, ...], in one
+    batch.
+    """
     rows = jnp.asarray(rows, jnp.zeros(()).dtype)
     n = len(rows)
-    return jax.device_get(jax.vmap(sim.evaluate)(blackbox.Record(jnp.ones(n, bool), jnp.full(n, rows.shape[1], jnp.int32), (), rows)))
+    return jax.device_get(
+        jax.vmap(sim.evaluate)(
+            blackbox.Record(jnp.ones(n, bool), jnp.full(n, rows.shape[1], jnp.int32), (), rows)
+        )
+    )
 
 
 def in_jax(horizon=4, **fields):
     """`blackboxes.Walk`."""
     evaluate = lambda s: (s >= 4.0, jnp.maximum(4.0 - s, 0.0))
-    return jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x, lambda s: NORMAL, evaluate, horizon, **fields)
+    return jast.Simulator(
+        lambda x0: jnp.zeros(()), lambda s, x: s + x, lambda s: NORMAL, evaluate, horizon, **fields
+    )
 
 
 def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     sim = box(blackboxes.walk, 4)
-    ours, theirs = (jast.search.monte_carlo(key, s, episodes=1500, top=3) for s in (sim, in_jax(episodic=True)))
-    assert ours.failing_share == theirs.failing_share > 0 and ours.first_failure == theirs.first_failure
-    np.testing.assert_array_equal(ours.failures.episodes.disturbances, theirs.failures.episodes.disturbances)
+    ours, theirs = (
+        jast.search.monte_carlo(key, s, episodes=1500, top=3) for s in (sim, in_jax(episodic=True))
+    )
+    assert (
+        ours.failing_share == theirs.failing_share > 0
+        and ours.first_failure == theirs.first_failure
+    )
+    np.testing.assert_array_equal(
+        ours.failures.episodes.disturbances, theirs.failures.episodes.disturbances
+    )
     np.testing.assert_allclose(ours.best.reward, theirs.best.reward, rtol=1e-6)
     n = blackbox.calls(sim)
-    assert n.rows == n.episodes == ours.episodes + 1 + 3 and n.transitions == 4 * n.episodes  # the best one and three failures are replayed
+    # the best one and three failures are replayed
+    assert n.rows == n.episodes == ours.episodes + 1 + 3 and n.transitions == 4 * n.episodes
     assert n.calls < 40 and n.seconds > 0 and "ms an outcome" in str(n)
     assert incidents(sim) == ()
 
 
 def test_objects_are_those_of_the_system_in_jax():
     sim = box(blackboxes.Walk, 5, episodic=False)
-    theirs = in_jax(5, is_terminal=lambda s: s < -4.0, observe=lambda s: jnp.stack([s, jnp.ones_like(s)]))
+    theirs = in_jax(
+        5, is_terminal=lambda s: s < -4.0, observe=lambda s: jnp.stack([s, jnp.ones_like(s)])
+    )
     for x in ([1, 1, -1, 1, 1], [1.5, 1.5, 1.5, 0, 0], [-3, -2, 9, 9, 9]):
         a, b = (jast.replay(s, jnp.array(x, jnp.zeros(()).dtype)) for s in (sim, theirs))
         n = int(a.length)
         assert (n, a.failure, a.log_prob) == (b.length, b.failure, b.log_prob)
         np.testing.assert_allclose(a.distance, b.distance)
-        np.testing.assert_allclose(*(jax.vmap(s.observe)(e.states)[: n + 1] for s, e in ((sim, a), (theirs, b))))
+        np.testing.assert_allclose(
+            *(jax.vmap(s.observe)(e.states)[: n + 1] for s, e in ((sim, a), (theirs, b)))
+        )
     assert incidents(sim) == ()
 
 
 def test_a_tree_counts_what_the_host_runs(key):
     sim = box(blackboxes.walk, 3)
     found = jast.search.mcts(key, sim, simulations=60)
-    assert found.episodes - 10 < blackbox.calls(sim).episodes <= found.episodes + 1 + len(found.failures.counts)  # the outcome of an ended node is kept
+    assert (
+        found.episodes - 10
+        < blackbox.calls(sim).episodes
+        <= found.episodes + 1 + len(found.failures.counts)
+    )  # the outcome of an ended node is kept
     assert incidents(sim) == ()
 
 
@@ -71,10 +97,12 @@ def test_an_object_is_moved_on_and_a_lost_one_repeats_its_history():
     for _ in range(3):
         before, state = state, sim.step(state, jnp.ones(()))
     assert count() == (1, 3) and state.distance == 1
-    assert sim.step(before, jnp.ones(())).distance == 1 and count() == (2, 6)  # another child of the last but one
+    # another child of the last but one
+    assert sim.step(before, jnp.ones(())).distance == 1 and count() == (2, 6)
     end = sim.step(state, jnp.ones(()))
     assert end.event and count() == (2, 7)
-    assert sim.step(end, jnp.ones(())) is not None and count() == (2, 7)  # an ended state is not asked for
+    # an ended state is not asked for
+    assert sim.step(end, jnp.ones(())) is not None and count() == (2, 7)
 
 
 def test_one_call_under_any_number_of_vmaps(equal):
@@ -83,7 +111,9 @@ def test_one_call_under_any_number_of_vmaps(equal):
     one = lambda x0, x: sim.evaluate(sim.step(sim.step(sim.init(x0), x[0]), x[1]))
     event, distance = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(x0, rows)
     assert blackbox.calls(sim)[:3] == (1, 12, 12)
-    np.testing.assert_allclose(distance, np.maximum(4 - x0[:, None] - rows.sum(1)[None], 0), rtol=1e-6)
+    np.testing.assert_allclose(
+        distance, np.maximum(4 - x0[:, None] - rows.sum(1)[None], 0), rtol=1e-6
+    )
     nothing = jax.tree.map(jnp.zeros_like, sim.init(x0[0]))
     equal(sim.evaluate(nothing), (jnp.zeros((), bool), jnp.zeros(())))
     assert np.isnan(sim.evaluate(sim.init(x0[0]))[1])  # no end of an episode
@@ -96,10 +126,25 @@ def test_what_goes_wrong_is_counted_with_an_example():
     np.testing.assert_array_equal(distance, [9, np.nan, np.nan, np.nan, np.nan, np.nan, 8])
     assert not event.any()
     found = {i.kind: i for i in incidents(sim)}
-    assert sorted(i.kind for i in incidents(sim)) == ["NaN", "raised", "wrong answer", "wrong answer"]
-    assert found["raised"].count == 2 and found["raised"].disturbances.tolist() == [1, 0] and found["raised"].x0 == ()
-    assert found["raised"].message.startswith("raised ZeroDivisionError: float division by zero (blackboxes.py:")
-    assert str(found["NaN"]) == "1 x NaN: distance is nan; return a finite number for every input; an episode without one is no failure and has reward -inf"
+    assert sorted(i.kind for i in incidents(sim)) == [
+        "NaN",
+        "raised",
+        "wrong answer",
+        "wrong answer",
+    ]
+    assert (
+        found["raised"].count == 2
+        and found["raised"].disturbances.tolist() == [1, 0]
+        and found["raised"].x0 == ()
+    )
+    assert found["raised"].message.startswith(
+        "raised ZeroDivisionError: float division by zero (blackboxes.py:"
+    )
+    assert (
+        str(found["NaN"])
+        == "1 x NaN: distance is nan; return a finite number for every input; an episode without"
+        " one is no failure and has reward -inf"
+    )
     before = incidents(sim)
     ends(sim, [[1, 2]])
     assert [(i.kind, i.count) for i in since(before, incidents(sim))] == [("raised", 1)]
@@ -110,7 +155,10 @@ def test_a_search_goes_on_without_the_invalid_episodes(key):
     found = jast.search.monte_carlo(key, sim, episodes=128, top=2)
     (only,) = incidents(sim)
     assert 0 < found.invalid < 128 and found.failing_share == 0 and only.count >= found.invalid
-    assert only.message == f"raised RuntimeError: beyond 2 (blackboxes.py:{blackboxes.Fragile.transition.__code__.co_firstlineno + 3})"
+    assert (
+        only.message == "raised RuntimeError: beyond 2"
+        f" (blackboxes.py:{blackboxes.Fragile.transition.__code__.co_firstlineno + 3})"
+    )
     assert len(only.disturbances) <= 3 and only.disturbances.sum() > 2
 
 
@@ -143,13 +191,20 @@ def test_an_outcome_has_no_gradient():
 def test_a_failure_probability():
     sim = box(blackboxes.branches, 1, MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)))
     found = jast.estimate.failure_probability(jax.random.key(0), sim, 5000)
-    assert abs(np.log(found.mean / 2.2227950662e-3)) < 0.25 and found.interval[0] < 2.2227950662e-3 < found.interval[1]
+    assert (
+        abs(np.log(found.mean / 2.2227950662e-3)) < 0.25
+        and found.interval[0] < 2.2227950662e-3 < found.interval[1]
+    )
     assert abs(blackbox.calls(sim).episodes - 5000) < 500
 
 
 def test_the_nominal_system():
     found = jast.nominal(jax.random.key(0), sim := box(blackboxes.walk, 4), episodes=500)
-    assert not found.undisturbed.failure and found.undisturbed.distance == 4 and 0 < found.failures < 50
+    assert (
+        not found.undisturbed.failure
+        and found.undisturbed.distance == 4
+        and 0 < found.failures < 50
+    )
     assert blackbox.calls(sim).episodes in (501, 502)
 
 
@@ -165,7 +220,12 @@ def test_seeds_are_the_disturbance_of_a_system_of_unknown_density():
 def test_disturbances_may_be_trees_that_depend_on_the_past():
     def disturbance(state):
         last = state.disturbances["gust"][state.t - 1]
-        return Joint({"gust": Independent(Normal(0.5 * last, 1.0), 1), "hit": Categorical(probs=jnp.array([0.5, 0.5]))})
+        return Joint(
+            {
+                "gust": Independent(Normal(0.5 * last, 1.0), 1),
+                "hit": Categorical(probs=jnp.array([0.5, 0.5])),
+            }
+        )
 
     run = lambda x: (bool(x["hit"].all()), float(x["gust"].sum()))
     with pytest.raises(ValueError, match="from_python: disturbance: .*; give like="):
@@ -175,7 +235,13 @@ def test_disturbances_may_be_trees_that_depend_on_the_past():
     assert episode.failure == episode.disturbances["hit"].all()
     np.testing.assert_allclose(episode.distance, episode.disturbances["gust"].sum(), rtol=1e-5)
     # a vector that needs no like
-    sim = box(lambda x: (False, float(x[-1, 0])), 3, lambda s: MultivariateNormalDiag(jnp.zeros(2) + s.t.astype(jnp.zeros(()).dtype), jnp.ones(2)))
+    sim = box(
+        lambda x: (False, float(x[-1, 0])),
+        3,
+        lambda s: MultivariateNormalDiag(
+            jnp.zeros(2) + s.t.astype(jnp.zeros(()).dtype), jnp.ones(2)
+        ),
+    )
     assert sim.init(()).disturbances.shape == (3, 2)
 
 
@@ -185,7 +251,8 @@ task = json.load(sys.stdin)
 x = task["disturbances"]
 if x[0] == 1: sys.exit("no good")
 print("a line before")
-print("no answer" if x[0] == 2 else json.dumps({"event": task["x0"] is not None, "distance": sum(x)}))
+answer = {"event": task["x0"] is not None, "distance": sum(x)}
+print("no answer" if x[0] == 2 else json.dumps(answer))
 """
 
 
@@ -195,14 +262,23 @@ def test_an_external_program():
     np.testing.assert_array_equal(distance, [3.5, np.nan, np.nan])
     assert not event.any()
     raised, answered = sorted(incidents(sim))
-    assert "exit status 1: no good" in raised.message and answered.kind == "wrong answer" and "received 'no answer'" in answered.message
+    assert (
+        "exit status 1: no good" in raised.message
+        and answered.kind == "wrong answer"
+        and "received 'no answer'" in answered.message
+    )
 
 
 def test_a_gymnasium_environment():
     gymnasium = pytest.importorskip("gymnasium")
     make = lambda: gymnasium.make("CartPole-v1").unwrapped
     upright = lambda now: 0.2095 - abs(float(now.observation[2]))
-    system = blackbox.gymnasium_system(make, upright, agent=lambda seen: int(seen[2] + 0.5 * seen[3] > 0), apply=lambda a, x: a if x < 1 else 1 - a)
+    system = blackbox.gymnasium_system(
+        make,
+        upright,
+        agent=lambda seen: int(seen[2] + 0.5 * seen[3] > 0),
+        apply=lambda a, x: a if x < 1 else 1 - a,
+    )
     sim = box(system, 25, start=jast.distributions.seeds(), episodic=False)
     one = jast.replay(sim, jnp.full(25, 2.0), x0=jnp.uint32(3))  # it always does the opposite
     assert one.failure and 5 < one.length < 25 and one.distance < 0
@@ -215,7 +291,8 @@ def test_a_gymnasium_environment():
     assert n == one.length
     np.testing.assert_allclose(one.states.seen[one.length], seen, rtol=1e-6)
     assert not jast.replay(sim, jnp.zeros(25), x0=jnp.uint32(3)).failure and incidents(sim) == ()
-    whole = box(blackbox.gymnasium_system(make, upright, apply=lambda a, x: int(x > 0)), 25)  # the disturbance is the action
+    # the disturbance is the action
+    whole = box(blackbox.gymnasium_system(make, upright, apply=lambda a, x: int(x > 0)), 25)
     assert ends(whole, np.ones((1, 25)))[0].all() and incidents(whole) == ()
 
 
@@ -231,21 +308,37 @@ class Waits(blackboxes.Walk):
 @pytest.mark.parametrize(
     "system, settings, message",
     [
-        (3, {}, "from_python: system must be a function of the disturbances, or a class, received 3"),
+        (
+            3,
+            {},
+            "from_python: system must be a function of the disturbances, or a class, received 3",
+        ),
         (blackboxes.Walk(), {}, "give its class"),
         (Mute, {}, "Mute lacks is_event"),
         (lambda: Mute(), {}, "Mute lacks is_event"),
         (lambda: 1 / 0, {}, "raised ZeroDivisionError"),
         (Waits, {"episodic": False}, "observe must return a vector of numbers, received 'nothing'"),
-        (blackboxes.walk, {"start": lambda: NORMAL}, r"function of \(disturbances, x0\), as start is random, received walk\(disturbances\)"),
+        (
+            blackboxes.walk,
+            {"start": lambda: NORMAL},
+            r"function of \(disturbances, x0\), as start is random, received walk\(disturbances\)",
+        ),
         (blackboxes.walk, {"episodic": False}, "episodic=False needs a class"),
         (blackboxes.walk, {"episodic": 1}, "episodic must be True or False"),
         (blackboxes.walk, {"horizon": 0}, "from_python: horizon"),
         (blackboxes.walk, {"workers": -1}, "from_python: workers"),
-        (blackboxes.walk, {"time_limit": 0.0, "workers": 1}, "from_python: time_limit must be a number of seconds above 0"),
+        (
+            blackboxes.walk,
+            {"time_limit": 0.0, "workers": 1},
+            "from_python: time_limit must be a number of seconds above 0",
+        ),
         (blackboxes.walk, {"time_limit": 1.0}, "time_limit needs workers of at least 1"),
         (blackboxes.walk, {"disturbance": 3.0}, "disturbance must be a distribution"),
-        (blackboxes.walk, {"disturbance": lambda s: 3.0}, "disturbance: TypeError: expected a distribution, received 3.0"),
+        (
+            blackboxes.walk,
+            {"disturbance": lambda s: 3.0},
+            "disturbance: TypeError: expected a distribution, received 3.0",
+        ),
         (blackboxes.walk, {"start": 3.0}, "start must be a distribution"),
         (blackboxes.walk, {"observe": 3.0}, "observe must be a function"),
     ],
@@ -256,12 +349,20 @@ def test_bad_input_is_named(system, settings, message):
 
 
 def test_bad_programs_and_environments_are_named():
-    for command, message in (("no-such-program -x", "'no-such-program' is not found"), ([], "must name a program"), (__file__, "is not found or is none")):
+    for command, message in (
+        ("no-such-program -x", "'no-such-program' is not found"),
+        ([], "must name a program"),
+        (__file__, "is not found or is none"),
+    ):
         with pytest.raises(ValueError, match=message):
             blackbox.program(command)
     with pytest.raises(ValueError, match="folder must be a directory"):
         blackbox.program("true", folder="/no/such/folder")
-    for settings, message in ((dict(agent=len), "needs apply"), (dict(seed=-1), "seed must be"), (dict(event=3), "event must be a function")):
+    for settings, message in (
+        (dict(agent=len), "needs apply"),
+        (dict(seed=-1), "seed must be"),
+        (dict(event=3), "event must be a function"),
+    ):
         with pytest.raises(ValueError, match=f"gymnasium_system: .*{message}"):
             blackbox.gymnasium_system(len, len, **settings)
     with pytest.raises(ValueError, match="calls: sim must be"):

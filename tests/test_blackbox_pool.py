@@ -1,4 +1,6 @@
-"""Black boxes in worker processes: what hangs, dies or raises there costs its own row only, and no process outlives its simulator."""
+"""Black boxes in worker processes: what hangs, dies or raises there costs its own row only, and no
+process outlives its simulator.
+"""
 
 import gc
 import os
@@ -23,7 +25,10 @@ LIMIT = 0.3
 
 
 def box(system, **settings):
-    return blackbox.from_python(system, **(dict(horizon=2, disturbance=Normal(0.0, 1.0), workers=2, time_limit=LIMIT) | settings))
+    return blackbox.from_python(
+        system,
+        **(dict(horizon=2, disturbance=Normal(0.0, 1.0), workers=2, time_limit=LIMIT) | settings),
+    )
 
 
 def ends(sim, first):
@@ -31,12 +36,21 @@ def ends(sim, first):
     first = jnp.asarray(first, jnp.zeros(()).dtype)
     n = len(first)
     rows = jnp.stack([first, jnp.zeros(n)], axis=1)
-    return np.asarray(jax.vmap(sim.evaluate)(blackbox.Record(jnp.ones(n, bool), jnp.full(n, 2, jnp.int32), (), rows))[1])
+    return np.asarray(
+        jax.vmap(sim.evaluate)(
+            blackbox.Record(jnp.ones(n, bool), jnp.full(n, 2, jnp.int32), (), rows)
+        )[1]
+    )
 
 
 def processes(sim):
     """The numbers of the processes that run at the moment."""
-    return [pid for w in sim.evaluate.func.host.runner.workers if w.executor is not None for pid in w.executor._processes]
+    return [
+        pid
+        for w in sim.evaluate.func.host.runner.workers
+        if w.executor is not None
+        for pid in w.executor._processes
+    ]
 
 
 def alive(pid):
@@ -66,7 +80,9 @@ def test_what_hangs_or_dies_costs_its_own_row_only():
     assert sorted(k for k, _ in found) == kinds and all(i.count == 1 for i in found.values())
     assert found["died", "the process ended: EXIT(3)"].disturbances.tolist() == [4, 0]
     assert found["timed out", "no answer within 0.3 s"].disturbances.tolist() == [2, 0]
-    assert found["timed out", "no answer within 0.3 s, and could not be interrupted"].disturbances.tolist() == [3, 0]
+    assert found[
+        "timed out", "no answer within 0.3 s, and could not be interrupted"
+    ].disturbances.tolist() == [3, 0]
     assert blackbox.calls(sim).rows == len(first)
     # it ends by itself where every row hangs, and works again after that
     started = time.monotonic()
@@ -84,27 +100,39 @@ def test_what_hangs_or_dies_costs_its_own_row_only():
 def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
     sim = box(blackboxes.modules, workers=1)
     np.testing.assert_array_equal(ends(sim, np.zeros(3)), 0)
-    sim, scale = box(lambda x: (blackboxes.time.sleep(0.02), blackboxes.process(x))[1]), 1.0  # a function of this file, by value
+    # a function of this file, by value
+    sim, scale = box(lambda x: (blackboxes.time.sleep(0.02), blackboxes.process(x))[1]), 1.0
     pids = ends(sim, np.arange(16.0))
     assert len(set(pids)) == 2 and os.getpid() not in pids
     assert scale and incidents(sim) == ()
 
 
 def test_a_search_with_workers_is_that_without(key, equal):
-    sims = [box(blackboxes.Walk, episodic=False, horizon=8, workers=n, time_limit=None) for n in (0, 2)]
+    sims = [
+        box(blackboxes.Walk, episodic=False, horizon=8, workers=n, time_limit=None) for n in (0, 2)
+    ]
     found = [jast.search.monte_carlo(key, sim, episodes=64, top=2) for sim in sims]
     equal(found[0].best, found[1].best)
     assert found[0].best.failure and found[0].failing_share == found[1].failing_share
     ours, theirs = (blackbox.calls(sim) for sim in sims)
     # rows stay with their workers, and so do the objects: few histories are repeated
-    assert ours.rows == theirs.rows and ours.episodes <= theirs.episodes <= ours.episodes + 10 and theirs.transitions <= ours.transitions + 60
+    assert (
+        ours.rows == theirs.rows
+        and ours.episodes <= theirs.episodes <= ours.episodes + 10
+        and theirs.transitions <= ours.transitions + 60
+    )
     assert incidents(sims[1]) == ()
 
 
 def test_threads_may_ask_at_once():
     sim = box(lambda x: (False, float(x[0])))
     answers = {}
-    threads = [threading.Thread(target=lambda i=i: answers.update({i: ends(sim, np.arange(10.0 * i, 10.0 * i + 8))})) for i in range(4)]
+    threads = [
+        threading.Thread(
+            target=lambda i=i: answers.update({i: ends(sim, np.arange(10.0 * i, 10.0 * i + 8))})
+        )
+        for i in range(4)
+    ]
     [t.start() for t in threads], [t.join() for t in threads]
     for i in range(4):
         np.testing.assert_array_equal(answers[i], np.arange(10.0 * i, 10.0 * i + 8))
@@ -117,7 +145,11 @@ def test_a_program_is_ended_with_its_children():
     assert np.isnan(ends(sim, [0.0]))
     (only,) = incidents(sim)
     assert only.kind == "timed out"
-    running = [pid for pid in os.listdir("/proc") if pid.isdigit() and f"60.{mark[-6:]}".encode() in _command(pid)]
+    running = [
+        pid
+        for pid in os.listdir("/proc")
+        if pid.isdigit() and f"60.{mark[-6:]}".encode() in _command(pid)
+    ]
     assert gone(running)
 
 
@@ -136,7 +168,10 @@ class Broken(blackboxes.Walk):
 
 def test_bad_input_is_named(monkeypatch):
     lock = threading.Lock()
-    with pytest.raises(ValueError, match="system cannot be sent to a worker process: .*lock.*define it at the top of a module"):
+    with pytest.raises(
+        ValueError,
+        match="system cannot be sent to a worker process: .*lock.*define it at the top of a module",
+    ):
         box(lambda x: (lock.locked(), 1.0))
     with pytest.raises(ValueError, match="from_python: system: the process ended"):
         box(Broken, episodic=False)
@@ -154,5 +189,7 @@ def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch)
 
     sim = box(only_here.run, workers=1)
     (tmp_path / "only_here.py").write_text("raise OSError('no licence')\n")
-    with pytest.raises(RuntimeError, match="a worker process could not load the system: OSError: no licence"):
+    with pytest.raises(
+        RuntimeError, match="a worker process could not load the system: OSError: no licence"
+    ):
         ends(sim, [0.0])

@@ -1,4 +1,6 @@
-"""BlueSky as a black box: routes that pass and fail, the same to the bit, in this process and in another one."""
+"""BlueSky as a black box: routes that pass and fail, the same to the bit, in this process and in
+another one.
+"""
 
 import importlib.metadata
 
@@ -19,12 +21,15 @@ def installed():
 
 
 STRAIGHT = np.array([[0.0, 7.0, 0.0, 0.0], [20.0, 4.0, 0.0, 0.0]])
-SHARP = np.array([[0.0, 6.0, 0.0, 0.0], [165.0, 6.0, 0.0, 0.0]])  # BlueSky turns long before the waypoint
+# BlueSky turns long before the waypoint
+SHARP = np.array([[0.0, 6.0, 0.0, 0.0], [165.0, 6.0, 0.0, 0.0]])
 
 
 def test_routes_pass_and_fail_as_the_track_says(installed, equal):
     sim = bluesky(2)
-    calm, missed = (jast.replay(sim, jnp.asarray(x, jnp.zeros(()).dtype)) for x in (STRAIGHT, SHARP))
+    calm, missed = (
+        jast.replay(sim, jnp.asarray(x, jnp.zeros(()).dtype)) for x in (STRAIGHT, SHARP)
+    )
     assert not calm.failure and 1 < calm.distance < 7 and missed.failure and missed.distance < -0.5
     assert incidents(sim) == () and blackbox.calls(sim).episodes == 2
     equal(missed, jast.replay(sim, jnp.asarray(SHARP, jnp.zeros(()).dtype)))
@@ -35,17 +40,23 @@ def test_routes_pass_and_fail_as_the_track_says(installed, equal):
         np.testing.assert_allclose(flight.track[0], 0)
         excess = np.max(flight.nearest - flight.allowed)
         np.testing.assert_allclose(episode.distance, np.log(1 / max(excess, 1e-3)), rtol=1e-5)
-        np.testing.assert_allclose(flight.nearest, np.min(np.hypot(*(flight.track - flight.route[1:, None]).T), axis=0), atol=0.05)
+        np.testing.assert_allclose(
+            flight.nearest,
+            np.min(np.hypot(*(flight.track - flight.route[1:, None]).T), axis=0),
+            atol=0.05,
+        )
 
 
 def test_a_flight_is_the_same_after_others_and_prints_nothing(installed, capfd):
     first = bluesky_flight(SHARP)
     bluesky_flight(STRAIGHT[:1])
     assert np.array_equal(bluesky_flight(SHARP).track, first.track)
-    assert np.ptp(bluesky_flight([[90.0, 3.0, 0.0, 60.0]]).track[:, 0]) < 0.05  # a cross wind does not carry it away
+    # a cross wind does not carry it away
+    assert np.ptp(bluesky_flight([[90.0, 3.0, 0.0, 60.0]]).track[:, 0]) < 0.05
     here = Route(1.0)
     here.initialize()
-    here.transition(np.array([0.0, -5.0, 0.0, 0.0], np.float32))  # a leg is never shorter than 0.1 nmi
+    # a leg is never shorter than 0.1 nmi
+    here.transition(np.array([0.0, -5.0, 0.0, 0.0], np.float32))
     here.evaluate()
     assert not here.is_event()
     assert capfd.readouterr().out == ""
@@ -61,7 +72,13 @@ def test_bad_input_and_a_missing_extra_are_named(monkeypatch):
         bluesky(0)
     with pytest.raises(ValueError, match="bluesky: tolerance must be a number of nmi above 0"):
         bluesky(tolerance=0.0)
-    with pytest.raises(ValueError, match=r"bluesky_flight: disturbances must be finite and \[waypoints, 4\], received shape \(3,\)"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"bluesky_flight: disturbances must be finite and \[waypoints, 4\], received shape"
+            r" \(3,\)"
+        ),
+    ):
         bluesky_flight(np.zeros(3))
 
     def missing(name):

@@ -1,4 +1,6 @@
-"""The cross-entropy search: it finds what random search does not, for every kind of disturbance, and its counts, archive and traced runs are honest."""
+"""The cross-entropy search: it finds what random search does not, for every kind of disturbance,
+and its counts, archive and traced runs are honest.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,13 @@ def lock():
         right = (x >> 29) == (s[1] * 3 % 8).astype(jnp.uint32)
         return s[0] + right.astype(jnp.int32), s[1] + 1
 
-    return jast.Simulator(lambda x0: (jnp.int32(0), jnp.int32(0)), step, lambda s: seeds(), lambda s: (s[0] >= 10, (10 - s[0]).astype(float)), 10)
+    return jast.Simulator(
+        lambda x0: (jnp.int32(0), jnp.int32(0)),
+        step,
+        lambda s: seeds(),
+        lambda s: (s[0] >= 10, (10 - s[0]).astype(float)),
+        10,
+    )
 
 
 def check_replays(sim, result, reward, equal):
@@ -50,7 +58,9 @@ def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
     assert not monte_carlo(key, sim, episodes=4000, reward=reward).failing.any()
     r = cem(key, sim, reward=reward, samples=200, elites=20, iterations=20)
-    assert r.failing.all() and r.failures.size == 64 and r.settings["actions"] == "actions.quantiles"
+    assert (
+        r.failing.all() and r.failures.size == 64 and r.settings["actions"] == "actions.quantiles"
+    )
     check_replays(sim, r, reward, equal)
     np.testing.assert_allclose(r.best.disturbances[0], 3, atol=0.3)
 
@@ -59,16 +69,28 @@ def _distance_first(log_p, event, distance, terminal, approach):
     return log_p - 20 * distance
 
 
-@pytest.mark.parametrize("choice", [actions.uniform(0.0, 1.0), actions.quantiles(), actions.samples()])
+@pytest.mark.parametrize(
+    "choice", [actions.uniform(0.0, 1.0), actions.quantiles(), actions.samples()]
+)
 def test_ferry(key, equal, choice):
     """Random search finds no collision in two million episodes."""
     sim = jast.simulators.ferry()
     r = cem(key, sim, trees=4, actions=choice, reward=S0["reward"])
     assert r.failing.all() and (r.best_reward_per_tree > 29).all() and r.best.reward < 29.65
-    assert r.episodes == 36_000 and r.simulator_steps <= 36_000 * 21 and r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
+    assert (
+        r.episodes == 36_000
+        and r.simulator_steps <= 36_000 * 21
+        and r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
+    )
     check_replays(sim, r, S0["reward"], equal)
-    assert r.history.best_reward.shape == (30, 4) and (np.diff(r.history.best_reward, axis=0) >= 0).all()
-    assert r.history.simulations.tolist() == list(range(300, 9001, 300)) and r.history.failures[-1] == r.failures.seen
+    assert (
+        r.history.best_reward.shape == (30, 4)
+        and (np.diff(r.history.best_reward, axis=0) >= 0).all()
+    )
+    assert (
+        r.history.simulations.tolist() == list(range(300, 9001, 300))
+        and r.history.failures[-1] == r.failures.seen
+    )
     assert 1 < r.first_failure <= r.episodes and r.failing_share == r.failures.seen / r.episodes
 
 
@@ -77,7 +99,10 @@ def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim, reward = ring(), rewards.standard()
     r = cem(key, sim, actions=choice, trees=4)
     check_replays(sim, r, reward, equal)
-    assert r.failing.all() and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
+    assert (
+        r.failing.all()
+        and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
+    )
 
 
 def test_random_start_of_a_rare_failure(key, equal):
@@ -85,7 +110,9 @@ def test_random_start_of_a_rare_failure(key, equal):
     sim, reward = jast.simulators.landing(), rewards.Partial(_far_from_the_line)
     r = cem(key, sim, reward=reward)
     check_replays(sim, r, reward, equal)
-    assert abs(r.best.x0) == pytest.approx(0.526, abs=0.06) and abs(r.best.disturbances).mean() == pytest.approx(0.0474, abs=0.006)
+    assert abs(r.best.x0) == pytest.approx(0.526, abs=0.06) and abs(
+        r.best.disturbances
+    ).mean() == pytest.approx(0.0474, abs=0.006)
 
 
 def _far_from_the_line(log_p, event, distance, terminal, approach):
@@ -103,30 +130,56 @@ def test_seeds_of_unknown_density(key, equal):
 def test_trees_are_independent_of_their_number(key, equal):
     few, many = (cem(key, walk(), trees=n, **SMALL) for n in (1, 3))
     np.testing.assert_allclose(few.best_reward_per_tree, many.best_reward_per_tree[:1], rtol=1e-5)
-    assert len(set(many.best_reward_per_tree.tolist())) == 3 and set(many.failures.tree) <= {0, 1, 2}
+    assert len(set(many.best_reward_per_tree.tolist())) == 3 and set(many.failures.tree) <= {
+        0,
+        1,
+        2,
+    }
 
 
 def test_counts_of_repetitions(key):
     """One failure only: every time it was found is counted."""
     sim = jast.Simulator(
-        lambda x0: jnp.int32(0), lambda s, x: x.astype(jnp.int32), lambda s: jast.distributions.Categorical(probs=jnp.array([0.9, 0.1])),
-        lambda s: (s == 1, (1 - s).astype(float)), 1,
-    )  # fmt: skip
+        lambda x0: jnp.int32(0),
+        lambda s, x: x.astype(jnp.int32),
+        lambda s: jast.distributions.Categorical(probs=jnp.array([0.9, 0.1])),
+        lambda s: (s == 1, (1 - s).astype(float)),
+        1,
+    )
     r = cem(key, sim, trees=2, actions=actions.samples(), samples=50, elites=5, iterations=4)
-    assert r.failures.size == 1 and r.failures.counts.sum() == r.failures.seen == round(r.failing_share * 400)
+    assert r.failures.size == 1 and r.failures.counts.sum() == r.failures.seen == round(
+        r.failing_share * 400
+    )
 
 
 def test_invalid_episodes_are_counted_and_never_elite(key):
     r = cem(key, walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x)), **SMALL)
-    assert 0 < r.invalid < 600 and np.isfinite(r.best.reward) and np.isfinite(r.failures.episodes.reward).all()
+    assert (
+        0 < r.invalid < 600
+        and np.isfinite(r.best.reward)
+        and np.isfinite(r.failures.episodes.reward).all()
+    )
     r = cem(key, walk(step=lambda s, x: s + jnp.nan), trees=2, **SMALL)
-    assert r.invalid == r.episodes == r.simulator_steps == 2000 and r.best.reward == -np.inf and not r.best.failure
-    assert (r.best_reward_per_tree == -np.inf).all() and r.failures.size == 0 and r.first_failure is None
+    assert (
+        r.invalid == r.episodes == r.simulator_steps == 2000
+        and r.best.reward == -np.inf
+        and not r.best.failure
+    )
+    assert (
+        (r.best_reward_per_tree == -np.inf).all()
+        and r.failures.size == 0
+        and r.first_failure is None
+    )
 
 
 def test_systems_that_never_or_always_fail(key):
     r = cem(key, walk(fails=lambda s: s > 1e9), **SMALL)
-    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (0, None, 0, 6000)
+    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (
+        0,
+        None,
+        0,
+        6000,
+    )
     r = cem(key, walk(fails=lambda s: s < 1e9), trees=2, **SMALL)  # at the start
     assert (r.failing_share, r.first_failure, r.simulator_steps, r.best.length) == (1, 1, 0, 0)
     assert r.failures.size == 1 and r.failures.counts.tolist() == [r.failures.seen] == [2000]
@@ -134,15 +187,30 @@ def test_systems_that_never_or_always_fail(key):
 
 def test_under_jit_and_vmap(key):
     betas = jnp.array([3.0, 4.0])
-    search = lambda sim, smoothing=0.3: cem(key, sim, reward=WEIGHED, trees=2, smoothing=smoothing, **SMALL)
+    search = lambda sim, smoothing=0.3: cem(
+        key, sim, reward=WEIGHED, trees=2, smoothing=smoothing, **SMALL
+    )
     traced = jax.jit(jax.vmap(lambda b, s: search(hyperplane(b), s)))(betas, jnp.array([0.3, 0.3]))
     for i, b in enumerate(betas):
         r = search(hyperplane(b))
         # the last digit of an episode may decide who is an elite
-        np.testing.assert_allclose(traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=2e-2)
-        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (r.episodes, r.simulator_steps, r.invalid)
-        assert float(traced.best.reward[i]) == pytest.approx(float(traced.best_reward_per_tree[i].max()), rel=1e-5)
-    assert traced.failures is None and traced.history is None and traced.settings is None and traced.failing.shape == (2, 2)
+        np.testing.assert_allclose(
+            traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=2e-2
+        )
+        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (
+            r.episodes,
+            r.simulator_steps,
+            r.invalid,
+        )
+        assert float(traced.best.reward[i]) == pytest.approx(
+            float(traced.best_reward_per_tree[i].max()), rel=1e-5
+        )
+    assert (
+        traced.failures is None
+        and traced.history is None
+        and traced.settings is None
+        and traced.failing.shape == (2, 2)
+    )
 
 
 def test_interruption(key, equal):
@@ -152,7 +220,11 @@ def test_interruption(key, equal):
             raise KeyboardInterrupt
 
     r = cem(key, walk(), trees=2, callback=callback, **SMALL)
-    assert r.episodes == 600 and r.settings["interrupted"] == "after 600 of 2000 episodes" and len(r.history.failures) == 3
+    assert (
+        r.episodes == 600
+        and r.settings["interrupted"] == "after 600 of 2000 episodes"
+        and len(r.history.failures) == 3
+    )
     equal(r.failures, cem(key, walk(), trees=2, samples=100, elites=10, iterations=3).failures)
 
 

@@ -19,9 +19,12 @@ from jast.simulators import ferry, landing, limit_state, walk1d
 
 def line(**changes):
     fields = dict(
-        init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, disturbance=lambda s: D.Normal(0.0, 1.0), evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
         horizon=10,
-    )  # fmt: skip
+    )
     return jast.Simulator(**(fields | changes))
 
 
@@ -44,43 +47,119 @@ def explode(*args):
 
 SHAPES = {  # found by tracing
     "start raises": (dict(start=explode), r"start: raised RuntimeError: no such file"),
-    "start is no distribution": (dict(start=lambda: jnp.zeros(2)), r"start: expected a distribution \(with sample and log_prob\), received float..\[2\]"),
+    "start is no distribution": (
+        dict(start=lambda: jnp.zeros(2)),
+        r"start: expected a distribution \(with sample and log_prob\), received float..\[2\]",
+    ),
     "init raises": (dict(init=lambda x0: x0["missing"]), r"init: raised TypeError"),
-    "init of text": (dict(init=lambda x0: dict(a=jnp.zeros(()), name="walk")), r"init: leaf \['name'\] is str 'walk', expected an array"),
-    "init of a key": (dict(init=lambda x0: jax.random.key(0)), r"init: leaf .* is key<fry>\[\], expected an array"),
+    "init of text": (
+        dict(init=lambda x0: dict(a=jnp.zeros(()), name="walk")),
+        r"init: leaf \['name'\] is str 'walk', expected an array",
+    ),
+    "init of a key": (
+        dict(init=lambda x0: jax.random.key(0)),
+        r"init: leaf .* is key<fry>\[\], expected an array",
+    ),
     "disturbance raises": (dict(disturbance=explode), r"disturbance: raised RuntimeError"),
-    "disturbance is a number": (dict(disturbance=lambda s: s), r"disturbance: expected a distribution .*received float..\[\]"),
-    "disturbance is None": (dict(disturbance=lambda s: None), r"disturbance: expected a distribution .*received NoneType"),
+    "disturbance is a number": (
+        dict(disturbance=lambda s: s),
+        r"disturbance: expected a distribution .*received float..\[\]",
+    ),
+    "disturbance is None": (
+        dict(disturbance=lambda s: None),
+        r"disturbance: expected a distribution .*received NoneType",
+    ),
     "log_prob is a vector": (
         dict(disturbance=lambda s: D.Normal(jnp.zeros(3), jnp.ones(3))),
         r"disturbance: log_prob has shape \(3,\), expected \(\); wrap it in Independent",
     ),
-    "start log_prob is a vector": (dict(start=lambda: D.Normal(jnp.zeros(2), jnp.ones(2))), r"start: log_prob has shape \(2,\), expected \(\); wrap it"),
-    "log_prob is a whole number": (dict(disturbance=lambda s: Bare(lambda x: jnp.int32(0))), r"disturbance: log_prob has dtype int32, expected a float"),
-    "log_prob raises": (dict(disturbance=lambda s: Bare(explode)), r"disturbance: log_prob: raised RuntimeError"),
+    "start log_prob is a vector": (
+        dict(start=lambda: D.Normal(jnp.zeros(2), jnp.ones(2))),
+        r"start: log_prob has shape \(2,\), expected \(\); wrap it",
+    ),
+    "log_prob is a whole number": (
+        dict(disturbance=lambda s: Bare(lambda x: jnp.int32(0))),
+        r"disturbance: log_prob has dtype int32, expected a float",
+    ),
+    "log_prob raises": (
+        dict(disturbance=lambda s: Bare(explode)),
+        r"disturbance: log_prob: raised RuntimeError",
+    ),
     "evaluate raises": (dict(evaluate=explode), r"evaluate: raised RuntimeError"),
-    "evaluate is no pair": (dict(evaluate=lambda s: s >= 5), r"evaluate: expected a pair \(event, distance\), received bool\[\]"),
+    "evaluate is no pair": (
+        dict(evaluate=lambda s: s >= 5),
+        r"evaluate: expected a pair \(event, distance\), received bool\[\]",
+    ),
     "evaluate is a triple": (dict(evaluate=lambda s: (s >= 5, s, s)), r"evaluate: expected a pair"),
-    "event is a vector": (dict(evaluate=lambda s: (jnp.stack([s, s]) >= 5, s)), r"evaluate: event has shape \(2,\), expected \(\)"),
-    "event is a float": (dict(evaluate=lambda s: (s, s)), r"evaluate: event has dtype float.., expected bool"),
-    "event is None": (dict(evaluate=lambda s: (None, s)), r"evaluate: event: received NoneType None, expected a bool scalar"),
-    "distance is a vector": (dict(evaluate=lambda s: (s >= 5, jnp.stack([s, s]))), r"evaluate: distance has shape \(2,\), expected \(\)"),
-    "distance is a whole number": (dict(evaluate=lambda s: (s >= 5, jnp.int32(1))), r"evaluate: distance has dtype int32, expected a float"),
-    "log_prob is None": (dict(disturbance=lambda s: Bare(lambda x: None)), r"disturbance: log_prob: received NoneType None, expected a float scalar"),
-    "observe is a list": (dict(observe=lambda s: [s, s]), r"observe: returns list .*, expected a float vector"),
-    "is_terminal is a float": (dict(is_terminal=lambda s: s), r"is_terminal has dtype float.., expected bool"),
-    "is_terminal is a vector": (dict(is_terminal=lambda s: jnp.stack([s, s]) > 1), r"is_terminal has shape \(2,\)"),
-    "is_terminal branches": (dict(is_terminal=lambda s: True if s > 3 else False), r"is_terminal: raised TracerBoolConversionError"),
-    "observe is a scalar": (dict(observe=lambda s: s), r"observe: returns float..\[\], expected a float vector"),
-    "observe is whole numbers": (dict(observe=lambda s: jnp.zeros(3, jnp.int32)), r"observe: returns int32\[3\], expected a float vector"),
-    "observe is long": (dict(observe=lambda s: jnp.zeros(200)), r"observe: returns 200 numbers, expected at most 64"),
+    "event is a vector": (
+        dict(evaluate=lambda s: (jnp.stack([s, s]) >= 5, s)),
+        r"evaluate: event has shape \(2,\), expected \(\)",
+    ),
+    "event is a float": (
+        dict(evaluate=lambda s: (s, s)),
+        r"evaluate: event has dtype float.., expected bool",
+    ),
+    "event is None": (
+        dict(evaluate=lambda s: (None, s)),
+        r"evaluate: event: received NoneType None, expected a bool scalar",
+    ),
+    "distance is a vector": (
+        dict(evaluate=lambda s: (s >= 5, jnp.stack([s, s]))),
+        r"evaluate: distance has shape \(2,\), expected \(\)",
+    ),
+    "distance is a whole number": (
+        dict(evaluate=lambda s: (s >= 5, jnp.int32(1))),
+        r"evaluate: distance has dtype int32, expected a float",
+    ),
+    "log_prob is None": (
+        dict(disturbance=lambda s: Bare(lambda x: None)),
+        r"disturbance: log_prob: received NoneType None, expected a float scalar",
+    ),
+    "observe is a list": (
+        dict(observe=lambda s: [s, s]),
+        r"observe: returns list .*, expected a float vector",
+    ),
+    "is_terminal is a float": (
+        dict(is_terminal=lambda s: s),
+        r"is_terminal has dtype float.., expected bool",
+    ),
+    "is_terminal is a vector": (
+        dict(is_terminal=lambda s: jnp.stack([s, s]) > 1),
+        r"is_terminal has shape \(2,\)",
+    ),
+    "is_terminal branches": (
+        dict(is_terminal=lambda s: True if s > 3 else False),
+        r"is_terminal: raised TracerBoolConversionError",
+    ),
+    "observe is a scalar": (
+        dict(observe=lambda s: s),
+        r"observe: returns float..\[\], expected a float vector",
+    ),
+    "observe is whole numbers": (
+        dict(observe=lambda s: jnp.zeros(3, jnp.int32)),
+        r"observe: returns int32\[3\], expected a float vector",
+    ),
+    "observe is long": (
+        dict(observe=lambda s: jnp.zeros(200)),
+        r"observe: returns 200 numbers, expected at most 64",
+    ),
     "step raises": (dict(step=explode), r"step: raised RuntimeError"),
     "step grows": (
-        dict(init=lambda x0: dict(path=jnp.zeros(1)), step=lambda s, x: dict(path=jnp.append(s["path"], x)), evaluate=lambda s: (False, 0.0)),
+        dict(
+            init=lambda x0: dict(path=jnp.zeros(1)),
+            step=lambda s, x: dict(path=jnp.append(s["path"], x)),
+            evaluate=lambda s: (False, 0.0),
+        ),
         r"step: state leaf \['path'\] has shape \(2,\), expected \(1,\)",
     ),
-    "step changes the dtype": (dict(step=lambda s, x: (s + x).astype(jnp.float16)), r"step: state leaf .* has dtype float16, expected float"),
-    "step changes the structure": (dict(step=lambda s, x: (s, x)), r"step: state has structure .*, expected"),
+    "step changes the dtype": (
+        dict(step=lambda s, x: (s + x).astype(jnp.float16)),
+        r"step: state leaf .* has dtype float16, expected float",
+    ),
+    "step changes the structure": (
+        dict(step=lambda s, x: (s, x)),
+        r"step: state has structure .*, expected",
+    ),
 }
 
 
@@ -96,20 +175,51 @@ def test_shapes(name):
 
 
 NUMBERS = {  # found by running
-    "log_prob is NaN": (dict(disturbance=lambda s: D.Normal(0.0, jnp.asarray(jnp.nan))), r"disturbance: log_prob is not finite in 32 of 32 .* at step 1"),
-    "log_prob is NaN later": (dict(disturbance=lambda s: Bare(lambda x: jnp.where(s == 0, 0.0, jnp.nan))), r"disturbance: log_prob is not .* at step 2"),
-    "start log_prob is -inf": (dict(start=lambda: Bare(lambda x: jnp.asarray(-jnp.inf))), r"start: log_prob is not finite in 32 of 32 of its own samples"),
-    "sample is outside of the support": (dict(disturbance=lambda s: D.where(s > 9, Shifted(), Shifted())), r"disturbance: log_prob is not finite"),
+    "log_prob is NaN": (
+        dict(disturbance=lambda s: D.Normal(0.0, jnp.asarray(jnp.nan))),
+        r"disturbance: log_prob is not finite in 32 of 32 .* at step 1",
+    ),
+    "log_prob is NaN later": (
+        dict(disturbance=lambda s: Bare(lambda x: jnp.where(s == 0, 0.0, jnp.nan))),
+        r"disturbance: log_prob is not .* at step 2",
+    ),
+    "start log_prob is -inf": (
+        dict(start=lambda: Bare(lambda x: jnp.asarray(-jnp.inf))),
+        r"start: log_prob is not finite in 32 of 32 of its own samples",
+    ),
+    "sample is outside of the support": (
+        dict(disturbance=lambda s: D.where(s > 9, Shifted(), Shifted())),
+        r"disturbance: log_prob is not finite",
+    ),
     "init is NaN": (
-        dict(init=lambda x0: dict(x=jnp.asarray(jnp.nan)), step=lambda s, x: s, evaluate=lambda s: (False, 1.0)),
+        dict(
+            init=lambda x0: dict(x=jnp.asarray(jnp.nan)),
+            step=lambda s, x: s,
+            evaluate=lambda s: (False, 1.0),
+        ),
         r"init: state leaf \['x'\] is NaN",
     ),
     "step is NaN": (dict(step=lambda s, x: s / s), r"step: state leaf .* is NaN after 1 steps"),
-    "distance is NaN": (dict(evaluate=lambda s: (s >= 5, s * jnp.nan)), r"evaluate: distance is not finite after 0 steps"),
-    "distance is NaN undisturbed": (dict(evaluate=lambda s: (s >= 5, jnp.log(s * 0 + 1) / s)), r"evaluate: distance is not finite after 0 steps"),
-    "init is random": (dict(init=lambda x0: jnp.asarray(np.random.rand())), r"init: leaf \(the whole\) differs between two runs"),
-    "step is random": (dict(step=lambda s, x: s + x + random.random()), r"step: leaf \(the whole\) differs between two runs on the same input"),
-    "evaluate is random": (dict(evaluate=lambda s: (s >= 5, 5 - s + random.random())), r"evaluate: leaf \[1\] differs between two runs"),
+    "distance is NaN": (
+        dict(evaluate=lambda s: (s >= 5, s * jnp.nan)),
+        r"evaluate: distance is not finite after 0 steps",
+    ),
+    "distance is NaN undisturbed": (
+        dict(evaluate=lambda s: (s >= 5, jnp.log(s * 0 + 1) / s)),
+        r"evaluate: distance is not finite after 0 steps",
+    ),
+    "init is random": (
+        dict(init=lambda x0: jnp.asarray(np.random.rand())),
+        r"init: leaf \(the whole\) differs between two runs",
+    ),
+    "step is random": (
+        dict(step=lambda s, x: s + x + random.random()),
+        r"step: leaf \(the whole\) differs between two runs on the same input",
+    ),
+    "evaluate is random": (
+        dict(evaluate=lambda s: (s >= 5, 5 - s + random.random())),
+        r"evaluate: leaf \[1\] differs between two runs",
+    ),
 }
 
 
@@ -150,10 +260,20 @@ def test_what_is_no_simulator():
 
 
 GOOD = dict(
-    ferry=ferry, walk=walk1d, landing=landing, limit=lambda: limit_state(lambda x: 5 - x.sum(), 100), weak=lambda: line(init=lambda x0: 0.0),
-    seeds=lambda: line(disturbance=lambda s: D.seeds(), step=lambda s, x: s + jax.random.normal(jax.random.key(x), dtype=s.dtype)),
-    nan_after_the_end=lambda: line(init=lambda x0: jnp.asarray(4.9), step=lambda s, x: jnp.where(s >= 5, jnp.nan, s + jnp.abs(x))),
-)  # fmt: skip
+    ferry=ferry,
+    walk=walk1d,
+    landing=landing,
+    limit=lambda: limit_state(lambda x: 5 - x.sum(), 100),
+    weak=lambda: line(init=lambda x0: 0.0),
+    seeds=lambda: line(
+        disturbance=lambda s: D.seeds(),
+        step=lambda s, x: s + jax.random.normal(jax.random.key(x), dtype=s.dtype),
+    ),
+    nan_after_the_end=lambda: line(
+        init=lambda x0: jnp.asarray(4.9),
+        step=lambda s, x: jnp.where(s >= 5, jnp.nan, s + jnp.abs(x)),
+    ),
+)
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -168,44 +288,88 @@ def test_good_simulators_pass(name):
 
 
 def test_actions():
-    assert jast.check(ferry(), actions.uniform(0.0, 1.0)) and jast.check(ferry(), actions.quantiles())
-    with pytest.raises(ValueError, match=r"actions\.uniform: expected disturbances inside the support.* \d+% of 64 draws at the start on the box \[2.*, 9"):
+    assert jast.check(ferry(), actions.uniform(0.0, 1.0)) and jast.check(
+        ferry(), actions.quantiles()
+    )
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"actions\.uniform: expected disturbances inside the support.* \d+% of 64 draws at the"
+            r" start on the box \[2.*, 9"
+        ),
+    ):
         jast.check(ferry(), actions.uniform(2.0, 9.0))
-    with pytest.raises(ValueError, match=r"actions\.uniform: expected disturbances inside the support"):
+    with pytest.raises(
+        ValueError, match=r"actions\.uniform: expected disturbances inside the support"
+    ):
         jast.check(ferry(), actions.uniform(-4.0, 5.0))
     assert jast.check(ferry(), actions.uniform(-0.2, 1.2))  # a little wider does no harm
 
 
 @pytest.mark.parametrize("function", [jast.check, contract])
 def test_action_shapes(function):
-    with pytest.raises(ValueError, match=r"actions\.uniform: low has shape \(3,\), expected one that broadcasts to the disturbance's \(\)"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"actions\.uniform: low has shape \(3,\), expected one that broadcasts to the"
+            r" disturbance's \(\)"
+        ),
+    ):
         function(walk1d(), actions.uniform(jnp.zeros(3), 1.0))
     with pytest.raises(ValueError, match=r"actions\.uniform: high has shape \(2,\).*\(5,\)"):
         function(limit_state(lambda x: x.sum(), 5), actions.uniform(0.0, jnp.ones(2)))
     gamma = line(disturbance=lambda s: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
-    with pytest.raises(ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"):
+    with pytest.raises(
+        ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"
+    ):
         function(gamma, actions.quantiles())
     started = line(start=lambda: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
-    with pytest.raises(ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"):
+    with pytest.raises(
+        ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"
+    ):
         function(started, actions.quantiles())
-    with pytest.raises(ValueError, match="actions: expected one of jast.actions, received 'uniform'"):
+    with pytest.raises(
+        ValueError, match="actions: expected one of jast.actions, received 'uniform'"
+    ):
         function(walk1d(), "uniform")
 
 
 # nominal
 
 
-@pytest.mark.parametrize("k, n", [(0, 10), (10, 10), (3, 10), (1, 100_000), (10_870, 100_000), (99_999, 100_000), (40, 1_000_000_000)])
+@pytest.mark.parametrize(
+    "k, n",
+    [
+        (0, 10),
+        (10, 10),
+        (3, 10),
+        (1, 100_000),
+        (10_870, 100_000),
+        (99_999, 100_000),
+        (40, 1_000_000_000),
+    ],
+)
 @pytest.mark.parametrize("level", [0.95, 0.9, 0.999])
 def test_clopper_pearson_is_scipys(k, n, level):
     low, high = clopper_pearson(k, n, level)
     tail = (1 - level) / 2
-    assert low == pytest.approx(0 if k == 0 else scipy.stats.beta.ppf(tail, k, n - k + 1), rel=1e-6, abs=0)
-    assert high == pytest.approx(1 if k == n else scipy.stats.beta.ppf(1 - tail, k + 1, n - k), rel=1e-6)
+    assert low == pytest.approx(
+        0 if k == 0 else scipy.stats.beta.ppf(tail, k, n - k + 1), rel=1e-6, abs=0
+    )
+    assert high == pytest.approx(
+        1 if k == n else scipy.stats.beta.ppf(1 - tail, k + 1, n - k), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(
-    "bad, match", [((1, 0), "n must be"), ((5, 4), "k must be"), ((-1, 4), "k must be"), ((1, 4, 1.0), "level must"), ((0.5, 4), "k must")]
+    "bad, match",
+    [
+        ((1, 0), "n must be"),
+        ((5, 4), "k must be"),
+        ((-1, 4), "k must be"),
+        ((1, 4, 1.0), "level must"),
+        ((0.5, 4), "k must"),
+    ],
 )
 def test_clopper_pearson_names_what_is_wrong(bad, match):
     with pytest.raises(ValueError, match=f"clopper_pearson: {match}"):
@@ -221,7 +385,9 @@ def test_nominal_is_a_loop_of_rollouts(key):
     assert found.interval == clopper_pearson(found.failures, n) and found.rate == found.failures / n
     assert float(found.undisturbed.distance) == 10 and int(found.undisturbed.length) == 30
     text = str(found)
-    assert "no failure" in text and f"{found.failures} of {n}" in text and len(text.splitlines()) < 8
+    assert (
+        "no failure" in text and f"{found.failures} of {n}" in text and len(text.splitlines()) < 8
+    )
 
 
 def test_nominal_says_when_the_system_fails_undisturbed(key):
@@ -235,9 +401,15 @@ def test_nominal_counts_invalid_episodes(key):
     with pytest.warns(UserWarning, match="of 2000 nominal episodes are invalid"):
         found = jast.nominal(key, sim, episodes=2000)
     share = scipy.stats.norm.sf(1)
-    assert abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000) and found.mean_distance == pytest.approx(5) and found.failures == 0
+    assert (
+        abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000)
+        and found.mean_distance == pytest.approx(5)
+        and found.failures == 0
+    )
     with pytest.warns(UserWarning, match="of 5 nominal"):
-        assert np.isnan(jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5).mean_distance)
+        assert np.isnan(
+            jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5).mean_distance
+        )
 
 
 def test_nominal_of_seeds_has_no_undisturbed_episode(key):
@@ -256,7 +428,8 @@ def test_nominal_checks_the_simulator(key):
         jast.nominal(key, line(evaluate=lambda s: s), episodes=10)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jast.nominal(key, line(observe=lambda s: jnp.zeros(200)), episodes=10)  # it observes nothing
+        # it observes nothing
+        jast.nominal(key, line(observe=lambda s: jnp.zeros(200)), episodes=10)
 
 
 def test_a_second_instance_does_not_recompile(key):
@@ -268,7 +441,11 @@ def test_a_second_instance_does_not_recompile(key):
 
     base = line()
     make = lambda drift: dataclasses.replace(base, step=Partial(step, jnp.asarray(drift)))
-    for use in (lambda s: jast.rollout(key, s), lambda s: jast.replay(s, jnp.zeros((3,))), lambda s: jast.nominal(key, s, episodes=20)):
+    for use in (
+        lambda s: jast.rollout(key, s),
+        lambda s: jast.replay(s, jnp.zeros((3,))),
+        lambda s: jast.nominal(key, s, episodes=20),
+    ):
         use(make(0.1))
         first = len(traces)
         use(make(0.2))
@@ -278,7 +455,9 @@ def test_a_second_instance_does_not_recompile(key):
 
 def test_a_host_callback_that_raises():
     def step(s, x):
-        return jax.pure_callback(explode, jax.ShapeDtypeStruct((), s.dtype), s, x, vmap_method="sequential")
+        return jax.pure_callback(
+            explode, jax.ShapeDtypeStruct((), s.dtype), s, x, vmap_method="sequential"
+        )
 
     with pytest.raises(ValueError, match="raised.*"):
         jast.check(line(step=step))

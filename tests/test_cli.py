@@ -1,4 +1,6 @@
-"""The command line: its report, its files, its refusals and its exit status, with counts as small as they go."""
+"""The command line: its report, its files, its refusals and its exit status, with counts as small
+as they go.
+"""
 
 import os
 import subprocess
@@ -23,16 +25,30 @@ def run(capsys, tmp_path, *argv):
 
 @pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
 def test_every_method_reports_and_saves(capsys, tmp_path, method):
-    status, text, out = run(capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else []))
+    status, text, out = run(
+        capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else [])
+    )
     assert status == 0
     assert "undisturbed    no failure" in text and "95 %" in text and "best episode" in text
-    rows = [line.split()[:2] for line in text.splitlines() if line.startswith((method, "monte-carlo")) and "failing" not in line]
+    rows = [
+        line.split()[:2]
+        for line in text.splitlines()
+        if line.startswith((method, "monte-carlo")) and "failing" not in line
+    ]
     episodes = str(2 * 3 * 30 if method == "forest" else 2 * 30)
-    assert rows == [[method, episodes]] + ([["monte-carlo", episodes]] if method != "monte-carlo" else [])
+    assert rows == [[method, episodes]] + (
+        [["monte-carlo", episodes]] if method != "monte-carlo" else []
+    )
     held, settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())
-    assert held.size == 0 and settings["simulator"] == "ferry" and settings["method"] == method.replace("-", "_")
+    assert (
+        held.size == 0
+        and settings["simulator"] == "ferry"
+        and settings["method"] == method.replace("-", "_")
+    )
     pytest.importorskip("matplotlib")
-    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in ("episode.png", "history.png"))
+    assert all(
+        (out / name).read_bytes().startswith(b"\x89PNG") for name in ("episode.png", "history.png")
+    )
 
 
 @pytest.mark.parametrize("simulator", [name for name in cli.SYSTEMS if name != "ferry"])
@@ -57,7 +73,10 @@ def test_heads_of_a_forest(capsys, tmp_path):
 
 
 def test_a_seed_gives_the_same_report(capsys, tmp_path):
-    one, two, other = (run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2", "--seed", seed)[1] for seed in "330")
+    one, two, other = (
+        run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2", "--seed", seed)[1]
+        for seed in "330"
+    )
     assert one == two != other
 
 
@@ -72,7 +91,9 @@ def test_help(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
     text = capsys.readouterr().out
-    assert end.value.code == 0 and all(option in text for option in ("--simulator", "--method", "--paper", "--quiet", "ferry-b"))
+    assert end.value.code == 0 and all(
+        option in text for option in ("--simulator", "--method", "--paper", "--quiet", "ferry-b")
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,14 +102,32 @@ def test_help(capsys):
         (["--simulator", "boat"], "argument --simulator: invalid choice: 'boat'"),
         (["--method", "luck"], "argument --method: invalid choice: 'luck'"),
         (["--trees", "0"], "argument --trees: must be a whole number of at least 1, received '0'"),
-        (["--simulations", "-3"], "argument --simulations: must be a whole number of at least 1, received '-3'"),
-        (["--prunes", "1.5"], "argument --prunes: must be a whole number of at least 1, received '1.5'"),
+        (
+            ["--simulations", "-3"],
+            "argument --simulations: must be a whole number of at least 1, received '-3'",
+        ),
+        (
+            ["--prunes", "1.5"],
+            "argument --prunes: must be a whole number of at least 1, received '1.5'",
+        ),
         (["--seed", "x"], "argument --seed: invalid int value: 'x'"),
-        (["--method", "mcts", "--prunes", "3"], "argument --prunes: only of --method forest, not of mcts"),
-        (["--method", "mcts", "--heads", "both"], "argument --heads: only of --method forest, not of mcts"),
-        (["--method", "cem", "--paper"], "argument --paper: only with --method forest or mcts, not with cem"),
+        (
+            ["--method", "mcts", "--prunes", "3"],
+            "argument --prunes: only of --method forest, not of mcts",
+        ),
+        (
+            ["--method", "mcts", "--heads", "both"],
+            "argument --heads: only of --method forest, not of mcts",
+        ),
+        (
+            ["--method", "cem", "--paper"],
+            "argument --paper: only with --method forest or mcts, not with cem",
+        ),
         (["--output", __file__], "argument --output: "),
-        (["--trees", "1", "--simulations", "2000000000"], "prunes * simulations must be below 2**24"),
+        (
+            ["--trees", "1", "--simulations", "2000000000"],
+            "prunes * simulations must be below 2**24",
+        ),
     ],
 )
 def test_bad_arguments(capsys, tmp_path, monkeypatch, argv, words):
@@ -127,19 +166,61 @@ def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch)
         return whole(*args, callback=callback, threads=1, lanes=1, **kwargs)
 
     monkeypatch.setattr(cli, "forest", stopped)
-    status = cli.main(["--simulator", "walk1d", "--trees", "40", "--simulations", "200", "--quiet", "--output", str(tmp_path)])
+    status = cli.main(
+        [
+            "--simulator",
+            "walk1d",
+            "--trees",
+            "40",
+            "--simulations",
+            "200",
+            "--quiet",
+            "--output",
+            str(tmp_path),
+        ]
+    )
     text = capsys.readouterr().out
     assert status == 130 and "interrupted: " in text and "monte-carlo" not in text
-    assert 0 < int(next(line for line in text.splitlines() if line.startswith("forest")).split()[1]) < 40 * 18 * 200
+    assert (
+        0
+        < int(next(line for line in text.splitlines() if line.startswith("forest")).split()[1])
+        < 40 * 18 * 200
+    )
 
 
 @pytest.mark.long
 def test_as_a_program(tmp_path):
-    command = [sys.executable, "-m", "jast", "--simulator", "walk1d", "--trees", "2", "--prunes", "2", "--simulations", "20"]
-    cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, env=os.environ | cache, capture_output=True, text=True, timeout=300)
+    command = [
+        sys.executable,
+        "-m",
+        "jast",
+        "--simulator",
+        "walk1d",
+        "--trees",
+        "2",
+        "--prunes",
+        "2",
+        "--simulations",
+        "20",
+    ]
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "",
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | cache, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     assert "saved jast-output" in done.stdout and "forest: 100%" in done.stderr
     assert (tmp_path / "jast-output" / "failures.npz").exists()
-    wrong = subprocess.run([*command, "--trees", "none"], cwd=tmp_path, env=os.environ | cache, capture_output=True, text=True, timeout=300)
-    assert wrong.returncode == 2 and wrong.stderr.splitlines()[-1].startswith("python -m jast: error: argument --trees")
+    wrong = subprocess.run(
+        [*command, "--trees", "none"],
+        cwd=tmp_path,
+        env=os.environ | cache,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert wrong.returncode == 2 and wrong.stderr.splitlines()[-1].startswith(
+        "python -m jast: error: argument --trees"
+    )

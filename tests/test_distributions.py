@@ -24,23 +24,40 @@ def dtype(request):
 
 
 def supported(dtype):
-    """(distribution, its quantile function by SciPy or None) for each class that `quantile` knows."""
+    """(distribution, its quantile function by SciPy or None) for each class that `quantile`
+    knows.
+    """
     f = lambda v: jnp.asarray(v, dtype)
     chol = np.array([[1.0, 0.0], [0.5, 2.0]])
     u2 = np.array([0.2, 0.9])
     return {
         "uniform": (D.Uniform(f(-1), f(3)), lambda u: -1 + 4 * u),
         "normal": (D.Normal(f(1), f(2)), lambda u: scipy.stats.norm.ppf(u, 1, 2)),
-        "diag": (D.MultivariateNormalDiag(f([0, 1]), f([1, 3])), lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3])),
-        "tri": (D.MultivariateNormalTri(f([0, 1]), f(chol)), lambda u: np.array([0, 1]) + chol @ scipy.stats.norm.ppf(u2)),
+        "diag": (
+            D.MultivariateNormalDiag(f([0, 1]), f([1, 3])),
+            lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3]),
+        ),
+        "tri": (
+            D.MultivariateNormalTri(f([0, 1]), f(chol)),
+            lambda u: np.array([0, 1]) + chol @ scipy.stats.norm.ppf(u2),
+        ),
         "logistic": (D.Logistic(f(1), f(0.5)), lambda u: scipy.stats.logistic.ppf(u, 1, 0.5)),
         "laplace": (D.Laplace(f(1), f(0.5)), lambda u: scipy.stats.laplace.ppf(u, 1, 0.5)),
         "bernoulli": (D.Bernoulli(probs=f(0.3)), lambda u: scipy.stats.bernoulli.ppf(u, 0.3)),
-        "categorical": (D.Categorical(probs=f([0.2, 0.5, 0.3])), lambda u: scipy.stats.rv_discrete(values=([0, 1, 2], [0.2, 0.5, 0.3])).ppf(u)),
-        "independent": (D.Independent(D.Normal(f([0, 1]), f([1, 3])), 1), lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3])),
-        "exp": (D.Transformed(D.Normal(f(0), f(1)), jnp.exp), lambda u: scipy.stats.lognorm.ppf(u, 1)),
+        "categorical": (
+            D.Categorical(probs=f([0.2, 0.5, 0.3])),
+            lambda u: scipy.stats.rv_discrete(values=([0, 1, 2], [0.2, 0.5, 0.3])).ppf(u),
+        ),
+        "independent": (
+            D.Independent(D.Normal(f([0, 1]), f([1, 3])), 1),
+            lambda u: scipy.stats.norm.ppf(u2, [0, 1], [1, 3]),
+        ),
+        "exp": (
+            D.Transformed(D.Normal(f(0), f(1)), jnp.exp),
+            lambda u: scipy.stats.lognorm.ppf(u, 1),
+        ),
         "tent": (D.tent(f(0.5)), lambda u: scipy.stats.triang.ppf(0.125 + u * 0.75, 0.5, -0.5, 2)),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("name", list(supported("float32")))
@@ -51,15 +68,26 @@ def test_quantile_is_scipys(name, dtype):
     for u in (0.03, 0.25, 0.5, 0.71, 0.97):
         x = D.quantile(d, jnp.asarray(u if not like.shape else [0.2, 0.9], dtype))
         assert (x.shape, x.dtype) == (like.shape, like.dtype)
-        np.testing.assert_allclose(x, truth(u), rtol=tolerance(dtype, 2e-5, 1e-9), atol=tolerance(dtype, 1e-6, 1e-12))
+        np.testing.assert_allclose(
+            x, truth(u), rtol=tolerance(dtype, 2e-5, 1e-9), atol=tolerance(dtype, 1e-6, 1e-12)
+        )
 
 
 def test_quantiles_of_a_joint(dtype):
-    d = D.Joint((D.Normal(jnp.asarray(0, dtype), jnp.asarray(1, dtype)), D.Categorical(probs=jnp.asarray([0.5, 0.5], dtype))))
+    d = D.Joint(
+        (
+            D.Normal(jnp.asarray(0, dtype), jnp.asarray(1, dtype)),
+            D.Categorical(probs=jnp.asarray([0.5, 0.5], dtype)),
+        )
+    )
     x, n = D.quantile(d, (jnp.asarray(0.975, dtype), jnp.asarray(0.7, dtype)))
     assert float(x) == pytest.approx(1.959964, rel=1e-5) and int(n) == 1
     u, v = D.cdf(d, (x, n))
-    assert float(u) == pytest.approx(0.975, rel=1e-5) and float(v) == 0.75 and u.dtype == v.dtype == dtype
+    assert (
+        float(u) == pytest.approx(0.975, rel=1e-5)
+        and float(v) == 0.75
+        and u.dtype == v.dtype == dtype
+    )
 
 
 @pytest.mark.parametrize("bijector, truth", [("neg", 1.2), ("pos", -1.2)])
@@ -67,8 +95,11 @@ def test_quantile_of_a_decreasing_transform(bijector, truth):
     sign = -1.0 if bijector == "neg" else 1.0
     d = D.Transformed(D.Normal(0.0, 1.0), lambda x: sign * x)
     u = float(scipy.stats.norm.cdf(-1.2))
-    assert float(D.quantile(d, jnp.asarray(u))) == pytest.approx(-1.2, rel=1e-4)  # symmetric: the same value, from the other end
-    assert float(D.quantile(D.Transformed(D.Uniform(0.0, 1.0), lambda x: sign * x), jnp.asarray(0.2))) == pytest.approx(0.2 if sign > 0 else -0.8, rel=1e-5)
+    # symmetric: the same value, from the other end
+    assert float(D.quantile(d, jnp.asarray(u))) == pytest.approx(-1.2, rel=1e-4)
+    assert float(
+        D.quantile(D.Transformed(D.Uniform(0.0, 1.0), lambda x: sign * x), jnp.asarray(0.2))
+    ) == pytest.approx(0.2 if sign > 0 else -0.8, rel=1e-5)
 
 
 def test_value_errors_name_the_distribution():
@@ -97,17 +128,34 @@ def supported_too(dtype):
         "affine": D.Transformed(D.Uniform(f(0), f(2)), lambda x: 3 - 2 * x),
         "vector of exp": D.Independent(D.Transformed(D.Normal(f([0, 1]), f([1, 0.5])), jnp.exp), 1),
         "where": D.where(False, D.Normal(f(0), f(1)), D.tent(f(0.2))),
-        "where of ints": D.where(True, D.Categorical(probs=f([0.5, 0.5])), D.Bernoulli(probs=f(0.1))),
-        "joint": D.Joint({"n": D.Categorical(probs=f([0.1, 0.9])), "v": D.Independent(D.Normal(f([0, 0, 1]), f([1, 2, 3])), 1), "x": D.Uniform(f(0), f(1))}),
-    }  # fmt: skip
+        "where of ints": D.where(
+            True, D.Categorical(probs=f([0.5, 0.5])), D.Bernoulli(probs=f(0.1))
+        ),
+        "joint": D.Joint(
+            {
+                "n": D.Categorical(probs=f([0.1, 0.9])),
+                "v": D.Independent(D.Normal(f([0, 0, 1]), f([1, 2, 3])), 1),
+                "x": D.Uniform(f(0), f(1)),
+            }
+        ),
+    }
 
 
 def points(d, n, low=0.0, high=1.0):
-    """n points [n, ...] of [low, high]^d: an even grid in each coordinate, in an order of its own."""
+    """n points [n, ...] of [low, high]^d: an even grid in each coordinate, in an order of its
+    own.
+    """
     leaves, treedef = jax.tree.flatten(D.event_like(d))
     rng = np.random.default_rng(0)
-    grids = [np.stack([rng.permutation(np.linspace(low, high, n)) for _ in range(int(np.prod(s.shape)))], 1).reshape(n, *s.shape) for s in leaves]
-    return treedef.unflatten([jnp.asarray(g, D.float_dtype(s.dtype)) for g, s in zip(grids, leaves)])
+    grids = [
+        np.stack(
+            [rng.permutation(np.linspace(low, high, n)) for _ in range(int(np.prod(s.shape)))], 1
+        ).reshape(n, *s.shape)
+        for s in leaves
+    ]
+    return treedef.unflatten(
+        [jnp.asarray(g, D.float_dtype(s.dtype)) for g, s in zip(grids, leaves)]
+    )
 
 
 @pytest.mark.parametrize("name", list(supported_too("float32")))
@@ -133,7 +181,12 @@ def test_cdf_inverts_quantile(name, dtype):
             continue
         np.testing.assert_allclose(v, u, rtol=0, atol=tolerance(dtype, 2e-6, 1e-14))
         inner = (u > 0.02) & (u < 0.98)  # nearer to the ends a number u has many x
-        np.testing.assert_allclose(b[inner], a[inner], rtol=tolerance(dtype, 1e-4, 1e-12), atol=tolerance(dtype, 1e-5, 1e-13))
+        np.testing.assert_allclose(
+            b[inner],
+            a[inner],
+            rtol=tolerance(dtype, 1e-4, 1e-12),
+            atol=tolerance(dtype, 1e-5, 1e-13),
+        )
 
 
 def test_cdf_of_arrays_is_elementwise(dtype):
@@ -149,7 +202,9 @@ def test_cdf_of_arrays_is_elementwise(dtype):
 
 
 def closed_forms():
-    """SciPy's distribution function for each of `supported`; of integers, the middle of its step."""
+    """SciPy's distribution function for each of `supported`; of integers, the middle of its
+    step.
+    """
     middle = lambda d: lambda x: (d.cdf(x - 1) + d.cdf(x)) / 2
     chol = np.array([[1.0, 0.0], [0.5, 2.0]])
     return {
@@ -173,12 +228,21 @@ def test_cdf_is_scipys(name, dtype):
     x = jax.jit(jax.vmap(lambda u: D.quantile(d, u)))(points(d, 200, 0.01, 0.99))
     u = jax.jit(jax.vmap(lambda x: D.cdf(d, x)))(x)
     x = np.asarray(x, np.float64 if x.dtype == dtype else x.dtype)
-    np.testing.assert_allclose(u, closed_forms()[name](x), rtol=tolerance(dtype, 1e-5, 1e-9), atol=tolerance(dtype, 1e-6, 1e-12))
+    np.testing.assert_allclose(
+        u,
+        closed_forms()[name](x),
+        rtol=tolerance(dtype, 1e-5, 1e-9),
+        atol=tolerance(dtype, 1e-6, 1e-12),
+    )
 
 
-@pytest.mark.parametrize("name", [name for name in supported_too("float32") if name not in ("joint", "tri", "upper")])
+@pytest.mark.parametrize(
+    "name", [name for name in supported_too("float32") if name not in ("joint", "tri", "upper")]
+)
 def test_cdf_never_falls_and_ends_at_0_and_1(name, dtype):
-    """From far below the support, infinity included, to far above it. Coordinates that are not independent are below."""
+    """From far below the support, infinity included, to far above it. Coordinates that are not
+    independent are below.
+    """
     d = supported_too(dtype)[name]
     like = D.event_like(d)
     if jnp.issubdtype(like.dtype, jnp.integer):
@@ -186,8 +250,15 @@ def test_cdf_never_falls_and_ends_at_0_and_1(name, dtype):
     elif like.dtype == bool:
         ends, x = (0.35, 0.85), np.array([False, True])
     else:
-        ends, x = (0, 1), np.concatenate([[-np.inf, -1e30, -300], np.linspace(-12, 12, 2001), [300, 1e30, np.inf]])
-    x = jnp.asarray(np.broadcast_to(x.reshape(-1, *[1] * len(like.shape)), (x.size, *like.shape)), like.dtype)
+        ends, x = (
+            (0, 1),
+            np.concatenate(
+                [[-np.inf, -1e30, -300], np.linspace(-12, 12, 2001), [300, 1e30, np.inf]]
+            ),
+        )
+    x = jnp.asarray(
+        np.broadcast_to(x.reshape(-1, *[1] * len(like.shape)), (x.size, *like.shape)), like.dtype
+    )
     u = np.asarray(jax.jit(jax.vmap(lambda v: D.cdf(d, v)))(x))
     assert np.isfinite(u).all() and (np.diff(u, axis=0) >= -tolerance(dtype, 2e-7, 1e-15)).all()
     np.testing.assert_allclose(u[0], ends[0], rtol=1e-6)
@@ -206,42 +277,74 @@ def test_cdf_of_dependent_coordinates_is_no_nan(name, dtype):
 
 def test_cdf_outside_of_the_range_of_a_bijector(dtype):
     f = lambda v: jnp.asarray(v, dtype)
-    above, below = D.Transformed(D.Normal(f(0), f(1)), jnp.exp), D.Transformed(D.Normal(f(0), f(1)), lambda x: -jnp.exp(x))
+    above, below = (
+        D.Transformed(D.Normal(f(0), f(1)), jnp.exp),
+        D.Transformed(D.Normal(f(0), f(1)), lambda x: -jnp.exp(x)),
+    )
     assert [float(D.cdf(above, f(x))) for x in (-2, 0, 1)] == [0, 0, 0.5]
     assert [float(D.cdf(below, f(x))) for x in (-1, 0, 2)] == [0.5, 1, 1]
-    inverse = D.Transformed(D.Uniform(f(1), f(2)), lambda x: 1 / x)  # on [1/2, 1], and the inverse of -1 is below 1
-    assert [float(D.cdf(inverse, f(x))) for x in (-1, 0, 0.4, 0.5, 0.8, 1, 9)] == pytest.approx([0, 0, 0, 0, 0.75, 1, 1], rel=1e-6)
+    # on [1/2, 1], and the inverse of -1 is below 1
+    inverse = D.Transformed(D.Uniform(f(1), f(2)), lambda x: 1 / x)
+    assert [float(D.cdf(inverse, f(x))) for x in (-1, 0, 0.4, 0.5, 0.8, 1, 9)] == pytest.approx(
+        [0, 0, 0, 0, 0.75, 1, 1], rel=1e-6
+    )
 
 
 def test_cdf_where_there_is_no_spread(dtype):
     f = lambda v: jnp.asarray(v, dtype)
     x = f([1, 2, 3])
-    for d in (D.Normal(f([2, 2, 2]), f([0, 0, 0])), D.Laplace(f([2, 2, 2]), f([0, 0, 0])), D.MultivariateNormalDiag(f([2, 2, 2]), f([0, 0, 0]))):
+    for d in (
+        D.Normal(f([2, 2, 2]), f([0, 0, 0])),
+        D.Laplace(f([2, 2, 2]), f([0, 0, 0])),
+        D.MultivariateNormalDiag(f([2, 2, 2]), f([0, 0, 0])),
+    ):
         assert D.cdf(d, x).tolist() == [0, 0.5, 1]
     assert D.cdf(D.Uniform(f(2), f(2)), f(2)) == 0.5
 
 
 @jax.jit
 def integers_again(weights):
-    """Each of the integers by `cdf` and `quantile` of a Categorical, and of a Bernoulli by its first two weights; the probabilities of both."""
+    """Each of the integers by `cdf` and `quantile` of a Categorical, and of a Bernoulli by its
+    first two weights; the probabilities of both.
+    """
     again = lambda d: lambda x: D.quantile(d, D.cdf(d, x))
     die, coin = D.Categorical(probs=weights), D.Bernoulli(probs=weights[0])
-    return jax.vmap(again(die))(jnp.arange(weights.size)), die.probs, jax.vmap(again(coin))(jnp.arange(2)), jnp.stack([1 - coin.probs, coin.probs])
+    return (
+        jax.vmap(again(die))(jnp.arange(weights.size)),
+        die.probs,
+        jax.vmap(again(coin))(jnp.arange(2)),
+        jnp.stack([1 - coin.probs, coin.probs]),
+    )
 
 
 @settings(max_examples=100, deadline=None)
-@given(weights=st.lists(st.one_of(st.just(0.0), st.floats(2.0**-20, 1.0, width=32)), min_size=9, max_size=9).filter(any), double=st.booleans())
+@given(
+    weights=st.lists(
+        st.one_of(st.just(0.0), st.floats(2.0**-20, 1.0, width=32)), min_size=9, max_size=9
+    ).filter(any),
+    double=st.booleans(),
+)
 def test_cdf_of_every_integer_leads_back_to_it(weights, double):
     with jax.enable_x64(double):
-        rolls, die, tosses, coin = map(np.asarray, integers_again(jnp.asarray(weights, jnp.zeros(()).dtype)))
+        rolls, die, tosses, coin = map(
+            np.asarray, integers_again(jnp.asarray(weights, jnp.zeros(()).dtype))
+        )
     assert (rolls == np.arange(9))[die > 0].all() and (tosses == np.arange(2))[coin > 0].all()
 
 
 def test_cdf_of_an_integer_with_one_number_for_itself():
     eps = 2.0**-24
     d = D.Categorical(probs=jnp.asarray([0.5, 2 * eps, 0.5 - 2 * eps], jnp.float32))
-    assert [int(D.quantile(d, D.cdf(d, jnp.asarray(i)).astype(jnp.float32))) for i in range(3)] == [0, 1, 2]
-    assert [float(D.cdf(D.Categorical(probs=jnp.ones(1)), jnp.asarray(i))) for i in (-1, 0, 1)] == [0, 0.5, 1]
+    assert [int(D.quantile(d, D.cdf(d, jnp.asarray(i)).astype(jnp.float32))) for i in range(3)] == [
+        0,
+        1,
+        2,
+    ]
+    assert [float(D.cdf(D.Categorical(probs=jnp.ones(1)), jnp.asarray(i))) for i in (-1, 0, 1)] == [
+        0,
+        0.5,
+        1,
+    ]
 
 
 @settings(max_examples=60, deadline=None)
@@ -275,10 +378,17 @@ def test_cdf_of_the_users_own(key):
             return D.quantile(D.Normal(1.0, 1.0), u)
 
     assert D.has_cdf(Inverted()) and D.cdf(Inverted(), jnp.asarray(0.25)) == 0.5
-    assert D.cdf(D.Joint([Inverted(), D.Uniform(0.0, 2.0)]), [jnp.asarray(0.25), jnp.asarray(0.5)]) == [0.5, 0.25]
+    assert D.cdf(
+        D.Joint([Inverted(), D.Uniform(0.0, 2.0)]), [jnp.asarray(0.25), jnp.asarray(0.5)]
+    ) == [0.5, 0.25]
     for d in (Square(), Shifted(0.0, 1.0)):
         assert D.has_quantile(d) and not D.has_cdf(d)
-        with pytest.raises(ValueError, match=f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it"):
+        with pytest.raises(
+            ValueError,
+            match=(
+                f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it"
+            ),
+        ):
             D.cdf(d, jnp.asarray(0.25))
 
 
@@ -286,8 +396,12 @@ def test_cdf_names_the_distribution_that_has_no_quantile():
     one = jnp.asarray(1.0)
     for d in (D.Gamma(one, one), D.Beta(one, one), D.seeds(), D.Deterministic(one)):
         assert not D.has_cdf(d)
-        for e in (d, D.where(True, d, d)) + ((D.Joint([D.Normal(0.0, 1.0), d]),) if d.event_shape == () else ()):
-            with pytest.raises(ValueError, match=f"cdf: {type(d).__name__} has no quantile function here to invert"):
+        for e in (d, D.where(True, d, d)) + (
+            (D.Joint([D.Normal(0.0, 1.0), d]),) if d.event_shape == () else ()
+        ):
+            with pytest.raises(
+                ValueError, match=f"cdf: {type(d).__name__} has no quantile function here to invert"
+            ):
                 x = D.sample(d, jax.random.key(0))
                 D.cdf(e, [one, x] if isinstance(e, D.Joint) else x)
     twice = D.Transformed(D.Normal(0.0, 1.0), lambda x: x + jnp.exp(x))
@@ -299,7 +413,10 @@ def test_cdf_names_the_distribution_that_has_no_quantile():
 # tent
 
 
-@pytest.mark.parametrize("center, width, low, high", [(0.5, 1, 0, 1), (0.0, 1, 0, 1), (1.0, 1, 0, 1), (0.9, 0.3, 0, 1), (2.0, 5, -1, 4)])
+@pytest.mark.parametrize(
+    "center, width, low, high",
+    [(0.5, 1, 0, 1), (0.0, 1, 0, 1), (1.0, 1, 0, 1), (0.9, 0.3, 0, 1), (2.0, 5, -1, 4)],
+)
 def test_tent(center, width, low, high, dtype, key):
     d = D.tent(*(jnp.asarray(v, dtype) for v in (center, width, low, high)))
     grid = jnp.linspace(low, high, 200_001, dtype=dtype)
@@ -310,9 +427,17 @@ def test_tent(center, width, low, high, dtype, key):
     inside = np.abs(x - center) < width * 0.999
     expected = np.log(1 - np.abs(x - center)[inside] / width)
     np.testing.assert_allclose(
-        np.asarray(jax.vmap(lambda v: D.log_density(d, v, "mode"))(grid))[inside], expected, rtol=1e-3, atol=tolerance(dtype, 1e-3, 1e-10)
+        np.asarray(jax.vmap(lambda v: D.log_density(d, v, "mode"))(grid))[inside],
+        expected,
+        rtol=1e-3,
+        atol=tolerance(dtype, 1e-3, 1e-10),
     )
-    np.testing.assert_allclose(D.log_density(d, grid[7], "raw") - D.log_mode(d), D.log_density(d, grid[7], "mode"), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        D.log_density(d, grid[7], "raw") - D.log_mode(d),
+        D.log_density(d, grid[7], "mode"),
+        rtol=1e-4,
+        atol=1e-4,
+    )
     u = jnp.linspace(0, 1, 101, dtype=dtype)
     q = np.asarray(jax.vmap(d.quantile)(u), np.float64)
     assert (np.diff(q) >= 0).all() and q[0] >= low and q[-1] <= high
@@ -371,7 +496,9 @@ def test_where_under_vmap_and_jit(key):
     x, log_p = jax.vmap(draw)(preds, keys)
     for i in range(6):
         one = D.tent(jnp.asarray(0.9)) if preds[i] else D.Normal(0.0, 1.0)
-        assert x[i] == pytest.approx(float(one.sample(seed=keys[i])), rel=1e-5) and log_p[i] == pytest.approx(float(one.log_prob(x[i])), rel=1e-4)
+        assert x[i] == pytest.approx(float(one.sample(seed=keys[i])), rel=1e-5) and log_p[
+            i
+        ] == pytest.approx(float(one.log_prob(x[i])), rel=1e-4)
 
 
 def test_seeds(key):
@@ -383,7 +510,12 @@ def test_seeds(key):
 
 
 def test_fixed_and_deterministic(key):
-    assert D.Fixed().sample(seed=key) == () and D.mode(D.Fixed()) == () and D.Fixed().log_prob(()) == 0 and D.quantile(D.Fixed(), ()) == ()
+    assert (
+        D.Fixed().sample(seed=key) == ()
+        and D.mode(D.Fixed()) == ()
+        and D.Fixed().log_prob(()) == 0
+        and D.quantile(D.Fixed(), ()) == ()
+    )
     assert D.has_cdf(D.Fixed()) and D.cdf(D.Fixed(), ()) == ()
     d = D.Deterministic((jnp.ones(2), jnp.int32(3)))
     assert D.sample(d, key)[1] == 3 and d.log_prob(D.mode(d)) == 0
@@ -397,7 +529,8 @@ def test_fixed_and_deterministic(key):
 def test_log_density_is_raw_or_less_that_of_the_mode(name, dtype, key):
     d, _ = supported(dtype)[name]
     x = D.sample(d, key)
-    with jax.numpy_dtype_promotion("standard"):  # distrax's Bernoulli multiplies whole numbers and floats
+    # distrax's Bernoulli multiplies whole numbers and floats
+    with jax.numpy_dtype_promotion("standard"):
         raw, by_mode, top = D.log_density(d, x), D.log_density(d, x, "mode"), D.log_mode(d)
         at_mode = D.log_density(d, D.mode(d), "mode")
     assert raw.shape == by_mode.shape == () and raw.dtype == by_mode.dtype == dtype
@@ -407,10 +540,20 @@ def test_log_density_is_raw_or_less_that_of_the_mode(name, dtype, key):
 
 
 def test_joint_and_independent(key):
-    d = D.Joint({"a": D.Normal(0.0, 1.0), "n": D.Categorical(probs=jnp.asarray([0.1, 0.9])), "v": D.Independent(D.Normal(jnp.zeros(3), jnp.ones(3)), 1)})
+    d = D.Joint(
+        {
+            "a": D.Normal(0.0, 1.0),
+            "n": D.Categorical(probs=jnp.asarray([0.1, 0.9])),
+            "v": D.Independent(D.Normal(jnp.zeros(3), jnp.ones(3)), 1),
+        }
+    )
     x = D.sample(d, key)
     assert x["v"].shape == (3,) and jnp.issubdtype(x["n"].dtype, jnp.integer)
-    parts = scipy.stats.norm.logpdf(x["a"]) + np.log([0.1, 0.9])[int(x["n"])] + scipy.stats.norm.logpdf(x["v"]).sum()
+    parts = (
+        scipy.stats.norm.logpdf(x["a"])
+        + np.log([0.1, 0.9])[int(x["n"])]
+        + scipy.stats.norm.logpdf(x["v"]).sum()
+    )
     assert float(D.log_density(d, x)) == pytest.approx(parts, rel=1e-5)
     top = scipy.stats.norm.logpdf(0) * 4 + np.log(0.9)
     assert float(D.log_mode(d)) == pytest.approx(top, rel=1e-5)
@@ -426,11 +569,20 @@ def test_a_distribution_of_the_users_own_need_be_no_pytree(key):
         def log_prob(self, x):
             return -x * x
 
-    assert D.event_like(Own()).shape == () and not D.has_mode(Own()) and not D.has_quantile(Own()) and not D.has_cdf(Own())
+    assert (
+        D.event_like(Own()).shape == ()
+        and not D.has_mode(Own())
+        and not D.has_quantile(Own())
+        and not D.has_cdf(Own())
+    )
 
 
 @settings(max_examples=40, deadline=None)
-@given(loc=st.floats(-10, 10, width=32), scale=st.floats(0.125, 8, width=32), u=st.floats(0.015625, 0.984375, width=32))
+@given(
+    loc=st.floats(-10, 10, width=32),
+    scale=st.floats(0.125, 8, width=32),
+    u=st.floats(0.015625, 0.984375, width=32),
+)
 def test_normal_quantile_inverts_the_distribution_function(loc, scale, u):
     x = D.quantile(D.Normal(jnp.float32(loc), jnp.float32(scale)), jnp.float32(u))
     assert scipy.stats.norm.cdf(float(x), loc, scale) == pytest.approx(u, abs=1e-5)
@@ -441,5 +593,7 @@ def test_quantiles_of_uniform_numbers_are_draws(key):
         d, _ = supported("float32")[name]
         u = jax.random.uniform(key, (20_000,), jnp.float32)
         x = np.asarray(jax.jit(jax.vmap(lambda v, d=d: D.quantile(d, v)))(u), np.float64)
-        other = np.asarray(d.sample(seed=jax.random.fold_in(key, 1), sample_shape=(20_000,)), np.float64)
+        other = np.asarray(
+            d.sample(seed=jax.random.fold_in(key, 1), sample_shape=(20_000,)), np.float64
+        )
         assert abs(x.mean() - other.mean()) < 4 * np.sqrt((x.var() + other.var()) / 20_000)

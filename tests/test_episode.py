@@ -14,19 +14,52 @@ from jast import policy, rewards
 from jast.simulators import ferry, landing, walk1d
 
 PAPER = [
-    0.9795401687709587, 0.931634727796635, 0.9182992945295753, 0.9875367896498295, 0.9540570304688828, 0.8771477273691892, 0.862390861979752,
-    0.8795539869456118, 0.8453253347665413, 0.8486280841264486, 0.6894060333380425, 0.6295909310314968, 0.41676262118668805, 0.4127368211497019,
-    0.41815086583326605, 0.4188880550807259, 0.4833180771470985, 0.4700646283098928, 0.44995750050640954, 0.454360642513824,
-]  # fmt: skip
-FERRY = {  # seeds -> reward, failure, steps, miss distance, log-likelihood by the mode; float64, of an independent implementation
+    0.9795401687709587,
+    0.931634727796635,
+    0.9182992945295753,
+    0.9875367896498295,
+    0.9540570304688828,
+    0.8771477273691892,
+    0.862390861979752,
+    0.8795539869456118,
+    0.8453253347665413,
+    0.8486280841264486,
+    0.6894060333380425,
+    0.6295909310314968,
+    0.41676262118668805,
+    0.4127368211497019,
+    0.41815086583326605,
+    0.4188880550807259,
+    0.4833180771470985,
+    0.4700646283098928,
+    0.44995750050640954,
+    0.454360642513824,
+]
+# seeds -> reward, failure, steps, miss distance, log-likelihood by the mode; float64, of an
+# independent implementation
+FERRY = {
     "half": ([0.5] * 21, -24.20743687382041, False, 21, 24.20743687382041, 0),
     "zero": ([0.0] * 21, -33.83362424658773, False, 21, 33.83362424658773, 0),
     "one": ([1.0] * 21, -20.736188072461154, False, 21, 20.736188072461154, 0),
     "best constant": ([0.8363] * 21, -10.00753870070671, False, 21, 10.00753870070671, 0),
-    "scattered": ([(0.37 * i) % 1 for i in range(21)], -41.32347477384132, False, 21, 28.35724788567899, -12.96622688816233),
+    "scattered": (
+        [(0.37 * i) % 1 for i in range(21)],
+        -41.32347477384132,
+        False,
+        21,
+        28.35724788567899,
+        -12.96622688816233,
+    ),
     "paper": (PAPER, 29.092054904933118, True, 20, 4.7764725102288645, -0.9079450950668829),
-    "near best": ([0.998] * 4 + [0.9273, 0.8188, 0.7135, 0.6448] + [0.6431] * 13, 29.627684415379345, True, 19, 4.837140795059192, -0.37231558462065456),
-}  # fmt: skip
+    "near best": (
+        [0.998] * 4 + [0.9273, 0.8188, 0.7135, 0.6448] + [0.6431] * 13,
+        29.627684415379345,
+        True,
+        19,
+        4.837140795059192,
+        -0.37231558462065456,
+    ),
+}
 REWARD = rewards.standard(event_bonus=30.0, density="mode")
 GOLDEN = Path(__file__).parents[2] / "shared" / "data" / "ferry" / "golden_episodes.json"
 
@@ -56,10 +89,14 @@ def test_ferry_golden_values(name, precision):
     assert float(episode.reward) == pytest.approx(reward, **close)
     assert float(episode.distance) == pytest.approx(distance, **close)
     assert (bool(episode.failure), int(episode.length)) == (failure, steps)
-    assert float(episode.reward - jnp.where(episode.failure, 30, -episode.distance)) == pytest.approx(likelihood, **within(1e-9, 1e-3))
+    assert float(
+        episode.reward - jnp.where(episode.failure, 30, -episode.distance)
+    ) == pytest.approx(likelihood, **within(1e-9, 1e-3))
 
 
-@pytest.mark.skipif(not GOLDEN.exists(), reason="the published ferry episodes lie outside of the repository")
+@pytest.mark.skipif(
+    not GOLDEN.exists(), reason="the published ferry episodes lie outside of the repository"
+)
 def test_ferry_published_episodes(precision):
     episodes = json.loads(GOLDEN.read_text())["episodes"]
     assert len(episodes) == 200
@@ -80,7 +117,9 @@ def test_raw_density_differs_from_that_by_the_mode_by_the_normalisers(x64):
     seeds = np.asarray(PAPER)
     masses = [1 - ((1 - c) ** 2 + c**2) / 2 for c in seeds[:-1]]  # of the tent on [0, 1]
     episode = jast.replay(ferry(), floats(seeds), reward=REWARD)
-    assert float(episode.log_prob) == pytest.approx(FERRY["paper"][5] - np.log(masses).sum(), abs=1e-9)
+    assert float(episode.log_prob) == pytest.approx(
+        FERRY["paper"][5] - np.log(masses).sum(), abs=1e-9
+    )
 
 
 # replay
@@ -112,19 +151,28 @@ def test_replay_of_fewer_rows_ends_there(equal):
 def test_padding_is_zero(key):
     episode = jast.replay(ferry(), floats(PAPER + [0.9]))
     assert int(episode.length) == 20
-    assert not np.asarray(episode.disturbances[20:]).any() and not any(np.asarray(leaf[21:]).any() for leaf in episode.states)
+    assert not np.asarray(episode.disturbances[20:]).any() and not any(
+        np.asarray(leaf[21:]).any() for leaf in episode.states
+    )
     drawn = jax.vmap(lambda k: jast.rollout(k, walk1d(sigma=3.0)))(jax.random.split(key, 50))
     after = np.arange(30) >= np.asarray(drawn.length)[:, None]
-    assert after.any() and not np.asarray(drawn.disturbances)[after].any() and np.asarray(drawn.disturbances)[~after].all()
+    assert (
+        after.any()
+        and not np.asarray(drawn.disturbances)[after].any()
+        and np.asarray(drawn.disturbances)[~after].all()
+    )
 
 
-@pytest.mark.parametrize("bad, match", [
-    (lambda: jast.replay(walk1d(), jnp.zeros((31,))), "between 0 and 30 rows"),
-    (lambda: jast.replay(walk1d(), jnp.zeros(())), "between 0 and 30 rows"),
-    (lambda: jast.replay(walk1d(), jnp.zeros((4, 2))), "disturbances must be"),
-    (lambda: jast.replay(landing(), jnp.zeros((4,))), "x0 must be"),
-    (lambda: jast.replay(landing(), jnp.zeros((4,)), x0=jnp.zeros((2,))), "x0 must be"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "bad, match",
+    [
+        (lambda: jast.replay(walk1d(), jnp.zeros((31,))), "between 0 and 30 rows"),
+        (lambda: jast.replay(walk1d(), jnp.zeros(())), "between 0 and 30 rows"),
+        (lambda: jast.replay(walk1d(), jnp.zeros((4, 2))), "disturbances must be"),
+        (lambda: jast.replay(landing(), jnp.zeros((4,))), "x0 must be"),
+        (lambda: jast.replay(landing(), jnp.zeros((4,)), x0=jnp.zeros((2,))), "x0 must be"),
+    ],
+)
 def test_replay_names_what_does_not_fit(bad, match):
     with pytest.raises(ValueError, match=f"replay: .*{match}"):
         bad()
@@ -136,20 +184,30 @@ def test_replay_names_what_does_not_fit(bad, match):
 def line(**changes):
     """A walk by given steps, as a simulator to be bent."""
     fields = dict(
-        init=lambda x0: jnp.zeros(()), step=lambda s, x: s + x, disturbance=lambda s: D.Normal(0.0, 1.0), evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: D.Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
         horizon=4,
-    )  # fmt: skip
+    )
     return jast.Simulator(**(fields | changes))
 
 
 def test_a_failure_at_the_start_has_length_zero(key):
     sim = line(init=lambda x0: jnp.asarray(6.0))
     episode = jast.rollout(key, sim)
-    assert (int(episode.length), bool(episode.failure), float(episode.distance), float(episode.log_prob)) == (0, True, 0.0, 0.0)
+    assert (
+        int(episode.length),
+        bool(episode.failure),
+        float(episode.distance),
+        float(episode.log_prob),
+    ) == (0, True, 0.0, 0.0)
     assert not np.asarray(episode.disturbances).any()
     started = line(init=lambda x0: x0, start=lambda: D.Normal(9.0, 1.0))
     episode = jast.rollout(key, started)
-    assert int(episode.length) == 0 and float(episode.log_prob) == pytest.approx(float(D.Normal(9.0, 1.0).log_prob(episode.x0)))
+    assert int(episode.length) == 0 and float(episode.log_prob) == pytest.approx(
+        float(D.Normal(9.0, 1.0).log_prob(episode.x0))
+    )
 
 
 def test_the_order_at_a_state_is_failure_then_terminal_then_horizon():
@@ -157,7 +215,8 @@ def test_the_order_at_a_state_is_failure_then_terminal_then_horizon():
     assert bool(jast.replay(both, floats([6.0])).failure)
     early = jast.replay(line(is_terminal=lambda s: s >= 3), floats([3.0, 3.0]))
     assert (int(early.length), bool(early.failure), float(early.distance)) == (1, False, 2.0)
-    assert bool(jast.replay(line(), floats([2.0, 1.0, 1.0, 1.0])).failure)  # in the step that reaches the horizon
+    # in the step that reaches the horizon
+    assert bool(jast.replay(line(), floats([2.0, 1.0, 1.0, 1.0])).failure)
     ended = jast.replay(line(is_terminal=lambda s: s >= 0), floats([6.0]))
     assert (int(ended.length), bool(ended.failure)) == (0, False)
 
@@ -179,21 +238,33 @@ def test_a_failure_may_have_a_distance_and_the_least_one_counts():
     assert float(away.distance) == 4.0
 
 
-@pytest.mark.parametrize("changes", [
-    dict(step=lambda s, x: jnp.where(x > 2, jnp.nan, s + x)),
-    dict(evaluate=lambda s: (s >= 5, jnp.where(s > 2, jnp.nan, 5 - s))),
-    dict(evaluate=lambda s: (s >= 2, jnp.where(s > 2, jnp.nan, 5 - s))),
-    dict(disturbance=lambda s: D.Normal(jnp.where(s > 0.5, jnp.nan, 0.0), 1.0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(step=lambda s, x: jnp.where(x > 2, jnp.nan, s + x)),
+        dict(evaluate=lambda s: (s >= 5, jnp.where(s > 2, jnp.nan, 5 - s))),
+        dict(evaluate=lambda s: (s >= 2, jnp.where(s > 2, jnp.nan, 5 - s))),
+        dict(disturbance=lambda s: D.Normal(jnp.where(s > 0.5, jnp.nan, 0.0), 1.0)),
+    ],
+)
 def test_nan_is_an_outcome(changes):
     episode = jast.replay(line(**changes), floats([1.0, 3.0, 0.0, 0.0]))
-    assert (bool(episode.failure), float(episode.distance), float(episode.reward), int(episode.length)) == (False, np.inf, -np.inf, 2)
+    assert (
+        bool(episode.failure),
+        float(episode.distance),
+        float(episode.reward),
+        int(episode.length),
+    ) == (False, np.inf, -np.inf, 2)
 
 
 def test_nan_after_the_end_is_not_counted():
     sim = line(step=lambda s, x: jnp.where(s >= 5, jnp.nan, s + x))
     episode = jast.replay(sim, floats([6.0]))
-    assert bool(episode.failure) and np.isfinite(episode.reward) and np.isfinite(np.asarray(episode.states)).all()
+    assert (
+        bool(episode.failure)
+        and np.isfinite(episode.reward)
+        and np.isfinite(np.asarray(episode.states)).all()
+    )
 
 
 def test_gradients_are_finite_where_an_ended_lane_would_give_nan(key):
@@ -201,7 +272,11 @@ def test_gradients_are_finite_where_an_ended_lane_would_give_nan(key):
         return s + x * jnp.sqrt(5 - s) / jnp.sqrt(5.0)  # NaN beyond 5, where the episode has ended
 
     def reward(scale, key):
-        sim = line(step=step, disturbance=Partial(lambda scale, s: D.Normal(jnp.zeros_like(scale) + 1, scale), scale), horizon=12)
+        sim = line(
+            step=step,
+            disturbance=Partial(lambda scale, s: D.Normal(jnp.zeros_like(scale) + 1, scale), scale),
+            horizon=12,
+        )
         return jast.rollout(key, sim, reward=rewards.shaped(1.0)).reward
 
     keys = jax.random.split(key, 20)
@@ -230,15 +305,21 @@ def test_vmap_over_keys_is_a_loop(key):
 
 def test_vmap_over_simulators_is_a_loop(key):
     xs = floats([5.0, 3.0, 1.0])
-    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(walk1d(threshold=b) for b in (4.0, 8.0, 12.0)))
+    stacked = jax.tree.map(
+        lambda *a: jnp.stack(a), *(walk1d(threshold=b) for b in (4.0, 8.0, 12.0))
+    )
     many = jax.vmap(lambda s: jast.replay(s, xs))(stacked)
-    assert np.asarray(many.failure).tolist() == [True, True, False] and np.asarray(many.length).tolist() == [1, 2, 3]
+    assert np.asarray(many.failure).tolist() == [True, True, False] and np.asarray(
+        many.length
+    ).tolist() == [1, 2, 3]
     swept = jax.vmap(lambda b: jast.rollout(key, landing(b=b)))(floats([0.01, 9.0]))
     assert np.asarray(swept.failure).tolist() == [True, False]
     ferries = jax.vmap(ferry)(floats([[16.0, 0.0], [17.0, 0.0]]))
     seeds = floats(FERRY["half"][0])
     both = jax.vmap(lambda s: jast.replay(s, seeds, reward=REWARD).reward)(ferries)
-    assert float(both[1]) == pytest.approx(float(jast.replay(ferry((17.0, 0.0)), seeds, reward=REWARD).reward), rel=1e-5)
+    assert float(both[1]) == pytest.approx(
+        float(jast.replay(ferry((17.0, 0.0)), seeds, reward=REWARD).reward), rel=1e-5
+    )
 
 
 class Ring(NamedTuple):
@@ -250,11 +331,22 @@ class Ring(NamedTuple):
 
 
 def ring():
-    """Disturbances that are a pytree of a float and an integer, a state with a ring buffer, an integer and a key's worth of memory."""
+    """Disturbances that are a pytree of a float and an integer, a state with a ring buffer, an
+    integer and a key's worth of memory.
+    """
     return jast.Simulator(
         init=lambda x0: Ring(jnp.zeros((3, 2)), jnp.int32(0), jnp.int32(0)),
-        step=lambda s, x: Ring(s.buffer.at[s.next].set(x["push"]), (s.next + 1) % 3, s.hits + (x["kind"] == 2).astype(jnp.int32)),
-        disturbance=lambda s: D.Joint(dict(push=D.MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)), kind=D.Categorical(probs=jnp.asarray([0.5, 0.3, 0.2])))),
+        step=lambda s, x: Ring(
+            s.buffer.at[s.next].set(x["push"]),
+            (s.next + 1) % 3,
+            s.hits + (x["kind"] == 2).astype(jnp.int32),
+        ),
+        disturbance=lambda s: D.Joint(
+            dict(
+                push=D.MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)),
+                kind=D.Categorical(probs=jnp.asarray([0.5, 0.3, 0.2])),
+            )
+        ),
         evaluate=lambda s: (s.hits >= 2, jnp.maximum(2 - s.hits, 0).astype(s.buffer.dtype)),
         horizon=6,
     )
@@ -264,14 +356,18 @@ def test_pytree_and_integer_disturbances_and_a_ring_buffer(key, equal):
     sim = jast.check(ring())
     keys = jax.random.split(key, 2000)
     many = jax.vmap(jast.rollout, (0, None))(keys, sim)
-    assert jnp.issubdtype(many.disturbances["kind"].dtype, jnp.integer) and many.disturbances["push"].shape == (2000, 6, 2)
+    assert jnp.issubdtype(many.disturbances["kind"].dtype, jnp.integer) and many.disturbances[
+        "push"
+    ].shape == (2000, 6, 2)
     truth = 1 - 0.8**6 - 6 * 0.2 * 0.8**5  # two or more hits of six
     assert abs(float(many.failure.mean()) - truth) < 4 * np.sqrt(truth * (1 - truth) / 2000)
     one = jast.rollout(keys[0], sim)
     equal(one, jast.replay(sim, one))
     rows = int(one.length)
     got = np.log([0.5, 0.3, 0.2])[np.asarray(one.disturbances["kind"][:rows])].sum()
-    got += (-0.5 * np.asarray(one.disturbances["push"][:rows], float) ** 2 - 0.5 * np.log(2 * np.pi)).sum()
+    got += (
+        -0.5 * np.asarray(one.disturbances["push"][:rows], float) ** 2 - 0.5 * np.log(2 * np.pi)
+    ).sum()
     assert float(one.log_prob) == pytest.approx(got, rel=1e-5)
     last = np.asarray(one.disturbances["push"][max(rows - 3, 0) : rows])
     assert np.asarray(one.states.buffer[rows]).sum() == pytest.approx(last.sum(), rel=1e-5)
@@ -280,8 +376,12 @@ def test_pytree_and_integer_disturbances_and_a_ring_buffer(key, equal):
 def test_log_prob_counts_the_start(key):
     sim = landing()
     episode = jast.rollout(key, sim)
-    expected = D.Normal(0.0, 0.1).log_prob(episode.x0) + sum(D.Normal(0.0, 0.03).log_prob(x) for x in episode.disturbances)
-    assert float(episode.log_prob) == pytest.approx(float(expected), rel=1e-5) and float(episode.states.x2[0]) == float(episode.x0)
+    expected = D.Normal(0.0, 0.1).log_prob(episode.x0) + sum(
+        D.Normal(0.0, 0.03).log_prob(x) for x in episode.disturbances
+    )
+    assert float(episode.log_prob) == pytest.approx(float(expected), rel=1e-5) and float(
+        episode.states.x2[0]
+    ) == float(episode.x0)
 
 
 # policies
@@ -293,7 +393,8 @@ def test_policies(key, equal):
     assert float(quiet.reward) == pytest.approx(FERRY["half"][1], **within(1e-9, 1e-3))
     drawn = jast.replay(sim, jast.rollout(key, sim))
     again = jast.rollout(jax.random.fold_in(key, 1), sim, policy.recorded(drawn.disturbances))
-    np.testing.assert_allclose(again.log_prob, drawn.log_prob, rtol=1e-5)  # the true density, whatever the policy
+    # the true density, whatever the policy
+    np.testing.assert_allclose(again.log_prob, drawn.log_prob, rtol=1e-5)
     equal(again.disturbances, drawn.disturbances)
     equal(jast.rollout(key, sim, policy.nominal_policy(sim)), jast.rollout(key, sim))
 
@@ -301,7 +402,11 @@ def test_policies(key, equal):
 # rates
 
 
-@pytest.mark.parametrize("make, truth", [(walk1d, 0.1087363323), (lambda: walk1d("one-sided"), 9.578759495e-4)], ids=["two-sided", "one-sided"])
+@pytest.mark.parametrize(
+    "make, truth",
+    [(walk1d, 0.1087363323), (lambda: walk1d("one-sided"), 9.578759495e-4)],
+    ids=["two-sided", "one-sided"],
+)
 def test_walk_rate(make, truth, key):
     n = 200_000
     found = jast.nominal(key, make(), episodes=n)
@@ -314,5 +419,9 @@ def test_landing_rate_depends_on_when_it_is_evaluated(key):
     assert at_end == pytest.approx(0.14679308730757, rel=1e-5)
     sim = landing(b=0.2)
     assert abs(jast.nominal(key, sim, episodes=n).rate - at_end) < 4 * np.sqrt(at_end / n)
-    every = jast.Simulator(sim.init, sim.step, sim.disturbance, sim.evaluate, sim.horizon, start=sim.start)
-    assert jast.nominal(key, every, episodes=n).rate == pytest.approx(0.2277, abs=4 * np.sqrt(0.2 / n) + 2e-3)
+    every = jast.Simulator(
+        sim.init, sim.step, sim.disturbance, sim.evaluate, sim.horizon, start=sim.start
+    )
+    assert jast.nominal(key, every, episodes=n).rate == pytest.approx(
+        0.2277, abs=4 * np.sqrt(0.2 / n) + 2e-3
+    )

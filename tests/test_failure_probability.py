@@ -1,4 +1,6 @@
-"""Proposals that are found: closed forms within their standard errors, lost modes, what the search is made of, and failures as they would happen."""
+"""Proposals that are found: closed forms within their standard errors, lost modes, what the search
+is made of, and failures as they would happen.
+"""
 
 from typing import NamedTuple
 
@@ -13,7 +15,13 @@ from scipy.special import logsumexp
 import jast
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
-from jast.estimate import adaptive_cross_entropy, failure_probability, failure_samples, subset_simulation, trace_proposal
+from jast.estimate import (
+    adaptive_cross_entropy,
+    failure_probability,
+    failure_samples,
+    subset_simulation,
+    trace_proposal,
+)
 from jast.estimate import latent as L
 from jast.estimate.adaptive import LEAST
 from jast.estimate.batches import numbers
@@ -41,7 +49,9 @@ def _step(sight, s, x):
 def _evaluate(beta, early, s):
     along = s.total / 2
     counts, gap = early | (s.steps == 4), jnp.minimum(beta[0] - along, beta[1] + along)
-    return counts & (gap <= 0), jnp.where(s.lost, jnp.nan, jnp.where(counts, jnp.maximum(gap, 0), 100))
+    return counts & (gap <= 0), jnp.where(
+        s.lost, jnp.nan, jnp.where(counts, jnp.maximum(gap, 0), 100)
+    )
 
 
 def _start(x0):
@@ -53,16 +63,32 @@ def _normal(s):
 
 
 def planes(up=FAR, down=FAR, sight=FAR, early=False):
-    """Four normal steps, failure where half of their sum is beyond ``up`` or below -``down``: P = Phi(-up) + Phi(-down). NaN after a step above ``sight``;
-    ``early``: a failure at any step counts. One program serves all."""
-    beta, sight = jnp.asarray([up, down], jnp.zeros(()).dtype), jnp.asarray(sight, jnp.zeros(()).dtype)
-    return jast.Simulator(_start, Partial(_step, sight), _normal, Partial(_evaluate, beta, jnp.asarray(early)), 4)
+    """Four normal steps, failure where half of their sum is beyond ``up`` or below -``down``: P =
+    Phi(-up) + Phi(-down). NaN after a step above ``sight``; ``early``: a failure at any step
+    counts. One program serves all.
+    """
+    beta, sight = (
+        jnp.asarray([up, down], jnp.zeros(()).dtype),
+        jnp.asarray(sight, jnp.zeros(()).dtype),
+    )
+    return jast.Simulator(
+        _start, Partial(_step, sight), _normal, Partial(_evaluate, beta, jnp.asarray(early)), 4
+    )
 
 
 def good(found, truth, budget=BUDGET):
-    """Within 4 of its standard errors, which are small; believed; and the evaluations are those that were granted."""
-    return abs(found.log_mean - np.log(truth)) < 4 * found.relative_error and found.relative_error < 0.05
-    assert not found.reliable and any("if they failed" in w for w in found.warnings) and found.evaluations <= budget
+    """Within 4 of its standard errors, which are small; believed; and the evaluations are those
+    that were granted.
+    """
+    return (
+        abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
+        and found.relative_error < 0.05
+    )
+    assert (
+        not found.reliable
+        and any("if they failed" in w for w in found.warnings)
+        and found.evaluations <= budget
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +101,17 @@ def two():
 def test_two_modes(two):
     sim, truth, found = two
     assert good(found, truth), str(found)
-    assert found.method == "failure_probability" and len(found.modes) == 2 and found.modes.sum() == pytest.approx(1)
+    assert (
+        found.method == "failure_probability"
+        and len(found.modes) == 2
+        and found.modes.sum() == pytest.approx(1)
+    )
     assert abs(found.modes[1] - norm.sf(4.5) / truth) < 4 * 2 * np.sqrt(0.1 / found.ess)
-    assert found.evaluations > 0.95 * BUDGET and BUDGET // 10 <= found.samples < found.evaluations and len(found.history) > 3
+    assert (
+        found.evaluations > 0.95 * BUDGET
+        and BUDGET // 10 <= found.samples < found.evaluations
+        and len(found.history) > 3
+    )
 
 
 @pytest.mark.parametrize("gradients", [True, False])
@@ -96,39 +130,76 @@ def test_where_failures_are_common(key, up):
     """P = .84, .5 and .16: not worse than counting the same number of episodes."""
     found = failure_probability(key, planes(up), BUDGET)
     truth = norm.sf(up)
-    assert good(found, truth) and found.relative_error < 1.1 * np.sqrt((1 - truth) / truth / found.samples)
+    assert good(found, truth) and found.relative_error < 1.1 * np.sqrt(
+        (1 - truth) / truth / found.samples
+    )
 
 
 def test_walk_that_often_fails(key):
-    """At any step, on either side, so that episodes use one to four numbers: P = .068, by quadrature."""
+    """At any step, on either side, so that episodes use one to four numbers: P = .068, by
+    quadrature.
+    """
     found = failure_probability(key, planes(2.0, 2.0, early=True), BUDGET)
     assert good(found, walk_probability(4.0, 4, True)) and found.steps < 4 * found.samples
 
 
 def test_invalid_episodes(key):
-    """NaN where a step is above 2.2: counted, no failures, and the rest as in NumPy by importance sampling of 400,000 (4 of both standard errors)."""
+    """NaN where a step is above 2.2: counted, no failures, and the rest as in NumPy by importance
+    sampling of 400,000 (4 of both standard errors).
+    """
     found = failure_probability(key, planes(3.5, sight=2.2), BUDGET)
     z = np.random.default_rng(0).normal(1.75, 1, size=(400_000, 4))
-    w = np.where((z.sum(axis=1) >= 7) & (z <= 2.2).all(axis=1), np.exp((1.75**2 / 2 - 1.75 * z).sum(axis=1)), 0)
+    w = np.where(
+        (z.sum(axis=1) >= 7) & (z <= 2.2).all(axis=1),
+        np.exp((1.75**2 / 2 - 1.75 * z).sum(axis=1)),
+        0,
+    )
     truth, error = w.mean(), w.std() / np.sqrt(len(w))
-    assert abs(found.mean - truth) < 4 * np.hypot(error, found.standard_error) and found.relative_error < 0.05
+    assert (
+        abs(found.mean - truth) < 4 * np.hypot(error, found.standard_error)
+        and found.relative_error < 0.05
+    )
     assert not found.reliable and any("if they failed" in w for w in found.warnings)
     assert found.invalid > 0 and "invalid" in found.warnings[-1], str(found)
 
 
 def test_below_the_least_double(key):
-    """2 Phi(-60), a number of 783 digits behind the point: as a logarithm, within 4 standard errors of scipy's."""
+    """2 Phi(-60), a number of 783 digits behind the point: as a logarithm, within 4 standard errors
+    of scipy's.
+    """
     found = failure_probability(key, planes(60.0, 60.0), BUDGET)
-    assert abs(found.log_mean - np.log(2) - norm.logsf(60)) < 4 * found.relative_error < 0.2 and found.mean == 0 and "probability    10^-783." in str(found)
+    assert (
+        abs(found.log_mean - np.log(2) - norm.logsf(60)) < 4 * found.relative_error < 0.2
+        and found.mean == 0
+        and "probability    10^-783." in str(found)
+    )
 
 
 def test_no_failure(key):
-    """Every episode is invalid: neither a number nor trust; the upper bounds are those of what was drawn of the model."""
+    """Every episode is invalid: neither a number nor trust; the upper bounds are those of what was
+    drawn of the model.
+    """
     sim = planes(sight=-FAR)
     found = failure_probability(key, sim, BUDGET)
-    assert np.isnan(found.mean) and not found.reliable and found.failures_seen == 0 and found.proposal is None and found.evaluations <= BUDGET
-    assert found.interval[0] == 0 < found.interval[1] < 1e-3 and str(found).startswith("UNRELIABLE: no failure in") and found.invalid >= found.samples
-    with pytest.raises(ValueError, match="failure_samples: source must hold a proposal, received .* failure_probability without one"):
+    assert (
+        np.isnan(found.mean)
+        and not found.reliable
+        and found.failures_seen == 0
+        and found.proposal is None
+        and found.evaluations <= BUDGET
+    )
+    assert (
+        found.interval[0] == 0 < found.interval[1] < 1e-3
+        and str(found).startswith("UNRELIABLE: no failure in")
+        and found.invalid >= found.samples
+    )
+    with pytest.raises(
+        ValueError,
+        match=(
+            "failure_samples: source must hold a proposal, received .* failure_probability"
+            " without one"
+        ),
+    ):
         failure_samples(key, sim, found)
     assert len(design_points(key, sim).points) == 0
 
@@ -136,7 +207,10 @@ def test_no_failure(key):
 def test_the_least_budget_is_kept(key):
     """Gradients included; and it is enough for one near plane."""
     found = failure_probability(key, planes(3.0), LEAST)
-    assert found.evaluations <= LEAST and abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error, found.history
+    assert (
+        found.evaluations <= LEAST
+        and abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error
+    ), found.history
 
 
 def test_interrupts_keep_whole_chunks(two):
@@ -149,24 +223,46 @@ def test_interrupts_keep_whole_chunks(two):
     sim, truth, whole = two
     found = failure_probability(jax.random.key(5), sim, BUDGET, callback=stop)
     done, total = seen[0]
-    assert len(seen) == 1 and found.samples == done < total == whole.samples and found.history == whole.history
-    assert whole.evaluations - found.evaluations == total - done and found.warnings == (f"interrupted after {done} of {total} episodes",)
+    assert (
+        len(seen) == 1
+        and found.samples == done < total == whole.samples
+        and found.history == whole.history
+    )
+    assert whole.evaluations - found.evaluations == total - done and found.warnings == (
+        f"interrupted after {done} of {total} episodes",
+    )
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
 
 def test_subset_simulation(key):
-    """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30 %; each population is counted."""
+    """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30
+    %; each population is counted.
+    """
     found = subset_simulation(key, planes(4.0), SIZE)
-    assert abs(found.mean - norm.sf(4)) < 4 * found.standard_error and found.relative_error < 0.3 and found.reliable
-    assert found.samples == found.failures_seen == 5000 and found.evaluations == sum(int(h.split()[-2]) for h in found.history)
+    assert (
+        abs(found.mean - norm.sf(4)) < 4 * found.standard_error
+        and found.relative_error < 0.3
+        and found.reliable
+    )
+    assert found.samples == found.failures_seen == 5000 and found.evaluations == sum(
+        int(h.split()[-2]) for h in found.history
+    )
     assert found.interval[0] < found.mean < found.interval[1]
-    with pytest.raises(ValueError, match="subset_simulation: replicates must be a whole number of at least 3, received 2"):
+    with pytest.raises(
+        ValueError,
+        match="subset_simulation: replicates must be a whole number of at least 3, received 2",
+    ):
         subset_simulation(key, planes(4.0), SIZE, replicates=2)
 
 
 def test_adaptive_cross_entropy(key):
     found = adaptive_cross_entropy(key, planes(3.5), BUDGET)
-    assert good(found, norm.sf(3.5)) and found.method == "adaptive_cross_entropy" and found.evaluations == BUDGET and found.samples == BUDGET * 4 // 5
+    assert (
+        good(found, norm.sf(3.5))
+        and found.method == "adaptive_cross_entropy"
+        and found.evaluations == BUDGET
+        and found.samples == BUDGET * 4 // 5
+    )
 
 
 def _gamma(s):
@@ -175,25 +271,73 @@ def _gamma(s):
 
 @pytest.mark.parametrize("method", [failure_probability, subset_simulation])
 def test_no_quantile_function(key, method):
-    sim = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x, _gamma, lambda s: (s > 9, jnp.maximum(9 - s, 0)), 2)
-    with pytest.raises(ValueError, match=f"{method.__name__}: disturbance: Gamma has no quantile function; jast.estimate.monte_carlo needs none"):
+    sim = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s + x,
+        _gamma,
+        lambda s: (s > 9, jnp.maximum(9 - s, 0)),
+        2,
+    )
+    with pytest.raises(
+        ValueError,
+        match=(
+            f"{method.__name__}: disturbance: Gamma has no quantile function;"
+            " jast.estimate.monte_carlo needs none"
+        ),
+    ):
         method(key, sim)
-    start = jast.Simulator(lambda x0: x0, lambda s, x: s + x, lambda s: D.Normal(s, 1.0), lambda s: (s > 9, jnp.maximum(9 - s, 0)), 2, start=lambda: _gamma(0))
-    with pytest.raises(ValueError, match=f"{method.__name__}: start: Gamma has no quantile function"):
+    start = jast.Simulator(
+        lambda x0: x0,
+        lambda s, x: s + x,
+        lambda s: D.Normal(s, 1.0),
+        lambda s: (s > 9, jnp.maximum(9 - s, 0)),
+        2,
+        start=lambda: _gamma(0),
+    )
+    with pytest.raises(
+        ValueError, match=f"{method.__name__}: start: Gamma has no quantile function"
+    ):
         method(key, start)
 
 
-@pytest.mark.parametrize("make, match", [
-    (lambda key: failure_probability(key, planes(), LEAST - 1), f"failure_probability: budget must be a .* at least {LEAST}, received {LEAST - 1}"),
-    (lambda key: failure_probability(key, planes(), level=1.0), "failure_probability: level must be a number between 0 and 1, received 1.0"),
-    (lambda key: adaptive_cross_entropy(key, planes(), 10), "adaptive_cross_entropy: budget must be a whole number of at least .*, received 10"),
-    (lambda key: subset_simulation(key, planes(), 99), "subset_simulation: samples must be a whole number of at least 100, received 99"),
-    (lambda key: subset_simulation(key, planes(), level=0), "subset_simulation: level must be a number between 0 and 1, received 0"),
-    (lambda key: failure_samples(key, planes(), "x"), "failure_samples: proposal must be a Proposal or a jast.Policy, received str"),
-    (lambda key: failure_samples(key, planes(), None), "failure_samples: (source|proposal) must"),
-    (lambda key: failure_samples(key, planes(), "x", 0), "failure_samples: samples must be a whole number of at least 1, received 0"),
-    (lambda key: failure_probability(key, "x"), "sim must be a jast.Simulator, received str"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (
+            lambda key: failure_probability(key, planes(), LEAST - 1),
+            f"failure_probability: budget must be a .* at least {LEAST}, received {LEAST - 1}",
+        ),
+        (
+            lambda key: failure_probability(key, planes(), level=1.0),
+            "failure_probability: level must be a number between 0 and 1, received 1.0",
+        ),
+        (
+            lambda key: adaptive_cross_entropy(key, planes(), 10),
+            "adaptive_cross_entropy: budget must be a whole number of at least .*, received 10",
+        ),
+        (
+            lambda key: subset_simulation(key, planes(), 99),
+            "subset_simulation: samples must be a whole number of at least 100, received 99",
+        ),
+        (
+            lambda key: subset_simulation(key, planes(), level=0),
+            "subset_simulation: level must be a number between 0 and 1, received 0",
+        ),
+        (
+            lambda key: failure_samples(key, planes(), "x"),
+            "failure_samples: proposal must be a Proposal or a jast.Policy, received str",
+        ),
+        (
+            lambda key: failure_samples(key, planes(), None),
+            "failure_samples: (source|proposal) must",
+        ),
+        (
+            lambda key: failure_samples(key, planes(), "x", 0),
+            "failure_samples: samples must be a whole number of at least 1, received 0",
+        ),
+        (lambda key: failure_probability(key, "x"), "sim must be a jast.Simulator, received str"),
+    ],
+)
 def test_bad_arguments(key, make, match):
     with pytest.raises(ValueError, match=match):
         make(key)
@@ -203,26 +347,38 @@ def test_bad_arguments(key, make, match):
 
 
 def test_design_points(key):
-    """The points of the two planes, by rising norm, within 2 % and next to the boundary; all are failures."""
+    """The points of the two planes, by rising norm, within 2 % and next to the boundary; all are
+    failures.
+    """
     found = design_points(key, planes(4.0, 4.5))
     np.testing.assert_allclose(found.points, [4 * DIAGONAL, -4.5 * DIAGONAL], atol=0.05)
-    assert L.outcomes(planes(4.0, 4.5), jnp.asarray(found.points, jnp.zeros(()).dtype)).failure.all() and found.evaluations > 0
+    assert (
+        L.outcomes(planes(4.0, 4.5), jnp.asarray(found.points, jnp.zeros(()).dtype)).failure.all()
+        and found.evaluations > 0
+    )
 
 
 def test_distinct_points():
     """By rising norm, none nearer to a kept one than half of its norm."""
     points = np.array([[0.0, 5.0], [3.0, 0.1], [3.0, 0.0], [-3.5, 0.0], [3.0, 1.4], [3.0, 1.6]])
-    np.testing.assert_array_equal(distinct(points, 9), [[3.0, 0.0], [3.0, 1.6], [-3.5, 0.0], [0.0, 5.0]])
+    np.testing.assert_array_equal(
+        distinct(points, 9), [[3.0, 0.0], [3.0, 1.6], [-3.5, 0.0], [0.0, 5.0]]
+    )
     assert distinct(points, 2).shape == (2, 2) and distinct(np.zeros((0, 3)), 4).shape == (0, 3)
 
 
 def test_populations_estimate(key):
-    """P = 3.17e-5 by 12 populations of 500: a population's relative error is about sqrt(levels (1 - p) / (p n) (1 + gamma)) = .42 with p = .25, 7.5 levels and
-    gamma = 3 (Au and Beck 2001); the mean is within 4 of the standard errors from that, and the deviation is not above twice it."""
+    """P = 3.17e-5 by 12 populations of 500: a population's relative error is about sqrt(levels (1 -
+    p) / (p n) (1 + gamma)) = .42 with p = .25, 7.5 levels and gamma = 3 (Au and Beck 2001); the
+    mean is within 4 of the standard errors from that, and the deviation is not above twice it.
+    """
     found = [explore(k, planes(4.0), SIZE) for k in jax.random.split(key, 12)]
     p = np.exp([f.log_mean for f in found])
     expected = np.sqrt(-np.log(norm.sf(4)) / np.log(4) * 3 / SIZE * 4)
-    assert abs(p.mean() / norm.sf(4) - 1) < 4 * expected / np.sqrt(12) and p.std() / norm.sf(4) < 2 * expected
+    assert (
+        abs(p.mean() / norm.sf(4) - 1) < 4 * expected / np.sqrt(12)
+        and p.std() / norm.sf(4) < 2 * expected
+    )
     for f in found:
         assert (
             f.points.shape == (SIZE, 4)
@@ -233,27 +389,44 @@ def test_populations_estimate(key):
 
 
 def test_populations_kept_out(key):
-    """What a proposal covers is left out: only the other side is found, and the estimate is of it alone."""
+    """What a proposal covers is left out: only the other side is found, and the estimate is of it
+    alone.
+    """
     q = as_latent([(1.0, unit(4 * DIAGONAL[None]))], jnp.zeros(()).dtype)
     covered = q, jnp.asarray(0.0, jnp.zeros(()).dtype)
-    found = [explore(k, planes(4.0, 4.5), SIZE // 2, covered=covered) for k in jax.random.split(key, 6)]
+    found = [
+        explore(k, planes(4.0, 4.5), SIZE // 2, covered=covered) for k in jax.random.split(key, 6)
+    ]
     assert all((f.points.sum(axis=1) / 2 < -4.5).all() and f.reached for f in found)
-    assert abs(np.mean(np.exp([f.log_mean for f in found])) / norm.sf(4.5) - 1) < 4 * 1.03 / np.sqrt(6)
+    assert abs(
+        np.mean(np.exp([f.log_mean for f in found])) / norm.sf(4.5) - 1
+    ) < 4 * 1.03 / np.sqrt(6)
     assert not explore(key, planes(4.0), SIZE // 2, covered=covered, least=-15.0).reached
 
 
 def test_populations_give_up(key):
     """At the evaluations or the probability they are given."""
     found = explore(key, planes(12.0), SIZE, most=3000)
-    assert not found.reached and found.log_mean == -np.inf and found.evaluations <= 3000 and found.points.shape == (0, 4)
+    assert (
+        not found.reached
+        and found.log_mean == -np.inf
+        and found.evaluations <= 3000
+        and found.points.shape == (0, 4)
+    )
     assert len(explore(key, planes(12.0), SIZE, least=-5.0).levels) <= 5
 
 
 def test_cooling_keeps_every_mode(key):
-    """The farther of two modes, 1.2e-4 of the probability, has its share of the chains, most near the least norm of their plane."""
+    """The farther of two modes, 1.2e-4 of the probability, has its share of the chains, most near
+    the least norm of their plane.
+    """
     points = cool(key, planes(4.0, 5.5), 128).points
     along, norms = points.sum(axis=1) / 2, np.linalg.norm(points, axis=1)
-    assert (along > 4).sum() > 10 and (along < -5.5).sum() > 10 and np.median(np.where(along > 0, norms / 4, norms / 5.5)) < 1.2
+    assert (
+        (along > 4).sum() > 10
+        and (along < -5.5).sum() > 10
+        and np.median(np.where(along > 0, norms / 4, norms / 5.5)) < 1.2
+    )
     assert not cool(key, planes(), 128).reached
 
 
@@ -261,55 +434,90 @@ def test_log_ratios(key):
     """Against scipy's multivariate normal, over the used numbers only: their marginal."""
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.normal(size=(2, 4, 4)))[0]
-    g = Gaussians(np.array([0.7, 0.3]), rng.normal(size=(2, 4)), np.array([[0.5, 1, 2, 0.1], [1, 1, 3, 0.7]]), basis)
+    g = Gaussians(
+        np.array([0.7, 0.3]),
+        rng.normal(size=(2, 4)),
+        np.array([[0.5, 1, 2, 0.1], [1, 1, 3, 0.7]]),
+        basis,
+    )
     q = as_latent([(1.0, g)], jnp.zeros(()).dtype)
     z, used = rng.normal(size=(40, 4)) * 2, np.arange(40) % 5
     covariances = np.einsum("kij,kj,klj->kil", basis, g.values, basis)
     mvn = scipy.stats.multivariate_normal
-    expected = np.array([
-        [mvn.logpdf(x[:m], mean[:m], c[:m, :m]) - norm.logpdf(x[:m]).sum() if m else 0.0 for mean, c in zip(g.means, covariances, strict=True)]
-        for x, m in zip(z, used, strict=True)
-    ])  # fmt: skip
+    expected = np.array(
+        [
+            [
+                mvn.logpdf(x[:m], mean[:m], c[:m, :m]) - norm.logpdf(x[:m]).sum() if m else 0.0
+                for mean, c in zip(g.means, covariances, strict=True)
+            ]
+            for x, m in zip(z, used, strict=True)
+        ]
+    )
     z, used = jnp.asarray(z, q.means.dtype), jnp.asarray(used, jnp.int32)
-    np.testing.assert_allclose(jax.jit(L.log_ratios)(q, z, used)[:, :2], expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        jax.jit(L.log_ratios)(q, z, used)[:, :2], expected, rtol=1e-3, atol=1e-3
+    )
     np.testing.assert_allclose(np.exp(q.log_weights[:2]), [0.7, 0.3], rtol=1e-5)
 
 
 def test_draws_of_a_mixture(key):
-    """Moments of 20,000 draws, within 4.5 standard errors of each; unused components never drawn; shares of a mixture of two."""
+    """Moments of 20,000 draws, within 4.5 standard errors of each; unused components never drawn;
+    shares of a mixture of two.
+    """
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.normal(size=(1, 4, 4)))[0]
     g = Gaussians(np.ones(1), np.array([[3.0, 0, 0, -1]]), np.array([[0.2, 1, 2, 0.5]]), basis)
     dtype, n = jnp.zeros(()).dtype, 20_000
-    q = together(as_latent([(1.0, unit(np.full((1, 4), -20.0)))], dtype), as_latent([(1.0, g)], dtype), 0.25)
+    q = together(
+        as_latent([(1.0, unit(np.full((1, 4), -20.0)))], dtype), as_latent([(1.0, g)], dtype), 0.25
+    )
     z = np.asarray(jax.jit(L.place)(q, *numbers(key, n, 4, dtype)), float)
     near = z.sum(axis=1) < -40
-    assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n) and logsumexp(q.log_weights) == pytest.approx(0, abs=1e-5)
+    assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n) and logsumexp(
+        q.log_weights
+    ) == pytest.approx(0, abs=1e-5)
     other, covariance = z[~near], basis[0] @ np.diag(g.values[0]) @ basis[0].T
-    assert (abs(other.mean(axis=0) - g.means[0]) < 4.5 * np.sqrt(np.diag(covariance) / len(other))).all()
+    assert (
+        abs(other.mean(axis=0) - g.means[0]) < 4.5 * np.sqrt(np.diag(covariance) / len(other))
+    ).all()
     assert abs(np.cov(other.T) - covariance).max() < 4.5 * 2 * np.sqrt(2 / len(other))
 
 
 def test_shrunk():
-    """Noise about I, by the spectrum of 80 points in 20 dimensions, is flat; a spike of 12 stays; of many points each eigenvalue is its own."""
+    """Noise about I, by the spectrum of 80 points in 20 dimensions, is flat; a spike of 12 stays;
+    of many points each eigenvalue is its own.
+    """
     rng = np.random.default_rng(0)
     values = np.linalg.eigvalsh(np.cov(rng.normal(size=(20, 80)), bias=True))
     found = shrunk(values, 80)
-    assert values.max() / values.min() > 5 and np.ptp(found) == 0 and found[0] == pytest.approx(values.mean())
+    assert (
+        values.max() / values.min() > 5
+        and np.ptp(found) == 0
+        and found[0] == pytest.approx(values.mean())
+    )
     x = rng.normal(size=(20, 80)) * np.array([12.0**0.5] + [1.0] * 19)[:, None]
     values = np.linalg.eigvalsh(np.cov(x, bias=True))
     found = shrunk(values, 80)
     assert found[-1] == values[-1] > 8 and np.ptp(found[:-1]) == 0 and 0.8 < found[0] < 1.1
     different = np.array([0.1, 0.5, 1.0, 3.0])
     np.testing.assert_allclose(shrunk(different, 1e6), different)
-    assert shrunk(np.array([0.3]), 1).tolist() == [0.3] and (shrunk(different, 0.5) == different.mean()).all()
+    assert (
+        shrunk(np.array([0.3]), 1).tolist() == [0.3]
+        and (shrunk(different, 0.5) == different.mean()).all()
+    )
 
 
 def test_fit_of_two_components():
-    """Means, shares and variances of 3000 points with unequal weights, within .15, .05 and .15; one cloud stays one component."""
+    """Means, shares and variances of 3000 points with unequal weights, within .15, .05 and .15; one
+    cloud stays one component.
+    """
     rng = np.random.default_rng(0)
     far = rng.random(3000) < 0.7
-    z = np.where(far[:, None], rng.normal([3, 0, 0], [0.5, 1, 1], (3000, 3)), rng.normal([-3, 1, 0], 1.0, (3000, 3)))
+    z = np.where(
+        far[:, None],
+        rng.normal([3, 0, 0], [0.5, 1, 1], (3000, 3)),
+        rng.normal([-3, 1, 0], 1.0, (3000, 3)),
+    )
     w = np.where(far, 0.3 / 0.7, 1.0) * rng.uniform(0.5, 1.5, 3000)  # so that both weigh the same
     g = fit(rng, z, w / w.sum(), w.sum() ** 2 / (w**2).sum(), limit=2)
     order = np.argsort(g.means[:, 0])
@@ -338,15 +546,30 @@ def proposal():
 
 @pytest.mark.parametrize("moves", [0, 20])
 def test_samples_of_landing(key, proposal, moves):
-    """E|s0| = .536 and its deviation, .0689, in closed form (4 standard errors); both signs; every one of them replays to a failure."""
+    """E|s0| = .536 and its deviation, .0689, in closed form (4 standard errors); both signs; every
+    one of them replays to a failure.
+    """
     found = failure_samples(key, LANDING, proposal, 500, moves=moves)
     e = found.episodes
     n = len(e.length)
-    assert 480 < n <= 500 and e.failure.all() and e.states is None and found.ess > 300 and found.distinct > 200
-    # s0 given the end y, |y| > 1: mean 10/19 y; y beyond 1 by sigma / beta = .019, so that E|y| = 1.0184
-    truth, size = 10 / 19 * np.sqrt(0.019) * norm.pdf(1 / np.sqrt(0.019)) / norm.sf(1 / np.sqrt(0.019)), min(found.ess, n)
+    assert (
+        480 < n <= 500
+        and e.failure.all()
+        and e.states is None
+        and found.ess > 300
+        and found.distinct > 200
+    )
+    # s0 given the end y, |y| > 1: mean 10/19 y; y beyond 1 by sigma / beta = .019, so that E|y| =
+    # 1.0184
+    truth, size = (
+        10 / 19 * np.sqrt(0.019) * norm.pdf(1 / np.sqrt(0.019)) / norm.sf(1 / np.sqrt(0.019)),
+        min(found.ess, n),
+    )
     assert truth == pytest.approx(0.536, abs=5e-4)
-    assert abs(abs(e.x0).mean() - truth) < 4 * 0.069 / np.sqrt(size) and abs(e.x0.std() ** 2 + e.x0.mean() ** 2 - truth**2 - 0.069**2) < 0.02
+    assert (
+        abs(abs(e.x0).mean() - truth) < 4 * 0.069 / np.sqrt(size)
+        and abs(e.x0.std() ** 2 + e.x0.mean() ** 2 - truth**2 - 0.069**2) < 0.02
+    )
     assert abs((e.x0 > 0).mean() - 0.5) < 4 * 0.5 / np.sqrt(size) and e.log_prob.shape == (n,)
     assert (abs(e.x0 + e.disturbances.sum(axis=1, dtype=float)) > 1 - 1e-6).all()
     assert all(jast.replay(LANDING, jax.tree.map(lambda a, i=i: a[i], e)).failure for i in range(3))
@@ -359,11 +582,17 @@ def test_samples_of_an_estimate(key, two):
     sim, truth, estimate = two
     found = failure_samples(key, sim, estimate, 500)
     along = found.episodes.disturbances.sum(axis=1) / 2
-    assert ((along > 4) | (along < -4.5)).all() and abs((along < 0).mean() - norm.sf(4.5) / truth) < 4 * np.sqrt(0.1 / min(found.ess, 500))
+    assert ((along > 4) | (along < -4.5)).all() and abs(
+        (along < 0).mean() - norm.sf(4.5) / truth
+    ) < 4 * np.sqrt(0.1 / min(found.ess, 500))
     # beyond the plane by 1 / beta, and N(0, I) along it
-    assert abs(along[along > 0].mean() - norm.pdf(4) / norm.sf(4)) < 4 * 0.24 / np.sqrt(300) and "500 failures from" in str(found)
+    assert abs(along[along > 0].mean() - norm.pdf(4) / norm.sf(4)) < 4 * 0.24 / np.sqrt(
+        300
+    ) and "500 failures from" in str(found)
 
 
 def test_samples_without_a_failure(key, proposal):
-    with pytest.raises(ValueError, match="failure_samples: source gave no failure in 5000 episodes"):
+    with pytest.raises(
+        ValueError, match="failure_samples: source gave no failure in 5000 episodes"
+    ):
         failure_samples(key, landing(50.0), proposal, 500)

@@ -1,4 +1,6 @@
-"""The archive of failures: what is kept, how it is ranked and counted, and that a file gives back exactly what was saved, or says why not."""
+"""The archive of failures: what is kept, how it is ranked and counted, and that a file gives back
+exactly what was saved, or says why not.
+"""
 
 import json
 from typing import NamedTuple
@@ -16,10 +18,27 @@ from jast.distributions import Independent, Joint, Normal
 
 # the best failure published for the ferry: reward 29.092054904933118, collision at step 20
 P = [
-    0.9795401687709587, 0.931634727796635, 0.9182992945295753, 0.9875367896498295, 0.9540570304688828, 0.8771477273691892, 0.862390861979752,
-    0.8795539869456118, 0.8453253347665413, 0.8486280841264486, 0.6894060333380425, 0.6295909310314968, 0.41676262118668805, 0.4127368211497019,
-    0.41815086583326605, 0.4188880550807259, 0.4833180771470985, 0.4700646283098928, 0.44995750050640954, 0.454360642513824,
-]  # fmt: skip
+    0.9795401687709587,
+    0.931634727796635,
+    0.9182992945295753,
+    0.9875367896498295,
+    0.9540570304688828,
+    0.8771477273691892,
+    0.862390861979752,
+    0.8795539869456118,
+    0.8453253347665413,
+    0.8486280841264486,
+    0.6894060333380425,
+    0.6295909310314968,
+    0.41676262118668805,
+    0.4127368211497019,
+    0.41815086583326605,
+    0.4188880550807259,
+    0.4833180771470985,
+    0.4700646283098928,
+    0.44995750050640954,
+    0.454360642513824,
+]
 FERRY = jast.simulators.ferry()
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
 
@@ -45,13 +64,30 @@ def _far(state):
     return jnp.abs(state) >= 2, jnp.maximum(2 - jnp.abs(state), 0)
 
 
-WALK = jast.Simulator(init=lambda x0: x0, step=lambda s, x: s + x["wind"] + x["push"][0].sum(), disturbance=_gusts, evaluate=_far, horizon=6, start=_start)
-NAMED = jast.Simulator(init=lambda x0: x0, step=lambda s, x: s + x.wind + x.push, disturbance=_named, evaluate=_far, horizon=6, start=_start)
+WALK = jast.Simulator(
+    init=lambda x0: x0,
+    step=lambda s, x: s + x["wind"] + x["push"][0].sum(),
+    disturbance=_gusts,
+    evaluate=_far,
+    horizon=6,
+    start=_start,
+)
+NAMED = jast.Simulator(
+    init=lambda x0: x0,
+    step=lambda s, x: s + x.wind + x.push,
+    disturbance=_named,
+    evaluate=_far,
+    horizon=6,
+    start=_start,
+)
 PLAIN = jast.rewards.standard()
 
 
 def ferry_episodes(*sequences):
-    return jax.tree.map(lambda *a: np.stack(a), *(jax.device_get(jast.replay(FERRY, jnp.array(s), reward=REWARD)) for s in sequences))
+    return jax.tree.map(
+        lambda *a: np.stack(a),
+        *(jax.device_get(jast.replay(FERRY, jnp.array(s), reward=REWARD)) for s in sequences),
+    )
 
 
 def perturbed(i):
@@ -59,7 +95,9 @@ def perturbed(i):
 
 
 def rollouts(sim, n, seed=0):
-    return jax.vmap(lambda key: jast.rollout(key, sim, reward=PLAIN))(jax.random.split(jax.random.key(seed), n))
+    return jax.vmap(lambda key: jast.rollout(key, sim, reward=PLAIN))(
+        jax.random.split(jax.random.key(seed), n)
+    )
 
 
 def same(a, b):
@@ -80,12 +118,20 @@ def archive(walks):
 
 def test_ferry_failures_are_deduplicated_counted_and_ranked():
     candidates = ferry_episodes(perturbed(1), P, P, [0.5] * 21, perturbed(2), P)
-    found = F.collect(FERRY, REWARD, candidates, tree=[3, 2, 1, 0, 5, 9], simulation=[7, 8, 8, 0, 1, 9])
+    found = F.collect(
+        FERRY, REWARD, candidates, tree=[3, 2, 1, 0, 5, 9], simulation=[7, 8, 8, 0, 1, 9]
+    )
     assert found.size == 3 and found.seen == 5 and found.dropped == 0
-    assert list(found.counts) == [3, 1, 1] and list(found.tree) == [1, 3, 5] and list(found.simulation) == [8, 7, 1]
+    assert (
+        list(found.counts) == [3, 1, 1]
+        and list(found.tree) == [1, 3, 5]
+        and list(found.simulation) == [8, 7, 1]
+    )
     assert np.all(np.diff(found.episodes.reward) <= 0) and found.episodes.failure.all()
     assert abs(found.best.reward - 29.092054904933118) < 1e-4 and found.best.length == 20
-    np.testing.assert_array_equal(found.best.disturbances[:20], np.asarray(P, found.best.disturbances.dtype))
+    np.testing.assert_array_equal(
+        found.best.disturbances[:20], np.asarray(P, found.best.disturbances.dtype)
+    )
     assert not found.best.disturbances[20:].any()
 
 
@@ -93,7 +139,9 @@ def test_archived_numbers_replay_to_the_bit(archive):
     assert archive.size > 5
     for i in range(archive.size):
         episode = archive.episode(i)
-        same(jax.device_get(jast.replay(WALK, episode, reward=PLAIN)._replace(states=None)), episode)
+        same(
+            jax.device_get(jast.replay(WALK, episode, reward=PLAIN)._replace(states=None)), episode
+        )
 
 
 def test_candidates_that_no_longer_fail_are_dropped_and_counted():
@@ -112,7 +160,14 @@ def test_unused_rows_do_not_distinguish_failures():
 
 
 def test_the_start_distinguishes_failures():
-    one = jax.device_get(jast.replay(WALK, jax.tree.map(lambda s: jnp.zeros((0, *s.shape)), jax.eval_shape(_draw)), x0=jnp.asarray(2.5), reward=PLAIN))
+    one = jax.device_get(
+        jast.replay(
+            WALK,
+            jax.tree.map(lambda s: jnp.zeros((0, *s.shape)), jax.eval_shape(_draw)),
+            x0=jnp.asarray(2.5),
+            reward=PLAIN,
+        )
+    )
     pair = jax.tree.map(lambda a: np.stack([a, a]), one)
     pair = pair._replace(x0=np.array([2.5, 3.0], pair.x0.dtype))
     found = F.collect(WALK, PLAIN, pair)
@@ -142,9 +197,15 @@ def test_no_failure_works_and_says_so(tmp_path):
 def test_table():
     table = str(F.collect(FERRY, REWARD, ferry_episodes(*(perturbed(i) for i in range(12)))))
     lines = table.splitlines()
-    assert lines[0].startswith("12 distinct failures (12 failing episodes") and len(lines) == 13 and lines[-1] == "... and 2 more"
+    assert (
+        lines[0].startswith("12 distinct failures (12 failing episodes")
+        and len(lines) == 13
+        and lines[-1] == "... and 2 more"
+    )
     assert "29.092" in lines[2] and max(map(len, lines)) < 100
-    assert str(F.collect(FERRY, REWARD, ferry_episodes(P))).startswith("1 distinct failure (1 failing episode simulated)")
+    assert str(F.collect(FERRY, REWARD, ferry_episodes(P))).startswith(
+        "1 distinct failure (1 failing episode simulated)"
+    )
 
 
 def test_access_by_rank(archive):
@@ -170,13 +231,22 @@ def test_order_of_candidates_does_not_matter(picks, top, random):
         assert a.counts.sum() == len(failing)
 
 
-@given(st.lists(st.integers(0, 39), max_size=20), st.lists(st.integers(0, 39), max_size=20), st.integers(1, 40))
+@given(
+    st.lists(st.integers(0, 39), max_size=20),
+    st.lists(st.integers(0, 39), max_size=20),
+    st.integers(1, 40),
+)
 @settings(max_examples=25, deadline=None)
 def test_merge_is_collect_of_all(left, right, top):
     walks = jax.device_get(rollouts(WALK, 40)._replace(states=None))
     pick = lambda picks: jax.tree.map(lambda a: a[np.array(picks, int)], walks)
-    place = lambda picks, tree: dict(tree=np.full(len(picks), tree), simulation=np.arange(len(picks)))
-    a, b = F.collect(WALK, PLAIN, pick(left), **place(left, 0)), F.collect(WALK, PLAIN, pick(right), **place(right, 1))
+    place = lambda picks, tree: dict(
+        tree=np.full(len(picks), tree), simulation=np.arange(len(picks))
+    )
+    a, b = (
+        F.collect(WALK, PLAIN, pick(left), **place(left, 0)),
+        F.collect(WALK, PLAIN, pick(right), **place(right, 1)),
+    )
     places = jax.tree.map(lambda *v: np.concatenate(v), place(left, 0), place(right, 1))
     same(F.merge(a, b, top), F.collect(WALK, PLAIN, pick(left + right), **places, top=top))
     same(F.merge(a, b, top), F.merge(b, a, top))
@@ -198,12 +268,28 @@ def test_bad_arguments(walks, archive):
 
 def test_file_gives_back_what_was_saved(tmp_path, archive):
     path = tmp_path / "walk.jast"  # the name is kept as it is
-    plan = dict(method="forest", seed=3, trees=np.int32(4), widening=(0.5, 0.6), nothing=None, nested=dict(a=[1, 2]), rate=np.float32(0.5))
+    plan = dict(
+        method="forest",
+        seed=3,
+        trees=np.int32(4),
+        widening=(0.5, 0.6),
+        nothing=None,
+        nested=dict(a=[1, 2]),
+        rate=np.float32(0.5),
+    )
     F.save(path, archive, plan)
     for sim in (None, WALK):
         back, header = F.load(path, sim)
         same(back, archive)
-        assert header == dict(method="forest", seed=3, trees=4, widening=[0.5, 0.6], nothing=None, nested=dict(a=[1, 2]), rate=0.5)
+        assert header == dict(
+            method="forest",
+            seed=3,
+            trees=4,
+            widening=[0.5, 0.6],
+            nothing=None,
+            nested=dict(a=[1, 2]),
+            rate=0.5,
+        )
         assert str(back) == str(archive)
     F.save(path, F.empty(WALK))  # over the old one
     assert F.load(path)[0].size == 0 and F.load(path)[1] == {}
@@ -231,7 +317,9 @@ def test_settings_must_fit_json(tmp_path, archive):
 
 def test_interrupted_save_leaves_the_old_file(tmp_path, archive, monkeypatch):
     F.save(tmp_path / "a", archive)
-    monkeypatch.setattr(np, "savez_compressed", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt()))
+    monkeypatch.setattr(
+        np, "savez_compressed", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt())
+    )
     with pytest.raises(KeyboardInterrupt):
         F.save(tmp_path / "a", F.empty(WALK))
     monkeypatch.undo()
@@ -246,12 +334,22 @@ def test_precision_is_kept(tmp_path):
         sim = jast.simulators.ferry((16.0, 0.0))
         for s in (None, sim):
             same(F.load(tmp_path / "single", s)[0], single)
-        replayed = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(jast.replay(sim, jnp.array(P), reward=REWARD)))
+        replayed = jax.tree.map(
+            lambda a: np.asarray(a)[None],
+            jax.device_get(jast.replay(sim, jnp.array(P), reward=REWARD)),
+        )
         double = F.collect(sim, REWARD, replayed)
-        assert double.best.disturbances.dtype == np.float64 and abs(double.best.reward - 29.092054904933118) < 1e-12
+        assert (
+            double.best.disturbances.dtype == np.float64
+            and abs(double.best.reward - 29.092054904933118) < 1e-12
+        )
         F.save(tmp_path / "double", double)
     same(F.load(tmp_path / "double")[0], double)
-    half = single._replace(episodes=single.episodes._replace(disturbances=single.episodes.disturbances.astype(jnp.bfloat16)))
+    half = single._replace(
+        episodes=single.episodes._replace(
+            disturbances=single.episodes.disturbances.astype(jnp.bfloat16)
+        )
+    )
     F.save(tmp_path / "half", half)
     same(F.load(tmp_path / "half", FERRY)[0], half)
 
@@ -262,9 +360,17 @@ def test_load_refuses_what_does_not_fit(tmp_path, archive):
         F.load(tmp_path / "walk", FERRY)
     F.save(tmp_path / "ferry", F.empty(FERRY))
     longer = jast.Simulator(FERRY.init, FERRY.step, FERRY.disturbance, FERRY.evaluate, horizon=22)
-    with pytest.raises(ValueError, match=r"disturbances has float\d+\[21\], expected float\d+\[22\]"):
+    with pytest.raises(
+        ValueError, match=r"disturbances has float\d+\[21\], expected float\d+\[22\]"
+    ):
         F.load(tmp_path / "ferry", longer)
-    seeded = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s, lambda s: jast.distributions.seeds(), _far, horizon=21)
+    seeded = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s,
+        lambda s: jast.distributions.seeds(),
+        _far,
+        horizon=21,
+    )
     with pytest.raises(ValueError, match=r"disturbances has float\d+\[21\], expected uint32\[21\]"):
         F.load(tmp_path / "ferry", seeded)
 
@@ -293,7 +399,11 @@ def test_load_refuses_missing_and_changed_arrays(tmp_path, archive):
     F.save(path, archive)
     with np.load(path) as pack:
         arrays = dict(pack)
-    for change in (lambda a: a.pop("reward.0"), lambda a: a.update({"reward.0": a["reward.0"] + 1}), lambda a: a.update(extra=np.zeros(1))):
+    for change in (
+        lambda a: a.pop("reward.0"),
+        lambda a: a.update({"reward.0": a["reward.0"] + 1}),
+        lambda a: a.update(extra=np.zeros(1)),
+    ):
         changed = dict(arrays)
         change(changed)
         with open(path, "wb") as file:

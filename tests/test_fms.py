@@ -1,4 +1,6 @@
-"""The stand-in for a flight management system: its paths against a second implementation on Karney's geodesics, its events, and its measured rates."""
+"""The stand-in for a flight management system: its paths against a second implementation on
+Karney's geodesics, its events, and its measured rates.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,9 @@ CHUNK = 1024  # of routes: few programs, of one shape
 
 @jax.jit
 def _fly(sim, x):
-    return jax.lax.scan(lambda s, x: (jax.vmap(sim.step)(s, x), None), jax.vmap(lambda _: sim.init(()))(x[0]), x)[0]
+    return jax.lax.scan(
+        lambda s, x: (jax.vmap(sim.step)(s, x), None), jax.vmap(lambda _: sim.init(()))(x[0]), x
+    )[0]
 
 
 @jax.jit
@@ -36,11 +40,15 @@ def _judge(model, states):
 
 
 def judge(sim, states):
-    """The misses, whether the defect acted, and the legs (nmi) of many final states: NumPy arrays."""
+    """The misses, whether the defect acted, and the legs (nmi) of many final states: NumPy
+    arrays.
+    """
     n = len(states.t)
     judged = []
     for i in range(0, n, CHUNK):
-        chunk = jax.tree.map(lambda a, i=i: np.resize(np.asarray(a[i : i + CHUNK]), (CHUNK, *a.shape[1:])), states)
+        chunk = jax.tree.map(
+            lambda a, i=i: np.resize(np.asarray(a[i : i + CHUNK]), (CHUNK, *a.shape[1:])), states
+        )
         judged.append(jax.device_get(_judge(sim.init.args[0], chunk)))
     return jax.tree.map(lambda *a: np.concatenate(a)[:n], *judged)
 
@@ -68,7 +76,9 @@ def final(x):
 
 
 def turning(leg, courses=(200.0, 160.0)):
-    """A route whose two first turns are ``leg`` nmi apart: south, there on the first course, on on the second, and south again."""
+    """A route whose two first turns are ``leg`` nmi apart: south, there on the first course, on on
+    the second, and south again.
+    """
     x = np.tile([180.0, 50.0, 0.0, 0.0], (12, 1))
     x[1, :2], x[2, :2] = (courses[0], leg), (courses[1], 50.0)
     return x
@@ -78,9 +88,13 @@ def turning(leg, courses=(200.0, 160.0)):
 
 
 def reference(x, eps=0.03, bank=23.3, tas=450.0, every=False, snap=True):
-    """Packets (s, e, c, signed r, beta, straight) and the miss distances: plain Python on geographiclib."""
+    """Packets (s, e, c, signed r, beta, straight) and the miss distances: plain Python on
+    geographiclib.
+    """
     W = Geodesic.WGS84
-    ahead = lambda p, azimuth, m: (lambda g: ((g["lat2"], g["lon2"]), g["azi2"]))(W.Direct(*p, azimuth, m))
+    ahead = lambda p, azimuth, m: (lambda g: ((g["lat2"], g["lon2"]), g["azi2"]))(
+        W.Direct(*p, azimuth, m)
+    )
     wrapped = lambda degrees: (degrees + 180) % 360 - 180
     points = [KSFO]
     for course, distance, *_ in x:
@@ -116,27 +130,49 @@ def reference(x, eps=0.03, bank=23.3, tas=450.0, every=False, snap=True):
         straight = leads[i] + leads[i + 1] <= legs[i]["s12"]
         if snap and not straight:
             s = last
-        packets.append((s, e, c, np.copysign(radii[i], turns[i]), abs(turns[i]) * radii[i], straight))
+        packets.append(
+            (s, e, c, np.copysign(radii[i], turns[i]), abs(turns[i]) * radii[i], straight)
+        )
         last = e
     worst = gap = kink = bend = 0.0
     for i, (s, e, c, r, beta, straight) in enumerate(packets):
-        alpha = np.radians(np.sign(r) * (W.Inverse(*c, *e)["azi1"] - W.Inverse(*c, *s)["azi1"])) % (2 * np.pi)
+        alpha = np.radians(np.sign(r) * (W.Inverse(*c, *e)["azi1"] - W.Inverse(*c, *s)["azi1"])) % (
+            2 * np.pi
+        )
         alpha = 0 if 2 * np.pi - alpha < 1e-6 else alpha
         worst = max(worst, abs(beta - alpha * abs(r)) / FOOT)
         before = packets[i - 1][1] if i else KSFO
         if straight:
             g = W.Inverse(*before, *s)
             kink = max(kink, abs(wrapped(W.Inverse(*c, *s)["azi2"] - g["azi2"] + np.sign(r) * 90)))
-            bend = max(bend, abs(wrapped(g["azi1"] - W.Inverse(*points[i], *before)["azi2"])) if i and leads[i] else 0)
+            bend = max(
+                bend,
+                (
+                    abs(wrapped(g["azi1"] - W.Inverse(*points[i], *before)["azi2"]))
+                    if i and leads[i]
+                    else 0
+                ),
+            )
         elif i:
             gap = max(gap, W.Inverse(*before, *s)["s12"] / FOOT)
-    return packets, (100 * np.log(10 / max(worst, 1e-9)), 1e-3 - np.radians(kink), 10 - gap, np.radians(1 - bend))
+    return packets, (
+        100 * np.log(10 / max(worst, 1e-9)),
+        1e-3 - np.radians(kink),
+        10 - gap,
+        np.radians(1 - bend),
+    )
 
 
 HAND_MADE = [
-    turning(0.01), turning(0.01, (160.0, 220.0)), turning(0.029, (250.0, 110.0)), turning(0.031), turning(0.01, (200.0, 240.0)), turning(5.0),
-    turning(-0.02), turning(0.08),
-]  # fmt: skip
+    turning(0.01),
+    turning(0.01, (160.0, 220.0)),
+    turning(0.029, (250.0, 110.0)),
+    turning(0.031),
+    turning(0.01, (200.0, 240.0)),
+    turning(5.0),
+    turning(-0.02),
+    turning(0.08),
+]
 
 
 def test_packets_and_events_are_those_of_the_second_implementation():
@@ -163,19 +199,22 @@ def test_packets_and_events_are_those_of_the_second_implementation():
     assert 10 <= fails < len(xs)
 
 
-@pytest.mark.parametrize("x, settings, fails", [
-    (turning(0.01), {}, True),
-    (turning(0.01), dict(fixed=True), False),
-    (turning(0.01), dict(eps=0.005), False),
-    (turning(0.01), dict(snap=False), False),
-    (turning(0.01), dict(snap=False, event="disconnection"), True),
-    (turning(0.01), dict(event="disconnection"), False),
-    (turning(0.08), {}, False),
-    (turning(0.08), dict(eps=0.1), True),
-    (turning(0.01, (200.0, 240.0)), {}, False),  # both turns to the right
-    (turning(0.01, (200.0, 240.0)), dict(guard="all"), True),
-    (turning(0.01, (200.0, 240.0)), dict(guard="all", earth="sphere"), True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "x, settings, fails",
+    [
+        (turning(0.01), {}, True),
+        (turning(0.01), dict(fixed=True), False),
+        (turning(0.01), dict(eps=0.005), False),
+        (turning(0.01), dict(snap=False), False),
+        (turning(0.01), dict(snap=False, event="disconnection"), True),
+        (turning(0.01), dict(event="disconnection"), False),
+        (turning(0.08), {}, False),
+        (turning(0.08), dict(eps=0.1), True),
+        (turning(0.01, (200.0, 240.0)), {}, False),  # both turns to the right
+        (turning(0.01, (200.0, 240.0)), dict(guard="all"), True),
+        (turning(0.01, (200.0, 240.0)), dict(guard="all", earth="sphere"), True),
+    ],
+)
 def test_the_defect_acts_where_it_should(x, settings, fails):
     episode = jast.replay(fms(**settings), jnp.asarray(x))
     assert bool(episode.failure) == fails == (float(episode.distance) <= 0)
@@ -188,7 +227,10 @@ def test_an_arc_leads_nearly_all_the_way_round():
     angles = events.extent(sim.init.args[0].build.earth, path)
     assert 6.1 < angles[1] < 2 * np.pi and path.turn[0] > 1 and path.turn[1] < -0.6
     error = (angles[1] * abs(path.radius[1]) - path.beta[1]) / FOOT
-    assert float(episode.distance) == pytest.approx(100 * np.log(10 / float(error)), abs=1e-6) and float(episode.distance) < -980
+    assert (
+        float(episode.distance) == pytest.approx(100 * np.log(10 / float(error)), abs=1e-6)
+        and float(episode.distance) < -980
+    )
 
 
 # measured rates: within 4.5 standard errors of those of 400,000 routes
@@ -202,7 +244,11 @@ def test_rate_and_miss_distances():
     np.testing.assert_array_equal(fails, skipped)  # fails if and only if the defect acted
     rate = 1.29e-3
     assert abs(fails.mean() - rate) < 4.5 * np.sqrt(rate / n + 0.06e-3**2)
-    assert abs(d.mean() - 407.0) < 4.5 * 74 / np.sqrt(n) and 55 < d[~fails].std() < 60 and d[~fails].min() > 200
+    assert (
+        abs(d.mean() - 407.0) < 4.5 * 74 / np.sqrt(n)
+        and 55 < d[~fails].std() < 60
+        and d[~fails].min() > 200
+    )
     assert -1100 < d.min() < -900 and abs(d[fails].mean() + 845) < 4.5 * 110 / np.sqrt(fails.sum())
     assert fails.sum() < (legs.min(1) < 0.03).sum()  # near-duplicates do not always cause failures
     assert (np.array(found[1:]) > 0).all()  # the other events see nothing
@@ -223,9 +269,12 @@ def test_rate_and_miss_distances():
 
 def test_rate_of_short_legs():
     n = 5 * CHUNK
-    x = routes(n, 1, np.array([180.0, 1, -88.5, 66.8]), np.array([45.0, 3, 39.5, 24.4]))  # the thesis's first proposal of the cross-entropy method
+    # the thesis's first proposal of the cross-entropy method
+    x = routes(n, 1, np.array([180.0, 1, -88.5, 66.8]), np.array([45.0, 3, 39.5, 24.4]))
     d = fly(fms(), x)[0].arc_length
-    assert abs((d <= 0).mean() - 0.0428) < 4.5 * np.sqrt(0.0428 / n) and abs(d.mean() - 791) < 4.5 * 341 / np.sqrt(n)
+    assert abs((d <= 0).mean() - 0.0428) < 4.5 * np.sqrt(0.0428 / n) and abs(
+        d.mean() - 791
+    ) < 4.5 * 341 / np.sqrt(n)
     assert fly(fms(fixed=True), x[:CHUNK])[0].arc_length.min() > 0
 
 
@@ -233,7 +282,9 @@ def test_undisturbed():
     sim = fms()
     state = play(sim, np.tile(MEANS, (12, 1)))
     assert float(fms_misses(sim, state).arc_length) == pytest.approx(414.7, abs=0.1)
-    assert float(sim.disturbance(state).log_prob(jnp.asarray(MEANS))) - 2 == pytest.approx(-237.05 / 12, abs=1e-3)  # four normals: 2 below the mode, on average
+    assert float(sim.disturbance(state).log_prob(jnp.asarray(MEANS))) - 2 == pytest.approx(
+        -237.05 / 12, abs=1e-3
+    )  # four normals: 2 below the mode, on average
 
 
 def test_database():
@@ -252,7 +303,9 @@ def test_database():
     dist = sim.disturbance(sim.init(()))
     x = {"fix": jnp.int32(list(FIXES).index("SFO")), "wind": jnp.zeros(2)}
     assert dist.log_prob(x) == -jnp.inf  # the beacon of the airport is less than 5 nmi away
-    assert not np.diag(database.APART).any() and (database.APART[:-2] == database.APART[:-2].T).all()
+    assert (
+        not np.diag(database.APART).any() and (database.APART[:-2] == database.APART[:-2].T).all()
+    )
 
 
 # odd routes
@@ -265,20 +318,31 @@ def test_unfinished_routes_and_empty_states():
     for state in (zero, sim.init(()), full._replace(t=jnp.int32(1)), full._replace(t=jnp.int32(3))):
         assert np.isfinite(fms_misses(sim, state)).all()
     assert not bool(sim.evaluate(full._replace(t=jnp.int32(1)))[0]) and bool(sim.evaluate(full)[0])
-    short, path = jast.replay(sim, jnp.asarray(turning(0.01)[:3])), fms_path(sim, full._replace(t=jnp.int32(3)))
+    short, path = (
+        jast.replay(sim, jnp.asarray(turning(0.01)[:3])),
+        fms_path(sim, full._replace(t=jnp.int32(3))),
+    )
     assert bool(short.failure) and float(path.legs[4:].max()) == 0 and not path.arc[3:].any()
     few = fms(waypoints=3)  # ends where the cut one did
-    assert float(jast.replay(few, jnp.asarray(turning(0.01)[:3])).distance) == pytest.approx(float(short.distance), abs=1e-6)
-    assert np.isfinite(fms_misses(fms(waypoints=1), jast.replay(fms(waypoints=1), jnp.asarray(MEANS)[None]))).all()
+    assert float(jast.replay(few, jnp.asarray(turning(0.01)[:3])).distance) == pytest.approx(
+        float(short.distance), abs=1e-6
+    )
+    assert np.isfinite(
+        fms_misses(fms(waypoints=1), jast.replay(fms(waypoints=1), jnp.asarray(MEANS)[None]))
+    ).all()
 
 
 COURSE = st.one_of(st.sampled_from([0.0, 90.0, 180.0, 270.0, 360.0]), st.floats(-720, 720))
-LENGTH = st.one_of(st.sampled_from([0.0, 1e-9, 1e-6, 0.01, -0.01, 20.0, 50.0, 600.0]), st.floats(-200, 200))
+LENGTH = st.one_of(
+    st.sampled_from([0.0, 1e-9, 1e-6, 0.01, -0.01, 20.0, 50.0, 600.0]), st.floats(-200, 200)
+)
 WIND = st.one_of(st.just(0.0), st.floats(-500, 500))
 ROUTE = st.lists(st.tuples(COURSE, LENGTH, COURSE, WIND), min_size=12, max_size=12)
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(ROUTE, st.booleans(), st.booleans())
 def test_odd_routes_give_numbers(x, every, snap):
     for fixed in (False, True):
@@ -299,33 +363,69 @@ def test_contract(database, key):
     if database:
         return
     episode = jast.rollout(key, sim)
-    assert int(episode.length) == 12 and episode.distance.dtype == episode.log_prob.dtype == jnp.float64
-    assert float(fms_misses(sim, episode).arc_length) == float(fms_misses(sim, episode._replace(states=None)).arc_length)
-    assert float(fms_misses(sim, episode).arc_length) == pytest.approx(float(episode.distance), abs=1e-3)
-    assert sim.observe(jax.tree.map(lambda a: a[5], episode.states)).shape == (8,) and np.abs(sim.observe(sim.init(()))).max() < 5
+    assert (
+        int(episode.length) == 12
+        and episode.distance.dtype == episode.log_prob.dtype == jnp.float64
+    )
+    assert float(fms_misses(sim, episode).arc_length) == float(
+        fms_misses(sim, episode._replace(states=None)).arc_length
+    )
+    assert float(fms_misses(sim, episode).arc_length) == pytest.approx(
+        float(episode.distance), abs=1e-3
+    )
+    assert (
+        sim.observe(jax.tree.map(lambda a: a[5], episode.states)).shape == (8,)
+        and np.abs(sim.observe(sim.init(()))).max() < 5
+    )
 
 
 def test_settings_are_traced(key):
     before = [jast.rollout(key, fms()), system._evaluate._cache_size()]
-    for sim in (fms(0.1, 15, 300), fms(fixed=True), fms(guard="all", earth="sphere"), fms(jnp.float32(0.01), snap=False)):
+    for sim in (
+        fms(0.1, 15, 300),
+        fms(fixed=True),
+        fms(guard="all", earth="sphere"),
+        fms(jnp.float32(0.01), snap=False),
+    ):
         jast.rollout(key, sim)
         assert jax.tree.structure(sim) == jax.tree.structure(fms())
     assert system._evaluate._cache_size() == before[1]
 
 
-@pytest.mark.parametrize("bad, match", [
-    (lambda: fms(eps=-0.1), "fms: eps must be a number of nmi, at least 0, received -0.1"),
-    (lambda: fms(bank=90), "fms: bank must be a number of degrees between 0 and 90, received 90"),
-    (lambda: fms(tas=0.0), "fms: tas must be a number of knots, positive, received 0.0"),
-    (lambda: fms(waypoints=0), "fms: waypoints must be a whole number of at least 1"),
-    (lambda: fms(guard="some"), "fms: guard must be one of 's-turns', 'all', received 'some'"),
-    (lambda: fms(event="stall"), "fms: event must be one of 'arc length', 'kink', 'disconnection', 'course', received 'stall'"),
-    (lambda: fms(earth="flat"), "fms: earth must be one of 'wgs84', 'sphere', received 'flat'"),
-    (lambda: fms(fixed="no"), "fms: fixed must be True or False, received 'no'"),
-    (lambda: fms_path(jast.simulators.walk1d(), None), "fms_path: sim must be a jast.simulators.fms"),
-    (lambda: fms_misses(fms(), jnp.zeros(3)), "fms_misses: episode must be one Episode or FmsState of 12 waypoints"),
-    (lambda: fms_misses(fms(waypoints=3), fms().init(())), "fms_misses: episode must be one Episode or FmsState of 3 waypoints, received FmsState"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "bad, match",
+    [
+        (lambda: fms(eps=-0.1), "fms: eps must be a number of nmi, at least 0, received -0.1"),
+        (
+            lambda: fms(bank=90),
+            "fms: bank must be a number of degrees between 0 and 90, received 90",
+        ),
+        (lambda: fms(tas=0.0), "fms: tas must be a number of knots, positive, received 0.0"),
+        (lambda: fms(waypoints=0), "fms: waypoints must be a whole number of at least 1"),
+        (lambda: fms(guard="some"), "fms: guard must be one of 's-turns', 'all', received 'some'"),
+        (
+            lambda: fms(event="stall"),
+            (
+                "fms: event must be one of 'arc length', 'kink', 'disconnection', 'course',"
+                " received 'stall'"
+            ),
+        ),
+        (lambda: fms(earth="flat"), "fms: earth must be one of 'wgs84', 'sphere', received 'flat'"),
+        (lambda: fms(fixed="no"), "fms: fixed must be True or False, received 'no'"),
+        (
+            lambda: fms_path(jast.simulators.walk1d(), None),
+            "fms_path: sim must be a jast.simulators.fms",
+        ),
+        (
+            lambda: fms_misses(fms(), jnp.zeros(3)),
+            "fms_misses: episode must be one Episode or FmsState of 12 waypoints",
+        ),
+        (
+            lambda: fms_misses(fms(waypoints=3), fms().init(())),
+            "fms_misses: episode must be one Episode or FmsState of 3 waypoints, received FmsState",
+        ),
+    ],
+)
 def test_bad_settings(bad, match):
     with pytest.raises(ValueError, match=match):
         bad()

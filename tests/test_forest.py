@@ -1,4 +1,6 @@
-"""Forest and tree search as users see them: what a result holds, that it is honest, and that strange systems and bad input do no harm."""
+"""Forest and tree search as users see them: what a result holds, that it is honest, and that
+strange systems and bad input do no harm.
+"""
 
 import functools
 import json
@@ -35,10 +37,20 @@ def _count(s):
     return s >= 30, jnp.maximum(30 - s, 0).astype(jnp.zeros(()).dtype)
 
 
-DICE = jast.Simulator(lambda x0: jnp.zeros((), jnp.int32), lambda s, x: s + (x % 6).astype(jnp.int32), _dice, _count, 8)
+DICE = jast.Simulator(
+    lambda x0: jnp.zeros((), jnp.int32),
+    lambda s, x: s + (x % 6).astype(jnp.int32),
+    _dice,
+    _count,
+    8,
+)
 WALK, STATIC = jast.simulators.walk1d(threshold=6.0), jast.simulators.limit_state(_four_branches, 2)
 SYSTEMS = dict(ferry=FERRY, landing=LANDING, ring=RING, walk1d=WALK, limit_state=STATIC, dice=DICE)
-ACTIONS = dict(samples=jast.actions.samples(), quantiles=jast.actions.quantiles(), uniform=jast.actions.uniform(0.0, 1.0))
+ACTIONS = dict(
+    samples=jast.actions.samples(),
+    quantiles=jast.actions.quantiles(),
+    uniform=jast.actions.uniform(0.0, 1.0),
+)
 
 
 def searched(name, **changed):
@@ -57,11 +69,15 @@ def honest(result, sim, reward):
     assert (np.diff(archive.episodes.reward) <= 0).all()
     assert len({F.identity(archive.episode(i)) for i in range(archive.size)}) == archive.size
     assert (result.first_failure is None) == (archive.seen == 0)
-    assert result.failing.any() == (archive.seen > 0) and result.failing_trees == result.failing.mean()
+    assert (
+        result.failing.any() == (archive.seen > 0) and result.failing_trees == result.failing.mean()
+    )
     assert np.isfinite(result.roots.visits).all() and np.isfinite(result.roots.q).all()
     if archive.size:
         assert float(result.best.reward) == archive.episodes.reward[0]
-        np.testing.assert_allclose(result.best_reward_per_tree[result.failing].max(), result.best.reward, rtol=1e-4)
+        np.testing.assert_allclose(
+            result.best_reward_per_tree[result.failing].max(), result.best.reward, rtol=1e-4
+        )
         assert 1 <= result.first_failure <= result.episodes
     if archive.seen == 0:
         assert not result.best.failure
@@ -77,7 +93,8 @@ def replays(episode, sim, reward):
         assert a.dtype == b.dtype and a.tobytes() == b.tobytes(), name
 
 
-# --- what a result holds --------------------------------------------------------------------------------------------------------------------------------------
+# --- what a result holds
+# ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["ferry", "landing"])
@@ -85,10 +102,15 @@ def test_fields_are_as_documented(name):
     result, real = once(name), np.dtype(jnp.zeros(()).dtype)
     horizon = SYSTEMS[name].horizon
     assert isinstance(result, jast.search.SearchResult)
-    assert result.best.disturbances.shape == (horizon,) and jax.tree.leaves(result.best.states)[0].shape == (horizon + 1,)
+    assert result.best.disturbances.shape == (horizon,) and jax.tree.leaves(result.best.states)[
+        0
+    ].shape == (horizon + 1,)
     assert (result.best_reward_per_tree.shape, result.best_reward_per_tree.dtype) == ((6,), real)
     assert (result.failing.shape, result.failing.dtype) == ((6,), np.dtype(bool))
-    assert all(type(v) is int for v in (result.episodes, result.simulator_steps, result.invalid)) and type(result.failing_share) is float
+    assert (
+        all(type(v) is int for v in (result.episodes, result.simulator_steps, result.invalid))
+        and type(result.failing_share) is float
+    )
     assert result.first_failure is None if name == "ferry" else type(result.first_failure) is int
     history = result.history
     moments = history.simulations.shape[0]
@@ -97,9 +119,19 @@ def test_fields_are_as_documented(name):
     np.testing.assert_array_equal(history.best_reward[-1], result.best_reward_per_tree)
     roots = result.roots
     children = roots.visits.shape[2]
-    assert roots.depth.shape == roots.valid.shape == (3, 6) and roots.visits.shape == roots.q.shape == roots.actions.shape == (3, 6, children)
-    assert jax.tree.leaves(roots.starts) == [] if name == "ferry" else roots.starts.shape == (3, 6, children)
-    assert all(isinstance(leaf, np.ndarray | np.generic | int | float | str) for leaf in jax.tree.leaves(result._replace(settings=None)))
+    assert roots.depth.shape == roots.valid.shape == (
+        3,
+        6,
+    ) and roots.visits.shape == roots.q.shape == roots.actions.shape == (3, 6, children)
+    assert (
+        jax.tree.leaves(roots.starts) == []
+        if name == "ferry"
+        else roots.starts.shape == (3, 6, children)
+    )
+    assert all(
+        isinstance(leaf, np.ndarray | np.generic | int | float | str)
+        for leaf in jax.tree.leaves(result._replace(settings=None))
+    )
 
 
 @pytest.mark.parametrize("name", ["ferry", "landing", "ring"])
@@ -138,7 +170,18 @@ def test_the_first_failure_is_counted_in_the_order_of_simulation():
 
 def test_settings_say_what_was_asked_and_are_saved_with_the_failures(tmp_path, equal):
     result = once("landing")
-    asked = dict(method="forest", mode="default", memoize="node", exploration=10.0, widening=[2.0, 0.5], spread=True, focus=1.0) | SIZE
+    asked = (
+        dict(
+            method="forest",
+            mode="default",
+            memoize="node",
+            exploration=10.0,
+            widening=[2.0, 0.5],
+            spread=True,
+            focus=1.0,
+        )
+        | SIZE
+    )
     assert json.loads(json.dumps(result.settings)) == result.settings
     assert asked.items() <= result.settings.items()
     F.save(tmp_path / "found.jast", result.failures, result.settings)
@@ -150,44 +193,66 @@ def test_settings_say_what_was_asked_and_are_saved_with_the_failures(tmp_path, e
 def test_a_result_is_readable():
     found, none = str(once("landing")), str(once("ferry"))
     for text in (found, none):
-        assert text.splitlines()[0].split()[:3] == ["method", "episodes", "steps"] and "forest" in text and str(EPISODES) in text
+        assert (
+            text.splitlines()[0].split()[:3] == ["method", "episodes", "steps"]
+            and "forest" in text
+            and str(EPISODES) in text
+        )
         assert max(map(len, text.splitlines())) < 120
     assert "likeliest failure: reward" in found
     assert "no failure was found; the nearest episode came to distance" in none
 
 
 def test_random_starts_are_found():
-    """x0 is chosen by the tree: it differs between failures, and the first root's children are starts."""
+    """x0 is chosen by the tree: it differs between failures, and the first root's children are
+    starts.
+    """
     result = once("landing")
     assert np.unique(result.failures.episodes.x0).size > 5
     first = result.roots.visits[0] > 0
     np.testing.assert_allclose(result.roots.starts[0][first].std(), 0.1, rtol=0.5)
     mixed = once("ring")
-    assert np.issubdtype(mixed.failures.episodes.x0["hit"].dtype, np.integer) and set(np.unique(mixed.failures.episodes.x0["hit"])) <= {0, 1}
+    assert np.issubdtype(mixed.failures.episodes.x0["hit"].dtype, np.integer) and set(
+        np.unique(mixed.failures.episodes.x0["hit"])
+    ) <= {0, 1}
     assert mixed.failures.episodes.disturbances["gust"].shape == (mixed.failures.size, 8, 2)
 
 
 def test_mcts_is_a_forest_of_one_root(equal):
     size = dict(trees=6, simulations=60, reward=BONUS, widening=(2.0, 0.5))
-    one, other = mcts(jax.random.key(0), LANDING, **size), forest(jax.random.key(0), LANDING, prunes=1, **size)
+    one, other = (
+        mcts(jax.random.key(0), LANDING, **size),
+        forest(jax.random.key(0), LANDING, prunes=1, **size),
+    )
     assert one.settings["method"] == "mcts"
     equal(one._replace(settings=None), other._replace(settings=None))
 
 
-# --- all kinds of systems and actions -------------------------------------------------------------------------------------------------------------------------
+# --- all kinds of systems and actions
+# ----------------------------------------------------------------------------
 
 
-KINDS = dict(samples=SYSTEMS, quantiles=("landing", "ring", "limit_state", "dice"), uniform=("ferry", "ring", "dice"))
+KINDS = dict(
+    samples=SYSTEMS,
+    quantiles=("landing", "ring", "limit_state", "dice"),
+    uniform=("ferry", "ring", "dice"),
+)
 
 
-@pytest.mark.parametrize(("actions", "name"), [(actions, name) for actions, names in KINDS.items() for name in names])
+@pytest.mark.parametrize(
+    ("actions", "name"), [(actions, name) for actions, names in KINDS.items() for name in names]
+)
 def test_all_actions_search_all_systems(name, actions):
     reward = S0["reward"] if name == "ferry" else BONUS
     if (name, actions) == ("dice", "quantiles"):
         with pytest.raises(ValueError, match="Seeds has no quantile function"):
             searched(name, actions=ACTIONS[actions])
         return
-    result = once(name, actions=ACTIONS[actions]) if actions == "samples" else searched(name, actions=ACTIONS[actions])
+    result = (
+        once(name, actions=ACTIONS[actions])
+        if actions == "samples"
+        else searched(name, actions=ACTIONS[actions])
+    )
     honest(result, SYSTEMS[name], reward)
     assert 6 * 60 <= result.episodes <= EPISODES and result.invalid == 0
     if actions == "samples" and name != "ferry":
@@ -215,7 +280,11 @@ def test_a_simulator_that_returns_nan_is_counted_and_never_best():
 def test_a_simulator_that_returns_only_nan():
     sim = walk(step=lambda s, x: s * jnp.nan)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
-    assert result.invalid == result.episodes > 0 and result.failures.size == 0 and not result.best.failure
+    assert (
+        result.invalid == result.episodes > 0
+        and result.failures.size == 0
+        and not result.best.failure
+    )
     np.testing.assert_array_equal(result.best_reward_per_tree, -np.inf)
     assert "no failure was found" in str(result)
     honest(result, sim, BONUS)
@@ -224,7 +293,11 @@ def test_a_simulator_that_returns_only_nan():
 def test_a_system_that_never_fails():
     sim = walk(fails=lambda s: s > 1e6)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
-    assert result.failures.size == result.failures.seen == 0 and result.first_failure is None and result.failing_share == 0
+    assert (
+        result.failures.size == result.failures.seen == 0
+        and result.first_failure is None
+        and result.failing_share == 0
+    )
     assert "no failure was found" in str(result) and "no failure was found" in str(result.failures)
     honest(result, sim, BONUS)
 
@@ -232,16 +305,27 @@ def test_a_system_that_never_fails():
 def test_a_system_that_fails_at_its_start_takes_one_episode_a_tree():
     sim = walk(fails=lambda s: s > -1.0)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
-    assert (result.episodes, result.simulator_steps, result.first_failure, result.failing_share) == (6, 0, 1, 1.0)
-    assert result.best.length == 0 and result.failures.size == 1 and result.failures.seen == result.failures.counts[0] == 6
+    assert (
+        result.episodes,
+        result.simulator_steps,
+        result.first_failure,
+        result.failing_share,
+    ) == (6, 0, 1, 1.0)
+    assert (
+        result.best.length == 0
+        and result.failures.size == 1
+        and result.failures.seen == result.failures.counts[0] == 6
+    )
     honest(result, sim, BONUS)
 
 
 def test_a_system_that_always_fails_at_its_first_step():
     sim = walk(step=lambda s, x: jnp.full_like(s, 4.0))
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
-    assert result.episodes == 6 * 60 and result.failing_share == 1.0 and result.first_failure == 1  # the next root would be an episode's end
-    assert result.simulator_steps < result.episodes  # an end that is visited again is not simulated again
+    # the next root would be an episode's end
+    assert result.episodes == 6 * 60 and result.failing_share == 1.0 and result.first_failure == 1
+    # an end that is visited again is not simulated again
+    assert result.simulator_steps < result.episodes
     assert (result.failures.episodes.length == 1).all()
     honest(result, sim, BONUS)
 
@@ -249,14 +333,17 @@ def test_a_system_that_always_fails_at_its_first_step():
 def test_trees_that_end_early_end_apart():
     """A tree whose root is an episode's end stops; the others go on, also those of other groups."""
     sim = walk(fails=lambda s: s > 2.0)
-    result = forest(jax.random.key(0), sim, trees=6, prunes=6, simulations=60, reward=BONUS, lanes=2)
+    result = forest(
+        jax.random.key(0), sim, trees=6, prunes=6, simulations=60, reward=BONUS, lanes=2
+    )
     turns = result.roots.valid.sum(0)
     assert turns.min() < turns.max()
     assert result.episodes == 60 * turns.sum()
     honest(result, sim, BONUS)
 
 
-# --- interruption and input -----------------------------------------------------------------------------------------------------------------------------------
+# --- interruption and input
+# ----------------------------------------------------------------------------
 
 
 def test_an_interrupted_search_says_so():
@@ -264,7 +351,17 @@ def test_an_interrupted_search_says_so():
         assert 0 < done <= total == 12 * 18 * 400
         raise KeyboardInterrupt
 
-    result = forest(jax.random.key(0), FERRY, trees=12, prunes=18, simulations=400, lanes=6, threads=1, **S0, callback=stop)
+    result = forest(
+        jax.random.key(0),
+        FERRY,
+        trees=12,
+        prunes=18,
+        simulations=400,
+        lanes=6,
+        threads=1,
+        **S0,
+        callback=stop,
+    )
     assert 0 < result.episodes < 12 * 18 * 400
     assert "of 86400 simulations" in result.settings["interrupted"] and "interrupted" in str(result)
     honest(result, FERRY, S0["reward"])
@@ -277,7 +374,17 @@ def test_an_error_of_the_callback_ends_the_search_at_once():
 
     began = time.perf_counter()
     with pytest.raises(RuntimeError, match="enough"):
-        forest(jax.random.key(0), FERRY, trees=6000, prunes=18, simulations=400, lanes=6, threads=1, **S0, callback=fail)
+        forest(
+            jax.random.key(0),
+            FERRY,
+            trees=6000,
+            prunes=18,
+            simulations=400,
+            lanes=6,
+            threads=1,
+            **S0,
+            callback=fail,
+        )
     assert time.perf_counter() - began < 60  # all of it would take minutes
 
 
@@ -290,12 +397,25 @@ def test_the_callback_is_told_of_every_simulation():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("trees", 0), ("prunes", -1), ("simulations", 0), ("simulations", 2.5), ("top", 0), ("threads", 0), ("lanes", 0), ("widening", (1.0,)),
-        ("widening", 2.0), ("widening", (0.0, 0.5)), ("widening", (1.0, 1.5)),
-        ("widening", (float("nan"), 0.5)), ("mode", "published"), ("memoize", "leaf"), ("trees", True),
-        ("focus", 0.0), ("focus", -1.0),
+        ("trees", 0),
+        ("prunes", -1),
+        ("simulations", 0),
+        ("simulations", 2.5),
+        ("top", 0),
+        ("threads", 0),
+        ("lanes", 0),
+        ("widening", (1.0,)),
+        ("widening", 2.0),
+        ("widening", (0.0, 0.5)),
+        ("widening", (1.0, 1.5)),
+        ("widening", (float("nan"), 0.5)),
+        ("mode", "published"),
+        ("memoize", "leaf"),
+        ("trees", True),
+        ("focus", 0.0),
+        ("focus", -1.0),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_named(name, value):
     with pytest.raises(ValueError, match=f"forest: {name} must .*received"):
         searched("ferry", **{name: value})
@@ -313,19 +433,28 @@ def test_a_simulator_that_breaks_its_contract_is_refused():
         forest(jax.random.key(0), FERRY, trees=2, prunes=18, simulations=2**20)
 
 
-# --- tracing --------------------------------------------------------------------------------------------------------------------------------------------------
+# --- tracing
+# ----------------------------------------------------------------------------
 
 
 def test_a_second_simulator_of_a_kind_does_not_recompile():
     once("ferry")
     before = run._grow._cache_size(), run._prune._cache_size(), run._rebuild._cache_size()
-    forest(jax.random.key(5), jast.simulators.ferry(adversary=(17.0, 0.0)), **SIZE, **S0, exploration=5.0)
+    forest(
+        jax.random.key(5),
+        jast.simulators.ferry(adversary=(17.0, 0.0)),
+        **SIZE,
+        **S0,
+        exploration=5.0,
+    )
     assert (run._grow._cache_size(), run._prune._cache_size(), run._rebuild._cache_size()) == before
 
 
 @jax.jit
 def best_of(key, adversary, exploration):
-    return forest(key, jast.simulators.ferry(adversary), **SIZE, **S0, exploration=exploration).best_reward_per_tree
+    return forest(
+        key, jast.simulators.ferry(adversary), **SIZE, **S0, exploration=exploration
+    ).best_reward_per_tree
 
 
 def test_a_traced_search_is_the_same_search():
@@ -343,8 +472,12 @@ def test_vmap_over_simulators_is_a_loop():
 
 def test_vmap_over_a_setting_is_a_loop():
     weights = jnp.array([0.5, 10.0, 40.0])
-    together = jax.vmap(best_of, in_axes=(None, None, 0))(jax.random.key(3), jnp.array([16.0, 0.0]), weights)
-    apart = jnp.stack([best_of(jax.random.key(3), jnp.array([16.0, 0.0]), weight) for weight in weights])
+    together = jax.vmap(best_of, in_axes=(None, None, 0))(
+        jax.random.key(3), jnp.array([16.0, 0.0]), weights
+    )
+    apart = jnp.stack(
+        [best_of(jax.random.key(3), jnp.array([16.0, 0.0]), weight) for weight in weights]
+    )
     np.testing.assert_allclose(together, apart, rtol=1e-4)
     assert (together[0] != together[1]).any()
 
@@ -354,7 +487,11 @@ def test_a_traced_result_counts_as_an_eager_one():
     eager = once("landing")
     traced = jax.jit(lambda key: forest(key, LANDING, **SIZE, reward=BONUS))(jax.random.key(3))
     assert traced.failures is None and traced.history is None
-    assert (traced.episodes, traced.simulator_steps, traced.first_failure) == (eager.episodes, eager.simulator_steps, eager.first_failure)
+    assert (traced.episodes, traced.simulator_steps, traced.first_failure) == (
+        eager.episodes,
+        eager.simulator_steps,
+        eager.first_failure,
+    )
     np.testing.assert_allclose(traced.failing_share, eager.failing_share, rtol=1e-6)
     np.testing.assert_array_equal(traced.failing, eager.failing)
     np.testing.assert_allclose(traced.best.reward, eager.best.reward, rtol=1e-4)
@@ -364,30 +501,53 @@ def test_a_traced_result_counts_as_an_eager_one():
 
 def test_float64_within_a_block(x64):
     """Precision that is set for a block of code holds in the search's own threads."""
-    choices = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
+    choices = dict(
+        reward=jast.rewards.standard(event_bonus=30.0, density="mode"),
+        actions=jast.actions.uniform(0.0, 1.0),
+    )
     ferry = jast.simulators.ferry()
     result = forest(jax.random.key(3), ferry, **SIZE, **choices)
-    assert result.best_reward_per_tree.dtype == result.best.reward.dtype == result.roots.q.dtype == np.float64
+    assert (
+        result.best_reward_per_tree.dtype
+        == result.best.reward.dtype
+        == result.roots.q.dtype
+        == np.float64
+    )
     honest(result, ferry, choices["reward"])
 
 
-# --- what it is for -------------------------------------------------------------------------------------------------------------------------------------------
+# --- what it is for
+# ----------------------------------------------------------------------------
 
 
 def test_a_forest_beats_random_search():
-    """At equal budget, on a walk that fails about once in 8000 episodes, a forest sees far more failures, and a likelier one."""
-    sim, reward = jast.simulators.walk1d("one-sided", threshold=12.0), jast.rewards.standard(event_bonus=20.0, density="mode")
-    result = forest(jax.random.key(1), sim, trees=10, prunes=8, simulations=150, reward=reward, exploration=3.0)
-    random = jax.vmap(lambda key: jast.rollout(key, sim, reward=reward)._replace(states=None))(jax.random.split(jax.random.key(101), result.episodes))
+    """At equal budget, on a walk that fails about once in 8000 episodes, a forest sees far more
+    failures, and a likelier one.
+    """
+    sim, reward = (
+        jast.simulators.walk1d("one-sided", threshold=12.0),
+        jast.rewards.standard(event_bonus=20.0, density="mode"),
+    )
+    result = forest(
+        jax.random.key(1), sim, trees=10, prunes=8, simulations=150, reward=reward, exploration=3.0
+    )
+    random = jax.vmap(lambda key: jast.rollout(key, sim, reward=reward)._replace(states=None))(
+        jax.random.split(jax.random.key(101), result.episodes)
+    )
     assert result.failing_share > 10 * float(random.failure.mean())
     assert result.best.reward > random.reward.max()
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("search", "share", "within"), [(forest, 0.298, 0.04), (mcts, 0.405, 0.045)])
+@pytest.mark.parametrize(
+    ("search", "share", "within"), [(forest, 0.298, 0.04), (mcts, 0.405, 0.045)]
+)
 def test_the_published_failure_rates_on_s0(search, share, within):
-    """Share of 1000 trees of 9000 simulations that find a collision: MCFS-AP without networks, and MCTS-SA."""
+    """Share of 1000 trees of 9000 simulations that find a collision: MCFS-AP without networks, and
+    MCTS-SA.
+    """
     size = dict(prunes=18, simulations=500) if search is forest else dict(simulations=9000)
     result = search(jax.random.key(0), FERRY, trees=1000, mode="paper", **size, **S0)
-    assert 0.999 * 9_000_000 < result.episodes <= 9_000_000  # a tree whose root is a collision ends early
+    # a tree whose root is a collision ends early
+    assert 0.999 * 9_000_000 < result.episodes <= 9_000_000
     assert abs(result.failing_trees - share) < within

@@ -22,8 +22,14 @@ def sklearn_process(kernel, x, y, lengthscale, noise, variance):
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
-    shape = RBF(lengthscale) if kernel == "squared exponential" else Matern(lengthscale, nu={"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}[kernel])
-    return GaussianProcessRegressor(ConstantKernel(variance) * shape, alpha=noise * variance, optimizer=None).fit(x, y)
+    shape = (
+        RBF(lengthscale)
+        if kernel == "squared exponential"
+        else Matern(lengthscale, nu={"matern12": 0.5, "matern32": 1.5, "matern52": 2.5}[kernel])
+    )
+    return GaussianProcessRegressor(
+        ConstantKernel(variance) * shape, alpha=noise * variance, optimizer=None
+    ).fit(x, y)
 
 
 @pytest.mark.parametrize("kernel", gp.KERNELS)
@@ -40,7 +46,9 @@ def test_posterior_and_likelihood_are_those_of_scikit_learn(kernel, x64):
     np.testing.assert_allclose(ours, mean, atol=1e-8)
     np.testing.assert_allclose(spread, deviation**2, atol=1e-8 * variance)
     np.testing.assert_allclose(gp.predict(fitted, jnp.asarray(new)), ours)
-    assert float(fitted.log_likelihood) == pytest.approx(peer.log_marginal_likelihood_value_, abs=1e-7)
+    assert float(fitted.log_likelihood) == pytest.approx(
+        peer.log_marginal_likelihood_value_, abs=1e-7
+    )
 
 
 def test_the_variance_is_the_likeliest(x64):
@@ -48,7 +56,9 @@ def test_the_variance_is_the_likeliest(x64):
     fitted = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(25, bool), (0.9,), (1e-3,))
     best = float(fitted.log_likelihood)
     for factor in (0.9, 0.99, 1.01, 1.1):
-        peer = sklearn_process("squared exponential", x, y, 0.9, float(fitted.noise), factor * float(fitted.variance))
+        peer = sklearn_process(
+            "squared exponential", x, y, 0.9, float(fitted.noise), factor * float(fitted.variance)
+        )
         assert peer.log_marginal_likelihood_value_ < best
 
 
@@ -59,10 +69,15 @@ def test_the_grid_gives_its_likeliest_point(x64):
     each = {(a, b): float(fit((a,), (b,)).log_likelihood) for a in lengthscales for b in noises}
     chosen = fit(lengthscales, noises)
     a, b = max(each, key=each.get)
-    assert (float(chosen.lengthscale), float(chosen.noise)) == (pytest.approx(a), pytest.approx(b + gp.JITTER))
+    assert (float(chosen.lengthscale), float(chosen.noise)) == (
+        pytest.approx(a),
+        pytest.approx(b + gp.JITTER),
+    )
     assert float(chosen.log_likelihood) == pytest.approx(each[a, b])
     noisy = np.random.default_rng(3).normal(size=30)  # white noise: the most noise
-    assert float(gp.fit(jnp.asarray(x), jnp.asarray(noisy), jnp.ones(30, bool), lengthscales, noises).noise) == pytest.approx(1 + gp.JITTER)
+    assert float(
+        gp.fit(jnp.asarray(x), jnp.asarray(noisy), jnp.ones(30, bool), lengthscales, noises).noise
+    ) == pytest.approx(1 + gp.JITTER)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -71,7 +86,11 @@ def test_masked_rows_do_nothing(dtype, x64):
     new = jnp.asarray(data(15, 2, dtype, 1)[0])
     whole = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(20, bool), gp.LENGTHSCALES)
     at = np.sort(np.random.default_rng(0).permutation(29)[:20])
-    padded, values, mask = np.full((29, 2), np.nan, dtype), np.full(29, np.inf, dtype), np.zeros(29, bool)
+    padded, values, mask = (
+        np.full((29, 2), np.nan, dtype),
+        np.full(29, np.inf, dtype),
+        np.zeros(29, bool),
+    )
     padded[at], values[at], mask[at] = x, y, True
     part = gp.fit(jnp.asarray(padded), jnp.asarray(values), jnp.asarray(mask), gp.LENGTHSCALES)
     assert (part.lengthscale, part.noise) == (whole.lengthscale, whole.noise)
@@ -102,17 +121,28 @@ def test_equal_points_and_equal_values_are_finite():
 def test_it_vmaps():
     x, y = data(12, 2, np.float32)
     xs, ys = jnp.stack([x, 2 * x]), jnp.stack([y, -y])
-    both = jax.vmap(lambda x, y: gp.predict(gp.fit(x, y, jnp.ones(12, bool), gp.LENGTHSCALES), x[:3] + 0.1))(xs, ys)
+    both = jax.vmap(
+        lambda x, y: gp.predict(gp.fit(x, y, jnp.ones(12, bool), gp.LENGTHSCALES), x[:3] + 0.1)
+    )(xs, ys)
     for i in range(2):
         one = gp.predict(gp.fit(xs[i], ys[i], jnp.ones(12, bool), gp.LENGTHSCALES), xs[i, :3] + 0.1)
-        np.testing.assert_allclose(both[i], one, rtol=2e-2, atol=2e-2)  # float32, condition up to 1e4
+        # float32, condition up to 1e4
+        np.testing.assert_allclose(both[i], one, rtol=2e-2, atol=2e-2)
 
 
 def test_bad_input_is_named():
     x, y = jnp.zeros((4, 2)), jnp.zeros(4)
-    with pytest.raises(ValueError, match=r"gaussian_process.fit: kernel must be one of \['squared exponential', .*received 'cubic'"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"gaussian_process.fit: kernel must be one of \['squared exponential', .*received"
+            r" 'cubic'"
+        ),
+    ):
         gp.fit(x, y, y == 0, (1.0,), kernel="cubic")
-    with pytest.raises(ValueError, match=r"x must be \[n, d\], y and mask \[n\], received \(4, 2\), \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"x must be \[n, d\], y and mask \[n\], received \(4, 2\), \(3,\)"
+    ):
         gp.fit(x, y[:3], y == 0, (1.0,))
 
 
@@ -124,16 +154,25 @@ def test_least_squares_are_those_of_numpy(kind, x64):
     features = {
         "linear": lambda a, b: np.stack([a**0, a, b]),
         "polynomial": lambda a, b: np.stack([a**0, a, b, a * a, a * b, b * b]),
-        "radial basis": lambda a, b: np.exp(-((a[None] - x[:, :1]) ** 2 + (b[None] - x[:, 1:]) ** 2) / 4),
+        "radial basis": lambda a, b: np.exp(
+            -((a[None] - x[:, :1]) ** 2 + (b[None] - x[:, 1:]) ** 2) / 4
+        ),
     }[kind]
     m = features(a, b).T
     normal = m.T @ m
-    weights = np.linalg.solve(normal + surrogates.RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal)), m.T @ y)
+    weights = np.linalg.solve(
+        normal + surrogates.RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal)), m.T @ y
+    )
     new = data(30, 2, seed=2)[0]
     mask = jnp.arange(45) < 40
-    padded = jnp.asarray(np.concatenate([x, np.full((5, 2), np.nan)])), jnp.asarray(np.concatenate([y, np.full(5, np.nan)]))
+    padded = (
+        jnp.asarray(np.concatenate([x, np.full((5, 2), np.nan)])),
+        jnp.asarray(np.concatenate([y, np.full(5, np.nan)])),
+    )
     fitted = surrogates.fit(kind, *padded, mask, frame)
-    np.testing.assert_allclose(surrogates.predict(kind, fitted, jnp.asarray(new)), features(*new.T).T @ weights, rtol=2e-4)
+    np.testing.assert_allclose(
+        surrogates.predict(kind, fitted, jnp.asarray(new)), features(*new.T).T @ weights, rtol=2e-4
+    )
 
 
 def test_a_polynomial_finds_a_paraboloid(x64):
@@ -142,14 +181,21 @@ def test_a_polynomial_finds_a_paraboloid(x64):
     mask = jnp.ones(30, bool)
     frame = surrogates.frame(x, mask)
     new = jnp.asarray(data(10, 3, seed=1)[0])
-    np.testing.assert_allclose(surrogates.predict("polynomial", surrogates.fit("polynomial", x, f(x), mask, frame), new), f(new), atol=0.02)
+    np.testing.assert_allclose(
+        surrogates.predict("polynomial", surrogates.fit("polynomial", x, f(x), mask, frame), new),
+        f(new),
+        atol=0.02,
+    )
 
 
 FINITE = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.lists(FINITE | st.sampled_from([np.nan, np.inf, -np.inf]), min_size=1, max_size=12), st.integers(0, 4))
+@given(
+    st.lists(FINITE | st.sampled_from([np.nan, np.inf, -np.inf]), min_size=1, max_size=12),
+    st.integers(0, 4),
+)
 def test_ranks_are_normal_scores(values, padding):
     from scipy.stats import norm, rankdata
 
@@ -164,7 +210,10 @@ def test_ranks_are_normal_scores(values, padding):
 
 
 def test_other_warps_leave_out_what_is_not_finite():
-    y, mask = jnp.array([1.0, -4.0, jnp.nan, 2.0, jnp.inf, 9.0]), jnp.array([True, True, True, True, True, False])
+    y, mask = (
+        jnp.array([1.0, -4.0, jnp.nan, 2.0, jnp.inf, 9.0]),
+        jnp.array([True, True, True, True, True, False]),
+    )
     raw, kept = surrogates.warped("raw", y, mask)
     np.testing.assert_array_equal(kept, [True, True, False, True, False, False])
     np.testing.assert_allclose(raw[kept], [0.25, -1, 0.5])
@@ -181,18 +230,27 @@ def test_other_warps_leave_out_what_is_not_finite():
 def test_no_monotone_change_alters_the_ranks():
     y = jnp.asarray(data(20, 2, np.float32)[1])
     mask = jnp.ones(20, bool)
-    np.testing.assert_array_equal(surrogates.warped("rank", y, mask)[0], surrogates.warped("rank", jnp.exp(3 * y) - 5, mask)[0])
+    np.testing.assert_array_equal(
+        surrogates.warped("rank", y, mask)[0],
+        surrogates.warped("rank", jnp.exp(3 * y) - 5, mask)[0],
+    )
 
 
 def test_a_frame_whitens(x64):
     rng = np.random.default_rng(0)
-    x = jnp.asarray(rng.multivariate_normal([5, -3, 1], [[4, 1.5, 0], [1.5, 1, 0], [0, 0, 1e-6]], size=200))
+    x = jnp.asarray(
+        rng.multivariate_normal([5, -3, 1], [[4, 1.5, 0], [1.5, 1, 0], [0, 0, 1e-6]], size=200)
+    )
     f = surrogates.frame(x, jnp.ones(200, bool))
     z = np.linalg.solve(f.factor, (np.asarray(x) - np.asarray(f.centre)).T)
     np.testing.assert_allclose(z.mean(1), 0, atol=1e-9)
-    values = np.linalg.eigvalsh(np.cov(z, bias=True))  # a tenth of the identity is kept: between 1 / (0.9 + 0.1 / l) for the eigenvalues l of the correlation
+    # a tenth of the identity is kept: between 1 / (0.9 + 0.1 / l) for the eigenvalues l of the
+    # correlation
+    values = np.linalg.eigvalsh(np.cov(z, bias=True))
     correlation = np.linalg.eigvalsh(np.corrcoef(x.T))
-    np.testing.assert_allclose(np.sort(values), np.sort(correlation / (0.9 * correlation + 0.1)), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(values), np.sort(correlation / (0.9 * correlation + 0.1)), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2])
@@ -207,5 +265,7 @@ def test_a_frame_of_few_points_is_sound(rows):
 def test_surrogates_of_few_points_are_finite(kind, n):
     x, y = data(3, 4, np.float32)
     mask = jnp.arange(3) < n
-    fitted = surrogates.fit(kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.frame(jnp.asarray(x), mask))
+    fitted = surrogates.fit(
+        kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.frame(jnp.asarray(x), mask)
+    )
     assert np.isfinite(surrogates.predict(kind, fitted, jnp.asarray(x) + 1)).all()

@@ -1,4 +1,6 @@
-"""The geodesics of the flight management system against Karney's library, and against the closed forms of a sphere."""
+"""The geodesics of the flight management system against Karney's library, and against the closed
+forms of a sphere.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,9 @@ def earth(name="wgs84"):
 
 
 def legs(n=600, seed=0):
-    """Points, azimuths (degrees) and distances (m) of legs of .001 to 3000 nmi, half of them backwards."""
+    """Points, azimuths (degrees) and distances (m) of legs of .001 to 3000 nmi, half of them
+    backwards.
+    """
     rng = np.random.default_rng(seed)
     points = np.stack([rng.uniform(-85, 85, n), rng.uniform(-180, 180, n)], -1)
     distance = 1852 * 10 ** rng.uniform(-3, np.log10(3000), n) * rng.choice([-1, 1], n)
@@ -35,8 +39,12 @@ def turned(a, degrees):
 
 def test_direct():
     points, azimuth, distance = legs()
-    found, course = direct(earth(), jnp.asarray(points), jnp.radians(jnp.asarray(azimuth)), jnp.asarray(distance))
-    true = [Geodesic.WGS84.Direct(*p, z, s) for p, z, s in zip(points, azimuth, distance, strict=True)]
+    found, course = direct(
+        earth(), jnp.asarray(points), jnp.radians(jnp.asarray(azimuth)), jnp.asarray(distance)
+    )
+    true = [
+        Geodesic.WGS84.Direct(*p, z, s) for p, z, s in zip(points, azimuth, distance, strict=True)
+    ]
     end = np.array([[g["lat2"], g["lon2"]] for g in true])
     assert found.dtype == jnp.float64 and apart(np.asarray(found), end).max() < 1e-8
     flat = np.abs(end[:, 0]) < 85  # a course has no meaning at the poles
@@ -45,7 +53,15 @@ def test_direct():
 
 def test_inverse():
     points, azimuth, distance = legs(seed=1)
-    ends = np.array([[g["lat2"], g["lon2"]] for g in (Geodesic.WGS84.Direct(*p, z, s) for p, z, s in zip(points, azimuth, distance, strict=True))])
+    ends = np.array(
+        [
+            [g["lat2"], g["lon2"]]
+            for g in (
+                Geodesic.WGS84.Direct(*p, z, s)
+                for p, z, s in zip(points, azimuth, distance, strict=True)
+            )
+        ]
+    )
     found, first, last = inverse(earth(), jnp.asarray(points), jnp.asarray(ends))
     true = [Geodesic.WGS84.Inverse(*p, *q) for p, q in zip(points, ends, strict=True)]
     length = np.array([g["s12"] for g in true])
@@ -70,11 +86,26 @@ def test_points_that_coincide_or_nearly_do():
 
 
 def test_poles_equator_and_antipodes_are_finite():
-    ends = jnp.array([[90.0, 0.0], [-90.0, 30.0], [0.0, 0.0], [0.0, 10.0], [0.0, 180.0], [0.0, 179.9], [45.0, -180.0], [45.0, 180.0]])
-    a, b = (g.reshape(-1, 2) for g in (jnp.repeat(ends, len(ends), 0), jnp.tile(ends, (len(ends), 1))))
+    ends = jnp.array(
+        [
+            [90.0, 0.0],
+            [-90.0, 30.0],
+            [0.0, 0.0],
+            [0.0, 10.0],
+            [0.0, 180.0],
+            [0.0, 179.9],
+            [45.0, -180.0],
+            [45.0, 180.0],
+        ]
+    )
+    a, b = (
+        g.reshape(-1, 2) for g in (jnp.repeat(ends, len(ends), 0), jnp.tile(ends, (len(ends), 1)))
+    )
     length, first, last = (np.asarray(v).reshape(8, 8) for v in inverse(earth(), a, b))
     assert np.isfinite([length, first, last]).all()
-    assert length[2, 3] == pytest.approx(R * np.pi / 18, abs=1e-8) and first[2, 3] == pytest.approx(np.pi / 2)
+    assert length[2, 3] == pytest.approx(R * np.pi / 18, abs=1e-8) and first[2, 3] == pytest.approx(
+        np.pi / 2
+    )
     assert length[6, 7] < 1e-8  # one point, from both sides of the date line
     assert length[0, 2] == pytest.approx(10001965.729, abs=1e-3)  # a quarter of a meridian
 
@@ -82,14 +113,25 @@ def test_poles_equator_and_antipodes_are_finite():
 def test_sphere():
     points, azimuth, distance = legs(seed=3)
     ball, radius = earth("sphere"), EARTHS["sphere"][0]
-    there, _ = direct(ball, jnp.asarray(points), jnp.radians(jnp.asarray(azimuth)), jnp.asarray(distance))
+    there, _ = direct(
+        ball, jnp.asarray(points), jnp.radians(jnp.asarray(azimuth)), jnp.asarray(distance)
+    )
     length, first, _ = inverse(ball, jnp.asarray(points), there)
-    (phi, theta), (lam, mu) = (np.radians([a, b]) for a, b in zip(points.T, np.asarray(there).T, strict=True))
-    chord = np.sqrt(np.sin((theta - phi) / 2) ** 2 + np.cos(phi) * np.cos(theta) * np.sin((mu - lam) / 2) ** 2)
+    (phi, theta), (lam, mu) = (
+        np.radians([a, b]) for a, b in zip(points.T, np.asarray(there).T, strict=True)
+    )
+    chord = np.sqrt(
+        np.sin((theta - phi) / 2) ** 2 + np.cos(phi) * np.cos(theta) * np.sin((mu - lam) / 2) ** 2
+    )
     np.testing.assert_allclose(length, 2 * radius * np.arcsin(chord), atol=1e-8)
     np.testing.assert_allclose(length, np.abs(distance), atol=1e-8)
-    assert (turned(first, np.where(distance < 0, azimuth + 180, azimuth)) * np.asarray(length)).max() < 5e-8
+    assert (
+        turned(first, np.where(distance < 0, azimuth + 180, azimuth)) * np.asarray(length)
+    ).max() < 5e-8
 
 
 def test_wrap():
-    np.testing.assert_allclose(wrap(jnp.array([0.0, 3.0, 4.0, -4.0, 7.0])), [0, 3, 4 - 2 * np.pi, 2 * np.pi - 4, 7 - 2 * np.pi])
+    np.testing.assert_allclose(
+        wrap(jnp.array([0.0, 3.0, 4.0, -4.0, 7.0])),
+        [0, 3, 4 - 2 * np.pi, 2 * np.pi - 4, 7 - 2 * np.pi],
+    )

@@ -1,4 +1,6 @@
-"""Files of heads: they give back what was saved to the bit, and the very functions of networks that jast made, or say why not."""
+"""Files of heads: they give back what was saved to the bit, and the very functions of networks that
+jast made, or say why not.
+"""
 
 import functools
 import json
@@ -16,7 +18,9 @@ from jast.search import run
 
 WALK = jast.simulators.walk1d(threshold=4.0)  # one number observed, a disturbance of one
 SIZE = dict(trees=4, prunes=2, simulations=30)
-INPUTS = Moments(np.float32(7), np.array([0.5, -1.0], np.float32), np.array([2.0, 0.25], np.float32))
+INPUTS = Moments(
+    np.float32(7), np.array([0.5, -1.0], np.float32), np.array([2.0, 0.25], np.float32)
+)
 RETURNS = Moments(np.float32(3), np.array(-4.0, np.float32), np.array(1.5, np.float32))
 
 
@@ -24,7 +28,9 @@ RETURNS = Moments(np.float32(3), np.array(-4.0, np.float32), np.array(1.5, np.fl
 def made(policy=True, value=True, moments=True, activation="tanh"):
     keys = jax.random.split(jax.random.key(8))
     new = functools.partial(make_head, hidden=(5, 4), activation=activation, first_activation=False)
-    heads = Heads(new(keys[0], 1, (1, 6)) if policy else None, new(keys[1], 2) if value else None, levels=31)
+    heads = Heads(
+        new(keys[0], 1, (1, 6)) if policy else None, new(keys[1], 2) if value else None, levels=31
+    )
     return Heads(heads.policy, heads.value, INPUTS, RETURNS, 31) if moments else heads
 
 
@@ -34,7 +40,14 @@ def linear(params, x):
 
 
 def own(n=2, b=0.5):
-    return Head({"a": (np.arange(n, dtype=np.float32), np.float32(b)), "c": {"sizes": np.arange(3, dtype=np.int32)}, "none": None}, linear)
+    return Head(
+        {
+            "a": (np.arange(n, dtype=np.float32), np.float32(b)),
+            "c": {"sizes": np.arange(3, dtype=np.int32)},
+            "none": None,
+        },
+        linear,
+    )
 
 
 def saved(path, heads, given=None):
@@ -43,14 +56,17 @@ def saved(path, heads, given=None):
 
 
 def searched(heads):
-    return jast.search.forest(jax.random.key(2), WALK, heads=heads, head_settings=jast.heads.settings(train=False), **SIZE)
+    return jast.search.forest(
+        jax.random.key(2), WALK, heads=heads, head_settings=jast.heads.settings(train=False), **SIZE
+    )
 
 
 def outputs(heads, seen, x):
     return (heads.policy and histogram(heads, seen)), (heads.value and value(heads, seen, x))
 
 
-# --- round trips ----------------------------------------------------------------------------------------------------------------------------------------------
+# --- round trips
+# ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("policy,value", [(True, False), (False, True), (True, True)])
@@ -58,19 +74,29 @@ def test_file_gives_back_what_was_saved(tmp_path, equal, policy, value):
     heads = made(policy, value)
     back = saved(tmp_path / "h.jast", heads)
     equal(back, heads)
-    assert isinstance(back.levels, int) and (back.policy is None, back.value is None) == (not policy, not value)
+    assert isinstance(back.levels, int) and (back.policy is None, back.value is None) == (
+        not policy,
+        not value,
+    )
     for name in ("policy", "value"):
         if (head := getattr(heads, name)) is not None:
             assert getattr(back, name).apply is head.apply
-            assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves(getattr(back, name).params))
-    equal(saved(tmp_path / "h.jast", heads, heads), heads)  # over the old one, and with heads that fit
+            assert all(
+                type(leaf) is np.ndarray for leaf in jax.tree.leaves(getattr(back, name).params)
+            )
+    # over the old one, and with heads that fit
+    equal(saved(tmp_path / "h.jast", heads, heads), heads)
     equal(saved(tmp_path / "h.jast", back), heads)
     assert [p.name for p in tmp_path.iterdir()] == ["h.jast"]
     with np.load(tmp_path / "h.jast") as pack:  # no pickle inside
         header = json.loads(pack["header"].tobytes())
-    assert header["format"] == "jast heads" and set(header["heads"]) == {n for n, there in (("policy", policy), ("value", value)) if there}
+    assert header["format"] == "jast heads" and set(header["heads"]) == {
+        n for n, there in (("policy", policy), ("value", value)) if there
+    }
     if value:
-        assert header["heads"]["value"]["network"] == dict(inputs=2, outputs=[], hidden=[5, 4], activation="tanh", first_activation=False)
+        assert header["heads"]["value"]["network"] == dict(
+            inputs=2, outputs=[], hidden=[5, 4], activation="tanh", first_activation=False
+        )
 
 
 def test_untrained_heads_have_no_moments(tmp_path, equal):
@@ -124,11 +150,20 @@ def test_functions_around_a_network_are_ones_own(tmp_path, equal):
     ):
         heads = Heads(head)
         jast.heads.save(tmp_path / "h", heads)
-        with pytest.raises(ValueError, match=r"holds a policy head with a function that is not in the file: load\(path, heads\) with Heads that have it"):
+        with pytest.raises(
+            ValueError,
+            match=(
+                r"holds a policy head with a function that is not in the file: load\(path, heads\)"
+                r" with Heads that have it"
+            ),
+        ):
             jast.heads.load(tmp_path / "h")
         equal(jast.heads.load(tmp_path / "h", heads), heads)
     jast.heads.save(tmp_path / "h", Heads(policy))
-    assert jast.heads.load(tmp_path / "h", Heads((policy.params, doubled))).policy.apply.func is doubled  # whoever gives a function gets it
+    assert (
+        jast.heads.load(tmp_path / "h", Heads((policy.params, doubled))).policy.apply.func
+        is doubled
+    )  # whoever gives a function gets it
 
 
 def test_heads_that_passed_through_jit_are_still_networks(tmp_path, equal):
@@ -139,7 +174,10 @@ def test_heads_that_passed_through_jit_are_still_networks(tmp_path, equal):
     equal(back, made())
 
 
-@pytest.mark.parametrize("dtype", ["bfloat16", "float16", "float64", "float8_e4m3fn", "int4", "uint8", "bool", "complex64"])
+@pytest.mark.parametrize(
+    "dtype",
+    ["bfloat16", "float16", "float64", "float8_e4m3fn", "int4", "uint8", "bool", "complex64"],
+)
 def test_precision_is_kept(tmp_path, equal, dtype):
     dtype = jnp.dtype(dtype)
     numbers = np.arange(6).reshape(2, 3).T.astype(dtype)
@@ -152,13 +190,16 @@ def test_precision_is_kept(tmp_path, equal, dtype):
 
 def test_networks_made_in_double_precision_keep_theirs(tmp_path, equal):
     head = make_head(jax.random.key(0), 3, (2, 4))
-    double = Heads(head._replace(params=jax.tree.map(lambda a: np.asarray(a, np.float64) / 3, head.params)))
+    double = Heads(
+        head._replace(params=jax.tree.map(lambda a: np.asarray(a, np.float64) / 3, head.params))
+    )
     back = saved(tmp_path / "h", double)
     equal(back, double)
     assert back.policy.apply is head.apply
 
 
-# --- in use ---------------------------------------------------------------------------------------------------------------------------------------------------
+# --- in use
+# ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("policy,value", [(True, False), (False, True), (True, True)])
@@ -181,7 +222,11 @@ def test_loaded_heads_say_the_same_without_compiling(tmp_path, equal, policy, va
 def test_a_search_goes_on_with_loaded_heads(tmp_path, equal):
     heads = made()
     first = searched(heads)
-    programs = lambda: (run._grow._cache_size(), run._prune._cache_size(), run._rebuild._cache_size())
+    programs = lambda: (
+        run._grow._cache_size(),
+        run._prune._cache_size(),
+        run._rebuild._cache_size(),
+    )
     before = programs()
     again = searched(saved(tmp_path / "h", heads))
     assert programs() == before
@@ -192,14 +237,17 @@ def test_a_search_goes_on_with_loaded_heads(tmp_path, equal):
 
 def test_what_a_search_trained_can_be_saved(tmp_path, equal):
     settings = jast.heads.settings(hidden=(4,), bins=4, steps=(2, 2), round=2)
-    found = jast.search.forest(jax.random.key(2), WALK, heads="both", head_settings=settings, **SIZE)
+    found = jast.search.forest(
+        jax.random.key(2), WALK, heads="both", head_settings=settings, **SIZE
+    )
     back = saved(tmp_path / "h", found.heads)
     equal(back, found.heads)
     assert back.policy.apply is found.heads.policy.apply and back.inputs.count > 0
     equal(searched(back).best, searched(found.heads).best)
 
 
-# --- refused --------------------------------------------------------------------------------------------------------------------------------------------------
+# --- refused
+# ----------------------------------------------------------------------------
 
 
 def test_save_refuses_what_no_file_can_hold(tmp_path):
@@ -210,17 +258,41 @@ def test_save_refuses_what_no_file_can_hold(tmp_path):
         (None, "save: heads must be jast.heads.Heads, received NoneType"),
         (Heads("rollout"), r"save: the policy head must be a pair \(params, apply\), received str"),
         (Heads(head, levels=2.5), "save: levels must be an integer, received 2.5"),
-        (Heads(head, inputs=(1, 2, 3)), "save: inputs must be jast.heads.Moments or None, received tuple"),
-        (Heads(head, returns=RETURNS._replace(mean=0.5)), r"save: returns\.mean must be an array of numbers, received float 0.5"),
-        (Heads(({"w": [1.5]}, linear)), r"save: policy\['w'\]\[0\] must be an array of numbers, received float 1.5"),
-        (Heads(({"w": "a"}, linear)), r"save: policy\['w'\] must be an array of numbers, received str 'a'"),
-        (Heads((np.array([None]), linear)), r"save: policy must be an array of numbers, received object\[1\]"),
-        (Heads((np.array(["a"]), linear)), r"save: policy must be an array of numbers, received <U1\[1\]"),
-        (Heads((jax.random.key(0), linear)), r"save: policy must be an array of numbers, received key<fry>\[\]"),
+        (
+            Heads(head, inputs=(1, 2, 3)),
+            "save: inputs must be jast.heads.Moments or None, received tuple",
+        ),
+        (
+            Heads(head, returns=RETURNS._replace(mean=0.5)),
+            r"save: returns\.mean must be an array of numbers, received float 0.5",
+        ),
+        (
+            Heads(({"w": [1.5]}, linear)),
+            r"save: policy\['w'\]\[0\] must be an array of numbers, received float 1.5",
+        ),
+        (
+            Heads(({"w": "a"}, linear)),
+            r"save: policy\['w'\] must be an array of numbers, received str 'a'",
+        ),
+        (
+            Heads((np.array([None]), linear)),
+            r"save: policy must be an array of numbers, received object\[1\]",
+        ),
+        (
+            Heads((np.array(["a"]), linear)),
+            r"save: policy must be an array of numbers, received <U1\[1\]",
+        ),
+        (
+            Heads((jax.random.key(0), linear)),
+            r"save: policy must be an array of numbers, received key<fry>\[\]",
+        ),
     ):
         with pytest.raises(ValueError, match=reason):
             jast.heads.save(tmp_path / "h", heads)
-    with pytest.raises(ValueError, match=r"save: policy.* must be an array of numbers, received float32\[5\], traced"):
+    with pytest.raises(
+        ValueError,
+        match=r"save: policy.* must be an array of numbers, received float32\[5\], traced",
+    ):
         jax.jit(lambda p: jast.heads.save(tmp_path / "h", Heads((p, linear))))(head.params)
     assert not list(tmp_path.iterdir())
 
@@ -228,32 +300,59 @@ def test_save_refuses_what_no_file_can_hold(tmp_path):
 def test_load_refuses_heads_that_do_not_fit(tmp_path):
     path = tmp_path / "h"
     jast.heads.save(path, Heads(value=own()))
-    with pytest.raises(ValueError, match="load: .*h holds a value head with a function that is not in the file"):
+    with pytest.raises(
+        ValueError, match="load: .*h holds a value head with a function that is not in the file"
+    ):
         jast.heads.load(path)
     kept = own().params
     for params, reason in (
         (own(3).params, r"value\.params\['a'\]\[0\] has float32\[2\], expected float32\[3\]"),
-        (kept | {"c": {"sizes": np.zeros(3, np.float32)}}, r"value\.params\['c'\]\['sizes'\] has int32\[3\], expected float32\[3\]"),
-        (kept | {"c": [np.zeros(3, np.int32)]}, "value.params has the structure .*'sizes'.*, expected .*'list'"),
+        (
+            kept | {"c": {"sizes": np.zeros(3, np.float32)}},
+            r"value\.params\['c'\]\['sizes'\] has int32\[3\], expected float32\[3\]",
+        ),
+        (
+            kept | {"c": [np.zeros(3, np.int32)]},
+            "value.params has the structure .*'sizes'.*, expected .*'list'",
+        ),
         (kept | {"d": kept["a"][0]}, "value.params has the structure .*, expected .*'d'"),
     ):
         with pytest.raises(ValueError, match="load: .*h does not fit heads: " + reason):
             jast.heads.load(path, Heads(value=(params, linear)))
-    with pytest.raises(ValueError, match=r"load: value\.params\['a'\]\[1\] of heads must be an array of numbers, received float 1.0"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"load: value\.params\['a'\]\[1\] of heads must be an array of numbers, received"
+            r" float 1.0"
+        ),
+    ):
         jast.heads.load(path, Heads(value=(kept | {"a": (np.zeros(2), 1.0)}, linear)))
-    with pytest.raises(ValueError, match="does not fit heads: it holds no policy head, expected one"):
+    with pytest.raises(
+        ValueError, match="does not fit heads: it holds no policy head, expected one"
+    ):
         jast.heads.load(path, Heads(made().policy, own()))
     jast.heads.save(path, Heads(made().policy, own()))
-    with pytest.raises(ValueError, match="load: .*h holds a value head with a function that is not in the file"):
+    with pytest.raises(
+        ValueError, match="load: .*h holds a value head with a function that is not in the file"
+    ):
         jast.heads.load(path, Heads(made().policy))
-    for heads, reason in ((Heads(), "must have a policy or a value head"), (own(), "must be jast.heads.Heads, received Head")):
+    for heads, reason in (
+        (Heads(), "must have a policy or a value head"),
+        (own(), "must be jast.heads.Heads, received Head"),
+    ):
         with pytest.raises(ValueError, match="load: heads " + reason):
             jast.heads.load(path, heads)
 
 
 def test_load_refuses_another_network(tmp_path):
     jast.heads.save(tmp_path / "h", made())
-    with pytest.raises(ValueError, match="does not fit heads: policy is the network .*'activation': 'tanh'.*, expected .*'activation': 'relu'"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            "does not fit heads: policy is the network .*'activation': 'tanh'.*, expected"
+            " .*'activation': 'relu'"
+        ),
+    ):
         jast.heads.load(tmp_path / "h", made(activation="relu"))
 
 
@@ -261,7 +360,13 @@ def test_load_refuses_an_unknown_activation(tmp_path, monkeypatch):
     monkeypatch.setitem(networks.ACTIVATIONS, "mish", jax.nn.mish)
     jast.heads.save(tmp_path / "h", made(activation="mish"))
     monkeypatch.undo()
-    with pytest.raises(ValueError, match=f"has the activation 'mish', unknown here: use the jast that wrote it, {jast.__version__}"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            "has the activation 'mish', unknown here: use the jast that wrote it,"
+            f" {jast.__version__}"
+        ),
+    ):
         jast.heads.load(tmp_path / "h")
 
 
@@ -279,7 +384,13 @@ def test_load_refuses_other_files_and_versions(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(storage, "VERSION", version)
             jast.heads.save(path, made())
-        with pytest.raises(ValueError, match=f"has version {version}; this jast reads version 1: use the jast that wrote it, {jast.__version__}"):
+        with pytest.raises(
+            ValueError,
+            match=(
+                f"has version {version}; this jast reads version 1: use the jast that wrote it,"
+                f" {jast.__version__}"
+            ),
+        ):
             jast.heads.load(path)
     jast.heads.save(path, made())
     with pytest.raises(ValueError, match="is not a jast archive of failures"):
@@ -331,7 +442,9 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, equal):
 
 def test_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch, equal):
     jast.heads.save(tmp_path / "h", made())
-    monkeypatch.setattr(np, "savez_compressed", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt()))
+    monkeypatch.setattr(
+        np, "savez_compressed", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt())
+    )
     with pytest.raises(KeyboardInterrupt):
         jast.heads.save(tmp_path / "h", made(policy=False))
     monkeypatch.undo()

@@ -1,4 +1,6 @@
-"""Importance resampling: densities against NumPy, known probabilities within their standard errors, and what must not be believed is not."""
+"""Importance resampling: densities against NumPy, known probabilities within their standard errors,
+and what must not be believed is not.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,16 @@ from systems import walk
 import jast
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
-from jast.estimate import chernoff, clopper_pearson, importance, jeffreys, log_weights, monte_carlo, policy_proposal, trace_proposal
+from jast.estimate import (
+    chernoff,
+    clopper_pearson,
+    importance,
+    jeffreys,
+    log_weights,
+    monte_carlo,
+    policy_proposal,
+    trace_proposal,
+)
 from jast.estimate.blend import blend
 from jast.estimate.importance import LANES, chunks, even, played
 from jast.policy import Policy, recorded
@@ -30,8 +41,14 @@ UP = jast.replay(WALK, jnp.full(7, 1.45))  # fails at its seventh step
 
 
 def most_probable(sign=1.0, b=1.0):
-    """Landing's most probable failure on one side, a little beyond the boundary so that rounding does not decide."""
-    return jast.replay(landing(b), jnp.full(10, sign * b * SHIFT * 1.0001), x0=jnp.asarray(sign * b * START * 1.0001))
+    """Landing's most probable failure on one side, a little beyond the boundary so that rounding
+    does not decide.
+    """
+    return jast.replay(
+        landing(b),
+        jnp.full(10, sign * b * SHIFT * 1.0001),
+        x0=jnp.asarray(sign * b * START * 1.0001),
+    )
 
 
 BOTH = [most_probable(), most_probable(-1.0)]
@@ -42,7 +59,9 @@ SCALES = np.array([0.1] + [0.03] * 10)
 def _steer(state, t):
     """The mean shift of least norm from here to the nearer side."""
     side = jnp.where(state.x2 < 0, -1.0, 1.0).astype(state.x2.dtype)
-    return D.Normal((side - state.x2) / (10 - t).astype(state.x2.dtype), jnp.asarray(0.03, state.x2.dtype))
+    return D.Normal(
+        (side - state.x2) / (10 - t).astype(state.x2.dtype), jnp.asarray(0.03, state.x2.dtype)
+    )
 
 
 def _sides():
@@ -55,7 +74,9 @@ STEER = Policy(_sides, _steer)
 
 def rows(e):
     """x0 and the disturbances of landing's episodes: [n, 11]."""
-    return np.concatenate([np.asarray(e.x0, float)[:, None], np.asarray(e.disturbances, float)], axis=1)
+    return np.concatenate(
+        [np.asarray(e.x0, float)[:, None], np.asarray(e.disturbances, float)], axis=1
+    )
 
 
 def log_p(x, centre=0.0):
@@ -72,16 +93,28 @@ def within(found, truth, times=4):
 
 @pytest.mark.parametrize("epsilon", [0.05, 0.6])
 def test_weights_of_several_traces(key, epsilon):
-    """Algorithm 1 in each component, p / (eps p + (1 - eps) p(x - x*)) a step, start included, and eq. 20 over the components."""
+    """Algorithm 1 in each component, p / (eps p + (1 - eps) p(x - x*)) a step, start included, and
+    eq. 20 over the components.
+    """
     e, log_w = played(key, SIM, trace_proposal(SIM, BOTH, epsilon), N)
     x = rows(e)
-    log_q = np.stack([np.logaddexp(np.log(epsilon) + log_p(x), np.log1p(-epsilon) + log_p(x, c)).sum(axis=1) for c in CENTRES])
-    np.testing.assert_allclose(log_w, log_p(x).sum(axis=1) - (logsumexp(log_q, axis=0) - np.log(2)), atol=3e-3)
-    assert abs((x.sum(axis=1) > 0).mean() - 0.5) < 4 * 0.5 / np.sqrt(N)  # a component once a trace: half of them on either side
+    log_q = np.stack(
+        [
+            np.logaddexp(np.log(epsilon) + log_p(x), np.log1p(-epsilon) + log_p(x, c)).sum(axis=1)
+            for c in CENTRES
+        ]
+    )
+    np.testing.assert_allclose(
+        log_w, log_p(x).sum(axis=1) - (logsumexp(log_q, axis=0) - np.log(2)), atol=3e-3
+    )
+    # a component once a trace: half of them on either side
+    assert abs((x.sum(axis=1) > 0).mean() - 0.5) < 4 * 0.5 / np.sqrt(N)
 
 
 def test_weights_of_whole_traces(key):
-    """mixing="trace": q = eps p + (1 - eps) / 2 (q_1 + q_2); no weight is above 1 / eps, and their mean over all episodes is 1 within 4 standard errors."""
+    """mixing="trace": q = eps p + (1 - eps) / 2 (q_1 + q_2); no weight is above 1 / eps, and their
+    mean over all episodes is 1 within 4 standard errors.
+    """
     q = trace_proposal(SIM, BOTH, 0.1, mixing="trace")
     np.testing.assert_allclose(np.exp(q.log_weights), [0.45, 0.45, 0.1], rtol=1e-6)
     t = log_weights(key, SIM, q, LANES)
@@ -93,76 +126,147 @@ def test_weights_of_whole_traces(key):
 
 
 def test_weights_of_a_policy(key):
-    """Algorithm 2: the model moved to the policy's mode in the state at hand, eps mixed in at each step; the start of the policy's, mixed likewise."""
+    """Algorithm 2: the model moved to the policy's mode in the state at hand, eps mixed in at each
+    step; the start of the policy's, mixed likewise.
+    """
     e, log_w = played(key, SIM, policy_proposal(SIM, STEER), N)
     x = rows(e)
     before = np.cumsum(x, axis=1)[:, :-1]
     aim = (np.where(before < 0, -1, 1) - before) / (10 - np.arange(10))
-    log_q = np.logaddexp(np.log(0.05) + log_p(x)[:, 1:], np.log(0.95) + norm.logpdf(x[:, 1:], aim, 0.03)).sum(axis=1)
-    start = 0.05 * norm.pdf(x[:, 0], 0, 0.1) + 0.475 * (norm.pdf(x[:, 0], START, 0.1) + norm.pdf(x[:, 0], -START, 0.1))
+    log_q = np.logaddexp(
+        np.log(0.05) + log_p(x)[:, 1:], np.log(0.95) + norm.logpdf(x[:, 1:], aim, 0.03)
+    ).sum(axis=1)
+    start = 0.05 * norm.pdf(x[:, 0], 0, 0.1) + 0.475 * (
+        norm.pdf(x[:, 0], START, 0.1) + norm.pdf(x[:, 0], -START, 0.1)
+    )
     np.testing.assert_allclose(log_w, log_p(x).sum(axis=1) - log_q - np.log(start), atol=5e-3)
 
 
 def test_one_step_exactly(key):
-    """x recovered from the log weight: whether the episode failed follows from it, and x has the density of the proposal (Kolmogorov and Smirnov)."""
+    """x recovered from the log weight: whether the episode failed follows from it, and x has the
+    density of the proposal (Kolmogorov and Smirnov).
+    """
     sim = jast.Simulator(
-        lambda x0: jnp.zeros(()), lambda s, x: x, lambda s: D.Normal(jnp.zeros(()), 1.0), lambda s: (s > 2.5, jnp.maximum(2.5 - s, 0)), 1, episodic=True
+        lambda x0: jnp.zeros(()),
+        lambda s, x: x,
+        lambda s: D.Normal(jnp.zeros(()), 1.0),
+        lambda s: (s > 2.5, jnp.maximum(2.5 - s, 0)),
+        1,
+        episodic=True,
     )
     t = log_weights(key, sim, trace_proposal(sim, jast.replay(sim, jnp.asarray([3.0])), 0.3), 4096)
-    x = (np.log(np.maximum((np.exp(-np.asarray(t.log_weight, float)) - 0.3) / 0.7, 1e-300)) + 4.5) / 3
+    x = (
+        np.log(np.maximum((np.exp(-np.asarray(t.log_weight, float)) - 0.3) / 0.7, 1e-300)) + 4.5
+    ) / 3
     sure = abs(x - 2.5) > 1e-3
-    assert (t.failure[sure] == (x > 2.5)[sure]).all() and 0.3 < t.failure.mean() < 0.7 and (t.length == 1).all() and not t.invalid.any()
+    assert (
+        (t.failure[sure] == (x > 2.5)[sure]).all()
+        and 0.3 < t.failure.mean() < 0.7
+        and (t.length == 1).all()
+        and not t.invalid.any()
+    )
     inside = x > -1  # below, the weight is flat in x
     cdf = lambda x: 0.3 * norm.cdf(x) + 0.7 * norm.cdf(x, 3)
-    assert scipy.stats.kstest(cdf(x[inside]), scipy.stats.uniform(cdf(-1), 1 - cdf(-1)).cdf).pvalue > 1e-3
+    assert (
+        scipy.stats.kstest(cdf(x[inside]), scipy.stats.uniform(cdf(-1), 1 - cdf(-1)).cdf).pvalue
+        > 1e-3
+    )
 
 
 def test_to_the_end_and_to_the_horizon(key):
-    """A walk that fails early: both weights are unbiased (4 standard errors), of the same episodes; those of
-    Algorithm 1 in NumPy to the horizon are distributed as the paper's (Kolmogorov and Smirnov)."""
+    """A walk that fails early: both weights are unbiased (4 standard errors), of the same episodes;
+    those of Algorithm 1 in NumPy to the horizon are distributed as the paper's (Kolmogorov and
+    Smirnov).
+    """
     q, truth = trace_proposal(WALK, UP), walk_probability(10.0, 10, False)
     end, paper = importance(key, WALK, q, MORE), importance(key, WALK, q, MORE, mode="paper")
-    assert truth == pytest.approx(9.578759495e-4, rel=1e-8) and within(end, truth) and within(paper, truth)
+    assert (
+        truth == pytest.approx(9.578759495e-4, rel=1e-8)
+        and within(end, truth)
+        and within(paper, truth)
+    )
     assert max(end.relative_error, paper.relative_error) < 0.08
     assert end.failures_seen == paper.failures_seen and end.steps == paper.steps < 10 * MORE
     t, p = log_weights(key, WALK, q, LANES), log_weights(key, WALK, q, LANES, mode="paper")
     same = np.asarray(t.length) == 10
-    assert (t.failure == p.failure).all() and (t.length == p.length).all() and 0.05 < same.mean() < 0.95
+    assert (
+        (t.failure == p.failure).all()
+        and (t.length == p.length).all()
+        and 0.05 < same.mean() < 0.95
+    )
     np.testing.assert_allclose(t.log_weight[same], p.log_weight[same], atol=1e-4)
     assert (t.log_weight[~same] != p.log_weight[~same]).mean() > 0.5
 
     rng, centre = np.random.default_rng(1), np.array([1.45] * 7 + [0.0] * 3)
     x = rng.normal(size=(LANES, 10)) + np.where(rng.random((LANES, 10)) < 0.05, 0, centre)
-    log_w = -np.logaddexp(np.log(0.05), np.log(0.95) + norm.logpdf(x, centre) - norm.logpdf(x)).sum(axis=1)
+    log_w = -np.logaddexp(np.log(0.05), np.log(0.95) + norm.logpdf(x, centre) - norm.logpdf(x)).sum(
+        axis=1
+    )
     fails = (np.cumsum(x, axis=1) >= 10).any(axis=1)
-    p_values = [scipy.stats.ks_2samp(a, b).pvalue for a, b in ((log_w, p.log_weight), (log_w[fails], np.asarray(p.log_weight)[np.asarray(p.failure)]))]
-    assert min(p_values) > 1e-3 and abs(fails.mean() - np.asarray(t.failure).mean()) < 4 * np.sqrt(0.5 / LANES)
+    p_values = [
+        scipy.stats.ks_2samp(a, b).pvalue
+        for a, b in (
+            (log_w, p.log_weight),
+            (log_w[fails], np.asarray(p.log_weight)[np.asarray(p.failure)]),
+        )
+    ]
+    assert min(p_values) > 1e-3 and abs(fails.mean() - np.asarray(t.failure).mean()) < 4 * np.sqrt(
+        0.5 / LANES
+    )
 
 
 # Landing: the published problem
 
 
 def test_two_traces(key):
-    """1e5 episodes: within 3 standard errors, of at most 1.05 % (theory .92 % without eps), and half of it on each side."""
+    """1e5 episodes: within 3 standard errors, of at most 1.05 % (theory .92 % without eps), and
+    half of it on each side.
+    """
     found = importance(key, SIM, trace_proposal(SIM, BOTH))
     assert float(landing_probability()) == pytest.approx(MU, rel=1e-4)
-    assert within(found, MU, 3) and 0.009 < found.relative_error < 0.0105 and found.reliable and found.warnings == ()
+    assert (
+        within(found, MU, 3)
+        and 0.009 < found.relative_error < 0.0105
+        and found.reliable
+        and found.warnings == ()
+    )
     assert abs(found.modes - 0.5).max() < 4 * 0.5 * 0.015 and found.modes.sum() == pytest.approx(1)
-    assert (found.samples, found.evaluations, found.steps, found.invalid) == (100_000, 100_000, 1_000_000, 0) and found.k_hat < 0.7
-    assert found.interval[0] < MU * 1.03 and found.interval[1] > MU * 0.97 and found.standard_error == pytest.approx(found.mean * found.relative_error)
+    assert (found.samples, found.evaluations, found.steps, found.invalid) == (
+        100_000,
+        100_000,
+        1_000_000,
+        0,
+    ) and found.k_hat < 0.7
+    assert (
+        found.interval[0] < MU * 1.03
+        and found.interval[1] > MU * 0.97
+        and found.standard_error == pytest.approx(found.mean * found.relative_error)
+    )
 
 
 @pytest.mark.parametrize("exponent", [-30, -100])
 def test_any_range(key, exponent):
-    """Probabilities of 1e-30 and 1e-100, whatever the precision of the suite: within 3 standard errors of scipy's, as logarithms."""
-    b = scipy.optimize.brentq(lambda b: norm.logsf(b / np.sqrt(VARIANCE)) + np.log(2) - exponent * np.log(10), 1, 4)
-    found = importance(key, landing(b), trace_proposal(landing(b), [most_probable(s, b) for s in (1.0, -1.0)]))
-    assert abs(found.log10_mean - exponent) < 3 * found.relative_error / np.log(10) and found.relative_error < 0.025 and found.reliable
+    """Probabilities of 1e-30 and 1e-100, whatever the precision of the suite: within 3 standard
+    errors of scipy's, as logarithms.
+    """
+    b = scipy.optimize.brentq(
+        lambda b: norm.logsf(b / np.sqrt(VARIANCE)) + np.log(2) - exponent * np.log(10), 1, 4
+    )
+    found = importance(
+        key, landing(b), trace_proposal(landing(b), [most_probable(s, b) for s in (1.0, -1.0)])
+    )
+    assert (
+        abs(found.log10_mean - exponent) < 3 * found.relative_error / np.log(10)
+        and found.relative_error < 0.025
+        and found.reliable
+    )
     assert found.mean > 0 and found.interval[0] > 0
 
 
 def test_a_lost_mode_is_half(key):
-    """One trace, twice: half of the probability within 3 standard errors, and nothing in the weights shows it: said so in the documentation."""
+    """One trace, twice: half of the probability within 3 standard errors, and nothing in the
+    weights shows it: said so in the documentation.
+    """
     found = importance(key, SIM, trace_proposal(SIM, [BOTH[0]] * 2), MORE)
     assert within(found, MU / 2, 3) and found.reliable
 
@@ -170,15 +274,24 @@ def test_a_lost_mode_is_half(key):
 def test_policy_with_a_tilted_start(key):
     """1e5 episodes, standard error at most 1 %."""
     found = importance(key, SIM, policy_proposal(SIM, STEER))
-    assert within(found, MU, 3) and found.relative_error < 0.01 and found.reliable and found.k_hat < 0.7
+    assert (
+        within(found, MU, 3)
+        and found.relative_error < 0.01
+        and found.reliable
+        and found.k_hat < 0.7
+    )
 
 
 def test_algorithm_2_verbatim_is_unreliable():
-    """The best of policies with the start of the model: of 20 seeds all are flagged, and say why before any number."""
+    """The best of policies with the start of the model: of 20 seeds all are flagged, and say why
+    before any number.
+    """
     q = policy_proposal(SIM, STEER, tilt_start=False)
     for seed in range(20):
         found = importance(jax.random.key(seed), SIM, q, MORE)
-        assert not found.reliable and found.ess < 100 and (found.k_hat > 0.7 or found.max_share > 0.05)
+        assert (
+            not found.reliable and found.ess < 100 and (found.k_hat > 0.7 or found.max_share > 0.05)
+        )
         assert str(found).startswith("UNRELIABLE: ") and found.failures_seen > 100
 
 
@@ -187,13 +300,23 @@ def test_algorithm_2_verbatim_is_unreliable():
 
 def _boxes(s):
     z = jnp.zeros_like(s)
-    return D.Joint({"tent": D.tent(z + 0.3), "flat": D.Uniform(z, z + 1), "coin": D.Categorical(probs=jnp.stack([z + 0.9, z + 0.1]))})
+    return D.Joint(
+        {
+            "tent": D.tent(z + 0.3),
+            "flat": D.Uniform(z, z + 1),
+            "coin": D.Categorical(probs=jnp.stack([z + 0.9, z + 0.1])),
+        }
+    )
 
 
 BOXES = jast.Simulator(
-    lambda x0: jnp.zeros(()), lambda s, x: s + x["tent"] + x["flat"] + x["coin"].astype(s.dtype), _boxes, lambda s: (s > 5.2, jnp.maximum(5.2 - s, 0)), 2,
+    lambda x0: jnp.zeros(()),
+    lambda s, x: s + x["tent"] + x["flat"] + x["coin"].astype(s.dtype),
+    _boxes,
+    lambda s: (s > 5.2, jnp.maximum(5.2 - s, 0)),
+    2,
     episodic=True,
-)  # fmt: skip
+)
 
 
 def boxes_probability(h=2e-4):
@@ -207,14 +330,25 @@ def boxes_probability(h=2e-4):
 
 
 def test_bounded_disturbances(key):
-    """Tent, uniform and whole numbers in one disturbance, moved within their bounds: within 4 standard errors of a convolution."""
-    e = jast.replay(BOXES, {"tent": jnp.full(2, 0.8), "flat": jnp.full(2, 0.9), "coin": jnp.ones(2, jnp.int32)})
+    """Tent, uniform and whole numbers in one disturbance, moved within their bounds: within 4
+    standard errors of a convolution.
+    """
+    e = jast.replay(
+        BOXES, {"tent": jnp.full(2, 0.8), "flat": jnp.full(2, 0.9), "coin": jnp.ones(2, jnp.int32)}
+    )
     found, truth = importance(key, BOXES, trace_proposal(BOXES, e), MORE), boxes_probability()
-    assert within(found, truth) and found.reliable and found.relative_error < 0.05 < np.sqrt(1 / truth / MORE) / 4, (found.mean, truth)
+    assert (
+        within(found, truth)
+        and found.reliable
+        and found.relative_error < 0.05 < np.sqrt(1 / truth / MORE) / 4
+    ), (found.mean, truth)
 
 
 def test_a_batch_and_a_list_are_the_same_proposal():
-    one, batch = trace_proposal(SIM, BOTH), trace_proposal(SIM, jax.device_get(jax.tree.map(lambda *a: jnp.stack(a), *BOTH)))
+    one, batch = (
+        trace_proposal(SIM, BOTH),
+        trace_proposal(SIM, jax.device_get(jax.tree.map(lambda *a: jnp.stack(a), *BOTH))),
+    )
     assert jax.tree.structure(one) == jax.tree.structure(batch)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(batch), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -224,7 +358,9 @@ def test_a_batch_and_a_list_are_the_same_proposal():
 
 
 class Odd(D.Normal):
-    """A unit normal whose density above ``cut`` is ``value``, and which draws nothing above ``most``."""
+    """A unit normal whose density above ``cut`` is ``value``, and which draws nothing above
+    ``most``.
+    """
 
     def __init__(self, like, cut, value, most):
         super().__init__(jnp.zeros_like(like), jnp.ones_like(like))
@@ -242,34 +378,61 @@ def _odd_step(odd, s, t):
 
 
 def odd(cut=np.inf, value=0.0, most=np.inf):
-    return Policy(WALK.start, Partial(_odd_step, tuple(jnp.asarray(v, jnp.zeros(()).dtype) for v in (cut, value, most))))
+    return Policy(
+        WALK.start,
+        Partial(_odd_step, tuple(jnp.asarray(v, jnp.zeros(()).dtype) for v in (cut, value, most))),
+    )
 
 
 def test_all_of_the_model_is_plain(key):
-    """epsilon = 1, or a policy that is the model: every weight is 1; standard error and effective sample size are the binomial ones."""
+    """epsilon = 1, or a policy that is the model: every weight is 1; standard error and effective
+    sample size are the binomial ones.
+    """
     t = log_weights(key, SIM, trace_proposal(SIM, BOTH, 1), LANES)
     np.testing.assert_allclose(t.log_weight, 0, atol=1e-5)
     found = importance(key, WALK, odd(), 10 * MORE)
     k, n = found.failures_seen, found.samples
-    assert found.mean == pytest.approx(k / n) and found.ess == pytest.approx(k) and within(found, 9.578759495e-4) and found.reliable
-    assert found.relative_error == pytest.approx(np.sqrt((1 - k / n) / k), rel=1e-4) and found.k_hat == -np.inf
+    assert (
+        found.mean == pytest.approx(k / n)
+        and found.ess == pytest.approx(k)
+        and within(found, 9.578759495e-4)
+        and found.reliable
+    )
+    assert (
+        found.relative_error == pytest.approx(np.sqrt((1 - k / n) / k), rel=1e-4)
+        and found.k_hat == -np.inf
+    )
 
 
 def test_a_proposal_that_does_not_cover(key):
     """Steps above 2.2 cannot be drawn: flagged, though the weights look fine."""
     found = importance(key, WALK, odd(2.2, -np.inf, 2.2), 10 * MORE)
-    assert not found.reliable and "density 0 on" in found.warnings[0] and "of the model's own episodes" in found.warnings[0] and found.failures_seen > 100
+    assert (
+        not found.reliable
+        and "density 0 on" in found.warnings[0]
+        and "of the model's own episodes" in found.warnings[0]
+        and found.failures_seen > 100
+    )
 
 
 def test_weights_that_are_nan(key):
     """They count for nothing, and the estimate is not to be believed; neither are infinite ones."""
     for value in (np.nan, -np.inf):
         found = importance(key, WALK, odd(2.5, value), 10 * MORE)
-        assert not found.reliable and any("failing episodes have a weight that is NaN or infinite" in w for w in found.warnings) and np.isfinite(found.log_mean)
+        assert (
+            not found.reliable
+            and any(
+                "failing episodes have a weight that is NaN or infinite" in w
+                for w in found.warnings
+            )
+            and np.isfinite(found.log_mean)
+        )
 
 
 def test_invalid_episodes(key):
-    """A step of more than 3.2 gives NaN: no failure then, as in NumPy (400,000 episodes) within 4 of both standard errors; counted, and said."""
+    """A step of more than 3.2 gives NaN: no failure then, as in NumPy (400,000 episodes) within 4
+    of both standard errors; counted, and said.
+    """
     sim = walk(step=lambda s, x: jnp.where(x > 3.2, jnp.nan, s + x))
     found = importance(key, sim, trace_proposal(sim, jast.replay(sim, jnp.full(3, 1.2))), MORE)
     x = np.random.default_rng(0).normal(size=(400_000, 6))
@@ -277,34 +440,61 @@ def test_invalid_episodes(key):
     first = np.where(above.any(axis=1), above.argmax(axis=1), 6)
     truth = (above.any(axis=1) & ~(bad & (np.arange(6) <= first[:, None])).any(axis=1)).mean()
     assert abs(found.mean - truth) < 4 * np.hypot(np.sqrt(truth / 400_000), found.standard_error)
-    assert 0 < found.invalid < MORE - found.failures_seen and any("are invalid" in w for w in found.warnings)
+    assert 0 < found.invalid < MORE - found.failures_seen and any(
+        "are invalid" in w for w in found.warnings
+    )
 
 
 def test_no_failure(key):
     """A NaN, not a 0; nothing is known, so it says that and is not reliable."""
     found = importance(key, landing(50.0), trace_proposal(SIM, BOTH), MORE)
-    assert np.isnan([found.mean, found.log_mean, found.relative_error, found.standard_error, found.log10_mean]).all() and found.interval == (0.0, 1.0)
-    assert not found.reliable and found.failures_seen == 0 and found.warnings == ("no failure was seen",) and found.ess == 0 and found.modes is None
-    assert str(found).startswith("UNRELIABLE: no failure was seen\n") and "nothing is known" in str(found)
+    assert np.isnan(
+        [found.mean, found.log_mean, found.relative_error, found.standard_error, found.log10_mean]
+    ).all() and found.interval == (0.0, 1.0)
+    assert (
+        not found.reliable
+        and found.failures_seen == 0
+        and found.warnings == ("no failure was seen",)
+        and found.ess == 0
+        and found.modes is None
+    )
+    assert str(found).startswith("UNRELIABLE: no failure was seen\n") and "nothing is known" in str(
+        found
+    )
 
 
 # Chunks
 
 
 def test_chunks_are_those_of_log_weights(key):
-    """Chunk i is ``log_weights`` of ``fold_in(key, i)``; of the last one the first episodes count; the answer is the mean of exp(log w) over them."""
+    """Chunk i is ``log_weights`` of ``fold_in(key, i)``; of the last one the first episodes count;
+    the answer is the mean of exp(log w) over them.
+    """
     q = trace_proposal(SIM, BOTH)
     seen = []
     found = importance(key, SIM, q, MORE, callback=lambda done, total: seen.append((done, total)))
     own, _ = jax.random.split(key)
-    parts = [jax.device_get(log_weights(jax.random.fold_in(own, i), SIM, q, even(MORE))) for i in (0, 1)]
-    log_w, failure, shares = (np.concatenate([getattr(p, f) for p in parts])[:MORE] for f in ("log_weight", "failure", "shares"))
+    parts = [
+        jax.device_get(log_weights(jax.random.fold_in(own, i), SIM, q, even(MORE))) for i in (0, 1)
+    ]
+    log_w, failure, shares = (
+        np.concatenate([getattr(p, f) for p in parts])[:MORE]
+        for f in ("log_weight", "failure", "shares")
+    )
     w = np.where(failure, np.exp(log_w.astype(float)), 0)
-    assert found.mean == pytest.approx(w.mean(), rel=1e-10) and found.standard_error == pytest.approx(w.std(ddof=1) / np.sqrt(MORE), rel=1e-8)
-    assert found.ess == pytest.approx(w.sum() ** 2 / (w**2).sum()) and found.max_share == pytest.approx(w.max() / w.sum())
+    assert found.mean == pytest.approx(
+        w.mean(), rel=1e-10
+    ) and found.standard_error == pytest.approx(w.std(ddof=1) / np.sqrt(MORE), rel=1e-8)
+    assert found.ess == pytest.approx(
+        w.sum() ** 2 / (w**2).sum()
+    ) and found.max_share == pytest.approx(w.max() / w.sum())
     assert found.failures_seen == failure.sum()
-    np.testing.assert_allclose(np.sort(found.modes), np.sort((w @ np.exp(shares.astype(float))) / w.sum()), rtol=1e-6)
-    assert seen == [(even(MORE), MORE), (MORE, MORE)] and str(importance(key, SIM, q, MORE)) == str(found)
+    np.testing.assert_allclose(
+        np.sort(found.modes), np.sort((w @ np.exp(shares.astype(float))) / w.sum()), rtol=1e-6
+    )
+    assert seen == [(even(MORE), MORE), (MORE, MORE)] and str(importance(key, SIM, q, MORE)) == str(
+        found
+    )
 
 
 def test_interrupts_keep_whole_chunks(key, capsys):
@@ -314,9 +504,20 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         raise KeyboardInterrupt
 
     q = trace_proposal(SIM, BOTH)
-    found, first = importance(key, SIM, q, MORE, callback=stop, progress=True), importance(key, SIM, q, even(MORE))
-    assert found.samples == found.evaluations == even(MORE) and found.mean == first.mean and found.relative_error == first.relative_error
-    assert found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",) and found.reliable and "importance" in capsys.readouterr().err
+    found, first = (
+        importance(key, SIM, q, MORE, callback=stop, progress=True),
+        importance(key, SIM, q, even(MORE)),
+    )
+    assert (
+        found.samples == found.evaluations == even(MORE)
+        and found.mean == first.mean
+        and found.relative_error == first.relative_error
+    )
+    assert (
+        found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",)
+        and found.reliable
+        and "importance" in capsys.readouterr().err
+    )
     with pytest.raises(KeyboardInterrupt):
         chunks(lambda i: stop(0, 0), LANES, MORE)
 
@@ -324,24 +525,60 @@ def test_interrupts_keep_whole_chunks(key, capsys):
 # Refusals
 
 
-@pytest.mark.parametrize("make, match", [
-    (lambda: trace_proposal(SIM, BOTH, 0.0), "trace_proposal: epsilon must be a number above 0 and at most 1, received 0.0"),
-    (lambda: trace_proposal(SIM, BOTH, 1.1), "trace_proposal: epsilon must be"),
-    (lambda: policy_proposal(SIM, STEER, np.nan), "policy_proposal: epsilon must be"),
-    (lambda: trace_proposal(SIM, BOTH, mixing="both"), 'trace_proposal: mixing must be "step" or "trace", received \'both\''),
-    (lambda: trace_proposal(SIM, []), "trace_proposal: episodes must be"),
-    (lambda: trace_proposal(SIM, STEER), "trace_proposal: episodes must be"),
-    (lambda: trace_proposal(WALK, BOTH), "x0 must be"),
-    (lambda: policy_proposal(SIM, BOTH), "policy_proposal: policy must be a jast.Policy, received list"),
-    (lambda: importance(jax.random.key(0), SIM, "x"), "importance: proposal must be a Proposal or a jast.Policy, received str"),
-    (lambda: importance(jax.random.key(0), WALK, recorded(jnp.ones(10))), "importance: a policy that plays one value has no density"),
-    (lambda: log_weights(jax.random.key(0), WALK, recorded(jnp.ones(10)), 5), "log_weights: a policy that plays one value has no density"),
-    (lambda: importance(jax.random.key(0), SIM, STEER, 1), "importance: samples must be a whole number of at least 2, received 1"),
-    (lambda: importance(jax.random.key(0), SIM, STEER, mode="thesis"), 'importance: mode must be "default" or "paper", received \'thesis\''),
-    (lambda: log_weights(jax.random.key(0), SIM, STEER, 5, mode="thesis"), 'log_weights: mode must be "default" or "paper", received \'thesis\''),
-    (lambda: monte_carlo(jax.random.key(0), SIM, 0), "monte_carlo: samples must be a whole number of at least 1, received 0"),
-    (lambda: monte_carlo(jax.random.key(0), SIM, 5, level=1.0), "monte_carlo: level must be a number between 0 and 1, received 1.0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (
+            lambda: trace_proposal(SIM, BOTH, 0.0),
+            "trace_proposal: epsilon must be a number above 0 and at most 1, received 0.0",
+        ),
+        (lambda: trace_proposal(SIM, BOTH, 1.1), "trace_proposal: epsilon must be"),
+        (lambda: policy_proposal(SIM, STEER, np.nan), "policy_proposal: epsilon must be"),
+        (
+            lambda: trace_proposal(SIM, BOTH, mixing="both"),
+            'trace_proposal: mixing must be "step" or "trace", received \'both\'',
+        ),
+        (lambda: trace_proposal(SIM, []), "trace_proposal: episodes must be"),
+        (lambda: trace_proposal(SIM, STEER), "trace_proposal: episodes must be"),
+        (lambda: trace_proposal(WALK, BOTH), "x0 must be"),
+        (
+            lambda: policy_proposal(SIM, BOTH),
+            "policy_proposal: policy must be a jast.Policy, received list",
+        ),
+        (
+            lambda: importance(jax.random.key(0), SIM, "x"),
+            "importance: proposal must be a Proposal or a jast.Policy, received str",
+        ),
+        (
+            lambda: importance(jax.random.key(0), WALK, recorded(jnp.ones(10))),
+            "importance: a policy that plays one value has no density",
+        ),
+        (
+            lambda: log_weights(jax.random.key(0), WALK, recorded(jnp.ones(10)), 5),
+            "log_weights: a policy that plays one value has no density",
+        ),
+        (
+            lambda: importance(jax.random.key(0), SIM, STEER, 1),
+            "importance: samples must be a whole number of at least 2, received 1",
+        ),
+        (
+            lambda: importance(jax.random.key(0), SIM, STEER, mode="thesis"),
+            'importance: mode must be "default" or "paper", received \'thesis\'',
+        ),
+        (
+            lambda: log_weights(jax.random.key(0), SIM, STEER, 5, mode="thesis"),
+            'log_weights: mode must be "default" or "paper", received \'thesis\'',
+        ),
+        (
+            lambda: monte_carlo(jax.random.key(0), SIM, 0),
+            "monte_carlo: samples must be a whole number of at least 1, received 0",
+        ),
+        (
+            lambda: monte_carlo(jax.random.key(0), SIM, 5, level=1.0),
+            "monte_carlo: level must be a number between 0 and 1, received 1.0",
+        ),
+    ],
+)
 def test_bad_arguments(make, match):
     with pytest.raises(ValueError, match=match):
         make()
@@ -349,15 +586,25 @@ def test_bad_arguments(make, match):
 
 def test_a_bad_level_is_told_before_anything_is_simulated(key):
     seen = []
-    with pytest.raises(ValueError, match="importance: level must be a number between 0 and 1, received 95"):
-        importance(key, SIM, trace_proposal(SIM, BOTH), MORE, level=95, callback=lambda *a: seen.append(a))
+    with pytest.raises(
+        ValueError, match="importance: level must be a number between 0 and 1, received 95"
+    ):
+        importance(
+            key, SIM, trace_proposal(SIM, BOTH), MORE, level=95, callback=lambda *a: seen.append(a)
+        )
     assert not seen
 
 
 @pytest.mark.parametrize("mixing", ["step", "trace"])
 def test_disturbances_that_cannot_be_moved_are_named(mixing):
     """A Beta has no quantile function here."""
-    sim = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x, lambda s: D.Beta(jnp.asarray(2.0), jnp.asarray(3.0)), lambda s: (s > 1, 1 - s), 2)
+    sim = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s + x,
+        lambda s: D.Beta(jnp.asarray(2.0), jnp.asarray(3.0)),
+        lambda s: (s > 1, 1 - s),
+        2,
+    )
     e = jast.replay(sim, jnp.full(2, 0.6))
     with pytest.raises(ValueError, match="trace_proposal: disturbance: .*Beta"):
         trace_proposal(sim, e, mixing=mixing)
@@ -378,7 +625,9 @@ def test_a_start_that_cannot_be_moved(key):
 
 
 def test_a_start_of_one_value(key):
-    """Monte Carlo asks nothing of the distributions: a start that is `Deterministic` draws what it draws."""
+    """Monte Carlo asks nothing of the distributions: a start that is `Deterministic` draws what it
+    draws.
+    """
     sim = walk(lambda x0: x0, start=lambda: D.Deterministic(jnp.asarray(1.0)))
     found = monte_carlo(key, jast.check(sim), MORE)
     truth = walk_probability(2.0, 6, False)
@@ -389,9 +638,21 @@ def test_monte_carlo(key):
     """Counts, an exact interval, and the bounds of the paper also where nothing was seen."""
     found = monte_carlo(key, WALK, 10 * MORE)
     k, n = found.failures_seen, 10 * MORE
-    assert found.reliable and found.mean == k / n and within(found, 9.578759495e-4) and found.samples == found.evaluations == n
+    assert (
+        found.reliable
+        and found.mean == k / n
+        and within(found, 9.578759495e-4)
+        and found.samples == found.evaluations == n
+    )
     assert found.interval == pytest.approx(clopper_pearson(k, n), rel=1e-6)
-    assert (found.jeffreys, found.chernoff) == pytest.approx((jeffreys(k, n), chernoff(k, n)), rel=1e-6)
+    assert (found.jeffreys, found.chernoff) == pytest.approx(
+        (jeffreys(k, n), chernoff(k, n)), rel=1e-6
+    )
     none = monte_carlo(key, walk1d("one-sided", threshold=100.0), MORE, level=0.9)
-    assert np.isnan(none.mean) and not none.reliable and none.interval[0] == 0 and none.chernoff == pytest.approx(-np.expm1(np.log(0.1) / MORE), rel=1e-5)
+    assert (
+        np.isnan(none.mean)
+        and not none.reliable
+        and none.interval[0] == 0
+        and none.chernoff == pytest.approx(-np.expm1(np.log(0.1) / MORE), rel=1e-5)
+    )
     assert "UNRELIABLE: no failure in 20000 episodes" in str(none) and "Chernoff" in str(none)

@@ -10,11 +10,20 @@ from hypothesis import strategies as st
 
 from jast.cross_entropy import gaussian, mixture
 from jast.cross_entropy.gaussian import Gaussian
-from jast.cross_entropy.mixture import Mixture, em, log_likelihood, log_prob, responsibilities, sample
+from jast.cross_entropy.mixture import (
+    Mixture,
+    em,
+    log_likelihood,
+    log_prob,
+    responsibilities,
+    sample,
+)
 
 WEIGHTS = np.array([0.5, 0.3, 0.2])
 MEANS = np.array([[0.0, 0.0], [4.0, 1.0], [-3.0, 5.0]])
-COVARIANCES = np.array([[[1.0, 0.5], [0.5, 2.0]], [[0.3, 0.0], [0.0, 0.5]], [[2.0, -1.0], [-1.0, 1.0]]])
+COVARIANCES = np.array(
+    [[[1.0, 0.5], [0.5, 2.0]], [[0.3, 0.0], [0.0, 0.5]], [[2.0, -1.0], [-1.0, 1.0]]]
+)
 EM = jax.jit(em, static_argnames="iterations")
 SCORE, DENSITY, PARTS = jax.jit(log_likelihood), jax.jit(log_prob), jax.jit(responsibilities)
 DRAW = jax.jit(sample, static_argnums=2)
@@ -34,13 +43,19 @@ def start(x, k, seed):
     """k components at points of x, wide and of one weight each."""
     rng = np.random.default_rng(seed)
     spread = np.cov(x.T) + 0.1 * np.eye(x.shape[1])
-    return Mixture(np.full(k, 1 / k), x[rng.choice(len(x), k, replace=False)], np.broadcast_to(spread, (k, *spread.shape)).copy())
+    return Mixture(
+        np.full(k, 1 / k),
+        x[rng.choice(len(x), k, replace=False)],
+        np.broadcast_to(spread, (k, *spread.shape)).copy(),
+    )
 
 
 def data(seed, n=120):
     rng = np.random.default_rng(seed)
     which = rng.choice(3, n, p=WEIGHTS)
-    return MEANS[which] + np.einsum("nde,ne->nd", np.linalg.cholesky(COVARIANCES)[which], rng.normal(size=(n, 2)))
+    return MEANS[which] + np.einsum(
+        "nde,ne->nd", np.linalg.cholesky(COVARIANCES)[which], rng.normal(size=(n, 2))
+    )
 
 
 def put(m, dtype):
@@ -53,7 +68,13 @@ def same(a, b):
 
 def scipys(m, x):
     """Weight times density [n, k]."""
-    return np.stack([w * scipy.stats.multivariate_normal(mean, c).pdf(x) for w, mean, c in zip(*m, strict=True)], axis=-1)
+    return np.stack(
+        [
+            w * scipy.stats.multivariate_normal(mean, c).pdf(x)
+            for w, mean, c in zip(*m, strict=True)
+        ],
+        axis=-1,
+    )
 
 
 # sample, log_prob, responsibilities
@@ -62,10 +83,15 @@ def scipys(m, x):
 def test_densities_are_scipys(dtype):
     x = np.random.default_rng(0).normal(0, 3, (4, 5, 2))
     joint, rtol = scipys((WEIGHTS, MEANS, COVARIANCES), x), 2e-5 if dtype == "float32" else 1e-11
-    got, parts = DENSITY(three(dtype), jnp.asarray(x, dtype)), PARTS(three(dtype), jnp.asarray(x, dtype))
+    got, parts = (
+        DENSITY(three(dtype), jnp.asarray(x, dtype)),
+        PARTS(three(dtype), jnp.asarray(x, dtype)),
+    )
     assert got.dtype == parts.dtype == dtype and got.shape == (4, 5) and parts.shape == (4, 5, 3)
     np.testing.assert_allclose(got, np.log(joint.sum(-1)), rtol=rtol)
-    np.testing.assert_allclose(parts, joint / joint.sum(-1, keepdims=True), rtol=rtol * 10, atol=1e-30)
+    np.testing.assert_allclose(
+        parts, joint / joint.sum(-1, keepdims=True), rtol=rtol * 10, atol=1e-30
+    )
     one = jnp.asarray(x[0, 0], dtype)
     assert DENSITY(three(dtype), one).shape == () and PARTS(three(dtype), one).shape == (3,)
 
@@ -75,18 +101,26 @@ def test_samples_have_the_moments(dtype, key):
     x = np.asarray(DRAW(key, three(dtype), n), np.float64)
     mean = WEIGHTS @ MEANS
     c = MEANS - mean
-    covariance = np.einsum("k,kde->de", WEIGHTS, COVARIANCES) + np.einsum("k,kd,ke->de", WEIGHTS, c, c)
+    covariance = np.einsum("k,kde->de", WEIGHTS, COVARIANCES) + np.einsum(
+        "k,kd,ke->de", WEIGHTS, c, c
+    )
     assert (np.abs(x.mean(0) - mean) < 4.5 * np.sqrt(np.diag(covariance) / n)).all()
     squares = np.einsum("nd,ne->nde", x - mean, x - mean)
     assert (np.abs(squares.mean(0) - covariance) < 4.5 * squares.std(0) / np.sqrt(n)).all()
     # the coordinates one by one, by their distribution functions
     for i in range(2):
-        cdf = lambda v, i=i: sum(w * scipy.stats.norm.cdf(v, m[i], np.sqrt(s[i, i])) for w, m, s in zip(WEIGHTS, MEANS, COVARIANCES, strict=True))
+        cdf = lambda v, i=i: sum(
+            w * scipy.stats.norm.cdf(v, m[i], np.sqrt(s[i, i]))
+            for w, m, s in zip(WEIGHTS, MEANS, COVARIANCES, strict=True)
+        )
         assert scipy.stats.kstest(x[:, i], cdf).pvalue > 1e-3
 
 
 def test_far_from_everything_no_component_is_a_number(dtype):
-    far = jnp.asarray([[1e30 if dtype == "float32" else 1e200, 0.0], [np.inf, 0.0], [np.nan, 0.0], [0.0, 0.0]], dtype)
+    far = jnp.asarray(
+        [[1e30 if dtype == "float32" else 1e200, 0.0], [np.inf, 0.0], [np.nan, 0.0], [0.0, 0.0]],
+        dtype,
+    )
     parts = np.asarray(PARTS(three(dtype), far))
     np.testing.assert_allclose(parts[:3], np.broadcast_to(WEIGHTS, (3, 3)), rtol=1e-6)
     np.testing.assert_allclose(parts.sum(1), 1, rtol=1e-6)
@@ -98,7 +132,8 @@ def test_a_component_without_weight_makes_nothing(key, dtype):
     truth = scipy.stats.multivariate_normal(MEANS[1], COVARIANCES[1]).logpdf(MEANS)
     np.testing.assert_allclose(DENSITY(m, x), truth, rtol=1e-5)
     assert PARTS(m, x).tolist() == [[0, 1, 0]] * 3
-    assert np.abs(DRAW(key, m, 200) - x[1][None]).max() < 5  # six standard deviations of the second one
+    # six standard deviations of the second one
+    assert np.abs(DRAW(key, m, 200) - x[1][None]).max() < 5
 
 
 # em
@@ -111,16 +146,24 @@ def test_em_is_that_of_scikit_learn(k, regularisation, x64):
     x = data(k)
     m = start(x, k, 1)
     peer = peers.GaussianMixture(
-        k, covariance_type="full", tol=0, reg_covar=regularisation, max_iter=10, weights_init=m.weights, means_init=m.means,
+        k,
+        covariance_type="full",
+        tol=0,
+        reg_covar=regularisation,
+        max_iter=10,
+        weights_init=m.weights,
+        means_init=m.means,
         precisions_init=np.linalg.inv(m.covariances),
-    )  # fmt: skip
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "did not converge": ten iterations are asked for
         peer.fit(x)
     got = EM(put(m, "float64"), jnp.asarray(x), jnp.ones(len(x)), 10, regularisation, 0.0)
     for a, b in zip(got, (peer.weights_, peer.means_, peer.covariances_), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
-    assert float(SCORE(got, jnp.asarray(x), jnp.ones(len(x)))) == pytest.approx(peer.score(x) * len(x), rel=1e-10)
+    assert float(SCORE(got, jnp.asarray(x), jnp.ones(len(x)))) == pytest.approx(
+        peer.score(x) * len(x), rel=1e-10
+    )
 
 
 def test_em_by_the_text(dtype):
@@ -129,7 +172,9 @@ def test_em_by_the_text(dtype):
     joint = scipys(m, x)
     r = w[:, None] * joint / joint.sum(1, keepdims=True)
     means = r.T @ x / r.sum(0)[:, None]
-    covariances = [(r[:, k, None] * (x - means[k])).T @ (x - means[k]) / r[:, k].sum() for k in range(3)]
+    covariances = [
+        (r[:, k, None] * (x - means[k])).T @ (x - means[k]) / r[:, k].sum() for k in range(3)
+    ]
     got = EM(three(dtype), jnp.asarray(x, dtype), jnp.asarray(w, dtype), 1)
     assert all(a.dtype == dtype for a in got)
     tolerance = dict(rtol=1e-4, atol=1e-4) if dtype == "float32" else dict(rtol=1e-10)
@@ -138,7 +183,9 @@ def test_em_by_the_text(dtype):
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), double=st.booleans(), least=st.sampled_from([0.0, 2.0, 30.0]))
+@given(
+    seed=st.integers(0, 2**32 - 1), double=st.booleans(), least=st.sampled_from([0.0, 2.0, 30.0])
+)
 def test_no_iteration_lowers_the_likelihood(seed, double, least):
     with jax.enable_x64(double):
         dtype = jnp.zeros(()).dtype
@@ -148,7 +195,11 @@ def test_no_iteration_lowers_the_likelihood(seed, double, least):
         for _ in range(15):
             m = EM(m, x, w, 1, 0.0, least)
             values.append(float(SCORE(m, x, w)))
-    assert np.diff(values).min() >= -1e-11 * abs(values[0]) if double else np.diff(values).min() >= -1e-4 * abs(values[0])
+    assert (
+        np.diff(values).min() >= -1e-11 * abs(values[0])
+        if double
+        else np.diff(values).min() >= -1e-4 * abs(values[0])
+    )
 
 
 def test_iterations_add_up(dtype):
@@ -165,17 +216,25 @@ def test_a_weight_is_a_number_of_rows(seed, double, least):
     x, w = data(seed, 30), rng.integers(0, 4, 30)
     repeated = np.repeat(x, w, axis=0)
     m = start(repeated, 3, seed)
-    x[w == 0] = rng.choice([np.nan, np.inf, -np.inf, 1e30])  # a row without weight may hold anything
+    # a row without weight may hold anything
+    x[w == 0] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
     with jax.enable_x64(double):
         dtype = jnp.zeros(()).dtype
         padded = np.zeros((90, 2))  # one shape for all, so one program
         padded[: len(repeated)] = repeated
         m, ones = put(m, dtype), np.arange(90) < len(repeated)
-        rows, all_rows = (jnp.asarray(x, dtype), jnp.asarray(w, dtype)), (jnp.asarray(padded, dtype), jnp.asarray(ones))
+        rows, all_rows = (
+            (jnp.asarray(x, dtype), jnp.asarray(w, dtype)),
+            (jnp.asarray(padded, dtype), jnp.asarray(ones)),
+        )
         got, expected = EM(m, *rows, 5, 0.0, least), EM(m, *all_rows, 5, 0.0, least)
         for a, b in zip(got, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-8 if double else 2e-3, atol=1e-8 if double else 2e-3)
-        assert float(SCORE(got, *rows)) == pytest.approx(float(SCORE(got, *all_rows)), rel=1e-8 if double else 1e-4)
+            np.testing.assert_allclose(
+                a, b, rtol=1e-8 if double else 2e-3, atol=1e-8 if double else 2e-3
+            )
+        assert float(SCORE(got, *rows)) == pytest.approx(
+            float(SCORE(got, *all_rows)), rel=1e-8 if double else 1e-4
+        )
 
 
 def test_padding_is_nothing(dtype):
@@ -188,16 +247,28 @@ def test_padding_is_nothing(dtype):
 
 
 def test_a_small_component_keeps_its_covariance(dtype):
-    """The third component has two points: fewer than three keep their covariance, and it takes two by default (d)."""
-    x = jnp.asarray(np.concatenate([np.random.default_rng(0).normal(size=(40, 2)), [[50.0, 50.0], [51.0, 52.0]]]), dtype)
-    m = Mixture(jnp.asarray([0.9, 0.1], dtype), jnp.asarray([[0.0, 0.0], [50.0, 50.0]], dtype), jnp.asarray([np.eye(2), 4 * np.eye(2)], dtype))
+    """The third component has two points: fewer than three keep their covariance, and it takes two
+    by default (d).
+    """
+    x = jnp.asarray(
+        np.concatenate(
+            [np.random.default_rng(0).normal(size=(40, 2)), [[50.0, 50.0], [51.0, 52.0]]]
+        ),
+        dtype,
+    )
+    m = Mixture(
+        jnp.asarray([0.9, 0.1], dtype),
+        jnp.asarray([[0.0, 0.0], [50.0, 50.0]], dtype),
+        jnp.asarray([np.eye(2), 4 * np.eye(2)], dtype),
+    )
     for least in (3.0, 2.5):
         got = EM(m, x, jnp.ones(42, dtype), least=least)
         assert got.covariances[1].tolist() == [[4, 0], [0, 4]]
         np.testing.assert_allclose(got.means[1], [50.5, 51], rtol=1e-6)
         np.testing.assert_allclose(got.weights, [40 / 42, 2 / 42], rtol=1e-5)
         assert not np.array_equal(got.covariances[0], m.covariances[0])
-    # two points span a line, so the new covariance is refused, save with a regularisation: a quarter and a half of the differences' products
+    # two points span a line, so the new covariance is refused, save with a regularisation: a
+    # quarter and a half of the differences' products
     assert EM(m, x, jnp.ones(42, dtype)).covariances[1].tolist() == [[4, 0], [0, 4]]
     got = EM(m, x, jnp.ones(42, dtype), regularisation=0.1, least=1.5).covariances[1]
     np.testing.assert_allclose(got, [[0.35, 0.5], [0.5, 1.1]], rtol=1e-4)
@@ -210,7 +281,11 @@ def test_a_small_component_keeps_its_covariance(dtype):
 def test_a_component_that_no_point_belongs_to_stays(dtype):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(30, 2)), dtype)
     far = 1e6 if dtype == "float32" else 1e8
-    m = Mixture(jnp.full(2, 0.5, dtype), jnp.asarray([[0.0, 0.0], [far, far]], dtype), jnp.asarray([np.eye(2)] * 2, dtype))
+    m = Mixture(
+        jnp.full(2, 0.5, dtype),
+        jnp.asarray([[0.0, 0.0], [far, far]], dtype),
+        jnp.asarray([np.eye(2)] * 2, dtype),
+    )
     got = EM(m, x, jnp.ones(30, dtype))
     assert got.means[1].tolist() == [far, far] and got.covariances[1].tolist() == [[1, 0], [0, 1]]
     assert 0 < got.weights[1] < 1e-30 and np.isfinite(jnp.log(got.weights)).all()
@@ -242,7 +317,12 @@ def test_em_never_returns_nan(x, w, dtype):
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), double=st.booleans(), least=st.sampled_from([0.0, 2.0]), exponent=st.integers(-12, 12))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    double=st.booleans(),
+    least=st.sampled_from([0.0, 2.0]),
+    exponent=st.integers(-12, 12),
+)
 def test_em_never_returns_nan_either(seed, double, least, exponent):
     """More components than the points are good for, some of them the same, at any scale."""
     rng = np.random.default_rng(seed)
@@ -252,15 +332,31 @@ def test_em_never_returns_nan_either(seed, double, least, exponent):
     m = m._replace(covariances=m.covariances * 100.0 ** rng.integers(-3, 3, (8, 1, 1)))
     with jax.enable_x64(double):
         dtype = jnp.zeros(()).dtype
-        got = EM(put(m, dtype), jnp.asarray(x, dtype), jnp.asarray(rng.integers(0, 3, 12), dtype), 30, 0.0, least)
-        assert all(np.isfinite(a).all() for a in got) and np.isfinite(jnp.linalg.cholesky(got.covariances)).all()
+        got = EM(
+            put(m, dtype),
+            jnp.asarray(x, dtype),
+            jnp.asarray(rng.integers(0, 3, 12), dtype),
+            30,
+            0.0,
+            least,
+        )
+        assert (
+            all(np.isfinite(a).all() for a in got)
+            and np.isfinite(jnp.linalg.cholesky(got.covariances)).all()
+        )
         assert np.isfinite(np.asarray(DENSITY(got, jnp.asarray(x, dtype)))).all()
 
 
 def test_a_component_does_not_fall_into_a_point(dtype):
-    """Many times the same point, and others: what rounding leaves of the spread about it is no covariance."""
-    x = np.concatenate([np.random.default_rng(1).normal(size=(20, 2)), np.full((9, 2), [100 / 3, -200 / 7])])
-    m = Mixture(np.full(2, 0.5), np.array([[0.0, 0.0], [33.0, -28.0]]), np.array([np.eye(2), np.eye(2)]))
+    """Many times the same point, and others: what rounding leaves of the spread about it is no
+    covariance.
+    """
+    x = np.concatenate(
+        [np.random.default_rng(1).normal(size=(20, 2)), np.full((9, 2), [100 / 3, -200 / 7])]
+    )
+    m = Mixture(
+        np.full(2, 0.5), np.array([[0.0, 0.0], [33.0, -28.0]]), np.array([np.eye(2), np.eye(2)])
+    )
     got = EM(put(m, dtype), jnp.asarray(x, dtype), jnp.ones(29, dtype), 10, 0.0, 0.0)
     assert got.covariances[1].tolist() == [[1, 0], [0, 1]]
     np.testing.assert_allclose(got.means[1], [100 / 3, -200 / 7], rtol=1e-6)
@@ -272,7 +368,13 @@ def test_under_jit_and_vmap(dtype, key):
 
     def all_of_it(key, x, w, r):
         m = em(three(dtype), x, w, regularisation=r, least=r)
-        return m, log_prob(m, x), responsibilities(m, x), log_likelihood(m, x, w), sample(key, m, 10)
+        return (
+            m,
+            log_prob(m, x),
+            responsibilities(m, x),
+            log_likelihood(m, x, w),
+            sample(key, m, 10),
+        )
 
     keys = jax.random.split(key, 3)
     got = jax.jit(jax.vmap(all_of_it))(keys, x, w, reg)
@@ -280,20 +382,36 @@ def test_under_jit_and_vmap(dtype, key):
     np.testing.assert_allclose(log_prob(three(dtype), x[0]), DENSITY(three(dtype), x[0]), rtol=1e-5)
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(alone), strict=True):
         assert a.dtype == b.dtype == dtype
-        np.testing.assert_allclose(a[1], b, rtol=1e-3 if dtype == "float32" else 1e-9, atol=1e-4 if dtype == "float32" else 1e-9)
+        np.testing.assert_allclose(
+            a[1],
+            b,
+            rtol=1e-3 if dtype == "float32" else 1e-9,
+            atol=1e-4 if dtype == "float32" else 1e-9,
+        )
 
 
 def test_one_component_is_a_gaussian(dtype, key):
     x, w = jnp.asarray(data(5, 30), dtype), jax.random.uniform(key, (30,), dtype)
     g = Gaussian(jnp.zeros(2, dtype), jnp.eye(2, dtype=dtype))
-    got, fitted = EM(Mixture(jnp.ones(1, dtype), g.mean[None], g.covariance[None]), x, w, 1), jax.jit(gaussian.fit)(g, x, w)
+    got, fitted = (
+        EM(Mixture(jnp.ones(1, dtype), g.mean[None], g.covariance[None]), x, w, 1),
+        jax.jit(gaussian.fit)(g, x, w),
+    )
     np.testing.assert_allclose(got.means[0], fitted.mean, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(got.covariances[0], fitted.covariance, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("given, expected", [(dict(iterations=-1), "a whole number of at least 0, received -1"), (dict(iterations=2.0), "a whole number"),
-                                             (dict(iterations=True), "a whole number"), (dict(regularisation=-1e-3), "a number of at least 0"),
-                                             (dict(least=np.nan), "a number of at least 0"), (dict(least=np.ones(3)), "a number of at least 0")])  # fmt: skip
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        (dict(iterations=-1), "a whole number of at least 0, received -1"),
+        (dict(iterations=2.0), "a whole number"),
+        (dict(iterations=True), "a whole number"),
+        (dict(regularisation=-1e-3), "a number of at least 0"),
+        (dict(least=np.nan), "a number of at least 0"),
+        (dict(least=np.ones(3)), "a number of at least 0"),
+    ],
+)
 def test_bad_settings(given, expected):
     with pytest.raises(ValueError, match=f"mixture.em: {next(iter(given))} must be {expected}"):
         em(three("float32"), jnp.zeros((5, 2)), jnp.ones(5), **given)
@@ -303,8 +421,21 @@ def test_shapes_that_do_not_fit():
     m = three("float32")
     for f in (mixture.em, mixture.log_likelihood):
         for x, w in (((5, 3), (5,)), ((5, 2), (4,)), ((2,), (2,))):
-            with pytest.raises(ValueError, match=rf"mixture.{f.__name__}: x must be \[n, 2\] and its weights \[n\], received"):
+            with pytest.raises(
+                ValueError,
+                match=rf"mixture.{f.__name__}: x must be \[n, 2\] and its weights \[n\], received",
+            ):
                 f(m, jnp.zeros(x), jnp.zeros(w))
-        for bad in (m._replace(weights=jnp.ones(2)), m._replace(covariances=jnp.ones((3, 2))), m._replace(means=jnp.ones(3))):
-            with pytest.raises(ValueError, match=rf"mixture.{f.__name__}: weights must be \[k\], means \[k, d\] and covariances \[k, d, d\], received"):
+        for bad in (
+            m._replace(weights=jnp.ones(2)),
+            m._replace(covariances=jnp.ones((3, 2))),
+            m._replace(means=jnp.ones(3)),
+        ):
+            with pytest.raises(
+                ValueError,
+                match=(
+                    rf"mixture.{f.__name__}: weights must be \[k\], means \[k, d\] and covariances"
+                    r" \[k, d, d\], received"
+                ),
+            ):
                 f(bad, jnp.zeros((5, 2)), jnp.ones(5))

@@ -1,4 +1,6 @@
-"""Random search: its counts and rate against a known truth, episodes known by their numbers, an archive that replays, and traced runs."""
+"""Random search: its counts and rate against a known truth, episodes known by their numbers, an
+archive that replays, and traced runs.
+"""
 
 import importlib
 
@@ -14,25 +16,39 @@ from jast.distributions import Categorical, seeds
 from jast.search import episodes as E
 from jast.search.monte_carlo import monte_carlo
 
-module = importlib.import_module("jast.search.monte_carlo")  # the package has the function by that name
+# the package has the function by that name
+module = importlib.import_module("jast.search.monte_carlo")
 
 
 def lottery():
     """Four draws of seeds; fails where the low bits of all are zero: once in 2^8 episodes."""
     step = lambda s, x: s + (x % 4).astype(jnp.int32)
-    return jast.Simulator(lambda x0: jnp.int32(0), step, lambda s: seeds(), lambda s: (s == 0, s.astype(float)), 4, episodic=True)
+    return jast.Simulator(
+        lambda x0: jnp.int32(0),
+        step,
+        lambda s: seeds(),
+        lambda s: (s == 0, s.astype(float)),
+        4,
+        episodic=True,
+    )
 
 
 def coins():
     """Six coins that show heads in three of ten; fails at the fourth head."""
     step = lambda s, x: s + x.astype(jnp.int32)
     return jast.Simulator(
-        lambda x0: jnp.int32(0), step, lambda s: Categorical(probs=jnp.array([0.7, 0.3])), lambda s: (s >= 4, jnp.maximum(4 - s, 0).astype(float)), 6
+        lambda x0: jnp.int32(0),
+        step,
+        lambda s: Categorical(probs=jnp.array([0.7, 0.3])),
+        lambda s: (s >= 4, jnp.maximum(4 - s, 0).astype(float)),
+        6,
     )
 
 
 def check_replays(sim, result, reward, equal):
-    """Every archived failure fails again with the very same numbers, and they are distinct, best first."""
+    """Every archived failure fails again with the very same numbers, and they are distinct, best
+    first.
+    """
     f = result.failures
     for i in range(f.size):
         again = jax.device_get(jast.replay(sim, f.episode(i), reward=reward)._replace(states=None))
@@ -54,7 +70,11 @@ def test_rate_of_a_known_system(key, equal):
     assert r.best_reward_per_tree.shape == (1,) and r.history.best_reward.shape[1] == 1
     assert r.history.simulations[-1] == n and r.history.failures[-1] == r.failures.seen
     assert (np.diff(r.history.best_reward[:, 0]) >= 0).all()
-    assert r.settings["method"] == "monte_carlo" and r.settings["episodes"] == n and "interrupted" not in r.settings
+    assert (
+        r.settings["method"] == "monte_carlo"
+        and r.settings["episodes"] == n
+        and "interrupted" not in r.settings
+    )
     assert "likeliest failure" in str(r)
 
 
@@ -63,7 +83,19 @@ def test_counts_are_those_of_the_episodes(key):
     sim, n = walk(), 301  # no multiple of any number of lanes
     r = monte_carlo(key, sim, episodes=n, top=1000)
     tree = module.tree_keys(key, 1)[0]
-    one = jax.jit(lambda i: module._play(tree, sim, rewards.standard(), actions.samples(), i[None], jnp.ones((1,), bool), record=True).episode)
+    one = jax.jit(
+        lambda i: (
+            module._play(
+                tree,
+                sim,
+                rewards.standard(),
+                actions.samples(),
+                i[None],
+                jnp.ones((1,), bool),
+                record=True,
+            ).episode
+        )
+    )
     played = [jax.tree.map(lambda a: a[0], one(jnp.int32(i))) for i in range(n)]
     failing = [i for i, e in enumerate(played) if e.failure]
     assert r.episodes == n and r.failures.seen == len(failing) and r.first_failure == failing[0] + 1
@@ -77,7 +109,10 @@ def test_episodes_do_not_depend_on_their_number_or_the_lanes(key, equal, monkeyp
     sim = walk()
     short, long = (monte_carlo(key, sim, episodes=n, top=400) for n in (500, 700))
     within = long.failures.simulation < 500
-    assert sorted(short.failures.simulation) == sorted(long.failures.simulation[within]) and short.first_failure == long.first_failure
+    assert (
+        sorted(short.failures.simulation) == sorted(long.failures.simulation[within])
+        and short.first_failure == long.first_failure
+    )
     equal(jax.tree.map(lambda a: a[within], long.failures.episodes), short.failures.episodes)
     monkeypatch.setattr(module, "LANES", 64)
     chunked = monte_carlo(key, sim, episodes=700, top=400)
@@ -94,9 +129,15 @@ def test_kinds_of_disturbances(key, equal, make):
     check_replays(sim, r, rewards.standard(), equal)
     assert r.failing.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
-        assert r.simulator_steps == 30_000 and not r.best.failure and r.failures.size == 0 and r.first_failure is None
+        assert (
+            r.simulator_steps == 30_000
+            and not r.best.failure
+            and r.failures.size == 0
+            and r.first_failure is None
+        )
         assert "no failure" in str(r)
-    if make is coins:  # many repetitions: each distinct failure is kept once, with the times that it was found
+    # many repetitions: each distinct failure is kept once, with the times that it was found
+    if make is coins:
         assert r.failures.size < 64 and r.failures.counts.sum() == r.failures.seen > 150
         p = sum(c * 0.3**k * 0.7 ** (6 - k) for k, c in ((4, 15), (5, 6), (6, 1)))
         assert abs(r.failing_share - p) < 4 * np.sqrt(p * (1 - p) / 3000)
@@ -105,8 +146,18 @@ def test_kinds_of_disturbances(key, equal, make):
 def test_uniform_actions(key, equal):
     sim = jast.simulators.ferry()
     r = monte_carlo(key, sim, episodes=20_000, **S0)
-    assert not r.failing.any() and 20.9 < r.simulator_steps / r.episodes <= 21 and -20 < r.best.reward < -13
-    near = jast.Simulator(sim.init, sim.step, sim.disturbance, lambda s: (sim.evaluate(s)[0] | (sim.evaluate(s)[1] < 15), sim.evaluate(s)[1]), 21)
+    assert (
+        not r.failing.any()
+        and 20.9 < r.simulator_steps / r.episodes <= 21
+        and -20 < r.best.reward < -13
+    )
+    near = jast.Simulator(
+        sim.init,
+        sim.step,
+        sim.disturbance,
+        lambda s: (sim.evaluate(s)[0] | (sim.evaluate(s)[1] < 15), sim.evaluate(s)[1]),
+        21,
+    )
     check_replays(near, monte_carlo(key, near, episodes=20_000, **S0), S0["reward"], equal)
 
 
@@ -116,13 +167,24 @@ def test_invalid_episodes_are_counted_and_never_best(key):
     assert 0.2 < r.invalid / 2000 < 0.5 and np.isfinite(r.best.reward) and r.failing.any()
     assert np.isfinite(r.failures.episodes.reward).all() and "invalid" in str(r)
     r = monte_carlo(key, walk(step=lambda s, x: s + jnp.nan), episodes=200)
-    assert r.invalid == 200 and r.simulator_steps == 200 and r.best.reward == -np.inf and not r.failing.any() and r.failures.size == 0
+    assert (
+        r.invalid == 200
+        and r.simulator_steps == 200
+        and r.best.reward == -np.inf
+        and not r.failing.any()
+        and r.failures.size == 0
+    )
     assert r.best_reward_per_tree == -np.inf
 
 
 def test_systems_that_never_or_always_fail(key):
     r = monte_carlo(key, walk(fails=lambda s: s > 1e9), episodes=300)
-    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (0, None, 0, 1800)
+    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (
+        0,
+        None,
+        0,
+        1800,
+    )
     r = monte_carlo(key, walk(fails=lambda s: s < 1e9), episodes=300)  # at the start
     assert (r.failing_share, r.first_failure, r.simulator_steps, r.best.length) == (1, 1, 0, 0)
     assert (r.failures.size, r.failures.counts.tolist(), r.failures.seen) == (1, [300], 300)
@@ -132,15 +194,31 @@ def test_under_jit_and_vmap(key):
     thresholds = jnp.array([2.0, 3.0, 50.0])
     search = lambda sim: monte_carlo(key, sim, episodes=1000)
     loop = [search(jast.simulators.walk1d(threshold=float(t), horizon=6)) for t in thresholds]
-    traced = jax.jit(jax.vmap(lambda t: search(jast.simulators.walk1d(threshold=t, horizon=6))))(thresholds)
+    traced = jax.jit(jax.vmap(lambda t: search(jast.simulators.walk1d(threshold=t, horizon=6))))(
+        thresholds
+    )
     batch = jax.vmap(lambda t: jast.simulators.walk1d(threshold=t, horizon=6))(thresholds)
-    np.testing.assert_allclose(jax.vmap(lambda sim: search(sim).best_reward_per_tree)(batch), traced.best_reward_per_tree, rtol=1e-5)
+    np.testing.assert_allclose(
+        jax.vmap(lambda sim: search(sim).best_reward_per_tree)(batch),
+        traced.best_reward_per_tree,
+        rtol=1e-5,
+    )
     for i, r in enumerate(loop):
-        np.testing.assert_allclose(traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=1e-5)
-        np.testing.assert_allclose(traced.best.disturbances[i], r.best.disturbances, rtol=1e-4, atol=1e-5)
-        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (r.episodes, r.simulator_steps, r.invalid)
+        np.testing.assert_allclose(
+            traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=1e-5
+        )
+        np.testing.assert_allclose(
+            traced.best.disturbances[i], r.best.disturbances, rtol=1e-4, atol=1e-5
+        )
+        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (
+            r.episodes,
+            r.simulator_steps,
+            r.invalid,
+        )
         assert traced.first_failure[i] == (-1 if r.first_failure is None else r.first_failure)
-        assert traced.failing[i] == r.failing and traced.failing_share[i] == pytest.approx(r.failing_share)
+        assert traced.failing[i] == r.failing and traced.failing_share[i] == pytest.approx(
+            r.failing_share
+        )
     assert traced.failures is None and traced.history is None and traced.settings is None
 
 
@@ -154,7 +232,11 @@ def test_interruption_and_callback(key, equal, monkeypatch):
             raise KeyboardInterrupt
 
     r = monte_carlo(key, walk(), episodes=1000, callback=callback)
-    assert seen == [(128, 1000), (256, 1000)] and r.episodes == 256 and r.settings["interrupted"] == "after 256 of 1000 episodes"
+    assert (
+        seen == [(128, 1000), (256, 1000)]
+        and r.episodes == 256
+        and r.settings["interrupted"] == "after 256 of 1000 episodes"
+    )
     assert "interrupted: after 256" in str(r)
     equal(r.failures, monte_carlo(key, walk(), episodes=256).failures)
     with pytest.raises(KeyboardInterrupt):
@@ -167,7 +249,12 @@ def test_progress_bar(key, capsys):
 
 
 def test_plain_functions_and_old_keys(key):
-    r = monte_carlo(jax.random.PRNGKey(3), walk(), episodes=200, reward=lambda log_p, event, distance, terminal, approach: -distance)
+    r = monte_carlo(
+        jax.random.PRNGKey(3),
+        walk(),
+        episodes=200,
+        reward=lambda log_p, event, distance, terminal, approach: -distance,
+    )
     assert r.settings["seed"] == [0, 3] and r.best.reward <= 0
 
 

@@ -1,4 +1,6 @@
-"""Pictures: that each draws what it says, in the axes that it is given, and refuses what it cannot draw."""
+"""Pictures: that each draws what it says, in the axes that it is given, and refuses what it cannot
+draw.
+"""
 
 import subprocess
 import sys
@@ -35,8 +37,16 @@ def drawn(ax):
 
 
 def result(trees=5, best=None):
-    best = np.maximum.accumulate(np.random.default_rng(0).normal(size=(18, trees)), 0) if best is None else best
-    return SimpleNamespace(history=SimpleNamespace(simulations=np.arange(1, len(best) + 1) * 500, best_reward=jnp.asarray(best)))
+    best = (
+        np.maximum.accumulate(np.random.default_rng(0).normal(size=(18, trees)), 0)
+        if best is None
+        else best
+    )
+    return SimpleNamespace(
+        history=SimpleNamespace(
+            simulations=np.arange(1, len(best) + 1) * 500, best_reward=jnp.asarray(best)
+        )
+    )
 
 
 def test_ferry_shows_both_paths_and_the_closest_approach():
@@ -75,11 +85,27 @@ def test_history_mean_band_and_best():
 
 def test_disturbances_of_any_structure():
     [ax] = plot.disturbances(HIT)
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.asarray(HIT.disturbances)[: int(HIT.length)])
-    joint = lambda s: Joint({"a": Normal(0.0, 1.0), "b": MultivariateNormalDiag(jnp.zeros(3)), "c": MultivariateNormalDiag(jnp.zeros(9))})
-    sim = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x["a"], joint, lambda s: (jnp.abs(s) > 50, jnp.abs(s)), horizon=4)
+    np.testing.assert_array_equal(
+        ax.lines[0].get_ydata(), np.asarray(HIT.disturbances)[: int(HIT.length)]
+    )
+    joint = lambda s: Joint(
+        {
+            "a": Normal(0.0, 1.0),
+            "b": MultivariateNormalDiag(jnp.zeros(3)),
+            "c": MultivariateNormalDiag(jnp.zeros(9)),
+        }
+    )
+    sim = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s + x["a"],
+        joint,
+        lambda s: (jnp.abs(s) > 50, jnp.abs(s)),
+        horizon=4,
+    )
     axes = plot.disturbances(jast.rollout(jax.random.key(0), sim))
-    assert [len(drawn(ax).lines) for ax in axes] == [1, 3, 9] and [ax.get_ylabel() for ax in axes] == ["x['a']", "x['b']", "x['c']"]
+    assert [len(drawn(ax).lines) for ax in axes] == [1, 3, 9] and [
+        ax.get_ylabel() for ax in axes
+    ] == ["x['a']", "x['b']", "x['c']"]
     with pytest.raises(ValueError, match="plot.disturbances: axes must be at least 3"):
         plot.disturbances(jast.rollout(jax.random.key(0), sim), plt.figure().subplots())
     drawn(plot.disturbances(jast.replay(FERRY, jnp.zeros((0,))))[0])
@@ -87,8 +113,13 @@ def test_disturbances_of_any_structure():
 
 def test_distances():
     many = jax.vmap(lambda key: jast.rollout(key, FERRY))(jax.random.split(jax.random.key(0), 30))
-    ax = drawn(plot.distances(many, jax.tree.map(lambda a: a[None], HIT), labels=["nominal", "found"]))
-    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["nominal: 30 episodes, 0 fail", "found: 1 episode, 1 fail"]
+    ax = drawn(
+        plot.distances(many, jax.tree.map(lambda a: a[None], HIT), labels=["nominal", "found"])
+    )
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == [
+        "nominal: 30 episodes, 0 fail",
+        "found: 1 episode, 1 fail",
+    ]
     drawn(plot.distances(many._replace(distance=jnp.full(30, jnp.inf))))
     with pytest.raises(ValueError, match="plot.distances: labels must be 1 names"):
         plot.distances(many, labels=[])
@@ -99,7 +130,10 @@ def test_distances():
 def test_one_episode_of_the_right_system_is_asked_for():
     many = jax.tree.map(lambda a: jnp.stack([a, a]), HIT)
     for draw in (plot.ferry, plot.disturbances):
-        with pytest.raises(ValueError, match=r"episode must be one Episode, received Episode with leading axes \(2,\)"):
+        with pytest.raises(
+            ValueError,
+            match=r"episode must be one Episode, received Episode with leading axes \(2,\)",
+        ):
             draw(many)
     with pytest.raises(ValueError, match="plot.ferry: episode must be of jast.simulators.ferry"):
         plot.ferry(HIT._replace(states=jnp.zeros(22)))

@@ -1,4 +1,6 @@
-"""Pictures of encounters: that each shows what the states say, at the moments and times that it names, and refuses what it cannot draw."""
+"""Pictures of encounters: that each shows what the states say, at the moments and times that it
+names, and refuses what it cannot draw.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +47,11 @@ def drawn(axes):
 
 def labelled(ax):
     """The lines and shapes of a panel by their words in the legend."""
-    return {artist.get_label(): artist for artist in (*ax.lines, *ax.patches) if not (artist.get_label() or "_").startswith("_")}
+    return {
+        artist.get_label(): artist
+        for artist in (*ax.lines, *ax.patches)
+        if not (artist.get_label() or "_").startswith("_")
+    }
 
 
 def ways(episode, t):
@@ -64,10 +70,16 @@ def test_a_panel_shows_the_ways_up_to_its_moment():
     assert len(axes) == 3
     for ax, t in zip(axes, moments, strict=True):
         shown = labelled(ax)
-        for name, way in zip(("ferry", "adversary (a dot a step)", "adversary as believed"), ways(EPISODE, t), strict=True):
+        for name, way in zip(
+            ("ferry", "adversary (a dot a step)", "adversary as believed"),
+            ways(EPISODE, t),
+            strict=True,
+        ):
             np.testing.assert_allclose(shown[name].get_xydata(), way, rtol=1e-6)
         _, true, believed = (way[-1] for way in ways(EPISODE, t))
-        np.testing.assert_allclose(shown["from belief to truth"].get_xydata(), np.stack([true, believed]), rtol=1e-6)
+        np.testing.assert_allclose(
+            shown["from belief to truth"].get_xydata(), np.stack([true, believed]), rtol=1e-6
+        )
         np.testing.assert_array_equal(shown["the ferry's route"].get_xydata(), [[0, 0], [0, 100]])
         assert shown["adversary as believed"].is_dashed() and ax.get_aspect() == 1
 
@@ -78,19 +90,30 @@ def test_the_zones_are_those_of_the_believed_adversary():
     course = np.arctan2(track.v_e, track.v_n)
     for zone in planner.ZONES:
         edge = labelled(ax)[zone.name].get_xy()
-        np.testing.assert_allclose(edge[:200], zone_outline(zone, track.n, track.e, course), atol=1e-4)
+        np.testing.assert_allclose(
+            edge[:200], zone_outline(zone, track.n, track.e, course), atol=1e-4
+        )
         ahead = (edge - [track.e, track.n]) @ [np.sin(course), np.cos(course)]
         right = (edge - [track.e, track.n]) @ [np.cos(course), -np.sin(course)]
-        np.testing.assert_allclose([ahead.max(), right.max(), -ahead.min(), -right.min()], [zone.forward, zone.starboard, zone.aft, zone.port], rtol=1e-3)
+        np.testing.assert_allclose(
+            [ahead.max(), right.max(), -ahead.min(), -right.min()],
+            [zone.forward, zone.starboard, zone.aft, zone.port],
+            rtol=1e-3,
+        )
     looks = {(p.get_linestyle(), p.get_facecolor()) for p in ax.patches[:3]}
-    assert len(looks) == 3 and len({line for line, _ in looks}) == 3  # told apart without colour too
+    # told apart without colour too
+    assert len(looks) == 3 and len({line for line, _ in looks}) == 3
 
 
 def test_the_zones_of_a_track_at_rest_point_north():
     still = SCENARIOS["crossing"]._replace(route=np.zeros((3, 3)))
     episode = jast.replay(colav(still), jnp.zeros(3))
     [ax] = plot.colav(episode, moments=[3])
-    np.testing.assert_allclose(labelled(ax)["region of collision"].get_xy()[0], [50, 20 + planner.ZONES[0].forward], atol=1e-4)
+    np.testing.assert_allclose(
+        labelled(ax)["region of collision"].get_xy()[0],
+        [50, 20 + planner.ZONES[0].forward],
+        atol=1e-4,
+    )
 
 
 def test_ships_point_where_they_head():
@@ -98,7 +121,9 @@ def test_ships_point_where_they_head():
     s = at(EPISODE, 9)
     headings = (s.pose.psi, s.adversary.pose.psi, np.arctan2(s.track.v_e, s.track.v_n))
     for hull, way, psi in zip(ax.patches[3:], ways(EPISODE, 9), headings, strict=True):
-        np.testing.assert_allclose(hull.get_xy()[0], way[-1] + 4 * np.array([np.sin(psi), np.cos(psi)]), atol=1e-4)  # the bow, of 8 m
+        np.testing.assert_allclose(
+            hull.get_xy()[0], way[-1] + 4 * np.array([np.sin(psi), np.cos(psi)]), atol=1e-4
+        )  # the bow, of 8 m
         assert np.ptp(hull.get_xy(), 0).max() < 9
     assert ax.patches[5].get_facecolor()[3] == 0  # what is only believed is hollow
 
@@ -110,7 +135,8 @@ def test_moments():
     assert times(plot.colav(EPISODE, moments=1)) == expected[2:]
     assert times(plot.colav(EPISODE, moments=np.array([3, 1]))) == ["t = 9", "t = 3"]
     assert len(plot.colav(SHORT, moments=9)) == 5  # an episode of 4 steps has no more
-    soon = EPISODE._replace(states=EPISODE.states._replace(near=jnp.arange(26.0)))  # closest at the start: it is shown as it went on
+    # closest at the start: it is shown as it went on
+    soon = EPISODE._replace(states=EPISODE.states._replace(near=jnp.arange(26.0)))
     assert times(plot.colav(soon)) == ["t = 24", "t = 51", "t = 75"]
 
 
@@ -121,9 +147,16 @@ def test_titles_tell_the_orders_and_the_outcome():
     for t, ax in enumerate(axes):  # what is ordered on a picture is in force in the next step
         assert ax.get_title(loc="left") == f"t = {3 * t} s, ordered {orders[min(t + 1, N)]:.2f} m/s"
     title = axes[0].figure.get_suptitle()
-    assert "no failure, steps: 25" in title and f"log p {float(EPISODE.log_prob):.3f}" in title and "reward" in title
+    assert (
+        "no failure, steps: 25" in title
+        and f"log p {float(EPISODE.log_prob):.3f}" in title
+        and "reward" in title
+    )
     assert f"closest approach {float(EPISODE.distance):.2f} m by t = {3 * NEAREST} s" in title
-    assert "failure at step 25" in plot.colav(EPISODE._replace(failure=jnp.array(True)))[0].figure.get_suptitle()
+    assert (
+        "failure at step 25"
+        in plot.colav(EPISODE._replace(failure=jnp.array(True)))[0].figure.get_suptitle()
+    )
 
 
 def test_all_panels_have_the_same_limits_that_hold_the_ways():
@@ -137,7 +170,9 @@ def test_all_panels_have_the_same_limits_that_hold_the_ways():
 def test_the_legend_stands_beside_the_panels():
     axes = drawn(plot.colav(EPISODE))
     legend = axes[-1].get_legend()
-    assert {t.get_text() for t in legend.get_texts()} == set(labelled(axes[-1])) and len(legend.get_texts()) == 8
+    assert {t.get_text() for t in legend.get_texts()} == set(labelled(axes[-1])) and len(
+        legend.get_texts()
+    ) == 8
     assert legend.get_window_extent().x0 >= axes[-1].get_window_extent().x1
 
 
@@ -147,15 +182,23 @@ def test_given_axes_are_drawn_into():
     assert all(a is b for a, b in zip(axes, given[:3], strict=True)) and not given[3].lines
     given = plt.figure(layout="constrained").subplots(3)
     axes = drawn(plot.colav_story(EPISODE, axes=given))
-    assert all(a is b for a, b in zip(axes, given, strict=True)) and {ax.get_xlim() for ax in axes} == {(0, 75)}
+    assert all(a is b for a, b in zip(axes, given, strict=True)) and {
+        ax.get_xlim() for ax in axes
+    } == {(0, 75)}
     for draw in (plot.colav, plot.colav_story):
-        with pytest.raises(ValueError, match=f"plot.{draw.__name__}: axes must be at least 3, one for each .*, received 1"):
+        with pytest.raises(
+            ValueError,
+            match=f"plot.{draw.__name__}: axes must be at least 3, one for each .*, received 1",
+        ):
             draw(EPISODE, axes=given[0])
 
 
 def test_an_archived_episode_is_replayed():
     bare = jax.device_get(EPISODE._replace(states=None))
-    for draw, axes in ((plot.colav, plot.colav(EPISODE)), (plot.colav_story, plot.colav_story(EPISODE))):
+    for draw, axes in (
+        (plot.colav, plot.colav(EPISODE)),
+        (plot.colav_story, plot.colav_story(EPISODE)),
+    ):
         for ax, same in zip(axes, draw(bare, SIM), strict=True):
             for a, b in zip(ax.lines, same.lines, strict=True):
                 np.testing.assert_array_equal(a.get_xydata(), b.get_xydata())
@@ -191,17 +234,35 @@ def test_the_story_tells_the_kinds_of_disturbance(three):
     sim, episode = three
     x = {kind: np.asarray(a, float) for kind, a in episode.disturbances.items()}
     axes = drawn(plot.colav_story(episode, sim))
-    assert [ax.get_ylabel() for ax in axes] == ["delay (s)", "steering (rad/s)", "size of noise", "distance (m)", "speed (m/s)"]
+    assert [ax.get_ylabel() for ax in axes] == [
+        "delay (s)",
+        "steering (rad/s)",
+        "size of noise",
+        "distance (m)",
+        "speed (m/s)",
+    ]
     shown = [patch.get_data()[0] for ax in axes[:3] for patch in ax.patches]
     size = lambda a: np.linalg.norm(a, axis=1)
-    for values, expected in zip(shown, (40 * x["delay"], x["steering"] - 0.5, size(x["noise"][:, :2]), size(x["noise"][:, 2:])), strict=True):
+    for values, expected in zip(
+        shown,
+        (40 * x["delay"], x["steering"] - 0.5, size(x["noise"][:, :2]), size(x["noise"][:, 2:])),
+        strict=True,
+    ):
         np.testing.assert_allclose(values, expected[: int(episode.length)], rtol=1e-5)
-    assert [t.get_text() for t in axes[2].get_legend().get_texts()] == ["position (m)", "velocity (m/s)"]
+    assert [t.get_text() for t in axes[2].get_legend().get_texts()] == [
+        "position (m)",
+        "velocity (m/s)",
+    ]
 
 
 @pytest.mark.parametrize(
     ("kind", "x", "label"),
-    [("delay", 0.5, "delay (share)"), ("steering", 0.5, "steering (rad/s)"), ("steering", 0.0, "steering (rad/s)"), ("noise", [0.1] * 4, "size of noise")],
+    [
+        ("delay", 0.5, "delay (share)"),
+        ("steering", 0.5, "steering (rad/s)"),
+        ("steering", 0.0, "steering (rad/s)"),
+        ("noise", [0.1] * 4, "size of noise"),
+    ],
 )
 def test_the_story_tells_a_single_kind_by_itself(kind, x, label):
     episode = jast.replay(colav("sharp turn", kind), jnp.tile(jnp.array(x), (2, *[1] * np.ndim(x))))
@@ -211,7 +272,8 @@ def test_the_story_tells_a_single_kind_by_itself(kind, x, label):
 def test_the_story_takes_the_longest_delay_of_the_simulator():
     [delay, *_] = plot.colav_story(EPISODE, colav(longest_delay=10.0))
     np.testing.assert_allclose(delay.patches[0].get_data()[0], np.linspace(1, 6, 25), rtol=1e-6)
-    assert plot.colav_story(EPISODE, jast.simulators.walk1d())[0].get_ylabel() == "delay (share)"  # it cannot say
+    # it cannot say
+    assert plot.colav_story(EPISODE, jast.simulators.walk1d())[0].get_ylabel() == "delay (share)"
 
 
 def test_animation_goes_from_the_first_state_to_the_last():
@@ -225,8 +287,12 @@ def test_animation_goes_from_the_first_state_to_the_last():
         animation._func(frames[2 * t])
         np.testing.assert_allclose(believed(), ways(SHORT, t)[2], rtol=1e-6)
         [still] = plot.colav(SHORT, moments=[t])
-        for moving, standing in zip((*ax.lines, *ax.patches), (*still.lines, *still.patches), strict=True):
-            get = lambda artist: artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
+        for moving, standing in zip(
+            (*ax.lines, *ax.patches), (*still.lines, *still.patches), strict=True
+        ):
+            get = lambda artist: (
+                artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
+            )
             np.testing.assert_array_equal(get(moving), get(standing))
         assert ax.get_title(loc="left") == still.get_title(loc="left")
     animation._func(1.5)
@@ -240,11 +306,16 @@ def test_animation_goes_from_the_first_state_to_the_last():
 
 def test_headings_turn_the_short_way():
     states = SHORT.states._replace(
-        adversary=SHORT.states.adversary._replace(pose=SHORT.states.adversary.pose._replace(psi=jnp.array([3.1, -3.1, 3.1] + [3.1] * 23)))
+        adversary=SHORT.states.adversary._replace(
+            pose=SHORT.states.adversary.pose._replace(psi=jnp.array([3.1, -3.1, 3.1] + [3.1] * 23))
+        )
     )
     animation = plot.colav_animation(SHORT._replace(states=states), smooth=2)
     animation._func(0.5)
-    bow, centre = animation._fig.axes[0].patches[4].get_xy()[0], labelled(animation._fig.axes[0])["adversary (a dot a step)"].get_xydata()[-1]
+    bow, centre = (
+        animation._fig.axes[0].patches[4].get_xy()[0],
+        labelled(animation._fig.axes[0])["adversary (a dot a step)"].get_xydata()[-1],
+    )
     np.testing.assert_allclose(bow - centre, [0, -4], atol=1e-6)  # south, between the two
     animation.to_jshtml()
 
@@ -260,7 +331,9 @@ def test_animation_is_saved(tmp_path):
         assert image.n_frames == 3 and image.info["duration"] == 250
 
 
-@pytest.mark.skipif(not mpl_animation.writers.is_available("ffmpeg"), reason="ffmpeg is not installed")
+@pytest.mark.skipif(
+    not mpl_animation.writers.is_available("ffmpeg"), reason="ffmpeg is not installed"
+)
 def test_animation_is_saved_as_a_film(tmp_path):
     plot.colav_animation(SHORT, path=tmp_path / "a.mp4", smooth=1)
     assert b"ftyp" in (tmp_path / "a.mp4").read_bytes()[:16]
@@ -269,7 +342,13 @@ def test_animation_is_saved_as_a_film(tmp_path):
 def test_a_format_without_its_writer_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(mpl_animation.writers, "is_available", lambda name: name == "html")
     for name in ("a.mp4", "a.gif", "a.webm", "a"):
-        with pytest.raises(ValueError, match=rf"plot.colav_animation: path must end in one of \['.html'\], .* received '.*{name}'"):
+        with pytest.raises(
+            ValueError,
+            match=(
+                r"plot.colav_animation: path must end in one of \['.html'\], .* received"
+                rf" '.*{name}'"
+            ),
+        ):
             plot.colav_animation(SHORT, path=tmp_path / name)
     assert not list(tmp_path.iterdir())
 
@@ -278,24 +357,44 @@ def test_a_format_without_its_writer_is_refused(monkeypatch, tmp_path):
 def test_one_episode_of_the_right_system_is_asked_for(draw):
     name = f"plot.{draw.__name__}: episode must"
     many = jax.tree.map(lambda a: jnp.stack([a, a]), EPISODE)
-    with pytest.raises(ValueError, match=rf"{name} be one Episode, received Episode with leading axes \(2,\)"):
+    with pytest.raises(
+        ValueError, match=rf"{name} be one Episode, received Episode with leading axes \(2,\)"
+    ):
         draw(many)
     with pytest.raises(ValueError, match=f"{name} be one Episode, received NoneType"):
         draw(None)
-    with pytest.raises(ValueError, match=f"{name} have states, or sim be the simulator to replay it on, received neither"):
+    with pytest.raises(
+        ValueError,
+        match=f"{name} have states, or sim be the simulator to replay it on, received neither",
+    ):
         draw(EPISODE._replace(states=None))
-    with pytest.raises(ValueError, match=f"{name} be of jast.simulators.colav, received states of FerryState"):
+    with pytest.raises(
+        ValueError, match=f"{name} be of jast.simulators.colav, received states of FerryState"
+    ):
         draw(jast.replay(jast.simulators.ferry(), jnp.full(21, 0.5)))
 
 
 @pytest.mark.parametrize("moments", [0, -1, 2.5, "last", None, [], [0, 26], [-1], [1.5], [[1]]])
 def test_moments_outside_the_episode_are_refused(moments):
-    with pytest.raises(ValueError, match=r"plot.colav: moments must be at least 1, or step numbers in 0 .. 25, received"):
+    with pytest.raises(
+        ValueError,
+        match=r"plot.colav: moments must be at least 1, or step numbers in 0 .. 25, received",
+    ):
         plot.colav(EPISODE, moments=moments)
 
 
 @pytest.mark.parametrize(
-    "bad", [dict(fps=0), dict(fps=-1.0), dict(fps="8"), dict(fps=np.inf), dict(fps=np.nan), dict(smooth=0), dict(smooth=1.5), dict(smooth=True)]
+    "bad",
+    [
+        dict(fps=0),
+        dict(fps=-1.0),
+        dict(fps="8"),
+        dict(fps=np.inf),
+        dict(fps=np.nan),
+        dict(smooth=0),
+        dict(smooth=1.5),
+        dict(smooth=True),
+    ],
 )
 def test_bad_paces_of_an_animation_are_refused(bad):
     [name] = bad

@@ -1,4 +1,6 @@
-"""Pictures of estimates: that each draws what the numbers say, marks what must not be believed, and refuses what it cannot draw."""
+"""Pictures of estimates: that each draws what the numbers say, marks what must not be believed, and
+refuses what it cannot draw.
+"""
 
 from types import SimpleNamespace
 
@@ -19,7 +21,11 @@ from jast.estimate.estimate import Estimate  # noqa: E402
 from jast.plot.style import BLUE, VERMILION  # noqa: E402
 
 WALK = jast.simulators.walk1d()
-FEW = jax.device_get(jax.vmap(lambda key: jast.rollout(key, WALK)._replace(states=None))(jax.random.split(jax.random.key(0), 120)))
+FEW = jax.device_get(
+    jax.vmap(lambda key: jast.rollout(key, WALK)._replace(states=None))(
+        jax.random.split(jax.random.key(0), 120)
+    )
+)
 FAILED = jax.tree.map(lambda a: a[np.asarray(FEW.failure)], FEW)
 
 
@@ -36,9 +42,33 @@ def drawn(ax):
 
 def made(mean=1e-9, error=0.1, reliable=True, interval=None, level=0.95):
     """An estimate that was never made."""
-    log_mean, interval = np.log(mean), (mean * (1 - 2 * error), mean * (1 + 2 * error)) if interval is None else interval
-    numbers = dict(level=level, ess=500.0, k_hat=0.1, max_share=0.01, failures_seen=500, samples=1000, evaluations=1000, steps=9, invalid=0, modes=None)
-    return Estimate("made", log_mean, mean, mean * error, error, interval, reliable=reliable, warnings=() if reliable else ("a reason",), **numbers)
+    log_mean, interval = (
+        np.log(mean),
+        (mean * (1 - 2 * error), mean * (1 + 2 * error)) if interval is None else interval,
+    )
+    numbers = dict(
+        level=level,
+        ess=500.0,
+        k_hat=0.1,
+        max_share=0.01,
+        failures_seen=500,
+        samples=1000,
+        evaluations=1000,
+        steps=9,
+        invalid=0,
+        modes=None,
+    )
+    return Estimate(
+        "made",
+        log_mean,
+        mean,
+        mean * error,
+        error,
+        interval,
+        reliable=reliable,
+        warnings=() if reliable else ("a reason",),
+        **numbers,
+    )
 
 
 NOTHING = made(np.nan, np.nan, False, (0.0, 3.7e-6))
@@ -57,9 +87,16 @@ def test_an_estimate_and_its_interval_are_where_the_numbers_say():
     ax = drawn(plot.probability(e, 1.1e-9))
     truth, interval, dot = ax.lines
     assert ax.get_xscale() == "log" and ax.get_xlabel() == "failure probability"
-    assert tuple(interval.get_xdata()) == e.interval and list(dot.get_xdata()) == [e.mean] and list(truth.get_xdata()) == [1.1e-9] * 2
+    assert (
+        tuple(interval.get_xdata()) == e.interval
+        and list(dot.get_xdata()) == [e.mean]
+        and list(truth.get_xdata()) == [1.1e-9] * 2
+    )
     assert [label.get_text() for label in ax.get_yticklabels()] == ["made"]
-    assert words(ax) == ["1e-09  SE 10 %"] and legend(ax) == ["truth 1.1e-09", "estimate, 0.95 interval"]
+    assert words(ax) == ["1e-09  SE 10 %"] and legend(ax) == [
+        "truth 1.1e-09",
+        "estimate, 0.95 interval",
+    ]
 
 
 def test_what_is_not_to_be_believed_is_drawn_otherwise_and_named():
@@ -68,11 +105,19 @@ def test_what_is_not_to_be_believed_is_drawn_otherwise_and_named():
     assert good.get_color() == BLUE and not good.is_dashed() and dot.get_marker() == "o"
     assert bad.get_color() == VERMILION and bad.is_dashed() and cross.get_marker() == "X"
     assert words(ax) == ["1e-09  SE 10 %", "1e-09  UNRELIABLE"] and "UNRELIABLE" in legend(ax)
-    assert bad.get_ydata()[0] > good.get_ydata()[0] and ax.yaxis_inverted()  # the first row is the highest
+    # the first row is the highest
+    assert bad.get_ydata()[0] > good.get_ydata()[0] and ax.yaxis_inverted()
 
 
 def test_several_seeds_share_a_row():
-    ax = drawn(plot.probability({"seeds": [made(m, reliable=m < 2e-9) for m in (1e-9, 2e-9, 3e-9)], "fine": [made(), made()]}))
+    ax = drawn(
+        plot.probability(
+            {
+                "seeds": [made(m, reliable=m < 2e-9) for m in (1e-9, 2e-9, 3e-9)],
+                "fine": [made(), made()],
+            }
+        )
+    )
     heights = [line.get_ydata()[0] for line in ax.lines[::2]]
     assert len(set(heights)) == 5 and max(map(abs, heights[:3])) < 0.5 < min(heights[3:])
     assert words(ax) == ["2 of 3 UNRELIABLE", "2 runs"]
@@ -81,7 +126,11 @@ def test_several_seeds_share_a_row():
 def test_no_failure_is_an_upper_bound():
     ax = drawn(plot.probability({"nominal": NOTHING}))
     [bound] = ax.lines
-    assert list(bound.get_xdata()) == [3.7e-6] and words(ax) == ["below 3.7e-06"] and "upper bound" in legend(ax)[0]
+    assert (
+        list(bound.get_xdata()) == [3.7e-6]
+        and words(ax) == ["below 3.7e-06"]
+        and "upper bound" in legend(ax)[0]
+    )
     ax = drawn(plot.probability({"none": NOTHING._replace(interval=(0.0, 1.0)), "one": made()}))
     assert words(ax)[0] == "no failure seen" and len(ax.lines) == 2
     assert plot.probability(made(interval=(1e-320, 1e-8))).lines[0].get_xdata()[0] > 0
@@ -107,13 +156,24 @@ def test_probability_refuses(arguments, text):
 def test_a_fan_replays_every_failure():
     ax = drawn(plot.failure_fan(WALK, FAILED, lambda s: s, FEW))
     behind = [line for line in ax.lines if line.get_color() == plot.style.GREY]
-    lines = [line for line in ax.lines if line.get_color() in (BLUE, VERMILION) and line.get_linestyle() != "None" and len(line.get_xdata())]
+    lines = [
+        line
+        for line in ax.lines
+        if line.get_color() in (BLUE, VERMILION)
+        and line.get_linestyle() != "None"
+        and len(line.get_xdata())
+    ]
     assert len(behind) == len(FEW.length) and len(lines) == len(FAILED.length)
-    assert sorted(len(line.get_ydata()) for line in lines) == sorted(int(n) + 1 for n in FAILED.length)
+    assert sorted(len(line.get_ydata()) for line in lines) == sorted(
+        int(n) + 1 for n in FAILED.length
+    )
     assert {line.get_color() for line in lines} == {BLUE, VERMILION}
     for line in lines:  # the side is that of the end
         assert (line.get_ydata()[-1] > 0) == (line.get_color() == BLUE)
-    assert sum(int(text.split()[0]) for text in legend(ax)[1:]) == len(FAILED.length) and legend(ax)[0] == "120 nominal episodes"
+    assert (
+        sum(int(text.split()[0]) for text in legend(ax)[1:]) == len(FAILED.length)
+        and legend(ax)[0] == "120 nominal episodes"
+    )
 
 
 def test_a_fan_of_miss_distances():
@@ -126,18 +186,36 @@ def test_a_fan_of_miss_distances():
 
 
 def test_a_fan_refuses():
-    for other in (jax.tree.map(lambda a: a[0], FEW), jax.tree.map(lambda a: a[:0], FEW), FEW.length, SimpleNamespace()):
-        with pytest.raises(ValueError, match="plot.failure_fan: samples must be FailureSamples or Episodes with one leading axis"):
+    for other in (
+        jax.tree.map(lambda a: a[0], FEW),
+        jax.tree.map(lambda a: a[:0], FEW),
+        FEW.length,
+        SimpleNamespace(),
+    ):
+        with pytest.raises(
+            ValueError,
+            match=(
+                "plot.failure_fan: samples must be FailureSamples or Episodes with one leading axis"
+            ),
+        ):
             plot.failure_fan(WALK, other)
     with pytest.raises(ValueError, match="plot.failure_fan: most must be"):
         plot.failure_fan(WALK, FAILED, most=0)
-    with pytest.raises(ValueError, match=r"plot.failure_fan: value must return one number, received shape \(2,\)"):
+    with pytest.raises(
+        ValueError, match=r"plot.failure_fan: value must return one number, received shape \(2,\)"
+    ):
         plot.failure_fan(WALK, FAILED, lambda s: jnp.zeros(2))
 
 
 def traces(log_w, failing=None):
     n = len(log_w)
-    return Traces(log_w, np.zeros((n, 1)), np.ones(n, bool) if failing is None else failing, np.zeros(n, bool), np.ones(n, int))
+    return Traces(
+        log_w,
+        np.zeros((n, 1)),
+        np.ones(n, bool) if failing is None else failing,
+        np.zeros(n, bool),
+        np.ones(n, int),
+    )
 
 
 def test_weights_are_shares_above_and_the_tail_has_the_slope_of_k_hat():
@@ -149,19 +227,28 @@ def test_weights_are_shares_above_and_the_tail_has_the_slope_of_k_hat():
     for line, one in zip(points, t.values(), strict=True):
         w = np.exp(one.log_weight) * one.failure
         x, y = line.get_data()
-        np.testing.assert_allclose(y, [(w / w.mean() >= v * (1 - 1e-9)).mean() for v in x], rtol=1e-9)
+        np.testing.assert_allclose(
+            y, [(w / w.mean() >= v * (1 - 1e-9)).mean() for v in x], rtol=1e-9
+        )
     k = pareto_k(t["heavy"].log_weight, 20_000)
     x, y = (a[np.isfinite(fits[0].get_ydata())] for a in fits[0].get_data())
     assert np.log(y[-1] / y[-9]) / np.log(x[-1] / x[-9]) == pytest.approx(-1 / k, rel=0.1)
-    assert legend(ax) == [f"heavy: k-hat {k:.2f} UNRELIABLE", f"light: k-hat {pareto_k(0.2 * e[e > 0.5], 20_000):.2f}"]
+    assert legend(ax) == [
+        f"heavy: k-hat {k:.2f} UNRELIABLE",
+        f"light: k-hat {pareto_k(0.2 * e[e > 0.5], 20_000):.2f}",
+    ]
 
 
 def test_weights_of_any_kind():
     drawn(plot.weights(traces(np.zeros(100))))  # all alike: no tail to fit
     ax = drawn(plot.weights(traces(np.linspace(0, 1, 3))))
     assert legend(ax) == ["k-hat nan UNRELIABLE"]
-    drawn(plot.weights(traces(-1000 - np.random.default_rng(0).exponential(size=1000))))  # below the least double, and bounded
+    # below the least double, and bounded
+    drawn(plot.weights(traces(-1000 - np.random.default_rng(0).exponential(size=1000))))
     with pytest.raises(ValueError, match="plot.weights: traces must be Traces"):
         plot.weights(np.zeros(3))
-    with pytest.raises(ValueError, match="plot.weights: traces must hold at least 2 failures, received 0 for 'none'"):
+    with pytest.raises(
+        ValueError,
+        match="plot.weights: traces must hold at least 2 failures, received 0 for 'none'",
+    ):
         plot.weights({"none": traces(np.zeros(9), np.zeros(9, bool))})

@@ -1,4 +1,6 @@
-"""The parts of learned failure policies: distributions by their latents, lanes of episodes, the ring buffer, the tilted start, one update."""
+"""The parts of learned failure policies: distributions by their latents, lanes of episodes, the
+ring buffer, the tilted start, one update.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +27,22 @@ DISTRIBUTIONS = dict(
 def test_a_moved_and_a_blended_distribution_have_mass_one_and_their_own_samples(name, key):
     """By quadrature in x, and by the share of draws below a point."""
     dist = DISTRIBUTIONS[name]()
-    low, high = np.float64(x_of(dist, jnp.full((1,), -8.0))), np.float64(x_of(dist, jnp.full((1,), 8.0)))
+    low, high = (
+        np.float64(x_of(dist, jnp.full((1,), -8.0))),
+        np.float64(x_of(dist, jnp.full((1,), 8.0))),
+    )
     x = jnp.asarray(np.linspace(low, high, 20_002)[1:-1], jnp.float32)
     moved = Moved(dist, jnp.array([0.7]), jnp.array([0.6]))
-    blended = Blended(dist, jnp.array([0.25, 0.75]), jnp.array([[0.0], [-1.0]]), jnp.array([[1.0], [0.5]]))
+    blended = Blended(
+        dist, jnp.array([0.25, 0.75]), jnp.array([[0.0], [-1.0]]), jnp.array([[1.0], [0.5]])
+    )
     for q in (moved, blended):
         density = np.exp(np.float64(jax.vmap(q.log_prob)(x)))
         mass = np.cumsum(density) * (high - low) / len(x)
         np.testing.assert_allclose(mass[-1], 1, atol=2e-3)
-        draws = np.sort(np.asarray(jax.vmap(lambda k, q=q: q.sample(seed=k))(jax.random.split(key, 4000))))
+        draws = np.sort(
+            np.asarray(jax.vmap(lambda k, q=q: q.sample(seed=k))(jax.random.split(key, 4000)))
+        )
         expected = np.interp(draws, np.asarray(x), mass)
         assert stats.kstest(expected, "uniform").pvalue > 1e-3
     np.testing.assert_allclose(D.mode(moved), x_of(dist, jnp.array([0.7])), rtol=1e-6)
@@ -41,7 +50,9 @@ def test_a_moved_and_a_blended_distribution_have_mass_one_and_their_own_samples(
 
 
 def test_a_joint_disturbance_is_moved_number_by_number(key):
-    dist = D.Joint({"a": D.Normal(jnp.zeros(()), 1.0), "b": D.Independent(D.Normal(jnp.zeros(2), 2.0), 1)})
+    dist = D.Joint(
+        {"a": D.Normal(jnp.zeros(()), 1.0), "b": D.Independent(D.Normal(jnp.zeros(2), 2.0), 1)}
+    )
     q = Moved(dist, jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 0.5, 0.1]))
     x = q.sample(seed=key)
     assert (x["a"].shape, x["b"].shape) == ((), (2,))
@@ -54,10 +65,21 @@ def test_sizes_count_floats_and_name_what_cannot_be_tilted():
     start = lambda: D.Normal(jnp.zeros(3), 1.0)
     assert sizes(walk()) == (1, 0)
     assert sizes(walk(lambda x0: x0.sum(), start=lambda: D.Independent(start(), 1))) == (1, 3)
-    assert sizes(walk(lambda x0: x0.astype(jnp.zeros(()).dtype), start=lambda: D.Categorical(probs=jnp.array([0.5, 0.5])))) == (1, 0)
+    assert sizes(
+        walk(
+            lambda x0: x0.astype(jnp.zeros(()).dtype),
+            start=lambda: D.Categorical(probs=jnp.array([0.5, 0.5])),
+        )
+    ) == (1, 0)
     with pytest.raises(ValueError, match="sac: disturbance: expected floats, received float.*int"):
         sizes(ring())
-    beta = jast.Simulator(lambda x0: jnp.zeros(()), lambda s, x: s + x, lambda s: D.Beta(2.0, 2.0), lambda s: (s > 3, 3 - s), 4)
+    beta = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s + x,
+        lambda s: D.Beta(2.0, 2.0),
+        lambda s: (s > 3, 3 - s),
+        4,
+    )
     with pytest.raises(ValueError, match="sac: disturbance: Beta cannot be tilted"):
         sizes(beta)
 
@@ -69,8 +91,14 @@ def play(sim, x0, zs, dense=True):
         lane, row, valid, invalid = L.step(sim, dense, lane, z[None])
         return lane, (row, valid, invalid)
 
-    lane, (rows, valid, invalid) = jax.jit(lambda x0, zs: jax.lax.scan(body, L.at(sim, dense, x0), zs))(x0, jnp.asarray(zs, jnp.float32))
-    return lane, rows, list(zip(np.asarray(valid).tolist(), np.asarray(invalid).tolist(), strict=True))
+    lane, (rows, valid, invalid) = jax.jit(
+        lambda x0, zs: jax.lax.scan(body, L.at(sim, dense, x0), zs)
+    )(x0, jnp.asarray(zs, jnp.float32))
+    return (
+        lane,
+        rows,
+        list(zip(np.asarray(valid).tolist(), np.asarray(invalid).tolist(), strict=True)),
+    )
 
 
 def test_the_shaping_telescopes_and_a_failure_counts_as_no_distance():
@@ -80,7 +108,9 @@ def test_the_shaping_telescopes_and_a_failure_counts_as_no_distance():
     assert flags == [(True, False)] * 3 and not lane.over
     np.testing.assert_allclose([lane.gain, lane.log_p, lane.nearest], [2.0, -1.75, 1.0])
     far = walk()
-    far = jast.Simulator(far.init, far.step, far.disturbance, lambda s: (s > 3.0, jnp.abs(10.0 - s)), far.horizon)
+    far = jast.Simulator(
+        far.init, far.step, far.disturbance, lambda s: (s > 3.0, jnp.abs(10.0 - s)), far.horizon
+    )
     lane, rows, _ = play(far, (), [3.5])
     assert lane.failed and lane.over and float(rows.approach[0]) == 10.0 and rows.done[0]
 
@@ -92,7 +122,9 @@ def test_only_the_last_distance_counts_where_shaping_is_at_the_end():
 
 
 def test_an_episode_is_judged_as_a_rollout_is(key):
-    """Outcome, length and miss distance of lanes are those of `jast.replay`, on systems with and without an early end."""
+    """Outcome, length and miss distance of lanes are those of `jast.replay`, on systems with and
+    without an early end.
+    """
     terminal = walk(is_terminal=lambda s: s < -1.0)
     landing = jast.simulators.landing(0.1)
     for sim, x0 in ((terminal, ()), (landing, jnp.zeros(()))):
@@ -102,7 +134,11 @@ def test_an_episode_is_judged_as_a_rollout_is(key):
         ends = set()
         for lane, row, valid in zip(own, x, flags, strict=True):
             e = jast.replay(sim, row, *([x0] if sim.episodic else []))
-            assert (bool(lane.failed), int(lane.t), sum(v for v, _ in valid)) == (bool(e.failure), int(e.length), int(e.length))
+            assert (bool(lane.failed), int(lane.t), sum(v for v, _ in valid)) == (
+                bool(e.failure),
+                int(e.length),
+                int(e.length),
+            )
             np.testing.assert_allclose(lane.nearest, e.distance, rtol=1e-4, atol=1e-6)
             ends.add((bool(e.failure), int(e.length)))
         assert len(ends) > 1
@@ -125,7 +161,9 @@ def test_what_is_not_finite_is_invalid_and_ends_the_episode(where):
     )[where]
     sim = walk(**fields)
     if where == "evaluate":
-        sim = jast.Simulator(sim.init, sim.step, sim.disturbance, lambda s: (s > 3.0, bad(3.0 - bad(s))), sim.horizon)
+        sim = jast.Simulator(
+            sim.init, sim.step, sim.disturbance, lambda s: (s > 3.0, bad(3.0 - bad(s))), sim.horizon
+        )
     lane, _, flags = play(sim, (), [2.0])
     assert flags == [(False, True)] and lane.over and not lane.failed
 
@@ -135,7 +173,12 @@ def test_the_ring_buffer_holds_the_latest_valid_rows():
     kept = []
     for i in range(4):
         number = jnp.arange(3 * i, 3 * i + 3)
-        new = jax.tree.map(lambda a, number=number: jnp.broadcast_to(number.reshape(-1, *(1,) * (a.ndim - 1)), (3, *a.shape[1:])).astype(a.dtype), buffer)
+        new = jax.tree.map(
+            lambda a, number=number: jnp.broadcast_to(
+                number.reshape(-1, *(1,) * (a.ndim - 1)), (3, *a.shape[1:])
+            ).astype(a.dtype),
+            buffer,
+        )
         valid = jnp.array([True, i % 2 == 0, True])
         kept += [3 * i + j for j in range(3) if valid[j]]
         buffer, stored = L.put(buffer, stored, new, valid)
@@ -145,13 +188,17 @@ def test_the_ring_buffer_holds_the_latest_valid_rows():
 
 
 def test_the_fit_of_a_start_finds_unequal_modes(key):
-    """log_value such that p exp(value) is a known mixture, far out and without symmetry; the first component is the model itself."""
+    """log_value such that p exp(value) is a known mixture, far out and without symmetry; the first
+    component is the model itself.
+    """
     parts = [0.8, 0.2], [[4.0, 0.0], [-5.0, 1.0]], [[0.5, 1.0], [0.7, 0.6]]
     truth = Tilt(*(jnp.array(part, jnp.float32) for part in parts))
     value = lambda z: log_density(truth, z)[0] - log_normal(z) - 40.0
     tilt = jax.jit(lambda k: fit(k, value, 2))(key)
     np.testing.assert_allclose(tilt.weights.sum(), 1, rtol=1e-5)
-    np.testing.assert_allclose([tilt.weights[0], *tilt.means[0], *tilt.deviations[0]], [0.05, 0, 0, 1, 1], rtol=1e-5)
+    np.testing.assert_allclose(
+        [tilt.weights[0], *tilt.means[0], *tilt.deviations[0]], [0.05, 0, 0, 1, 1], rtol=1e-5
+    )
     right = np.asarray(tilt.means[1:, 0]) > 0
     w, m = np.asarray(tilt.weights[1:] / 0.95), np.asarray(tilt.means[1:])
     assert abs(w[right].sum() - 0.8) < 0.06
@@ -167,9 +214,18 @@ def test_where_nothing_is_known_the_start_is_the_model(value, key):
 
 
 def test_the_entropy_of_the_model_neither_gains_nor_loses():
-    """Under pi = N(0, I) the reward of a step and its entropy at temperature 1 cancel on average: E[-|z|^2 / 2 - term] = 0, for each z."""
+    """Under pi = N(0, I) the reward of a step and its entropy at temperature 1 cancel on average:
+    E[-|z|^2 / 2 - term] = 0, for each z.
+    """
     z = jnp.array([0.3, -1.2], jnp.float32)
-    np.testing.assert_allclose(-0.5 * jnp.sum(z**2) - entropy_term(z, jnp.zeros((1,), z.dtype), jnp.zeros_like(z)[None], jnp.ones_like(z)[None]), 0, atol=1e-6)
+    np.testing.assert_allclose(
+        -0.5 * jnp.sum(z**2)
+        - entropy_term(
+            z, jnp.zeros((1,), z.dtype), jnp.zeros_like(z)[None], jnp.ones_like(z)[None]
+        ),
+        0,
+        atol=1e-6,
+    )
 
 
 def test_networks_start_as_those_of_heads(key):
@@ -184,4 +240,6 @@ def test_networks_start_as_those_of_heads(key):
         np.testing.assert_allclose(jnp.std(layer["kernel"]), bound / np.sqrt(3), rtol=0.25)
     one, other = (jax.tree.map(lambda a, i=i: a[i], new.critic) for i in range(2))
     assert not np.allclose(one["params"]["Dense_0"]["kernel"], other["params"]["Dense_0"]["kernel"])
-    assert jax.tree.structure(new.actor) == jax.tree.structure(jax.eval_shape(networks(2, 1, (64, 32), 2)[0][0], key, jnp.zeros(4, jnp.float32)))
+    assert jax.tree.structure(new.actor) == jax.tree.structure(
+        jax.eval_shape(networks(2, 1, (64, 32), 2)[0][0], key, jnp.zeros(4, jnp.float32))
+    )

@@ -19,7 +19,14 @@ def test_the_example_runs_and_finds_a_failure(tmp_path):
     [code] = re.findall(r"```python\n(.*?)```", TEXT, re.S)
     (tmp_path / "example.py").write_text(code)
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [sys.executable, "example.py"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     assert done.returncode == 0, done.stderr
     shown = TEXT.split("This prints:\n```\n")[1]
     for words in ("undisturbed    no failure", "likeliest failure: reward"):
@@ -33,18 +40,32 @@ def test_names_in_the_tables_exist():
         thing = jast
         for part in name.split(".")[1:]:
             thing = getattr(thing, part, None)
-        assert callable(thing) or name in ("jast.actions", "jast.cross_entropy", "jast.estimate", "jast.rewards", "jast.plot"), name
+        assert callable(thing) or name in (
+            "jast.actions",
+            "jast.cross_entropy",
+            "jast.estimate",
+            "jast.rewards",
+            "jast.plot",
+        ), name
 
 
 def test_files_exist():
-    for path in re.findall(r"\]\(((?!http)[^)]+)\)", TEXT) + ["notebooks/quickstart.ipynb", "CITATION.cff"]:
+    for path in re.findall(r"\]\(((?!http)[^)]+)\)", TEXT) + [
+        "notebooks/quickstart.ipynb",
+        "CITATION.cff",
+    ]:
         assert (ROOT / path).exists(), path
     assert (ROOT / "docs/ferry_failure.png").stat().st_size < 150_000
 
 
 def test_the_test_command_is_the_one_that_is_run():
-    command = 'python3 -m venv .venv && .venv/bin/pip install -q -e ".[test]" && .venv/bin/python -m pytest'
-    assert command in TEXT.splitlines() and (ROOT / ".ci/run").read_text().splitlines()[-1] == command
+    command = (
+        'python3 -m venv .venv && .venv/bin/pip install -q -e ".[test]" && .venv/bin/python -m'
+        " pytest"
+    )
+    assert (
+        command in TEXT.splitlines() and (ROOT / ".ci/run").read_text().splitlines()[-1] == command
+    )
 
 
 def test_it_is_short():

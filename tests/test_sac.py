@@ -1,4 +1,6 @@
-"""Soft actor-critic: what is learned, the start by the critics, reproducibility, numbers that are not finite, errors, files and interruptions."""
+"""Soft actor-critic: what is learned, the start by the critics, reproducibility, numbers that are
+not finite, errors, files and interruptions.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -37,21 +39,37 @@ def _evaluate(s):
 
 TWO_SIDES = jast.Simulator(_init, _step, _disturbance, _evaluate, 2, start=_start, episodic=True)
 """x0 + x1 + x2 beyond +-5: P = 2 Phi(-5 / sqrt 3) = .0038924, given which x0 is about +-1.8."""
-ONE_WAY_OR_THE_OTHER = jast.Simulator(lambda x0: jnp.zeros(()), _step, _disturbance, lambda s: (jnp.abs(s) > 4.0, jnp.maximum(4.0 - jnp.abs(s), 0.0)), 1)
+ONE_WAY_OR_THE_OTHER = jast.Simulator(
+    lambda x0: jnp.zeros(()),
+    _step,
+    _disturbance,
+    lambda s: (jnp.abs(s) > 4.0, jnp.maximum(4.0 - jnp.abs(s), 0.0)),
+    1,
+)
 """P = 2 Phi(-4) = 6.334e-5, both ways out of the one start."""
 WALK = walk()
 
 
 def weighed(key, sim, policy, n):
-    """Log importance weights (-inf where it did not fail), x0 and the last state of ``n`` episodes of ``policy``."""
+    """Log importance weights (-inf where it did not fail), x0 and the last state of ``n`` episodes
+    of ``policy``.
+    """
 
     def one(key):
         e = jast.rollout(key, sim, policy)
         steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
-            jax.tree.map(lambda a: a[:-1], e.states), jnp.arange(sim.horizon, dtype=jnp.int32), e.disturbances
+            jax.tree.map(lambda a: a[:-1], e.states),
+            jnp.arange(sim.horizon, dtype=jnp.int32),
+            e.disturbances,
         )
-        log_q = policy.start().log_prob(e.x0) + jnp.sum(jnp.where(jnp.arange(sim.horizon, dtype=jnp.int32) < e.length, steps, 0))
-        return jnp.where(e.failure, e.log_prob - log_q, -jnp.inf), e.x0, jax.tree.leaves(e.states)[-1][e.length]
+        log_q = policy.start().log_prob(e.x0) + jnp.sum(
+            jnp.where(jnp.arange(sim.horizon, dtype=jnp.int32) < e.length, steps, 0)
+        )
+        return (
+            jnp.where(e.failure, e.log_prob - log_q, -jnp.inf),
+            e.x0,
+            jax.tree.leaves(e.states)[-1][e.length],
+        )
 
     return jax.jit(jax.vmap(one))(jax.random.split(key, n))
 
@@ -62,7 +80,9 @@ def learned():
 
 
 def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probability(learned, key):
-    """2 Phi(-5 / sqrt 3) = .0038924 within 4 SE of 4000 episodes, SE below 4 % (crude Monte Carlo: 25 %), half of it on each side."""
+    """2 Phi(-5 / sqrt 3) = .0038924 within 4 SE of 4000 episodes, SE below 4 % (crude Monte Carlo:
+    25 %), half of it on each side.
+    """
     log_w, x0, _ = weighed(key, TWO_SIDES, learned, 4000)
     w = np.exp(np.float64(log_w))
     se = w.std() / np.sqrt(len(w))
@@ -73,12 +93,18 @@ def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probabili
 
 
 def test_the_start_is_what_the_critics_say_of_the_true_value(learned):
-    """p(x0) exp(V_true) given failure, by quadrature: at +-1.74 on average (V not freed of lambda d(s0) would draw it to 0), deviation about .8."""
+    """p(x0) exp(V_true) given failure, by quadrature: at +-1.74 on average (V not freed of lambda
+    d(s0) would draw it to 0), deviation about .8.
+    """
     x = np.linspace(-6, 6, 1201)
-    given = stats.norm.pdf(x) * (stats.norm.sf((5 - x) / np.sqrt(2)) + stats.norm.sf((5 + x) / np.sqrt(2)))
+    given = stats.norm.pdf(x) * (
+        stats.norm.sf((5 - x) / np.sqrt(2)) + stats.norm.sf((5 + x) / np.sqrt(2))
+    )
     given /= integrate.simpson(given, x=x)
     wanted = integrate.simpson(given * np.abs(x), x=x)
-    density = np.exp(np.float64(jax.vmap(learned.start().log_prob)(jnp.asarray(x, jnp.zeros(()).dtype))))
+    density = np.exp(
+        np.float64(jax.vmap(learned.start().log_prob)(jnp.asarray(x, jnp.zeros(()).dtype)))
+    )
     np.testing.assert_allclose(integrate.simpson(density, x=x), 1, atol=5e-3)
     own = (density - 0.05 * stats.norm.pdf(x)) / 0.95
     assert abs(integrate.simpson(own * np.abs(x), x=x) - wanted) < 0.35
@@ -87,7 +113,9 @@ def test_the_start_is_what_the_critics_say_of_the_true_value(learned):
 
 
 def test_two_ways_out_of_one_state_are_both_taken(key):
-    """From a fixed start: the probability within 4 SE, SE below 4 %, half of it on each side; a policy of one component leaves a side out."""
+    """From a fixed start: the probability within 4 SE, SE below 4 %, half of it on each side; a
+    policy of one component leaves a side out.
+    """
     policy = sac(key, ONE_WAY_OR_THE_OTHER, **SMALL | dict(updates=30))
     log_w, _, sides = weighed(key, ONE_WAY_OR_THE_OTHER, policy, 4000)
     w, truth = np.exp(np.float64(log_w)), 2 * stats.norm.sf(4)
@@ -105,7 +133,11 @@ def test_the_mode_is_a_deterministic_policy_that_pushes_outwards(learned):
 
 def test_the_curve_tells_what_was_learned(learned):
     h = learned.history
-    assert h.episodes[-1] >= SMALL["episodes"] - SMALL["lanes"] and np.all(np.diff(h.episodes) >= 0) and h.invalid[-1] == 0
+    assert (
+        h.episodes[-1] >= SMALL["episodes"] - SMALL["lanes"]
+        and np.all(np.diff(h.episodes) >= 0)
+        and h.invalid[-1] == 0
+    )
     assert h.failing_share[-1] > 0.4 and h.critic_loss[-1] < h.critic_loss[0]
     text = str(learned)
     assert "lambda" in text and "start" in text and len(text.splitlines()) < 14
@@ -113,7 +145,9 @@ def test_the_curve_tells_what_was_learned(learned):
 
 def test_a_policy_goes_through_jit_and_vmap(learned, key):
     keys = jax.random.split(key, 3)
-    play = jax.jit(jax.vmap(lambda k, policy: jast.rollout(k, TWO_SIDES, policy).log_prob, (0, None)))
+    play = jax.jit(
+        jax.vmap(lambda k, policy: jast.rollout(k, TWO_SIDES, policy).log_prob, (0, None))
+    )
     given = play(keys, learned)
     assert given.shape == (3,) and bool(jnp.all(jnp.isfinite(given)))
 
@@ -123,7 +157,13 @@ def whole_run(tmp_path_factory):
     """An uninterrupted training with its checkpoint, and the rows that the callback got."""
     rows = []
     path = tmp_path_factory.mktemp("sac") / "whole.npz"
-    policy = sac(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=lambda n, row: rows.append((n, row)))
+    policy = sac(
+        jax.random.key(3),
+        WALK,
+        **TINY,
+        checkpoint=path,
+        callback=lambda n, row: rows.append((n, row)),
+    )
     return policy, rows, path
 
 
@@ -131,7 +171,9 @@ def test_the_callback_gets_the_rows_of_the_history(whole_run):
     policy, rows, _ = whole_run
     assert len(rows) == len(policy.history.episodes) >= 10
     assert [n for n, _ in rows] == policy.history.episodes.tolist()
-    np.testing.assert_array_equal([row.failing_share for _, row in rows], policy.history.failing_share)
+    np.testing.assert_array_equal(
+        [row.failing_share for _, row in rows], policy.history.failing_share
+    )
 
 
 def test_the_same_key_gives_the_same_policy(whole_run, equal):
@@ -139,7 +181,9 @@ def test_the_same_key_gives_the_same_policy(whole_run, equal):
     equal(again.learned, whole_run[0].learned)
     equal(again.history, whole_run[0].history)
     other = sac(jax.random.key(4), WALK, **TINY)
-    assert not np.array_equal(jax.tree.leaves(other.learned.actor)[0], jax.tree.leaves(again.learned.actor)[0])
+    assert not np.array_equal(
+        jax.tree.leaves(other.learned.actor)[0], jax.tree.leaves(again.learned.actor)[0]
+    )
 
 
 def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_path):
@@ -194,17 +238,28 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
         load(path, WALK)
     with pytest.raises(ValueError, match="does not fit sim: it holds a start, expected none"):
         load(path, walk(horizon=2))
-    two = jast.Simulator(lambda x0: jnp.stack([x0, x0]), _step, lambda s: D.Normal(s.sum() * 0, 1.0), lambda s: (s[0] > 3, 3 - s[0]), 2, start=_start)
+    two = jast.Simulator(
+        lambda x0: jnp.stack([x0, x0]),
+        _step,
+        lambda s: D.Normal(s.sum() * 0, 1.0),
+        lambda s: (s[0] > 3, 3 - s[0]),
+        2,
+        start=_start,
+    )
     with pytest.raises(ValueError, match="does not fit sim: actor"):
         load(path, two)
     with pytest.raises(ValueError, match="is not a file of a jast failure policy"):
         load(whole_run[2], WALK)
-    with pytest.raises(ValueError, match="save: policy must be a jast.policies.FailurePolicy, received Policy"):
+    with pytest.raises(
+        ValueError, match="save: policy must be a jast.policies.FailurePolicy, received Policy"
+    ):
         save(path, jast.Policy(_start, lambda s, t: _disturbance(s)))
 
 
 def test_what_is_not_finite_is_counted_and_never_learned_from():
-    """A tenth of the episodes and more come to a state that is NaN: every parameter stays finite, and failures are still found."""
+    """A tenth of the episodes and more come to a state that is NaN: every parameter stays finite,
+    and failures are still found.
+    """
     nan = walk(step=lambda s, x: jnp.where(s + x < -2.0, jnp.nan, s + x))
     policy = sac(jax.random.key(5), nan, **TINY)
     assert policy.history.invalid[-1] > 20
@@ -214,7 +269,9 @@ def test_what_is_not_finite_is_counted_and_never_learned_from():
 
 
 def test_lambda_is_raised_while_too_few_fail():
-    """A system that no episode of so few makes fail, with a distance that tells the model nothing new: lambda rises, at most to where three quarters are."""
+    """A system that no episode of so few makes fail, with a distance that tells the model nothing
+    new: lambda rises, at most to where three quarters are.
+    """
     far = walk(fails=lambda s: s > 1e6)
     h = sac(jax.random.key(6), far, **TINY).history
     steps = h.scale[1:] / h.scale[:-1]
@@ -226,8 +283,13 @@ def test_lambda_is_raised_while_too_few_fail():
 
 
 def test_the_temperature_follows_the_entropy():
-    """A wanted entropy that no policy of deviations up to e^2 has draws alpha up, one far below draws it down."""
-    high, low = (sac(jax.random.key(7), WALK, **TINY, alpha="auto", entropy=e).history.alpha for e in (3.0, -3.0))
+    """A wanted entropy that no policy of deviations up to e^2 has draws alpha up, one far below
+    draws it down.
+    """
+    high, low = (
+        sac(jax.random.key(7), WALK, **TINY, alpha="auto", entropy=e).history.alpha
+        for e in (3.0, -3.0)
+    )
     assert np.all(np.diff(high) > 0) and np.all(np.diff(low) < 0)
 
 
@@ -261,7 +323,9 @@ def test_settings_out_of_range_are_named(setting, value, words):
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_landing_without_a_word_about_its_modes(seed):
-    """P = 4.0236721906842e-13: 100,000 episodes of the policy as it draws and of its start give it within 10 %, with an SE below 2 %, half on each side."""
+    """P = 4.0236721906842e-13: 100,000 episodes of the policy as it draws and of its start give it
+    within 10 %, with an SE below 2 %, half on each side.
+    """
     sim = jast.simulators.landing()
     policy = sac(jax.random.key(seed), sim)
     log_w, x0, _ = weighed(jax.random.key(100 + seed), sim, policy, 100_000)

@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 
 from jast.cross_entropy import schedules
 
-TABLE = {  # of the published code, by the era of its library (reference section 3): (p, normaliser, budget)
+# of the published code, by the era of its library (reference section 3): (p, normaliser, budget)
+TABLE = {
     (0.1, "before", 100): (15, 13, 12, 11, 10, 9, 8, 7, 6, 9),
     (0.2, "before", 100): (22, 17, 14, 11, 9, 7, 5, 4, 3, 8),
     (0.3, "before", 100): (30, 21, 15, 10, 7, 5, 3, 2, 1, 6),
@@ -27,23 +28,40 @@ def test_geometric_is_the_published_one(p, normaliser, budget):
 
 def test_defaults():
     assert schedules.geometric()(100, 10) == TABLE[0.1, "before", 100]
-    assert schedules.counts(None, 10, 3) == schedules.counts("uniform", 10, 3) == schedules.counts(schedules.uniform(), 10, 3) == (10, 10, 10)
+    assert (
+        schedules.counts(None, 10, 3)
+        == schedules.counts("uniform", 10, 3)
+        == schedules.counts(schedules.uniform(), 10, 3)
+        == (10, 10, 10)
+    )
     assert schedules.uniform()(10, 4) == (3, 3, 2, 2)
 
 
 @settings(deadline=None)
-@given(budget=st.integers(1, 5000), iterations=st.integers(1, 60), p=st.floats(1e-6, 1 - 1e-6), normaliser=st.sampled_from(["before", "after"]))
+@given(
+    budget=st.integers(1, 5000),
+    iterations=st.integers(1, 60),
+    p=st.floats(1e-6, 1 - 1e-6),
+    normaliser=st.sampled_from(["before", "after"]),
+)
 def test_a_schedule_spends_its_budget(budget, iterations, p, normaliser):
     for schedule in (schedules.uniform(), schedules.geometric(p, normaliser)):
         sizes = schedule(budget, iterations)
-        assert len(sizes) == iterations and sum(sizes) == budget and min(sizes) >= 0 and all(type(n) is int for n in sizes)
+        assert (
+            len(sizes) == iterations
+            and sum(sizes) == budget
+            and min(sizes) >= 0
+            and all(type(n) is int for n in sizes)
+        )
         assert list(sizes[:-1]) == sorted(sizes[:-1], reverse=True)
 
 
 @settings(deadline=None)
 @given(budget=st.integers(1, 1000), iterations=st.integers(2, 30), p=st.floats(0.01, 0.9))
 def test_geometric_before_and_after(budget, iterations, p):
-    """Each share is the floor of the budget times its probability; the last one of "before" makes up for the floors alone."""
+    """Each share is the floor of the budget times its probability; the last one of "before" makes
+    up for the floors alone.
+    """
     k = np.arange(1, iterations + 1)
     for normaliser, start in (("before", 1), ("after", 0)):
         total = sum(p * (1 - p) ** j for j in range(start, iterations + 1))
@@ -62,7 +80,12 @@ def test_whole_shares_are_not_rounded_down():
 
 
 def test_one_iteration_gets_all():
-    for schedule in (schedules.uniform(), schedules.geometric(), schedules.geometric(0.3, "after"), schedules.manual([12])):
+    for schedule in (
+        schedules.uniform(),
+        schedules.geometric(),
+        schedules.geometric(0.3, "after"),
+        schedules.manual([12]),
+    ):
         assert schedule(12, 1) == (12,)
 
 
@@ -70,40 +93,77 @@ def test_manual():
     published = (20, 15, 9, *[8] * 7)
     assert schedules.manual(published)(100, 10) == published
     assert schedules.counts(schedules.manual(np.array(published)), 10, 10) == published
-    assert schedules.counts(list(published), 3, 2) == schedules.counts(np.array(published), 3, 2) == published  # they say themselves how many
+    assert (
+        schedules.counts(list(published), 3, 2)
+        == schedules.counts(np.array(published), 3, 2)
+        == published
+    )  # they say themselves how many
     for budget, iterations in ((99, 10), (100, 9)):
-        with pytest.raises(ValueError, match=f"schedule: expected {iterations} counts that sum to {budget}, received 10 that sum to 100"):
+        with pytest.raises(
+            ValueError,
+            match=(
+                f"schedule: expected {iterations} counts that sum to {budget}, received 10 that sum"
+                " to 100"
+            ),
+        ):
             schedules.manual(published)(budget, iterations)
 
 
 def test_a_function_of_the_users_own():
-    assert schedules.counts(lambda budget, iterations: [budget] + [0] * (iterations - 1), 5, 3) == (15, 0, 0)
-    with pytest.raises(ValueError, match="schedule: expected 3 counts that sum to the budget 15, received 3 that sum to 12"):
+    assert schedules.counts(lambda budget, iterations: [budget] + [0] * (iterations - 1), 5, 3) == (
+        15,
+        0,
+        0,
+    )
+    with pytest.raises(
+        ValueError,
+        match="schedule: expected 3 counts that sum to the budget 15, received 3 that sum to 12",
+    ):
         schedules.counts(lambda budget, iterations: (4,) * iterations, 5, 3)
-    with pytest.raises(ValueError, match="schedule: expected 3 counts that sum to the budget 15, received 2 that sum to 15"):
+    with pytest.raises(
+        ValueError,
+        match="schedule: expected 3 counts that sum to the budget 15, received 2 that sum to 15",
+    ):
         schedules.counts(lambda budget, iterations: (10, 5), 5, 3)
-    with pytest.raises(ValueError, match="schedule: counts must be whole numbers of at least 0, and not all 0, received 7"):
+    with pytest.raises(
+        ValueError,
+        match="schedule: counts must be whole numbers of at least 0, and not all 0, received 7",
+    ):
         schedules.counts(lambda budget, iterations: 7, 5, 3)
 
 
 @pytest.mark.parametrize("given", [(), (0, 0), (3, -1), (1.0, 2), (True, 2), 7, object()])
 def test_bad_counts(given):
-    with pytest.raises(ValueError, match="schedule: counts must be whole numbers of at least 0, and not all 0, received"):
+    with pytest.raises(
+        ValueError,
+        match="schedule: counts must be whole numbers of at least 0, and not all 0, received",
+    ):
         schedules.counts(given, 10, 10)
     with pytest.raises(ValueError, match="schedule: counts must be"):
         schedules.manual(given)
 
 
 def test_bad_settings():
-    with pytest.raises(ValueError, match="schedule: expected None, \"uniform\", a function .*, received 'geometric'"):
+    with pytest.raises(
+        ValueError,
+        match="schedule: expected None, \"uniform\", a function .*, received 'geometric'",
+    ):
         schedules.counts("geometric", 10, 10)
     for samples in (0, -1, 2.0, True, None):
-        with pytest.raises(ValueError, match=f"samples must be a whole number of at least 1, received {samples}"):
+        with pytest.raises(
+            ValueError, match=f"samples must be a whole number of at least 1, received {samples}"
+        ):
             schedules.counts(None, samples, 10)
-        with pytest.raises(ValueError, match=f"iterations must be a whole number of at least 1, received {samples}"):
+        with pytest.raises(
+            ValueError, match=f"iterations must be a whole number of at least 1, received {samples}"
+        ):
             schedules.counts(None, 10, samples)
     for p in (0, 1, -0.1, np.nan, "half", True):
-        with pytest.raises(ValueError, match="geometric: p must be a number between 0 and 1, received"):
+        with pytest.raises(
+            ValueError, match="geometric: p must be a number between 0 and 1, received"
+        ):
             schedules.geometric(p)
-    with pytest.raises(ValueError, match='geometric: normaliser must be "before" or "after", received None'):
+    with pytest.raises(
+        ValueError, match='geometric: normaliser must be "before" or "after", received None'
+    ):
         schedules.geometric(normaliser=None)

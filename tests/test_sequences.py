@@ -1,4 +1,6 @@
-"""Latent sequences: exact where the disturbance is normal, the model itself at N(0, 1), and fitted to those that count."""
+"""Latent sequences: exact where the disturbance is normal, the model itself at N(0, 1), and fitted
+to those that count.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +26,16 @@ def scalar(dtype):
 
 
 def test_fit(dtype):
-    """Mean and deviation of the episodes that reached a step; smoothed; not below the floor; kept where fewer than two did."""
+    """Mean and deviation of the episodes that reached a step; smoothed; not below the floor; kept
+    where fewer than two did.
+    """
     z = jnp.array([[1.0, 5.0, 9.0], [3.0, 5.0, 0.0], [100.0, 0.0, 0.0]], dtype)
     counts = jnp.array([[1, 1, 1], [1, 1, 0], [0, 0, 0]], bool)
     old = S.standard(scalar(dtype), 3)
-    for smoothing, mean, deviation in ((0.0, [2, 5, 0], [1, 0.2, 1]), (0.5, [1, 2.5, 0], [1, 0.5, 1])):
+    for smoothing, mean, deviation in (
+        (0.0, [2, 5, 0], [1, 0.2, 1]),
+        (0.5, [1, 2.5, 0], [1, 0.5, 1]),
+    ):
         new = S.fit(old, z, counts, jnp.asarray(smoothing), jnp.asarray(0.2))
         np.testing.assert_allclose(new.mean, mean)
         np.testing.assert_allclose(new.deviation, deviation, rtol=1e-6)
@@ -36,9 +43,17 @@ def test_fit(dtype):
 
 
 def test_fit_of_shares(dtype):
-    """An episode that counts for 1.5 of 2.5: weighted moments; one of 1.9 effective episodes in all moves nothing."""
+    """An episode that counts for 1.5 of 2.5: weighted moments; one of 1.9 effective episodes in all
+    moves nothing.
+    """
     z = jnp.array([[1.0, 1.0], [3.0, 3.0], [9.0, 9.0]], dtype)
-    new = S.fit(S.standard(scalar(dtype), 2), z, jnp.array([[1.5, 1.5], [1.0, 0.4], [0.0, 0.0]], dtype), jnp.asarray(0.0), jnp.asarray(0.1))
+    new = S.fit(
+        S.standard(scalar(dtype), 2),
+        z,
+        jnp.array([[1.5, 1.5], [1.0, 0.4], [0.0, 0.0]], dtype),
+        jnp.asarray(0.0),
+        jnp.asarray(0.1),
+    )
     np.testing.assert_allclose(new.mean, [1.8, 0], rtol=1e-6)
     np.testing.assert_allclose(new.deviation, [np.sqrt(0.96), 1], rtol=1e-6)
 
@@ -52,10 +67,15 @@ def test_quantile_is_exact_for_normals_far_out(dtype):
     np.testing.assert_allclose(S.quantile(D.MultivariateNormalDiag(loc, scale), z), expected)
     np.testing.assert_allclose(S.quantile(D.Independent(D.Normal(loc, scale), 1), z), expected)
     np.testing.assert_allclose(S.quantile(D.MultivariateNormalTri(loc, factor), z), [17, 2.5])
-    joint = S.quantile(D.Joint({"a": D.Normal(loc[0], scale[0]), "b": D.Normal(loc[1], scale[1])}), {"a": z[0], "b": z[1]})
+    joint = S.quantile(
+        D.Joint({"a": D.Normal(loc[0], scale[0]), "b": D.Normal(loc[1], scale[1])}),
+        {"a": z[0], "b": z[1]},
+    )
     assert (float(joint["a"]), float(joint["b"])) == (5, -23)
     one, other = D.Normal(loc[0], scale[0]), D.Normal(loc[1], scale[1])
-    assert [float(S.quantile(D.where(jnp.asarray(p), one, other), z[0])) for p in (True, False)] == [5, 22]
+    assert [
+        float(S.quantile(D.where(jnp.asarray(p), one, other), z[0])) for p in (True, False)
+    ] == [5, 22]
 
 
 def test_other_disturbances_by_their_quantile_function(dtype):
@@ -64,18 +84,30 @@ def test_other_disturbances_by_their_quantile_function(dtype):
     np.testing.assert_allclose(x, 2 + 2 * scipy.stats.norm.cdf(np.asarray(z, float)), rtol=1e-6)
     coin = D.Bernoulli(probs=jnp.asarray(0.1, dtype))
     assert [int(S.quantile(coin, v)) for v in z] == [0, 0, 0, 1, 1]
-    box = S.place(actions.uniform(-1.0, 1.0), D.Normal(jnp.zeros((), dtype), jnp.ones((), dtype)), z[4])
+    box = S.place(
+        actions.uniform(-1.0, 1.0), D.Normal(jnp.zeros((), dtype), jnp.ones((), dtype)), z[4]
+    )
     assert box.dtype == dtype and 0.999 < box <= 1
 
 
 def test_log_ratio(dtype):
     """Against scipy, and where the two densities differ by little at large z."""
-    m, s = jnp.asarray([[0.0, 3.0], [1e-3, -2.0]], dtype), jnp.asarray([[1.0, 0.5], [1.0, 2.0]], dtype)
+    m, s = (
+        jnp.asarray([[0.0, 3.0], [1e-3, -2.0]], dtype),
+        jnp.asarray([[1.0, 0.5], [1.0, 2.0]], dtype),
+    )
     z = jnp.asarray([[20.0, 2.5], [20.0, -7.0]], dtype)
     norm = scipy.stats.norm
-    expected = (norm.logpdf(np.asarray(z, float)) - norm.logpdf(np.asarray(z, float), np.asarray(m, float), np.asarray(s, float))).sum(axis=1)
+    expected = (
+        norm.logpdf(np.asarray(z, float))
+        - norm.logpdf(np.asarray(z, float), np.asarray(m, float), np.asarray(s, float))
+    ).sum(axis=1)
     np.testing.assert_allclose(S.log_ratio(S.Steps(m, s), z), expected, rtol=1e-5)
-    assert S.log_ratio(S.standard(scalar(dtype), 3), jnp.arange(3, dtype=dtype)).tolist() == [0, 0, 0]
+    assert S.log_ratio(S.standard(scalar(dtype), 3), jnp.arange(3, dtype=dtype)).tolist() == [
+        0,
+        0,
+        0,
+    ]
 
 
 def test_noise_is_addressed(key):
@@ -87,7 +119,9 @@ def test_noise_is_addressed(key):
 
 @pytest.mark.parametrize("make", [walk, ring], ids=["walk", "ring"])
 def test_player_at_standard_noise_is_the_model(key, make):
-    """The share of failures is the nominal one within 4 standard errors of the two binomial shares; structures and a random start included."""
+    """The share of failures is the nominal one within 4 standard errors of the two binomial shares;
+    structures and a random start included.
+    """
     sim, n = make(), 4000
     like0, like = jax.eval_shape(jast.episode._shapes, sim)
 
@@ -95,8 +129,14 @@ def test_player_at_standard_noise_is_the_model(key, make):
     def shares(key):
         def one(key):
             a, b, c, d = jax.random.split(key, 4)
-            z0 = jax.tree.map(lambda v: v[0], S.noise(a, S.standard(like0, 1), 0)) if jax.tree.leaves(like0) else ()
-            player = S.player(sim, actions.quantiles(), z0, S.noise(b, S.standard(like, sim.horizon), 0))
+            z0 = (
+                jax.tree.map(lambda v: v[0], S.noise(a, S.standard(like0, 1), 0))
+                if jax.tree.leaves(like0)
+                else ()
+            )
+            player = S.player(
+                sim, actions.quantiles(), z0, S.noise(b, S.standard(like, sim.horizon), 0)
+            )
             return jast.rollout(c, sim, player).failure, jast.rollout(d, sim).failure
 
         return jnp.stack(jax.vmap(one)(jax.random.split(key, n))).mean(axis=1)
@@ -107,15 +147,27 @@ def test_player_at_standard_noise_is_the_model(key, make):
 
 
 def test_latent_is_the_inverse_of_quantile(dtype):
-    """z -> x -> z, far out where the distribution is normal; through vectors, choices and structures."""
+    """z -> x -> z, far out where the distribution is normal; through vectors, choices and
+    structures.
+    """
     one = lambda *v: jnp.asarray(v, dtype)
-    z, far, loc, scale, no = one(-2.5, 1.3), one(-20.0, 30.0), one(1.0, -2.0), one(0.5, 3.0), jnp.asarray(False)
+    z, far, loc, scale, no = (
+        one(-2.5, 1.3),
+        one(-20.0, 30.0),
+        one(1.0, -2.0),
+        one(0.5, 3.0),
+        jnp.asarray(False),
+    )
     factor = jnp.stack([one(2, 0), one(1, 0.5)])
 
     @jax.jit
     def there_and_back():
         normal = D.Normal(loc, scale)
-        normals = D.MultivariateNormalDiag(loc, scale), D.Independent(normal, 1), D.MultivariateNormalTri(loc, factor)
+        normals = (
+            D.MultivariateNormalDiag(loc, scale),
+            D.Independent(normal, 1),
+            D.MultivariateNormalTri(loc, factor),
+        )
         others = (
             D.Uniform(loc, loc + scale),
             D.Laplace(loc, scale),
@@ -135,7 +187,9 @@ def test_latent_is_the_inverse_of_quantile(dtype):
 
 
 def test_latent_of_whole_numbers(dtype):
-    """The middle in probability of the normal numbers that give it, rare numbers last, by scipy; so it goes back to it."""
+    """The middle in probability of the normal numbers that give it, rare numbers last, by scipy; so
+    it goes back to it.
+    """
     dice = D.Categorical(probs=jnp.asarray([0.2, 0.5, 0.3], dtype))
     z = jax.jit(jax.vmap(lambda x: S.latent(dice, x)))(jnp.arange(3, dtype=jnp.int32))
     np.testing.assert_allclose(z, scipy.stats.norm.ppf([0.9, 0.25, 0.65]), atol=1e-4)
@@ -145,8 +199,15 @@ def test_latent_of_whole_numbers(dtype):
 def test_latent_is_finite(dtype):
     """At and beyond the ends of what a distribution can give, and at what rounds to them."""
     flat, tiny = D.Uniform(jnp.zeros((), dtype), jnp.ones((), dtype)), jnp.finfo(dtype).tiny
-    z = np.asarray(jax.jit(lambda x: S.latent(flat, x))(jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype)))
-    assert np.isfinite(z).all() and (np.diff(z[2:]) >= 0).all() and z[3] == 0 and z[0] == z[1] < -5 < 5 < z[4] == z[5]
+    z = np.asarray(
+        jax.jit(lambda x: S.latent(flat, x))(jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype))
+    )
+    assert (
+        np.isfinite(z).all()
+        and (np.diff(z[2:]) >= 0).all()
+        and z[3] == 0
+        and z[0] == z[1] < -5 < 5 < z[4] == z[5]
+    )
     assert S.normal_score(jnp.asarray([0.5, 1.0], dtype)).dtype == dtype
 
 

@@ -1,4 +1,6 @@
-"""Every simulator fits the contract, and its stated truth is re-derived here, by other means than sampling where there are any."""
+"""Every simulator fits the contract, and its stated truth is re-derived here, by other means than
+sampling where there are any.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +29,13 @@ def corner(x):
 
 
 ALL = {
-    "ferry": ferry, "walk1d two-sided": walk1d, "walk1d one-sided": lambda: walk1d("one-sided"), "landing": landing,
-    "limit_state": lambda: limit_state(plane, 3), "limit_state of 200": lambda: limit_state(plane, 200),
-}  # fmt: skip
+    "ferry": ferry,
+    "walk1d two-sided": walk1d,
+    "walk1d one-sided": lambda: walk1d("one-sided"),
+    "landing": landing,
+    "limit_state": lambda: limit_state(plane, 3),
+    "limit_state of 200": lambda: limit_state(plane, 200),
+}
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -53,11 +59,16 @@ def test_dtypes(name):
 
 
 def first_passage(nodes, steps, threshold, two_sided):
-    """P(|s| or s >= threshold within ``steps``): Gauss-Legendre nodes on the surviving band, the mass that passes summed step by step."""
+    """P(|s| or s >= threshold within ``steps``): Gauss-Legendre nodes on the surviving band, the
+    mass that passes summed step by step.
+    """
     low = -threshold if two_sided else -threshold - 8 * np.sqrt(steps)
     x, w = np.polynomial.legendre.leggauss(nodes)
     x, w = low + (x + 1) * (threshold - low) / 2, w * (threshold - low) / 2
-    passes = lambda s: scipy.stats.norm.sf(threshold - s) + (scipy.stats.norm.cdf(-threshold - s) if two_sided else 0)
+    passes = lambda s: (
+        scipy.stats.norm.sf(threshold - s)
+        + (scipy.stats.norm.cdf(-threshold - s) if two_sided else 0)
+    )
     total, density = passes(0.0), scipy.stats.norm.pdf(x)
     for _ in range(steps - 1):
         total += np.sum(w * density * passes(x))
@@ -65,7 +76,10 @@ def first_passage(nodes, steps, threshold, two_sided):
     return total
 
 
-@pytest.mark.parametrize("form, two_sided, truth", [("two-sided", True, 0.1087363323), ("one-sided", False, 9.578759495e-4)])
+@pytest.mark.parametrize(
+    "form, two_sided, truth",
+    [("two-sided", True, 0.1087363323), ("one-sided", False, 9.578759495e-4)],
+)
 def test_walk_truth(form, two_sided, truth):
     horizon = walk1d(form).horizon
     coarse, fine = (first_passage(n, horizon, 10.0, two_sided) for n in (200, 300))
@@ -75,14 +89,18 @@ def test_walk_truth(form, two_sided, truth):
 def test_walk_likeliest_failures():
     raw = jast.replay(walk1d(), jnp.full((7,), 10 / 7 * 1.00001))
     assert bool(raw.failure) and float(raw.log_prob) == pytest.approx(-13.5754, abs=1e-3)
-    by_mode = jast.replay(walk1d(), jnp.full((30,), 1 / 3 * 1.00001), reward=jast.rewards.standard(density="mode"))
+    by_mode = jast.replay(
+        walk1d(), jnp.full((30,), 1 / 3 * 1.00001), reward=jast.rewards.standard(density="mode")
+    )
     assert bool(by_mode.failure) and float(by_mode.reward) == pytest.approx(-100 / 60, abs=1e-3)
 
 
 def test_walk_parameters():
     assert walk1d(horizon=5).horizon == 5 and walk1d("one-sided").horizon == 10
     below = jnp.asarray([-6.0, -6.0])
-    assert bool(jast.replay(walk1d(), below).failure) and not bool(jast.replay(walk1d("one-sided"), below).failure)
+    assert bool(jast.replay(walk1d(), below).failure) and not bool(
+        jast.replay(walk1d("one-sided"), below).failure
+    )
     assert float(jast.replay(walk1d("one-sided"), below).distance) == 10
 
 
@@ -99,7 +117,9 @@ def test_landing_truth():
         x = np.linspace(-2, 2, 4001)
         density = scipy.stats.norm.pdf(x, scale=0.1)
         for _ in range(10):
-            density = np.convolve(density, scipy.stats.norm.pdf(x, scale=0.03), mode="same") * (x[1] - x[0])
+            density = np.convolve(density, scipy.stats.norm.pdf(x, scale=0.03), mode="same") * (
+                x[1] - x[0]
+            )
         outside = np.sum(density[np.abs(x) > 0.2]) * (x[1] - x[0])
         assert outside == pytest.approx(float(landing_probability(b=0.2)), abs=3e-3)
 
@@ -108,12 +128,20 @@ def test_landing_likeliest_failure():
     with jax.enable_x64(True):
         x0, x = 0.01 / 0.019, 0.0009 / 0.019
         episode = jast.replay(landing(), jnp.full((10,), x * (1 + 1e-9)), x0=jnp.asarray(x0))
-        assert bool(episode.failure) and float(episode.states.x1[-1]) == 10 and float(episode.distance) == 0
-        expected = scipy.stats.norm.logpdf(x0, scale=0.1) + 10 * scipy.stats.norm.logpdf(x, scale=0.03)
+        assert (
+            bool(episode.failure)
+            and float(episode.states.x1[-1]) == 10
+            and float(episode.distance) == 0
+        )
+        expected = scipy.stats.norm.logpdf(x0, scale=0.1) + 10 * scipy.stats.norm.logpdf(
+            x, scale=0.03
+        )
         assert float(episode.log_prob) == pytest.approx(expected, rel=1e-6)
         mirrored = jast.replay(landing(), -episode.disturbances, x0=-episode.x0)
         assert bool(mirrored.failure) and float(mirrored.log_prob) == float(episode.log_prob)
-        passing = jast.replay(landing(b=0.2), jnp.asarray([0.3, -0.3] + [0.0] * 8), x0=jnp.asarray(0.0))
+        passing = jast.replay(
+            landing(b=0.2), jnp.asarray([0.3, -0.3] + [0.0] * 8), x0=jnp.asarray(0.0)
+        )
         assert not bool(passing.failure) and float(passing.distance) == pytest.approx(0.2)
 
 
@@ -126,8 +154,11 @@ def test_limit_state():
     assert (bool(hit.failure), float(hit.distance), int(hit.length)) == (True, 0.0, 1)
     assert (bool(miss.failure), float(miss.distance)) == (False, 1.0)
     assert float(hit.log_prob) == pytest.approx(scipy.stats.norm.logpdf(2.6) * 4, rel=1e-5)
-    assert not bool(jast.rollout(jax.random.key(0), limit_state(lambda x: x[0] ** 2, 1)).failure)  # not asked at the origin
-    assert sim.observe(jnp.zeros(4)).shape == (4,) and limit_state(plane, 200).observe(jnp.zeros(200)).shape == (64,)
+    # not asked at the origin
+    assert not bool(jast.rollout(jax.random.key(0), limit_state(lambda x: x[0] ** 2, 1)).failure)
+    assert sim.observe(jnp.zeros(4)).shape == (4,) and limit_state(plane, 200).observe(
+        jnp.zeros(200)
+    ).shape == (64,)
 
 
 def test_limit_state_truths():
@@ -136,46 +167,78 @@ def test_limit_state_truths():
     with jax.enable_x64(True):
         # the hyperplane, with the disturbance tilted onto it: an unbiased estimate with weights
         x = np.random.default_rng(0).normal(size=(20_000, 3)) + 5 / np.sqrt(3)
-        fails = np.asarray(jax.vmap(lambda v: jast.replay(limit_state(plane, 3), v[None]).failure)(jnp.asarray(x)))
+        fails = np.asarray(
+            jax.vmap(lambda v: jast.replay(limit_state(plane, 3), v[None]).failure)(jnp.asarray(x))
+        )
         weights = fails * np.exp(-5 / np.sqrt(3) * x.sum(1) + 12.5)
         assert abs(weights.mean() - 2.8665157188e-7) < 4 * weights.std() / np.sqrt(len(x))
         # four branches, by the conditional probability along one axis: a sum over a grid
         grid = np.linspace(-8, 8, 2001)
         cell = (grid[1] - grid[0]) ** 2
-        values = jax.jit(jax.vmap(jax.vmap(lambda a, b: four_branch(jnp.stack([a, b])), (None, 0)), (0, None)))(jnp.asarray(grid), jnp.asarray(grid))
+        values = jax.jit(
+            jax.vmap(jax.vmap(lambda a, b: four_branch(jnp.stack([a, b])), (None, 0)), (0, None))
+        )(jnp.asarray(grid), jnp.asarray(grid))
         density = scipy.stats.norm.pdf(grid)[:, None] * scipy.stats.norm.pdf(grid)
-        assert np.sum(density * (np.asarray(values) <= 0)) * cell == pytest.approx(2.2227950662e-3, rel=2e-3)
-        corners = jax.vmap(jax.vmap(lambda a, b: corner(jnp.stack([a, b])), (None, 0)), (0, None))(jnp.asarray(grid), jnp.asarray(grid))
-        assert np.sum(density * (np.asarray(corners) <= 0)) * cell == pytest.approx(5.4116288413e-8, rel=0.05)
+        assert np.sum(density * (np.asarray(values) <= 0)) * cell == pytest.approx(
+            2.2227950662e-3, rel=2e-3
+        )
+        corners = jax.vmap(jax.vmap(lambda a, b: corner(jnp.stack([a, b])), (None, 0)), (0, None))(
+            jnp.asarray(grid), jnp.asarray(grid)
+        )
+        assert np.sum(density * (np.asarray(corners) <= 0)) * cell == pytest.approx(
+            5.4116288413e-8, rel=0.05
+        )
 
 
 def test_limit_state_rate(key):
     found = jast.nominal(key, limit_state(four_branch, 2), episodes=100_000)
     assert abs(found.rate - 2.2227950662e-3) < 4 * np.sqrt(2.2227950662e-3 / 100_000)
-    gaussian = jast.nominal(key, limit_state(lambda x: x[0] + 2, 1), episodes=50_000)  # fails below -2: Phi(-2)
+    # fails below -2: Phi(-2)
+    gaussian = jast.nominal(key, limit_state(lambda x: x[0] + 2, 1), episodes=50_000)
     assert abs(gaussian.rate - 0.0227501319) < 4 * np.sqrt(0.0227501319 / 50_000)
 
 
 # bad parameters
 
 
-@pytest.mark.parametrize("bad, match", [
-    (lambda: ferry(3.0), "ferry: adversary must be two numbers"),
-    (lambda: ferry((1.0, 2.0, 3.0)), "ferry: adversary must be two numbers"),
-    (lambda: ferry("left"), "ferry: adversary must be two numbers"),
-    (lambda: walk1d("both"), 'walk1d: form must be "two-sided" or "one-sided", received .both.'),
-    (lambda: walk1d(sigma=-1.0), "walk1d: sigma must be a positive number, received -1.0"),
-    (lambda: walk1d(horizon=0), "horizon must be an int of at least 1, received 0"),
-    (lambda: landing(b=0.0), "landing: b must be a positive number, received 0.0"),
-    (lambda: landing(sigma_t=jnp.ones(2)), "landing: sigma_t must be a positive number"),
-    (lambda: limit_state(plane, 0), "limit_state: dimension must be an int of at least 1, received 0"),
-    (lambda: limit_state(plane, 2.0), "limit_state: dimension must be an int of at least 1"),
-    (lambda: limit_state(5, 2), "limit_state: g must be a function, received 5"),
-    (lambda: limit_state(lambda x: x, 2), r"limit_state: g must return a float scalar, received float..\[2\]"),
-    (lambda: limit_state(lambda x: x.sum() > 0, 2), r"limit_state: g must return a float scalar, received bool\[\]"),
-    (lambda: limit_state(lambda x: (x.sum(), 1), 2), "limit_state: g must return a float scalar, received"),
-    (lambda: limit_state(lambda x: x["a"], 2), "limit_state: g raised TypeError on a vector of 2 numbers"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "bad, match",
+    [
+        (lambda: ferry(3.0), "ferry: adversary must be two numbers"),
+        (lambda: ferry((1.0, 2.0, 3.0)), "ferry: adversary must be two numbers"),
+        (lambda: ferry("left"), "ferry: adversary must be two numbers"),
+        (
+            lambda: walk1d("both"),
+            'walk1d: form must be "two-sided" or "one-sided", received .both.',
+        ),
+        (lambda: walk1d(sigma=-1.0), "walk1d: sigma must be a positive number, received -1.0"),
+        (lambda: walk1d(horizon=0), "horizon must be an int of at least 1, received 0"),
+        (lambda: landing(b=0.0), "landing: b must be a positive number, received 0.0"),
+        (lambda: landing(sigma_t=jnp.ones(2)), "landing: sigma_t must be a positive number"),
+        (
+            lambda: limit_state(plane, 0),
+            "limit_state: dimension must be an int of at least 1, received 0",
+        ),
+        (lambda: limit_state(plane, 2.0), "limit_state: dimension must be an int of at least 1"),
+        (lambda: limit_state(5, 2), "limit_state: g must be a function, received 5"),
+        (
+            lambda: limit_state(lambda x: x, 2),
+            r"limit_state: g must return a float scalar, received float..\[2\]",
+        ),
+        (
+            lambda: limit_state(lambda x: x.sum() > 0, 2),
+            r"limit_state: g must return a float scalar, received bool\[\]",
+        ),
+        (
+            lambda: limit_state(lambda x: (x.sum(), 1), 2),
+            "limit_state: g must return a float scalar, received",
+        ),
+        (
+            lambda: limit_state(lambda x: x["a"], 2),
+            "limit_state: g raised TypeError on a vector of 2 numbers",
+        ),
+    ],
+)
 def test_bad_parameters(bad, match):
     with pytest.raises(ValueError, match=match):
         bad()
@@ -188,12 +251,19 @@ def shifted(level, x):
     return level - x[0]
 
 
-@pytest.mark.parametrize("first, second", [
-    (lambda: ferry((16.0, 0.0)), lambda: ferry((17.0, 1.0))),
-    (lambda: walk1d(sigma=1.0), lambda: walk1d(sigma=2.0, threshold=3)),
-    (lambda: landing(), lambda: landing(b=0.2, sigma_i=0.3)),
-    (lambda: limit_state(Partial(shifted, jnp.asarray(1.0)), 2), lambda: limit_state(Partial(shifted, jnp.asarray(2.0)), 2)),
-], ids=["ferry", "walk1d", "landing", "limit_state"])  # fmt: skip
+@pytest.mark.parametrize(
+    "first, second",
+    [
+        (lambda: ferry((16.0, 0.0)), lambda: ferry((17.0, 1.0))),
+        (lambda: walk1d(sigma=1.0), lambda: walk1d(sigma=2.0, threshold=3)),
+        (lambda: landing(), lambda: landing(b=0.2, sigma_i=0.3)),
+        (
+            lambda: limit_state(Partial(shifted, jnp.asarray(1.0)), 2),
+            lambda: limit_state(Partial(shifted, jnp.asarray(2.0)), 2),
+        ),
+    ],
+    ids=["ferry", "walk1d", "landing", "limit_state"],
+)
 def test_a_second_instance_does_not_recompile(first, second, key):
     play = lambda sim: jast.rollout(key, sim)
     play(first())

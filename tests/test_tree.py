@@ -1,4 +1,6 @@
-"""The tree engine: the trees it builds, against an independent search; what holds in every tree; and what it costs in memory and copies."""
+"""The tree engine: the trees it builds, against an independent search; what holds in every tree;
+and what it costs in memory and copies.
+"""
 
 import functools
 import re
@@ -26,9 +28,27 @@ SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
 SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
 
 
-def problem(sim, simulations, reward, actions, widening=(2.0, 0.5), spread=False, focus=1.0, guide=(), **switches):
-    choice = Choice(actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0, **switches)
-    parts = T.Problem(sim, reward, choice, T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)), guide)
+def problem(
+    sim,
+    simulations,
+    reward,
+    actions,
+    widening=(2.0, 0.5),
+    spread=False,
+    focus=1.0,
+    guide=(),
+    **switches,
+):
+    choice = Choice(
+        actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0, **switches
+    )
+    parts = T.Problem(
+        sim,
+        reward,
+        choice,
+        T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)),
+        guide,
+    )
     return jax.tree.map(jnp.asarray, parts)
 
 
@@ -48,10 +68,16 @@ def grown(sim, keys, prunes=3, simulations=120, memoize="node", **choices):
 
 
 def slots_of(tree, lane):
-    """What one tree holds: node -> [(visits, sum of returns, child's id, child's reward, v)], the slots of its pages; the only place that knows the layout."""
+    """What one tree holds: node -> [(visits, sum of returns, child's id, child's reward, v)], the
+    slots of its pages; the only place that knows the layout.
+    """
     lanes = tree.key.shape[0]
     pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, T.ROW)[:, lane]
-    values = np.asarray(tree.values, np.float64).reshape(-1, lanes, T.PAGE + 1)[:, lane] if len(tree.values) else np.zeros((len(pages), T.PAGE + 1))
+    values = (
+        np.asarray(tree.values, np.float64).reshape(-1, lanes, T.PAGE + 1)[:, lane]
+        if len(tree.values)
+        else np.zeros((len(pages), T.PAGE + 1))
+    )
     made = np.flatnonzero((np.asarray(tree.outcome)[:, lane] & T.FRESH) > 0) + 1
     out = {}
     for node in [0, *made]:
@@ -59,7 +85,10 @@ def slots_of(tree, lane):
         while True:
             row = pages[page]
             columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
-            found += [(int(n), w, int(i), r, v) for n, w, i, r, v in zip(*columns, values[page, : T.PAGE], strict=True)]
+            found += [
+                (int(n), w, int(i), r, v)
+                for n, w, i, r, v in zip(*columns, values[page, : T.PAGE], strict=True)
+            ]
             page = int(row[T.LINK])
             if page == 0:
                 break
@@ -69,46 +98,70 @@ def slots_of(tree, lane):
 
 def visited_children(tree, lane):
     """Of the children that were visited, without v."""
-    return {node: [found[:4] for found in slots if found[0] > 0] for node, slots in slots_of(tree, lane).items()}
+    return {
+        node: [found[:4] for found in slots if found[0] > 0]
+        for node, slots in slots_of(tree, lane).items()
+    }
 
 
-# --- against an independent search ----------------------------------------------------------------------------------------------------------------------------
+# --- against an independent search
+# ----------------------------------------------------------------------------
 
 
 def drawn_as_published(keys, simulations, slots):
-    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, state)``, uniform numbers addressed by the keys of the tree, drawn beforehand."""
-    node_slot = jnp.stack(jnp.divmod(jnp.arange((simulations + 1) * slots), slots), axis=1).astype(jnp.int32)
+    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, state)``, uniform numbers
+    addressed by the keys of the tree, drawn beforehand.
+    """
+    node_slot = jnp.stack(jnp.divmod(jnp.arange((simulations + 1) * slots), slots), axis=1).astype(
+        jnp.int32
+    )
 
     @jax.jit
     def table(key):
         nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(node_slot[:, 0])
-        children = jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(nodes, node_slot[:, 1])
+        children = jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(
+            nodes, node_slot[:, 1]
+        )
         return children.reshape(-1, slots), rollouts(key, simulations)[0]
 
     def draw(of_child, of_level):
-        return lambda node, slot, last: of_child[node, slot], lambda i, level, state: of_level[i, level]
+        return (
+            lambda node, slot, last: of_child[node, slot],
+            lambda i, level, state: of_level[i, level],
+        )
 
     return [draw(*(np.asarray(a, np.float64) for a in table(key))) for key in keys]
 
 
 def drawn_by_default(keys, simulations, focus):
-    """The same for spread and focused actions: golden-ratio steps from a random place for each node; every second child, and steps by a coin, near the last.
+    """The same for spread and focused actions: golden-ratio steps from a random place for each
+    node; every second child, and steps by a coin, near the last.
 
     The steps only in half of the trees, by a coin of each.
     """
 
     @jax.jit
     def table(key):
-        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(jnp.arange(simulations + 1, dtype=jnp.int32))
-        return jax.vmap(lambda k: jax.random.bits(k, (), jnp.uint32))(nodes), *rollouts(key, simulations), jax.random.key_data(key)[1] & 1
+        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(
+            jnp.arange(simulations + 1, dtype=jnp.int32)
+        )
+        return (
+            jax.vmap(lambda k: jax.random.bits(k, (), jnp.uint32))(nodes),
+            *rollouts(key, simulations),
+            jax.random.key_data(key)[1] & 1,
+        )
 
-    near = lambda pred, a, last: min(max((0.5 if last is None else last) + focus * (a - 0.5), 0.0), 1.0) if pred else a
+    near = lambda pred, a, last: (
+        min(max((0.5 if last is None else last) + focus * (a - 0.5), 0.0), 1.0) if pred else a
+    )
     step = int((5**0.5 - 1) / 2 * 2**32)
 
     def draw(shift, of_level, coin, of_tree):
         place = lambda node, slot: ((int(shift[node]) + step * (slot // 2)) % 2**32 >> 8) / 2**24
         child = lambda node, slot, last: near(slot % 2, place(node, slot), last)
-        return child, lambda i, level, state: near(coin[i, level] & of_tree, float(of_level[i, level]), state[4])
+        return child, lambda i, level, state: near(
+            coin[i, level] & of_tree, float(of_level[i, level]), state[4]
+        )
 
     return [draw(*map(np.asarray, table(key))) for key in keys]
 
@@ -116,8 +169,13 @@ def drawn_by_default(keys, simulations, focus):
 def rollouts(key, simulations):
     """[simulations, 21] the uniform number and the coin of each level of each simulation."""
     at = lambda i, level: jax.random.fold_in(jax.random.fold_in(key, i), level)
-    keys = jax.vmap(lambda i: jax.vmap(lambda level: at(i, level))(jnp.arange(21, dtype=jnp.int32)))(jnp.arange(simulations, dtype=jnp.int32))
-    return jax.vmap(jax.vmap(lambda k: jax.random.uniform(k, ())))(keys), jax.random.key_data(keys)[..., 1] & 1
+    keys = jax.vmap(
+        lambda i: jax.vmap(lambda level: at(i, level))(jnp.arange(21, dtype=jnp.int32))
+    )(jnp.arange(simulations, dtype=jnp.int32))
+    return (
+        jax.vmap(jax.vmap(lambda k: jax.random.uniform(k, ())))(keys),
+        jax.random.key_data(keys)[..., 1] & 1,
+    )
 
 
 class Slot(NamedTuple):
@@ -130,15 +188,31 @@ class Slot(NamedTuple):
 
 
 def plain_search(
-    child, rollout, prunes, simulations, k, alpha, c, value=None, weights=(1.0, 0.0), one=False, follow=False, feed=False, urgent=False, x=16.0
-):  # fmt: skip
-    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children at each prune, and the reward of every simulation.
+    child,
+    rollout,
+    prunes,
+    simulations,
+    k,
+    alpha,
+    c,
+    value=None,
+    weights=(1.0, 0.0),
+    one=False,
+    follow=False,
+    feed=False,
+    urgent=False,
+    x=16.0,
+):
+    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children
+    at each prune, and the reward of every simulation.
 
-    With ``value(state, a)``, of ``weights`` (of Q, of v); ``one``: of a node's children that were not visited only the first is to be had. Third: of each node
-    the children to be had, (visits, Q, id, v), 0 where there is none; the v of an only child is never asked for.
+    With ``value(state, a)``, of ``weights`` (of Q, of v); ``one``: of a node's children that were
+    not visited only the first is to be had. Third: of each node the children to be had, (visits, Q,
+    id, v), 0 where there is none; the v of an only child is never asked for.
 
-    ``urgent``: children that were not visited first. ``follow``: after a failure better than all before, its actions are put into the tree one by one.
-    ``feed``: at level 11 of 21 a rollout takes what the best episode's rollout took there (with ``follow``, of the failures).
+    ``urgent``: children that were not visited first. ``follow``: after a failure better than all
+    before, its actions are put into the tree one by one. ``feed``: at level 11 of 21 a rollout
+    takes what the best episode's rollout took there (with ``follow``, of the failures).
     """
 
     def step(state, a):
@@ -153,12 +227,23 @@ def plain_search(
             gain += 30.0 if distance < 5 else -nearest
         return (ferry, x, y, heading, a, nearest), gain, end
 
-    children, count, visits, q, gains, ends, states = {0: []}, {0: 0}, {0: 1}, {0: 0.0}, {0: 0.0}, {}, {0: (0.0, x, 0.0, 0.0, None, np.hypot(x, 50))}
+    children, count, visits, q, gains, ends, states = (
+        {0: []},
+        {0: 0},
+        {0: 1},
+        {0: 0.0},
+        {0: 0.0},
+        {},
+        {0: (0.0, x, 0.0, 0.0, None, np.hypot(x, 50))},
+    )
     root, ancestors, log, at_prune = 0, [], [], []
-    best, source, way, ahead, fed, feeds = -np.inf, None, (), None, None, {}  # way: the best episode's nodes; ahead: the same while there are more to come
+    # way: the best episode's nodes; ahead: the same while there are more to come
+    best, source, way, ahead, fed, feeds = -np.inf, None, (), None, None, {}
 
     def rolled(i, level, state):
-        return feeds[i] if feed and level == 11 and feeds[i] is not None else rollout(i, level, state)
+        return (
+            feeds[i] if feed and level == 11 and feeds[i] is not None else rollout(i, level, state)
+        )
 
     def score(n, bonus):
         if urgent:
@@ -173,7 +258,11 @@ def plain_search(
         ids = [n for n in children[node] if n is not None] + [None] if one else children[node]
         lonely = value is None or len(children[node]) < 2
         return [
-            Slot(*((0, 0.0, 0) if n is None else (visits[n], q[n], n)), 0.0 if lonely else v(node, slot)) for slot, n in enumerate(ids[: len(children[node])])
+            Slot(
+                *((0, 0.0, 0) if n is None else (visits[n], q[n], n)),
+                0.0 if lonely else v(node, slot),
+            )
+            for slot, n in enumerate(ids[: len(children[node])])
         ]
 
     for turn in range(prunes):
@@ -186,7 +275,8 @@ def plain_search(
                 if ends.get(node):
                     level = total = None
                     break
-                if count[node] <= k * visits[node] ** alpha * (1 + 1e-14):  # widen by at most one child a visit; 32^0.6 is 8, not a little less
+                # widen by at most one child a visit; 32^0.6 is 8, not a little less
+                if count[node] <= k * visits[node] ** alpha * (1 + 1e-14):
                     count[node] += 1
                     children[node].append(None)
                 bonus = np.sqrt(np.log(visits[node]))
@@ -194,9 +284,19 @@ def plain_search(
                 slot = int(np.argmax(scores))
                 if children[node][slot] is None:
                     new = i + 1
-                    a = rolled(source, len(path) - 1, states[node]) if follows else child(node, slot, states[node][4])
+                    a = (
+                        rolled(source, len(path) - 1, states[node])
+                        if follows
+                        else child(node, slot, states[node][4])
+                    )
                     states[new], gains[new], ends[new] = step(states[node], a)
-                    children[node][slot], children[new], count[new], visits[new], q[new] = new, [], 0, 0, 0.0
+                    children[node][slot], children[new], count[new], visits[new], q[new] = (
+                        new,
+                        [],
+                        0,
+                        0,
+                        0.0,
+                    )
                     path.append(new)
                     node, level, total = new, len(path) - 1, 0.0
                     break
@@ -211,7 +311,9 @@ def plain_search(
                     state, gain, end = step(state, a)
                     total, level = total + gain, level + 1
                 reward = total + sum(gains[n] for n in path)
-                better = reward > best and (not follow or np.hypot(state[1] - state[0], state[2] - 50) < 5)
+                better = reward > best and (
+                    not follow or np.hypot(state[1] - state[0], state[2] - 50) < 5
+                )
                 if better:
                     best, source, fed = reward, i, fed if middle is None else middle
                 if follow and (better or follows):
@@ -231,18 +333,43 @@ def plain_search(
 
 
 def agree(key, k, alpha, focus=1.0, x=16.0, **switches):
-    """Same numbers drawn, same tree: visits of all children of every root, and every simulation's reward."""
+    """Same numbers drawn, same tree: visits of all children of every root, and every simulation's
+    reward.
+    """
     keys = tree_keys(key, 3)
-    choices = dict(reward=jast.rewards.standard(event_bonus=30.0, density="mode"), actions=jast.actions.uniform(0.0, 1.0))
-    tree, _, roots = grown(jast.simulators.ferry(adversary=(x, 0.0)), keys, widening=(k, alpha), spread=focus != 1, focus=focus, **choices, **switches)
-    assert not (switches.get("follow") or switches.get("feed")) or (np.asarray(tree.lead.source) > 0).any()
-    draws = drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max())) if focus == 1 else drawn_by_default(keys, 360, focus)
+    choices = dict(
+        reward=jast.rewards.standard(event_bonus=30.0, density="mode"),
+        actions=jast.actions.uniform(0.0, 1.0),
+    )
+    tree, _, roots = grown(
+        jast.simulators.ferry(adversary=(x, 0.0)),
+        keys,
+        widening=(k, alpha),
+        spread=focus != 1,
+        focus=focus,
+        **choices,
+        **switches,
+    )
+    assert (
+        not (switches.get("follow") or switches.get("feed"))
+        or (np.asarray(tree.lead.source) > 0).any()
+    )
+    draws = (
+        drawn_as_published(keys, 360, int(T.widths(360, k, alpha).max()))
+        if focus == 1
+        else drawn_by_default(keys, 360, focus)
+    )
     for lane, (child, rollout) in enumerate(draws):
         at_prune, log, _ = plain_search(child, rollout, 3, 120, k, alpha, 10.0, x=x, **switches)
         for turn, expected in enumerate(at_prune):
             found = roots[turn].visits[lane]
             assert found[found > 0].tolist() == expected, f"tree {lane}, prune {turn}"
-        np.testing.assert_allclose(np.asarray(tree.log)[:, lane], log, rtol=0, atol=1e-6 if tree.log.dtype == jnp.float64 else 1e-3)
+        np.testing.assert_allclose(
+            np.asarray(tree.log)[:, lane],
+            log,
+            rtol=0,
+            atol=1e-6 if tree.log.dtype == jnp.float64 else 1e-3,
+        )
 
 
 @pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (0.5, 0.6)])
@@ -254,7 +381,9 @@ def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_action
     agree(key, 2.0, 0.5, focus=0.25)
 
 
-@pytest.mark.parametrize("switches", [("urgent",), ("feed",), ("follow",), ("follow", "feed", "urgent")], ids=" ".join)
+@pytest.mark.parametrize(
+    "switches", [("urgent",), ("feed",), ("follow",), ("follow", "feed", "urgent")], ids=" ".join
+)
 def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key, switches):
     agree(key, 2.0, 0.5, x=28.0, **dict.fromkeys(switches, True))  # nearer to a collision
 
@@ -263,7 +392,8 @@ def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
     agree(key, 2.0, 0.5)
 
 
-# --- what holds in every tree ---------------------------------------------------------------------------------------------------------------------------------
+# --- what holds in every tree
+# ----------------------------------------------------------------------------
 
 
 def counts_add_up(tree, k, alpha):
@@ -286,7 +416,9 @@ def counts_add_up(tree, k, alpha):
                 assert len(found) <= np.floor(k * visits[node] ** alpha) + 1
             widest = max(widest, len(found))
         total = sum(w for _, w, _, _ in nodes[0])
-        np.testing.assert_allclose(total / (visits[0] - 1), log[ran, lane].astype(np.float64).mean(), rtol=1e-5)
+        np.testing.assert_allclose(
+            total / (visits[0] - 1), log[ran, lane].astype(np.float64).mean(), rtol=1e-5
+        )
     return widest
 
 
@@ -294,7 +426,8 @@ def counts_add_up(tree, k, alpha):
 def test_counts_of_every_node_add_up(name, key):
     sim, choices = SYSTEMS[name]
     tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(4.0, 0.5), **choices)
-    np.testing.assert_array_equal(root_visits[0], 121)  # the simulations, and the 1 that a root starts from
+    # the simulations, and the 1 that a root starts from
+    np.testing.assert_array_equal(root_visits[0], 121)
     widest = counts_add_up(tree, 4.0, 0.5)
     assert name != "ferry" or widest > T.PAGE  # pages were linked
 
@@ -322,7 +455,12 @@ def same(a, b):
     np.testing.assert_array_equal(a.history.failures, b.history.failures)
     np.testing.assert_array_equal(a.roots.visits, b.roots.visits)
     np.testing.assert_array_equal(a.roots.q, b.roots.q)
-    assert (a.episodes, a.first_failure, a.failing_share, a.invalid) == (b.episodes, b.first_failure, b.failing_share, b.invalid)
+    assert (a.episodes, a.first_failure, a.failing_share, a.invalid) == (
+        b.episodes,
+        b.first_failure,
+        b.failing_share,
+        b.invalid,
+    )
     np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
     np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
     assert a.failures.seen == b.failures.seen
@@ -365,14 +503,20 @@ def test_memoization_changes_the_steps_and_nothing_else(name):
 
 
 def test_the_steps_of_replays_add_up():
-    """From so far off nothing collides, so all episodes are of 21 steps, of which a kept root saves its depth."""
+    """From so far off nothing collides, so all episodes are of 21 steps, of which a kept root saves
+    its depth.
+    """
     sim, choices = jast.simulators.ferry(adversary=(16.0, -500.0)), SYSTEMS["ferry"][1]
-    root, none = (forest(jax.random.key(7), sim, **SIZE | choices, memoize=memoize) for memoize in ("root", "none"))
+    root, none = (
+        forest(jax.random.key(7), sim, **SIZE | choices, memoize=memoize)
+        for memoize in ("root", "none")
+    )
     assert none.simulator_steps == 5 * 360 * 21
     assert root.simulator_steps == none.simulator_steps - 5 * 120 * (0 + 1 + 2)
 
 
-# --- widths ---------------------------------------------------------------------------------------------------------------------------------------------------
+# --- widths
+# ----------------------------------------------------------------------------
 
 
 @given(k=st.floats(0.05, 8.0), alpha=st.floats(0.0, 1.0))
@@ -380,7 +524,8 @@ def test_the_steps_of_replays_add_up():
 def test_widths_are_those_of_widening_step_by_step(k, alpha):
     children, expected = 0, [0]
     for n in range(1, 402):
-        children += children <= k * n**alpha * (1 + 1e-14)  # n^alpha of a whole result may come out just below it
+        # n^alpha of a whole result may come out just below it
+        children += children <= k * n**alpha * (1 + 1e-14)
         expected.append(children)
     assert T.widths(400, k, alpha).tolist() == expected
 
@@ -393,15 +538,30 @@ def test_traced_widths_are_the_same(k, alpha):
 
 @pytest.mark.parametrize(("k", "alpha"), [(0.5, 0.6), (2.0, 0.4)])
 def test_traced_widths_of_an_exponent_that_float32_rounds_are_nearly_the_same(k, alpha):
-    """Where k n^alpha comes within rounding of a whole number, a child may come one visit early or late."""
+    """Where k n^alpha comes within rounding of a whole number, a child may come one visit early or
+    late.
+    """
     traced = jax.jit(lambda k, alpha: T.widths(9000, k, alpha))(k, alpha)
     off = np.asarray(traced) - np.asarray(T.widths(9000, k, alpha))
     assert np.abs(off).max() <= 1 and np.count_nonzero(off) <= 3
 
 
-# --- records --------------------------------------------------------------------------------------------------------------------------------------------------
+# --- records
+# ----------------------------------------------------------------------------
 
-DTYPES = ["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float16", "bfloat16", "float32", "complex64"]
+DTYPES = [
+    "bool",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "float16",
+    "bfloat16",
+    "float32",
+    "complex64",
+]
 WIDE = ["int64", "uint64", "float64", "complex128"]
 NAMED = dict(bfloat16=ml_dtypes.bfloat16)
 
@@ -412,7 +572,12 @@ def arrays(draw, names):
     dtype = np.dtype(NAMED.get(name := draw(st.sampled_from(names)), name))
     shape = draw(st.sampled_from([(), (1,), (3,), (2, 3), (0,)]))
     if dtype.kind == "b":
-        return np.array(draw(st.lists(st.booleans(), min_size=int(np.prod(shape)), max_size=int(np.prod(shape)))), bool).reshape(shape)
+        return np.array(
+            draw(
+                st.lists(st.booleans(), min_size=int(np.prod(shape)), max_size=int(np.prod(shape)))
+            ),
+            bool,
+        ).reshape(shape)
     size = int(np.prod(shape)) * dtype.itemsize
     return np.frombuffer(draw(st.binary(min_size=size, max_size=size)), dtype).reshape(shape)
 
@@ -445,7 +610,13 @@ def test_records_give_back_every_bit_of_wide_numbers(tree):
         same_bytes(tree, round_trip(tree))
 
 
-@pytest.mark.parametrize(("dtype", "bits"), [("float32", [0x7FC00001, 0xFFC12345, 0x7F800000, 0x80000000]), ("float16", [0x7E01, 0xFE23, 0x7C00, 0x8000])])
+@pytest.mark.parametrize(
+    ("dtype", "bits"),
+    [
+        ("float32", [0x7FC00001, 0xFFC12345, 0x7F800000, 0x80000000]),
+        ("float16", [0x7E01, 0xFE23, 0x7C00, 0x8000]),
+    ],
+)
 def test_records_keep_payloads_of_nan(dtype, bits):
     a = np.array(bits, f"u{np.dtype(dtype).itemsize}").view(dtype)
     same_bytes(a, round_trip(a))
@@ -455,13 +626,16 @@ def test_a_record_of_nothing_is_empty():
     assert pack(()).shape == (0,) and unpack(pack(()), ()) == ()
 
 
-# --- copies ---------------------------------------------------------------------------------------------------------------------------------------------------
+# --- copies
+# ----------------------------------------------------------------------------
 
 
 def compiled_text(sim, simulations, memoize, record=False, **choices):
     p = problem(sim, simulations, **choices)
     keys = tree_keys(jax.random.key(0), 2)
-    tree = jax.eval_shape(lambda: T.make(p, run._shared(p), keys, simulations, memoize, record=record))
+    tree = jax.eval_shape(
+        lambda: T.make(p, run._shared(p), keys, simulations, memoize, record=record)
+    )
     return run._grow.lower(p, tree, 0, 100, memoize).compile().as_text()
 
 
@@ -471,7 +645,9 @@ def large_copies(text, capacity):
     for line in text.splitlines():
         if line and not line[0].isspace():
             entry = line.startswith("ENTRY")
-        made = re.match(r"\s+(?:ROOT )?%?[\w.-]+ = \w+\[([\d,]*)\]\S* (copy|select|copy-start)\(", line)
+        made = re.match(
+            r"\s+(?:ROOT )?%?[\w.-]+ = \w+\[([\d,]*)\]\S* (copy|select|copy-start)\(", line
+        )
         if made and not entry and np.prod([int(n) for n in made[1].split(",") if n]) >= capacity:
             found.append(line.strip())
     return found
@@ -480,7 +656,12 @@ def large_copies(text, capacity):
 def test_large_copies_are_seen():
     """The test below would see one: a select of the whole array in a loop."""
     body = lambda i, a: jnp.where(a[i % 1000] > 0, a.at[i].set(1.0), a[::-1])
-    text = jax.jit(lambda a: jax.lax.fori_loop(0, 10, body, a)).lower(jnp.zeros(1000)).compile().as_text()
+    text = (
+        jax.jit(lambda a: jax.lax.fori_loop(0, 10, body, a))
+        .lower(jnp.zeros(1000))
+        .compile()
+        .as_text()
+    )
     assert large_copies(text, 1000)
 
 
@@ -497,7 +678,19 @@ def test_nor_with_other_states(name):
 
 @pytest.mark.parametrize("sim", [FERRY, LANDING], ids=["ferry", "landing"])
 def test_nor_when_the_best_episode_is_followed_and_trials_are_recorded(sim):
-    assert not large_copies(compiled_text(sim, 307, "node", record=True, follow=True, feed=True, urgent=True, **(S0 if sim is FERRY else PLAIN)), 307)
+    assert not large_copies(
+        compiled_text(
+            sim,
+            307,
+            "node",
+            record=True,
+            follow=True,
+            feed=True,
+            urgent=True,
+            **(S0 if sim is FERRY else PLAIN),
+        ),
+        307,
+    )
 
 
 def test_the_program_does_not_grow_with_the_simulations():
@@ -506,11 +699,15 @@ def test_the_program_does_not_grow_with_the_simulations():
     assert instructions[0] == instructions[1] > 1000
 
 
-# --- memory ---------------------------------------------------------------------------------------------------------------------------------------------------
+# --- memory
+# ----------------------------------------------------------------------------
 
 
 def nbytes(tree):
-    return sum(jax.random.key_data(a).nbytes if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a.nbytes for a in jax.tree.leaves(tree))
+    return sum(
+        jax.random.key_data(a).nbytes if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a.nbytes
+        for a in jax.tree.leaves(tree)
+    )
 
 
 @pytest.mark.parametrize("memoize", ["node", "root"])
@@ -527,16 +724,25 @@ def large(words):
     zero = jnp.zeros((), jnp.int32)
     init = lambda x0: (jnp.zeros(()), zero + jnp.zeros((words,), jnp.int32))
     return jast.Simulator(
-        init, lambda s, x: (s[0] + x, s[1] + 1), lambda s: jast.distributions.Normal(0.0, 1.0), lambda s: (s[0] > 9, 9 - s[0]), 6, observe=lambda s: s[0][None]
+        init,
+        lambda s, x: (s[0] + x, s[1] + 1),
+        lambda s: jast.distributions.Normal(0.0, 1.0),
+        lambda s: (s[0] > 9, 9 - s[0]),
+        6,
+        observe=lambda s: s[0][None],
     )
 
 
 def per_tree(sim, simulations, memoize):
-    return run.bytes_per_tree(problem(sim, simulations, **PLAIN), run.Plan(1, simulations, 20, memoize))
+    return run.bytes_per_tree(
+        problem(sim, simulations, **PLAIN), run.Plan(1, simulations, 20, memoize)
+    )
 
 
 def test_a_node_costs_its_edges_and_its_state():
-    a_node = lambda sim, memoize: (per_tree(sim, 15_000, memoize) - per_tree(sim, 7_500, memoize)) / 7_500
+    a_node = lambda sim, memoize: (
+        (per_tree(sim, 15_000, memoize) - per_tree(sim, 7_500, memoize)) / 7_500
+    )
     real = jnp.zeros(()).dtype.itemsize
     assert a_node(large(0), "root") < T.ROW * real * (1 + 1 / T.PAGE) + 8 * real + 24
     assert a_node(large(1000), "root") == a_node(large(0), "root")
@@ -545,18 +751,38 @@ def test_a_node_costs_its_edges_and_its_state():
 
 def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     ran = []
-    with pytest.raises(ValueError, match=r"forest: 1 trees in each of 1 threads take .* MB .*3 x 120 simulations.*10 kB are free; use fewer"):
-        forest(jax.random.key(0), large(2000), trees=1, prunes=3, simulations=120, available=10_000, memoize="node", callback=lambda *a: ran.append(a))
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"forest: 1 trees in each of 1 threads take .* MB .*3 x 120 simulations.*10 kB are"
+            r" free; use fewer"
+        ),
+    ):
+        forest(
+            jax.random.key(0),
+            large(2000),
+            trees=1,
+            prunes=3,
+            simulations=120,
+            available=10_000,
+            memoize="node",
+            callback=lambda *a: ran.append(a),
+        )
     with pytest.raises(ValueError, match="10 kB are free"):
         forest(jax.random.key(0), FERRY, trees=4, prunes=3, simulations=120, available=10_000)
     with pytest.raises(ValueError, match="10 kB are free"):
-        forest(jax.random.key(0), FERRY, trees=4, prunes=3, simulations=120, available=10_000, lanes=2)
+        forest(
+            jax.random.key(0), FERRY, trees=4, prunes=3, simulations=120, available=10_000, lanes=2
+        )
     assert not ran
 
 
 def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
     sim, size = large(2000), dict(trees=2, prunes=3, simulations=120, threads=1)
-    node, root = (run.bytes_per_tree(problem(sim, 360, **PLAIN), run.Plan(3, 120, 39, memoize)) for memoize in ("node", "root"))
+    node, root = (
+        run.bytes_per_tree(problem(sim, 360, **PLAIN), run.Plan(3, 120, 39, memoize))
+        for memoize in ("node", "root")
+    )
     assert node > 5 * root
     with pytest.warns(UserWarning, match='kept at roots: memoize="root"'):
         result = forest(jax.random.key(0), sim, **size, available=2 * 2 * root)

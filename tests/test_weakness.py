@@ -1,4 +1,6 @@
-"""The validation loop of jast.weakness: calls are counted and never repeated, nothing that was answered is lost, and scores are judged as scikit-learn does."""
+"""The validation loop of jast.weakness: calls are counted and never repeated, nothing that was
+answered is lost, and scores are judged as scikit-learn does.
+"""
 
 import importlib
 
@@ -14,7 +16,8 @@ from jast.counter import generator
 from jast.weakness import Selector, Step, validate
 
 KEY = jax.random.key(0)
-validation = importlib.import_module("jast.weakness.validate")  # the package's own `validate` is the function
+# the package's own `validate` is the function
+validation = importlib.import_module("jast.weakness.validate")
 
 
 def same(a, b):
@@ -32,7 +35,9 @@ def same(a, b):
 
 
 class System:
-    """Answers from a list, by the first number of an input, which is its index; notes what it was asked."""
+    """Answers from a list, by the first number of an input, which is its index; notes what it was
+    asked.
+    """
 
     def __init__(self, answers):
         self.answers, self.batches = np.asarray(answers), []
@@ -48,14 +53,22 @@ class System:
 
 
 def problem(n, rate=0.2, classes=3, seed=0):
-    """(inputs [n, 2] whose first number is the index, labels, answers of a system that is wrong at ``rate``)."""
+    """(inputs [n, 2] whose first number is the index, labels, answers of a system that is wrong at
+    ``rate``).
+    """
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, classes, n)
-    return np.stack([np.arange(n), rng.normal(size=n)], 1), labels, np.where(rng.random(n) < rate, (labels + 1) % classes, labels)
+    return (
+        np.stack([np.arange(n), rng.normal(size=n)], 1),
+        labels,
+        np.where(rng.random(n) < rate, (labels + 1) % classes, labels),
+    )
 
 
 def in_turn(size=7, sets=2):
-    """A selector that asks for the next inputs, ``sets`` times an iteration, and remembers how many it has seen fail."""
+    """A selector that asks for the next inputs, ``sets`` times an iteration, and remembers how many
+    it has seen fail.
+    """
 
     def step(key, data, memory, seen, ask):
         at = int(memory["at"])
@@ -63,9 +76,19 @@ def in_turn(size=7, sets=2):
             now = ask(np.arange(at, min(at + size, data.size)))
             at += size
         noise = generator(key).random(data.size, np.float32)
-        return Step({"at": np.asarray(at), "failed": np.asarray(now.failed.sum())}, noise, np.arange(int(memory["at"]), min(at, data.size)), 1.5)
+        return Step(
+            {"at": np.asarray(at), "failed": np.asarray(now.failed.sum())},
+            noise,
+            np.arange(int(memory["at"]), min(at, data.size)),
+            1.5,
+        )
 
-    return Selector("in turn", {"size": size}, lambda key, data: {"at": np.asarray(0), "failed": np.asarray(0)}, step)
+    return Selector(
+        "in turn",
+        {"size": size},
+        lambda key, data: {"at": np.asarray(0), "failed": np.asarray(0)},
+        step,
+    )
 
 
 @settings(deadline=None, max_examples=60)
@@ -73,13 +96,21 @@ def in_turn(size=7, sets=2):
 def test_every_input_is_asked_at_most_once_and_every_call_is_counted(n, budget, rate, seed):
     inputs, labels, answers = problem(n, rate, seed=seed)
     system = System(answers)
-    result = validate(jax.random.key(seed), system, inputs, labels, budget=budget, selector="random", classes=3)
+    result = validate(
+        jax.random.key(seed), system, inputs, labels, budget=budget, selector="random", classes=3
+    )
     assert result.calls == min(n, budget) == len(system.asked) == len(set(system.asked.tolist()))
     np.testing.assert_array_equal(result.order, system.asked)
-    np.testing.assert_array_equal(result.failures, [i for i in result.order if answers[i] != labels[i]])
-    np.testing.assert_array_equal(result.predicted, np.where(np.isin(np.arange(n), result.order), answers, -1))
+    np.testing.assert_array_equal(
+        result.failures, [i for i in result.order if answers[i] != labels[i]]
+    )
+    np.testing.assert_array_equal(
+        result.predicted, np.where(np.isin(np.arange(n), result.order), answers, -1)
+    )
     assert sorted(result.ranked.tolist() + result.order.tolist()) == list(range(n))
-    assert result.history.calls[-1] == result.calls and result.history.found[-1] == len(result.failures)
+    assert result.history.calls[-1] == result.calls and result.history.found[-1] == len(
+        result.failures
+    )
 
 
 def test_random_choice_expects_what_its_rate_says():
@@ -88,7 +119,9 @@ def test_random_choice_expects_what_its_rate_says():
     left = int(np.sum(answers != labels)) - len(result.failures)
     # hypergeometric: the standard error of the rate of 1000 of 4000, times the 3000 left; 4 of them
     assert abs(result.expected - left) < 4 * 4000 * np.sqrt(0.1 * 0.9 / 1000 * 3000 / 4000)
-    assert result.history.recall[-1] == pytest.approx(len(result.failures) / (len(result.failures) + result.expected))
+    assert result.history.recall[-1] == pytest.approx(
+        len(result.failures) / (len(result.failures) + result.expected)
+    )
 
 
 def test_rows_of_the_history():
@@ -98,9 +131,21 @@ def test_rows_of_the_history():
     ends = np.r_[14:60:14, 60]
     np.testing.assert_array_equal(result.history.calls, ends)
     np.testing.assert_array_equal(result.history.found, [failed[:e].sum() for e in ends])
-    np.testing.assert_allclose(result.history.precision, [failed[a:e].mean() for a, e in zip(np.r_[0, ends], ends, strict=False)])
-    np.testing.assert_allclose(result.history.recall, [failed[:e].sum() / (failed[:e].sum() + 1.5) for e in ends])
-    np.testing.assert_allclose(result.history.auc, [roc_auc_score(failed[:e], s[:e]) for e, s in zip(ends, result.history.scores, strict=True)], rtol=1e-6)
+    np.testing.assert_allclose(
+        result.history.precision,
+        [failed[a:e].mean() for a, e in zip(np.r_[0, ends], ends, strict=False)],
+    )
+    np.testing.assert_allclose(
+        result.history.recall, [failed[:e].sum() / (failed[:e].sum() + 1.5) for e in ends]
+    )
+    np.testing.assert_allclose(
+        result.history.auc,
+        [
+            roc_auc_score(failed[:e], s[:e])
+            for e, s in zip(ends, result.history.scores, strict=True)
+        ],
+        rtol=1e-6,
+    )
     np.testing.assert_array_equal(result.scores, result.history.scores[-1])
 
 
@@ -120,7 +165,13 @@ def test_large_batches_are_cut(monkeypatch):
 def test_inputs_reach_the_system_as_they_are():
     seen = []
     images = np.arange(40, dtype=np.uint8).reshape(10, 2, 2)
-    validate(KEY, lambda x: seen.append(x) or np.zeros(len(x), int), images, np.zeros(10, int), selector=in_turn(10, 1))
+    validate(
+        KEY,
+        lambda x: seen.append(x) or np.zeros(len(x), int),
+        images,
+        np.zeros(10, int),
+        selector=in_turn(10, 1),
+    )
     assert seen[0].dtype == np.uint8 and seen[0].shape == (10, 2, 2)
 
 
@@ -138,7 +189,9 @@ class Flaky(System):
         return super().__call__(batch)
 
 
-@pytest.mark.parametrize("error", [RuntimeError("out of memory"), KeyboardInterrupt()], ids=["raises", "interrupted"])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("out of memory"), KeyboardInterrupt()], ids=["raises", "interrupted"]
+)
 @pytest.mark.parametrize("at", [7, 20, 59])
 def test_an_interrupted_validation_goes_on_as_if_it_had_not_been(at, error):
     inputs, labels, answers = problem(60)
@@ -148,9 +201,14 @@ def test_an_interrupted_validation_goes_on_as_if_it_had_not_been(at, error):
         part = validate(KEY, system, inputs, labels, selector=in_turn())
     assert len(part.incidents) == 1 and part.calls == len(system.asked) < 60
     if isinstance(error, RuntimeError):
-        assert "RuntimeError: out of memory" in part.incidents[0] and f"[{at // 7 * 7}, " in part.incidents[0]
+        assert (
+            "RuntimeError: out of memory" in part.incidents[0]
+            and f"[{at // 7 * 7}, " in part.incidents[0]
+        )
         assert "out of memory" in str(part)
-    rest = validate(jax.random.key(99), system, inputs, labels, selector=in_turn(), state=part.state)
+    rest = validate(
+        jax.random.key(99), system, inputs, labels, selector=in_turn(), state=part.state
+    )
     same(rest, whole)
     assert len(system.asked) == 60
 
@@ -165,7 +223,14 @@ def test_a_checkpoint_holds_every_answer(tmp_path):
     assert len(weakness.load(path).order) == 35
     same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
     assert len(system.asked) == 60
-    again = validate(KEY, lambda x: pytest.fail("nothing is left to ask"), inputs, labels, selector=in_turn(), checkpoint=path)
+    again = validate(
+        KEY,
+        lambda x: pytest.fail("nothing is left to ask"),
+        inputs,
+        labels,
+        selector=in_turn(),
+        checkpoint=path,
+    )
     same(again, whole)
 
 
@@ -188,7 +253,11 @@ def test_answers_that_an_iteration_does_not_ask_for_again_are_kept():
 
     def step(key, data, memory, seen, ask):
         at = len(seen.order)
-        plan = [np.arange(at, min(at + 10, 60)), np.arange(30, 40)] if not mind else [np.flatnonzero(~seen.tried)[-25:]]
+        plan = (
+            [np.arange(at, min(at + 10, 60)), np.arange(30, 40)]
+            if not mind
+            else [np.flatnonzero(~seen.tried)[-25:]]
+        )
         for part in plan:
             now = ask(part)
         return Step({}, np.full(60, 0.5), plan[0], float(len(now.order)))
@@ -196,26 +265,38 @@ def test_answers_that_an_iteration_does_not_ask_for_again_are_kept():
     changing = Selector("changing", {}, lambda key, data: {}, step)
     with pytest.warns(RuntimeWarning, match="OSError"):
         part = validate(KEY, system, inputs, labels, selector=changing, budget=50)
-    assert part.order.tolist() == list(range(10)) and len(part.history.calls) == 0  # asked, but of an iteration that has not ended
+    # asked, but of an iteration that has not ended
+    assert part.order.tolist() == list(range(10)) and len(part.history.calls) == 0
     mind.append(True)
     result = validate(KEY, system, inputs, labels, selector=changing, budget=50, state=part.state)
     assert len(system.asked) == len(set(system.asked.tolist())) == result.calls == 50
-    assert result.history.calls.tolist() == [25, 40, 50] and set(range(10)) <= set(result.order.tolist())
-    assert result.state.complete == 50 and sorted(result.ranked.tolist() + result.order.tolist()) == list(range(60))
+    assert result.history.calls.tolist() == [25, 40, 50] and set(range(10)) <= set(
+        result.order.tolist()
+    )
+    assert result.state.complete == 50 and sorted(
+        result.ranked.tolist() + result.order.tolist()
+    ) == list(range(60))
 
 
 def test_a_larger_budget_goes_on():
     inputs, labels, answers = problem(60)
     part = validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())
     same(
-        validate(KEY, System(answers), inputs, labels, budget=60, selector=in_turn(), state=part.state),
+        validate(
+            KEY, System(answers), inputs, labels, budget=60, selector=in_turn(), state=part.state
+        ),
         validate(KEY, System(answers), inputs, labels, selector=in_turn()),
     )
 
 
 def test_a_selector_that_asks_nothing_is_stopped():
     inputs, labels, answers = problem(20)
-    idle = Selector("idle", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: Step({}, np.full(20, 0.5), np.zeros(0, int), 0.0))
+    idle = Selector(
+        "idle",
+        {},
+        lambda key, data: {},
+        lambda key, data, memory, seen, ask: Step({}, np.full(20, 0.5), np.zeros(0, int), 0.0),
+    )
     with pytest.warns(RuntimeWarning, match="nothing new"):
         result = validate(KEY, System(answers), inputs, labels, selector=idle)
     assert result.calls == 0 and np.isnan(result.history.precision).all()
@@ -228,16 +309,29 @@ def test_a_selector_may_pause():
     def step(key, data, memory, seen, ask):
         turn = int(memory["turn"])
         now = ask(np.arange(0 if turn % 15 else len(seen.order) + 10)[:30])
-        return Step({"turn": np.asarray(turn + 1)}, np.full(30, 0.5), np.zeros(0, int), float(len(now.order)))
+        return Step(
+            {"turn": np.asarray(turn + 1)},
+            np.full(30, 0.5),
+            np.zeros(0, int),
+            float(len(now.order)),
+        )
 
-    result = validate(KEY, System(answers), inputs, labels, selector=Selector("pauses", {}, lambda key, data: {"turn": np.asarray(0)}, step))
+    result = validate(
+        KEY,
+        System(answers),
+        inputs,
+        labels,
+        selector=Selector("pauses", {}, lambda key, data: {"turn": np.asarray(0)}, step),
+    )
     assert result.calls == 30 and len(result.history.calls) == 31 and not result.incidents
 
 
 @pytest.mark.parametrize("wrong", [[-1], [60], [0.5], [[1, 2]]])
 def test_indices_that_are_none(wrong):
     inputs, labels, answers = problem(60)
-    asks = Selector("odd", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: ask(wrong))
+    asks = Selector(
+        "odd", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: ask(wrong)
+    )
     with pytest.raises(ValueError, match="the selector odd must ask for indices"):
         validate(KEY, System(answers), inputs, labels, selector=asks)
 
@@ -253,17 +347,38 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
 
     def step(key, data, memory, seen, ask):
         out = in_turn().step(key, data, memory, seen, ask)
-        return out if len(seen.order) < 28 else boom() if where == "selector" else out._replace(scores=out.scores + 2)
+        return (
+            out
+            if len(seen.order) < 28
+            else boom()
+            if where == "selector"
+            else out._replace(scores=out.scores + 2)
+        )
 
     if where in ("selector", "scores"):
         selector = selector._replace(step=step)
     if where == "checkpoint":
         calls = []
         real = validation.save
-        monkeypatch.setattr(validation, "save", lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a))
+        monkeypatch.setattr(
+            validation,
+            "save",
+            lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a),
+        )
     at = (lambda i, r: boom() if i == 3 else None) if where == "callback" else None
-    with pytest.warns(RuntimeWarning, match="disk full" if where != "scores" else r"scores must be \[60\] in \[0, 1\]"):
-        part = validate(KEY, system, inputs, labels, selector=selector, callback=at, checkpoint=tmp_path / "c.npz" if where == "checkpoint" else None)
+    with pytest.warns(
+        RuntimeWarning,
+        match="disk full" if where != "scores" else r"scores must be \[60\] in \[0, 1\]",
+    ):
+        part = validate(
+            KEY,
+            system,
+            inputs,
+            labels,
+            selector=selector,
+            callback=at,
+            checkpoint=tmp_path / "c.npz" if where == "checkpoint" else None,
+        )
     assert part.calls == len(system.asked) == 42 and len(part.incidents) == 1
     assert np.isnan(part.expected) == (where != "callback")  # the third iteration had ended
     monkeypatch.undo()
@@ -284,7 +399,9 @@ def test_a_smaller_budget_ends_what_was_begun():
 
 def test_the_last_iteration_is_in_the_checkpoint(tmp_path):
     inputs, labels, answers = problem(60)
-    result = validate(KEY, System(answers), inputs, labels, selector=in_turn(), checkpoint=tmp_path / "c.npz")
+    result = validate(
+        KEY, System(answers), inputs, labels, selector=in_turn(), checkpoint=tmp_path / "c.npz"
+    )
     same(weakness.load(tmp_path / "c.npz"), result.state)
 
 
@@ -299,18 +416,26 @@ def test_more_classes_may_turn_up():
     assert weakness.influence(KEY, rest, inputs, labels).shape == (len(rest.failures), 2)
 
 
-@pytest.mark.parametrize("key", [jax.random.PRNGKey(3), jax.random.key(3, impl="rbg")], ids=["legacy", "rbg"])
+@pytest.mark.parametrize(
+    "key", [jax.random.PRNGKey(3), jax.random.key(3, impl="rbg")], ids=["legacy", "rbg"]
+)
 def test_keys_of_other_kinds(key):
     inputs, labels, answers = problem(60)
     part = validate(key, System(answers), inputs, labels, budget=20, selector="random")
     same(validate(key, System(answers), inputs, labels, budget=20, selector="random"), part)
-    assert validate(KEY, System(answers), inputs, labels, budget=40, selector="random", state=part.state).calls == 40
+    assert (
+        validate(
+            KEY, System(answers), inputs, labels, budget=40, selector="random", state=part.state
+        ).calls
+        == 40
+    )
 
 
 def test_random_choice_is_random():
     inputs, labels, answers = problem(400)
     order = validate(KEY, System(answers), inputs, labels, selector="random", budget=100).order
-    # the mean of 100 of 0 ... 399 without replacement has a standard error of 10; they are in no order
+    # the mean of 100 of 0 ... 399 without replacement has a standard error of 10; they are in no
+    # order
     assert abs(order.mean() - 199.5) < 40 and 30 < np.sum(np.diff(order) > 0) < 70
 
 
@@ -324,7 +449,12 @@ def test_a_selector_may_end_before_the_budget():
     inputs, labels, answers = problem(20)
     done = Selector("done", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: None)
     result = validate(KEY, System(answers), inputs, labels, selector=done)
-    assert result.calls == 0 and result.incidents == () and result.state.finished and len(result.ranked) == 20
+    assert (
+        result.calls == 0
+        and result.incidents == ()
+        and result.state.finished
+        and len(result.ranked) == 20
+    )
     assert "0 failures in 0 calls" in str(result)
 
 
@@ -333,7 +463,11 @@ def test_a_selector_may_end_before_the_budget():
 def test_a_system_without_failures_and_one_with_nothing_else(wrong, selector):
     inputs, labels, _ = problem(30)
     result = validate(KEY, System((labels + wrong) % 3), inputs, labels, selector=selector)
-    assert len(result.failures) == (30 if wrong else 0) and np.isnan(result.history.auc).all() and str(result)
+    assert (
+        len(result.failures) == (30 if wrong else 0)
+        and np.isnan(result.history.auc).all()
+        and str(result)
+    )
     judged = weakness.judge(result, np.full(30, wrong))
     assert np.isnan(judged.auc).all()
 
@@ -341,15 +475,37 @@ def test_a_system_without_failures_and_one_with_nothing_else(wrong, selector):
 def test_progress_and_callback(capsys):
     inputs, labels, answers = problem(60)
     calls = []
-    validate(KEY, System(answers), inputs, labels, selector=in_turn(), progress=True, callback=lambda i, r: calls.append((i, r.calls)))
-    assert calls == [(1, 14), (2, 28), (3, 42), (4, 56), (5, 60)] and "60/60" in capsys.readouterr().err
+    validate(
+        KEY,
+        System(answers),
+        inputs,
+        labels,
+        selector=in_turn(),
+        progress=True,
+        callback=lambda i, r: calls.append((i, r.calls)),
+    )
+    assert (
+        calls == [(1, 14), (2, 28), (3, 42), (4, 56), (5, 60)]
+        and "60/60" in capsys.readouterr().err
+    )
 
 
 def test_results_print_as_a_table():
     inputs, labels, answers = problem(60)
-    lines = str(validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())).splitlines()
+    lines = str(
+        validate(KEY, System(answers), inputs, labels, budget=28, selector=in_turn())
+    ).splitlines()
     assert "failures in 28 calls (60 inputs)" in lines[0]
-    assert lines[1].split() == ["iteration", "calls", "failures", "precision", "~recall", "AUC", "run", "~expected"]
+    assert lines[1].split() == [
+        "iteration",
+        "calls",
+        "failures",
+        "precision",
+        "~recall",
+        "AUC",
+        "run",
+        "~expected",
+    ]
     assert [line.split()[:2] for line in lines[2:]] == [["1", "14"], ["2", "28"]]
 
 
@@ -362,18 +518,33 @@ GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
         (dict(inputs=np.zeros(6)), r"inputs must be numbers \[n, ...\].*shape \(6,\)"),
         (dict(inputs=np.array([["a"] * 2] * 6)), "inputs must be numbers"),
         (dict(inputs=np.zeros((0, 2)), labels=np.zeros(0, int)), "inputs must be numbers"),
-        (dict(inputs=np.where(np.arange(12).reshape(6, 2) == 5, np.nan, 0.0)), "1 of 6 hold NaN or infinity, the first is number 2"),
-        (dict(inputs=np.where(np.arange(12).reshape(6, 2) > 9, np.inf, 0.0)), "1 of 6 hold NaN or infinity, the first is number 5"),
+        (
+            dict(inputs=np.where(np.arange(12).reshape(6, 2) == 5, np.nan, 0.0)),
+            "1 of 6 hold NaN or infinity, the first is number 2",
+        ),
+        (
+            dict(inputs=np.where(np.arange(12).reshape(6, 2) > 9, np.inf, 0.0)),
+            "1 of 6 hold NaN or infinity, the first is number 5",
+        ),
         (dict(labels=np.zeros(5, int)), r"labels must be whole numbers \[6\].*shape \(5,\)"),
         (dict(labels=np.zeros(6)), "labels must be whole numbers.*float64"),
-        (dict(labels=np.array([0, 1, -1, 0, 1, 2])), r"labels must lie in 0 ... 2; 1 do not, the first is number 2: -1"),
+        (
+            dict(labels=np.array([0, 1, -1, 0, 1, 2])),
+            r"labels must lie in 0 ... 2; 1 do not, the first is number 2: -1",
+        ),
         (dict(classes=2), r"labels must lie in 0 ... 1; 2 do not, the first is number 2: 2"),
         (dict(classes=1), "classes must be a whole number of at least 2"),
         (dict(inputs=GOOD[0] + 1e31), r"inputs must lie within 1e\+30 of 0"),
-        (dict(labels=np.array([0, 1, 2, 0, 1, 2**31])), "there may be 65536 classes, received 2147483649; np.unique"),
+        (
+            dict(labels=np.array([0, 1, 2, 0, 1, 2**31])),
+            "there may be 65536 classes, received 2147483649; np.unique",
+        ),
         (dict(labels=np.array(list("abcabc"))), r"labels must be whole numbers.*np.unique\(labels"),
         (dict(callback=3), "callback must be callable"),
-        (dict(checkpoint="/no/such/folder/file.npz"), "checkpoint must be a file in a folder that exists"),
+        (
+            dict(checkpoint="/no/such/folder/file.npz"),
+            "checkpoint must be a file in a folder that exists",
+        ),
         (dict(predict=None), "predict must be callable"),
         (dict(budget=0), "budget must be a whole number of at least 1"),
         (dict(selector="best"), "selector must be one of .*received 'best'"),
@@ -383,7 +554,15 @@ GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
     ],
 )
 def test_bad_arguments(change, message):
-    given = dict(predict=lambda x: np.zeros(len(x), int), inputs=GOOD[0], labels=GOOD[1], selector="random") | change
+    given = (
+        dict(
+            predict=lambda x: np.zeros(len(x), int),
+            inputs=GOOD[0],
+            labels=GOOD[1],
+            selector="random",
+        )
+        | change
+    )
     with pytest.raises(ValueError, match="validate: .*" + message):
         validate(KEY, given.pop("predict"), given.pop("inputs"), given.pop("labels"), **given)
 
@@ -391,8 +570,17 @@ def test_bad_arguments(change, message):
 @pytest.mark.parametrize(
     ("predict", "message"),
     [
-        (lambda x: 1 / 0, r"raised ZeroDivisionError: division by zero, on the batch of 6 inputs \[\d, \d, \d, \d, ...\]"),
-        (lambda x: np.zeros((len(x), 3), int), r"whole numbers \[6\], received int64 of shape \(6, 3\)"),
+        (
+            lambda x: 1 / 0,
+            (
+                r"raised ZeroDivisionError: division by zero, on the batch of 6 inputs \[\d, \d,"
+                r" \d, \d, ...\]"
+            ),
+        ),
+        (
+            lambda x: np.zeros((len(x), 3), int),
+            r"whole numbers \[6\], received int64 of shape \(6, 3\)",
+        ),
         (lambda x: np.zeros((len(x), 3)), r"received float64 of shape \(6, 3\); give the argmax"),
         (lambda x: np.zeros(len(x) - 1, int), r"received int64 of shape \(5,\)"),
         (lambda x: np.zeros(len(x)), "received float64"),
@@ -409,8 +597,17 @@ def test_a_system_that_does_not_answer_at_all(predict, message):
 def test_a_state_of_something_else_is_refused():
     inputs, labels, answers = problem(20)
     state = validate(KEY, System(answers), inputs, labels, budget=10, selector=in_turn()).state
-    with pytest.raises(ValueError, match="state must be the state of a Result, received Result: give result.state"):
-        validate(KEY, System(answers), inputs, labels, selector=in_turn(), state=validate(KEY, System(answers), inputs, labels, selector=in_turn()))
+    with pytest.raises(
+        ValueError, match="state must be the state of a Result, received Result: give result.state"
+    ):
+        validate(
+            KEY,
+            System(answers),
+            inputs,
+            labels,
+            selector=in_turn(),
+            state=validate(KEY, System(answers), inputs, labels, selector=in_turn()),
+        )
     with pytest.raises(ValueError, match="state is of other inputs or labels"):
         validate(KEY, System(answers), inputs + 1, labels, selector=in_turn(), state=state)
     with pytest.raises(ValueError, match="state is of the selector .*in turn"):
@@ -421,7 +618,15 @@ def test_a_state_of_something_else_is_refused():
 
 def test_answers_may_be_of_jax():
     inputs, labels, _ = problem(20)
-    assert len(validate(KEY, lambda x: jax.numpy.zeros(len(x), jax.numpy.int32), inputs, labels, selector="random").failures) == np.sum(labels != 0)
+    assert len(
+        validate(
+            KEY,
+            lambda x: jax.numpy.zeros(len(x), jax.numpy.int32),
+            inputs,
+            labels,
+            selector="random",
+        ).failures
+    ) == np.sum(labels != 0)
 
 
 @settings(deadline=None, max_examples=100)
@@ -445,7 +650,11 @@ def test_judged_by_the_truth():
     judged = weakness.judge(result, failed, threshold=0.8)
     for i, s in enumerate(result.history.scores):
         picked = s >= 0.8
-        assert judged.candidates[i] == picked.sum() and judged.precision[i] == failed[picked].mean() and judged.recall[i] == failed[picked].sum() / failed.sum()
+        assert (
+            judged.candidates[i] == picked.sum()
+            and judged.precision[i] == failed[picked].mean()
+            and judged.recall[i] == failed[picked].sum() / failed.sum()
+        )
         assert judged.auc[i] == pytest.approx(roc_auc_score(failed, s))
     top = weakness.judge(result, failed, top=20)
     np.testing.assert_array_equal(top.candidates, [20, 20])
@@ -458,13 +667,28 @@ def test_judged_by_the_truth():
         (lambda r: weakness.judge(r, np.zeros(5, bool)), r"judge: failed must be bool \[20\]"),
         (lambda r: weakness.judge(r, np.zeros(20)), "judge: failed must be bool .*float64"),
         (lambda r: weakness.judge(r, np.ones(20, bool), top=21), "judge: top must be at most 20"),
-        (lambda r: weakness.judge(r, np.ones(20, bool), top=0), "judge: top must be a whole number of at least 1"),
-        (lambda r: weakness.judge(r, np.ones(20, bool), threshold="a"), "judge: threshold must be a number"),
-        (lambda r: weakness.judge(3, np.ones(20, bool)), "judge: result must be a Result, received int"),
-        (lambda r: weakness.save("x", r), "save: state must be the state of a Result, received Result"),
+        (
+            lambda r: weakness.judge(r, np.ones(20, bool), top=0),
+            "judge: top must be a whole number of at least 1",
+        ),
+        (
+            lambda r: weakness.judge(r, np.ones(20, bool), threshold="a"),
+            "judge: threshold must be a number",
+        ),
+        (
+            lambda r: weakness.judge(3, np.ones(20, bool)),
+            "judge: result must be a Result, received int",
+        ),
+        (
+            lambda r: weakness.save("x", r),
+            "save: state must be the state of a Result, received Result",
+        ),
         (lambda r: weakness.judge(r, np.zeros(20, bool)), "failed must agree with the result"),
         (lambda r: weakness.roc(np.zeros(3), np.zeros(4, bool)), "roc: scores and failed must be"),
-        (lambda r: weakness.auc(np.array([0.0, np.nan]), np.zeros(2, bool)), "scores must not be NaN, 1 are"),
+        (
+            lambda r: weakness.auc(np.array([0.0, np.nan]), np.zeros(2, bool)),
+            "scores must not be NaN, 1 are",
+        ),
     ],
 )
 def test_bad_judgements(call, message):

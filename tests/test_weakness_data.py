@@ -11,13 +11,24 @@ import pytest
 from jast.weakness.data import digits, from_idx, idx
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
-CODES = {0x08: ("u1", "B"), 0x09: ("i1", "b"), 0x0B: ("i2", "h"), 0x0C: ("i4", "i"), 0x0D: ("f4", "f"), 0x0E: ("f8", "d")}
+CODES = {
+    0x08: ("u1", "B"),
+    0x09: ("i1", "b"),
+    0x0B: ("i2", "h"),
+    0x0C: ("i4", "i"),
+    0x0D: ("f4", "f"),
+    0x0E: ("f8", "d"),
+}
 
 
 def golden(code, shape, numbers):
     """The bytes of an IDX file, by the struct module alone."""
     letter = CODES[code][1]
-    return bytes([0, 0, code, len(shape)]) + b"".join(struct.pack(">I", n) for n in shape) + struct.pack(f">{len(numbers)}{letter}", *numbers)
+    return (
+        bytes([0, 0, code, len(shape)])
+        + b"".join(struct.pack(">I", n) for n in shape)
+        + struct.pack(f">{len(numbers)}{letter}", *numbers)
+    )
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -28,7 +39,12 @@ def test_idx_reads_every_type(tmp_path, code, packed):
     raw = golden(code, (2, 3), numbers)
     path.write_bytes(gzip.compress(raw) if packed else raw)
     array = idx(path)
-    assert array.dtype == np.dtype(CODES[code][0]) and array.dtype.isnative and array.shape == (2, 3) and array.flags.writeable
+    assert (
+        array.dtype == np.dtype(CODES[code][0])
+        and array.dtype.isnative
+        and array.shape == (2, 3)
+        and array.flags.writeable
+    )
     assert array.ravel().tolist() == numbers
 
 
@@ -51,14 +67,26 @@ DAMAGED = {
     "text": (b"<html>not found", "starting with two zero bytes"),
     "type": (bytes([0, 0, 0x0A]) + WHOLE[3:], "received 0x0A"),
     "header": (WHOLE[:7], "cut off in its header: 2 dimensions take 12 bytes, received 7"),
-    "dimensions": (bytes([0, 0, 8, 255]) + WHOLE[4:], "255 dimensions take 1024 bytes, received 16"),
-    "short": (WHOLE[:-1], "cut off: uint8 of shape \\(2, 2\\) is 4 bytes after the header, received 3"),
-    "long": (WHOLE + b"\0", "too long: uint8 of shape \\(2, 2\\) is 4 bytes after the header, received 5"),
+    "dimensions": (
+        bytes([0, 0, 8, 255]) + WHOLE[4:],
+        "255 dimensions take 1024 bytes, received 16",
+    ),
+    "short": (
+        WHOLE[:-1],
+        "cut off: uint8 of shape \\(2, 2\\) is 4 bytes after the header, received 3",
+    ),
+    "long": (
+        WHOLE + b"\0",
+        "too long: uint8 of shape \\(2, 2\\) is 4 bytes after the header, received 5",
+    ),
     "huge": (golden(0x0E, (2**32 - 1,) * 3, [1.0]), "cut off"),
     "gzip cut off": (gzip.compress(WHOLE)[:-9], "whole gzip file"),
     "gzip header": (gzip.compress(WHOLE)[:5], "whole gzip file"),
     "gzip checksum": (gzip.compress(WHOLE)[:-8] + b"\0" * 8, "whole gzip file"),
-    "gzip middle": (gzip.compress(WHOLE)[:12] + b"\xff" * 6 + gzip.compress(WHOLE)[18:], "whole gzip file"),
+    "gzip middle": (
+        gzip.compress(WHOLE)[:12] + b"\xff" * 6 + gzip.compress(WHOLE)[18:],
+        "whole gzip file",
+    ),
     "gzip of damaged": (gzip.compress(WHOLE[:-1]), "cut off"),
 }
 
@@ -85,28 +113,42 @@ LABELS = golden(0x08, (2,), [7, 0])
 @pytest.mark.parametrize("packed", [False, True])
 def test_from_idx(tmp_path, joint, packed):
     for part, raw in (f"images{joint}idx3", IMAGES), (f"labels{joint}idx1", LABELS):
-        (tmp_path / f"some-{part}-ubyte{'.gz' * packed}").write_bytes(gzip.compress(raw) if packed else raw)
+        (tmp_path / f"some-{part}-ubyte{'.gz' * packed}").write_bytes(
+            gzip.compress(raw) if packed else raw
+        )
     inputs, labels = from_idx(tmp_path, "some")
     assert inputs.dtype == np.float32 and inputs.shape == (2, 1, 3) and labels.dtype == np.int32
-    np.testing.assert_array_equal(inputs.ravel(), np.array([0, 255, 51, 1, 2, 3], np.float32) / np.float32(255))
+    np.testing.assert_array_equal(
+        inputs.ravel(), np.array([0, 255, 51, 1, 2, 3], np.float32) / np.float32(255)
+    )
     assert labels.tolist() == [7, 0]
 
 
 def test_from_idx_says_what_is_wrong(tmp_path):
     images, labels = tmp_path / "t10k-images-idx3-ubyte", tmp_path / "t10k-labels-idx1-ubyte"
-    with pytest.raises(FileNotFoundError, match="from_idx: none of t10k-images-idx3-ubyte, .*t10k-images.idx3-ubyte.gz is in "):
+    with pytest.raises(
+        FileNotFoundError,
+        match="from_idx: none of t10k-images-idx3-ubyte, .*t10k-images.idx3-ubyte.gz is in ",
+    ):
         from_idx(tmp_path)
     images.write_bytes(IMAGES)
     with pytest.raises(FileNotFoundError, match="t10k-labels-idx1-ubyte"):
         from_idx(tmp_path)
     labels.write_bytes(golden(0x08, (3,), [7, 0, 1]))
-    with pytest.raises(ValueError, match="from_idx: t10k in .* a label for each image, received 2 images and 3 labels"):
+    with pytest.raises(
+        ValueError,
+        match="from_idx: t10k in .* a label for each image, received 2 images and 3 labels",
+    ):
         from_idx(tmp_path)
     labels.write_bytes(golden(0x0C, (2,), [7, 0]))
-    with pytest.raises(ValueError, match="from_idx: .*labels.* unsigned bytes in 1 dimensions, received int32"):
+    with pytest.raises(
+        ValueError, match="from_idx: .*labels.* unsigned bytes in 1 dimensions, received int32"
+    ):
         from_idx(tmp_path)
     labels.write_bytes(IMAGES)
-    with pytest.raises(ValueError, match="from_idx: .*labels.* received uint8 of shape \\(2, 1, 3\\)"):
+    with pytest.raises(
+        ValueError, match="from_idx: .*labels.* received uint8 of shape \\(2, 1, 3\\)"
+    ):
         from_idx(tmp_path)
     labels.write_bytes(LABELS[:-1])
     with pytest.raises(ValueError, match="idx: .*labels.* cut off"):
@@ -115,7 +157,12 @@ def test_from_idx_says_what_is_wrong(tmp_path):
 
 def test_digits():
     inputs, labels = digits()
-    assert inputs.dtype == np.float32 and inputs.shape == (1797, 8, 8) and labels.dtype == np.int32 and labels.shape == (1797,)
+    assert (
+        inputs.dtype == np.float32
+        and inputs.shape == (1797, 8, 8)
+        and labels.dtype == np.int32
+        and labels.shape == (1797,)
+    )
     assert inputs.min() == 0 and inputs.max() == 1 and set(labels.tolist()) == set(range(10))
     assert np.isin(inputs * 16, np.arange(17)).all()
 
@@ -126,11 +173,18 @@ def test_digits_without_scikit_learn(monkeypatch):
         digits()
 
 
-@pytest.mark.skipif(not MNIST.is_dir(), reason="the MNIST test images are not here: ../shared/data/mnist")
+@pytest.mark.skipif(
+    not MNIST.is_dir(), reason="the MNIST test images are not here: ../shared/data/mnist"
+)
 def test_mnist():
     inputs, labels = from_idx(MNIST)
     assert inputs.shape == (10000, 28, 28) and inputs.min() == 0 and inputs.max() == 1
-    assert np.bincount(labels).tolist() == [980, 1135, 1032, 1010, 982, 892, 958, 1028, 974, 1009]  # as published
+    # as published
+    assert np.bincount(labels).tolist() == [980, 1135, 1032, 1010, 982, 892, 958, 1028, 974, 1009]
     weights = np.load(MNIST / "sut_784x32x10.npz")
-    predicted = np.argmax(np.maximum(inputs.reshape(-1, 784) @ weights["W1"] + weights["b1"], 0) @ weights["W2"] + weights["b2"], axis=1)
+    predicted = np.argmax(
+        np.maximum(inputs.reshape(-1, 784) @ weights["W1"] + weights["b1"], 0) @ weights["W2"]
+        + weights["b2"],
+        axis=1,
+    )
     assert np.sum(predicted != labels) == 677

@@ -1,4 +1,6 @@
-"""The default selector of jast.weakness and its parts, against NumPy, SciPy and scikit-learn, and on systems whose weakness is known."""
+"""The default selector of jast.weakness and its parts, against NumPy, SciPy and scikit-learn, and
+on systems whose weakness is known.
+"""
 
 import importlib
 
@@ -17,7 +19,8 @@ from jast.weakness import blend, committee, residual, validate, views
 from jast.weakness.contract import Seen
 from jast.weakness.data import Data
 
-selector = importlib.import_module("jast.weakness.default")  # the package's own `default` is the function
+# the package's own `default` is the function
+selector = importlib.import_module("jast.weakness.default")
 KEY = jax.random.key(0)
 
 
@@ -28,7 +31,9 @@ def brief(monkeypatch):
 
 
 def table(n=400, seed=0):
-    """(inputs [n, 6], labels of 3 classes by two of the columns, of which the second is a thousand times as large as the others)."""
+    """(inputs [n, 6], labels of 3 classes by two of the columns, of which the second is a thousand
+    times as large as the others).
+    """
     x = np.random.default_rng(seed).normal(size=(n, 6))
     labels = np.argmax(np.stack([x[:, 0], x[:, 1], -x[:, 0] - x[:, 1]]), axis=0)
     return x * np.array([1.0, 1000.0, 1.0, 1.0, 1.0, 1.0]), labels
@@ -54,11 +59,20 @@ def adam_by_hand(start, x, targets, weights, order, rate):
         q[np.arange(len(rows)), :, targets[rows]] -= 1
         q *= weights[:, rows].T[:, :, None] / len(rows)
         back = np.einsum("nmk,mhk->nmh", q, c) * (z > 0)
-        slope = [np.einsum("nd,nmh->dmh", x[rows], back), back.sum(0), np.einsum("nmh,nmk->mhk", hidden, q), q.sum(0)]
+        slope = [
+            np.einsum("nd,nmh->dmh", x[rows], back),
+            back.sum(0),
+            np.einsum("nmh,nmk->mhk", hidden, q),
+            q.sum(0),
+        ]
         for j in range(4):
             first[j] = 0.9 * first[j] + 0.1 * slope[j]
             second[j] = 0.999 * second[j] + 0.001 * slope[j] ** 2
-            step = first[j] / (1 - 0.9 ** (i + 1)) / (np.sqrt(second[j] / (1 - 0.999 ** (i + 1))) + 1e-8)
+            step = (
+                first[j]
+                / (1 - 0.9 ** (i + 1))
+                / (np.sqrt(second[j] / (1 - 0.999 ** (i + 1))) + 1e-8)
+            )
             p[j] = p[j] - rate * (1 - i / len(order)) * step
     return p
 
@@ -68,7 +82,14 @@ def test_the_committee_learns_as_adam_by_hand(monkeypatch):
     monkeypatch.setattr(committee, "BATCH", 16)
     kept = {}
     real = committee._fit
-    monkeypatch.setattr(committee, "_fit", lambda *a: kept.update(zip(["start", "x", "targets", "weights", "order"], a, strict=True)) or real(*a))
+    monkeypatch.setattr(
+        committee,
+        "_fit",
+        lambda *a: (
+            kept.update(zip(["start", "x", "targets", "weights", "order"], a, strict=True))
+            or real(*a)
+        ),
+    )
     rng = np.random.default_rng(0)
     x, targets = rng.normal(size=(50, 4)).astype(np.float32), rng.integers(0, 3, 50)
     weights = committee.folds(rng, 50) * rng.uniform(0.5, 3, 50)
@@ -76,18 +97,25 @@ def test_the_committee_learns_as_adam_by_hand(monkeypatch):
     assert kept["order"].shape == (30, 16)
     by_hand = adam_by_hand(**kept, rate=committee.RATE)
     for ours, theirs in zip(trained, by_hand, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=2e-4)  # float32 through thirty steps of a normalised gradient
+        # float32 through thirty steps of a normalised gradient
+        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=2e-4)
 
 
 def test_every_input_is_left_out_as_often():
     learn = committee.folds(np.random.default_rng(0), 53, 5, 4)
-    assert learn.shape == (20, 53) and np.all((~learn).sum(0) == 4) and np.all((~learn).reshape(4, 5, 53).sum(1) == 1)
+    assert (
+        learn.shape == (20, 53)
+        and np.all((~learn).sum(0) == 4)
+        and np.all((~learn).reshape(4, 5, 53).sum(1) == 1)
+    )
 
 
 def forward(trained, x):
     """Probabilities [M, n, k] in NumPy."""
     a, b, c, e = (np.asarray(p, float) for p in trained)
-    out = np.einsum("nmh,mhk->mnk", np.maximum(np.einsum("nd,dmh->nmh", x, a) + b, 0), c) + e[:, None]
+    out = (
+        np.einsum("nmh,mhk->mnk", np.maximum(np.einsum("nd,dmh->nmh", x, a) + b, 0), c) + e[:, None]
+    )
     out = np.exp(out - out.max(-1, keepdims=True))
     return out / out.sum(-1, keepdims=True)
 
@@ -95,7 +123,11 @@ def forward(trained, x):
 def test_who_has_not_learned_from_an_input_judges_it(monkeypatch):
     monkeypatch.setattr(committee, "ROWS", 7)
     rng = np.random.default_rng(0)
-    x, labels, learn = rng.normal(size=(53, 4)).astype(np.float32), rng.integers(0, 3, 53), committee.folds(rng, 53)
+    x, labels, learn = (
+        rng.normal(size=(53, 4)).astype(np.float32),
+        rng.integers(0, 3, 53),
+        committee.folds(rng, 53),
+    )
     trained = committee.fit(rng, x, labels, learn, 3, 8)
     p = forward(trained, x)
     by_hand = [p[~learn[:, i], i, labels[i]].mean() for i in range(53)]
@@ -108,7 +140,9 @@ def test_an_answer_does_not_move_its_own_score():
     learn, data = committee.folds(rng(), 200), Data(inputs, labels, 3)
     other = labels.copy()
     other[17] = (labels[17] + 1) % 3
-    a, b = (selector._odds(rng(), x, answers, learn * 10.0, learn, data) for answers in (labels, other))
+    a, b = (
+        selector._odds(rng(), x, answers, learn * 10.0, learn, data) for answers in (labels, other)
+    )
     assert a[17] == b[17] and np.abs(a - b).max() > 0.01
 
 
@@ -123,7 +157,10 @@ def test_the_gradient_is_that_of_the_log_odds():
 
     slope = np.asarray(committee.gradient(trained, x[:5], targets[:5].astype(np.int32)))
     for i in range(5):
-        numbers = [(odds(x[i] + h, targets[i]) - odds(x[i] - h, targets[i])) / 2e-6 for h in 1e-6 * np.eye(4)]
+        numbers = [
+            (odds(x[i] + h, targets[i]) - odds(x[i] - h, targets[i])) / 2e-6
+            for h in 1e-6 * np.eye(4)
+        ]
         np.testing.assert_allclose(slope[i], numbers, rtol=1e-3, atol=1e-4)
 
 
@@ -131,15 +168,22 @@ def test_the_gradient_is_that_of_the_log_odds():
 def test_the_regression_is_the_most_probable(separable):
     rng = np.random.default_rng(0)
     rows = np.c_[rng.normal(size=(80, 2)) * 3, np.ones(80)]
-    failed = rows[:, 0] > 0 if separable else rng.random(80) < blend.sigmoid(rows @ [0.7, -0.2, -1.0])
+    failed = (
+        rows[:, 0] > 0 if separable else rng.random(80) < blend.sigmoid(rows @ [0.7, -0.2, -1.0])
+    )
     mean, precision = np.array([0.5, 0.0, -0.5]), np.array([4.0, 2.0, 1.0])
-    cost = lambda b: np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
+    cost = lambda b: (
+        np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
+    )
     found = blend.logistic(rows, failed, mean, precision)
     np.testing.assert_allclose(found, minimize(cost, mean, tol=1e-12).x, atol=1e-4)
 
 
 def test_nothing_seen_leaves_the_prior():
-    np.testing.assert_array_equal(blend.logistic(np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION), selector.PRIOR)
+    np.testing.assert_array_equal(
+        blend.logistic(np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION),
+        selector.PRIOR,
+    )
 
 
 def test_laplace_against_scikit_learn():
@@ -172,22 +216,37 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     odds = np.full(600, -4.0)
     region = (labels == 1) & (close[:, 0] > 0.5)
     order = rng.permutation(600)[:300]
-    found = residual.residual(rng, close, labels, odds, seen_of(order, np.where(region, 0, labels), labels))
+    found = residual.residual(
+        rng, close, labels, odds, seen_of(order, np.where(region, 0, labels), labels)
+    )
     rest = np.setdiff1d(np.arange(600), order)
     assert weakness.auc(found[rest], region[rest]) > 0.97
-    assert np.median(found[rest][region[rest]]) > 4 > 0 > np.median(found[rest][~region[rest] & (labels[rest] == 1)])
+    assert (
+        np.median(found[rest][region[rest]])
+        > 4
+        > 0
+        > np.median(found[rest][~region[rest] & (labels[rest] == 1)])
+    )
     assert found[labels == 0].max() < 1
-    fair = np.where(rng.random(600) < blend.sigmoid(odds), 1 - labels, labels)  # what the odds say, and no more
-    np.testing.assert_array_equal(residual.residual(rng, close, labels, odds, seen_of(order, fair, labels)), 0)
+    # what the odds say, and no more
+    fair = np.where(rng.random(600) < blend.sigmoid(odds), 1 - labels, labels)
+    np.testing.assert_array_equal(
+        residual.residual(rng, close, labels, odds, seen_of(order, fair, labels)), 0
+    )
 
 
 def test_views_of_a_table_do_not_depend_on_units():
     inputs, labels = table(300)
     inputs = np.c_[inputs, np.full(300, 7.0)]  # a column that never varies
-    a, b = (views.views(Data(x, labels, 3), np.zeros((300, 0))) for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4))
+    a, b = (
+        views.views(Data(x, labels, 3), np.zeros((300, 0)))
+        for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4)
+    )
     np.testing.assert_allclose(a.scaled, b.scaled, atol=1e-5)
     np.testing.assert_allclose(a.centred, b.centred, atol=1e-4)
-    np.testing.assert_allclose(a.scaled[:, 1], 1.4 * ((rankdata(inputs[:, 1]) - 0.5) / 300 - 0.5), atol=1e-6)
+    np.testing.assert_allclose(
+        a.scaled[:, 1], 1.4 * ((rankdata(inputs[:, 1]) - 0.5) / 300 - 0.5), atol=1e-6
+    )
     assert np.abs(a.scaled[:, 6]).max() == 0
     np.testing.assert_allclose(a.centred[:, :6].std(0), 0.4, atol=0.01)
 
@@ -205,11 +264,17 @@ def test_views_of_images_keep_their_shades():
     assert views.reduce(None, data).shape == (40, 0)
     seen_as = views.views(data, views.reduce(None, data))
     np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
-    assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4) and all(a.dtype == np.float32 for a in seen_as)
-    centred, close = seen_as.centred.astype(float), views.components(None, seen_as.centred, 64).astype(float)
+    assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4) and all(
+        a.dtype == np.float32 for a in seen_as
+    )
+    centred, close = (
+        seen_as.centred.astype(float),
+        views.components(None, seen_as.centred, 64).astype(float),
+    )
     assert close.shape == (40, 25)
     distance = np.linalg.norm(centred[3] - centred[9])
-    assert np.linalg.norm(close[3] - close[9]) == pytest.approx(distance, rel=1e-4)  # 25 components are all
+    # 25 components are all
+    assert np.linalg.norm(close[3] - close[9]) == pytest.approx(distance, rel=1e-4)
 
 
 def test_wide_inputs_are_seen_by_their_components(monkeypatch):
@@ -221,7 +286,11 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
     data = Data(wide, np.zeros(200, np.int32), 2)
     reduced = views.reduce(np.random.default_rng(1), data)
     seen_as = views.views(data, reduced)
-    assert seen_as.scaled.shape == (200, 4) and np.abs(seen_as.scaled).max() == pytest.approx(1) and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
+    assert (
+        seen_as.scaled.shape == (200, 4)
+        and np.abs(seen_as.scaled).max() == pytest.approx(1)
+        and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
+    )
     flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
     true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
     ours = np.linalg.qr(reduced[:, :3].astype(float))[0]
@@ -231,8 +300,18 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
 def test_a_validation_of_wide_inputs(brief, monkeypatch):
     monkeypatch.setattr(views, "WIDE", 50)
     inputs = np.random.default_rng(0).normal(size=(60, 8, 9))
-    result = validate(KEY, lambda x: (x[:, 0, 0] > 1).astype(int), inputs, (inputs[:, 0, 0] > 0).astype(int), budget=30)
-    assert result.calls == 30 and result.state.memory["reduced"].shape == (60, 72) and result.state.memory["close"].shape == (60, 64)
+    result = validate(
+        KEY,
+        lambda x: (x[:, 0, 0] > 1).astype(int),
+        inputs,
+        (inputs[:, 0, 0] > 0).astype(int),
+        budget=30,
+    )
+    assert (
+        result.calls == 30
+        and result.state.memory["reduced"].shape == (60, 72)
+        and result.state.memory["close"].shape == (60, 64)
+    )
 
 
 @pytest.mark.parametrize("reference", [20_000, 120])
@@ -242,12 +321,20 @@ def test_neighbours_against_scikit_learn(reference, monkeypatch):
     rng = np.random.default_rng(0)
     close, labels = rng.normal(size=(200, 3)).astype(np.float32), rng.integers(0, 3, 200)
     ours = views.difficulty_of_neighbours(np.random.default_rng(7), close, labels, 3)
-    chosen = np.arange(200) if reference > 200 else np.sort(np.random.default_rng(7).choice(200, 120, replace=False))
+    chosen = (
+        np.arange(200)
+        if reference > 200
+        else np.sort(np.random.default_rng(7).choice(200, 120, replace=False))
+    )
     for i in (0, 5, 199):
         others = chosen[chosen != i]
-        distance, at = NearestNeighbors(n_neighbors=15).fit(close[others]).kneighbors(close[i : i + 1])
+        distance, at = (
+            NearestNeighbors(n_neighbors=15).fit(close[others]).kneighbors(close[i : i + 1])
+        )
         weight = 1 / (distance[0] ** 2 + 1e-3)
-        right = (15 * np.sum(weight * (labels[others[at[0]]] == labels[i])) / weight.sum() + 1 / 3) / 16
+        right = (
+            15 * np.sum(weight * (labels[others[at[0]]] == labels[i])) / weight.sum() + 1 / 3
+        ) / 16
         assert ours[i] == pytest.approx(np.log((1 - right) / right), abs=1e-3)
 
 
@@ -258,10 +345,19 @@ def test_a_batch_is_the_most_suspect_and_some_others():
     np.testing.assert_array_equal(first[0], np.arange(999, 949, -1))
     np.testing.assert_array_equal(first[0], first[1])
     seen = seen_of(first[0], labels, labels)
-    drawn = np.concatenate([(lambda c, likely: np.setdiff1d(c, likely))(*selector._batch(rng, suspicion, seen, 500, 0.01)) for _ in range(40)])
-    # the least likely of the batch has log odds -3.05, thus a fifth of 500 is drawn: 100 of each 500, standard error of the mean of 40 sqrt(80 / 40)
+    drawn = np.concatenate(
+        [
+            (lambda c, likely: np.setdiff1d(c, likely))(
+                *selector._batch(rng, suspicion, seen, 500, 0.01)
+            )
+            for _ in range(40)
+        ]
+    )
+    # the least likely of the batch has log odds -3.05, thus a fifth of 500 is drawn: 100 of each
+    # 500, standard error of the mean of 40 sqrt(80 / 40)
     assert abs(len(drawn) / 40 - 100) < 4 * np.sqrt(500 * 0.2 * 0.8 / 40)
-    assert drawn.max() < 600 and not set(drawn) & set(first[0])  # from those that are not among the most suspect
+    # from those that are not among the most suspect
+    assert drawn.max() < 600 and not set(drawn) & set(first[0])
     few = selector._batch(rng, np.linspace(-1, 3, 1000), seen, 500, 0.01)
     assert len(set(few[0])) == 500 and len(few[0]) - len(few[1]) < 30
 
@@ -274,18 +370,23 @@ def test_random_calls_correct_what_is_expected():
     seen, drawn = seen_of(order, predicted, labels), np.isin(np.arange(100), [*range(20), 95])
     left = scores[20:90].sum()
     assert selector._expected(scores, seen, np.zeros(100, bool)) == pytest.approx(left)
-    # of the twenty drawn that are like those left, 1.9 should have failed and 3 have; input 95 is not like them
+    # of the twenty drawn that are like those left, 1.9 should have failed and 3 have; input 95 is
+    # not like them
     assert selector._expected(scores, seen, drawn) == pytest.approx(left * (2 + 3) / (2 + 1.9))
     assert selector._expected(scores, seen_of(np.arange(100), predicted, labels), drawn) == 0
 
 
 @pytest.fixture(scope="module")
 def digits():
-    """C -> (inputs, labels, predictions of a logistic regression of that C that was trained on other digits)"""
+    """C -> (inputs, labels, predictions of a logistic regression of that C that was trained on
+    other digits)
+    """
     images, labels = weakness.digits()
 
     def trained(C):
-        model = LogisticRegression(C=C, max_iter=500).fit(images[:600].reshape(600, -1), labels[:600])
+        model = LogisticRegression(C=C, max_iter=500).fit(
+            images[:600].reshape(600, -1), labels[:600]
+        )
         return images[600:], labels[600:], model.predict(images[600:].reshape(-1, 64))
 
     return trained
@@ -299,7 +400,14 @@ def lookup(inputs, predicted):
 def test_failures_are_found_early(digits):
     inputs, labels, predicted = digits(0.02)
     failed = predicted != labels
-    result = validate(KEY, lookup(inputs, predicted), inputs, labels, budget=len(labels) // 4, selector=weakness.default(repeats=2))
+    result = validate(
+        KEY,
+        lookup(inputs, predicted),
+        inputs,
+        labels,
+        budget=len(labels) // 4,
+        selector=weakness.default(repeats=2),
+    )
     hits = np.cumsum(failed[result.order]) / failed.sum()
     tenth = len(labels) // 10
     # random choice finds a tenth, with a standard error below sqrt(.09 / failures)
@@ -325,7 +433,9 @@ def test_an_outcome_does_not_move_its_own_score(brief):
             asked.append(batch)
             return said
 
-        results.append(validate(KEY, predict, inputs, labels, budget=20, selector=weakness.default(first=20)))
+        results.append(
+            validate(KEY, predict, inputs, labels, budget=20, selector=weakness.default(first=20))
+        )
     one, other = results
     at = one.order[3]
     assert one.predicted[at] != other.predicted[at] and np.array_equal(one.order, other.order)
@@ -338,8 +448,18 @@ def test_noise_is_told_apart_by_nobody(brief):
     for seed in range(12):
         inputs, labels = table(200, seed)
         answers = np.where(np.random.default_rng(seed).random(200) < 0.3, (labels + 1) % 3, labels)
-        areas.append(validate(jax.random.key(seed), lookup(inputs, answers), inputs, labels, budget=60, selector=weakness.default(repeats=1)).history.auc[-1])
-    # 60 inputs of which 18 fail: the standard deviation of one area is sqrt((60 + 1) / (12 * 18 * 42)) = .082
+        areas.append(
+            validate(
+                jax.random.key(seed),
+                lookup(inputs, answers),
+                inputs,
+                labels,
+                budget=60,
+                selector=weakness.default(repeats=1),
+            ).history.auc[-1]
+        )
+    # 60 inputs of which 18 fail: the standard deviation of one area is sqrt((60 + 1) / (12 * 18 *
+    # 42)) = .082
     assert np.mean(areas) < 0.5 + 3 * 0.082 / np.sqrt(12)
 
 
@@ -350,7 +470,10 @@ def test_one_value_far_out_does_not_hide_a_column(far):
     seen_as = views.views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
     assert len(np.unique(seen_as.scaled[:, 0])) == 300
     rest = np.arange(300) != 7
-    assert np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99 and seen_as.centred[rest, 0].std() > 0.3
+    assert (
+        np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99
+        and seen_as.centred[rest, 0].std() > 0.3
+    )
 
 
 def test_what_failures_teach(digits):
@@ -358,18 +481,37 @@ def test_what_failures_teach(digits):
     inputs, labels, predicted = digits(1.0)
     bright = np.isin(labels, (3, 7)) & (inputs.sum((1, 2)) > np.quantile(inputs.sum((1, 2)), 0.6))
     planted = np.where(bright, (labels + 1) % 10, predicted)
-    result = validate(KEY, lookup(inputs, planted), inputs, labels, budget=360, selector=weakness.default(repeats=2))
+    result = validate(
+        KEY,
+        lookup(inputs, planted),
+        inputs,
+        labels,
+        budget=360,
+        selector=weakness.default(repeats=2),
+    )
     alone = (planted != labels)[np.argsort(-result.state.memory["difficulty"])[:360]].sum()
     assert len(result.failures) > 1.2 * alone
-    easy = np.flatnonzero(bright & (result.state.memory["difficulty"] < np.median(result.state.memory["difficulty"])))
-    share = 360 / len(labels)  # what random choice finds of these, with a hypergeometric standard error below the binomial one
-    assert len(easy) > 30 and np.isin(easy, result.failures).mean() > share + 3 * np.sqrt(share * (1 - share) / len(easy))
+    easy = np.flatnonzero(
+        bright & (result.state.memory["difficulty"] < np.median(result.state.memory["difficulty"]))
+    )
+    # what random choice finds of these, with a hypergeometric standard error below the binomial one
+    share = 360 / len(labels)
+    assert len(easy) > 30 and np.isin(easy, result.failures).mean() > share + 3 * np.sqrt(
+        share * (1 - share) / len(easy)
+    )
 
 
 def test_a_table_whose_columns_have_units_of_their_own():
     inputs, labels = table(600)
     wrong = inputs[:, 2] > 1.2  # a weakness in a column that tells nothing of the label
-    result = validate(KEY, lookup(inputs, np.where(wrong, (labels + 1) % 3, labels)), inputs, labels, budget=200, selector=weakness.default(exploration=0.05))
+    result = validate(
+        KEY,
+        lookup(inputs, np.where(wrong, (labels + 1) % 3, labels)),
+        inputs,
+        labels,
+        budget=200,
+        selector=weakness.default(exploration=0.05),
+    )
     # random choice finds a third, with a hypergeometric standard error
     total = wrong.sum()
     assert len(result.failures) > total / 3 + 4 * np.sqrt(total * (1 / 3) * (2 / 3))
@@ -378,10 +520,19 @@ def test_a_table_whose_columns_have_units_of_their_own():
 def test_influence_names_the_column():
     inputs, labels = table(600)
     wrong = np.flatnonzero(inputs[:, 2] > 1.2)
-    result = validate(KEY, lookup(inputs, np.where(inputs[:, 2] > 1.2, (labels + 1) % 3, labels)), inputs, labels, selector="random")
+    result = validate(
+        KEY,
+        lookup(inputs, np.where(inputs[:, 2] > 1.2, (labels + 1) % 3, labels)),
+        inputs,
+        labels,
+        selector="random",
+    )
     shown = weakness.influence(KEY, result, inputs, labels)
     assert shown.shape == (len(wrong), 6) and set(result.failures) == set(wrong)
-    assert shown.mean(0).argmax() == 2 and shown[:, 2].mean() > 3 * np.abs(np.delete(shown, 2, 1).mean(0)).max()
+    assert (
+        shown.mean(0).argmax() == 2
+        and shown[:, 2].mean() > 3 * np.abs(np.delete(shown, 2, 1).mean(0)).max()
+    )
 
 
 def test_an_interruption_changes_nothing(brief, digits):
@@ -408,19 +559,34 @@ def test_an_interruption_changes_nothing(brief, digits):
 @pytest.mark.parametrize("wrong", [False, True])
 def test_few_inputs(brief, n, wrong):
     inputs, labels = table(n)
-    result = validate(KEY, lambda x: (labels + wrong)[:0] if not len(x) else lookup(inputs, (labels + wrong) % 3)(x), inputs, labels, classes=3)
-    assert result.calls == n and len(result.failures) == n * wrong and np.isfinite(result.scores).all() and result.expected == 0
+    result = validate(
+        KEY,
+        lambda x: (labels + wrong)[:0] if not len(x) else lookup(inputs, (labels + wrong) % 3)(x),
+        inputs,
+        labels,
+        classes=3,
+    )
+    assert (
+        result.calls == n
+        and len(result.failures) == n * wrong
+        and np.isfinite(result.scores).all()
+        and result.expected == 0
+    )
 
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_no_failures_and_nothing_else(brief, wrong):
     inputs, labels = table(200)
     result = validate(KEY, lookup(inputs, (labels + wrong) % 3), inputs, labels, budget=120)
-    assert len(result.failures) == 120 * wrong and (result.scores[result.ranked].mean() > 0.5) == wrong
+    assert (
+        len(result.failures) == 120 * wrong and (result.scores[result.ranked].mean() > 0.5) == wrong
+    )
 
 
 def test_inputs_that_are_all_the_same(brief):
-    result = validate(KEY, lambda x: np.zeros(len(x), int), np.ones((40, 3, 3), np.uint8), np.arange(40) % 2)
+    result = validate(
+        KEY, lambda x: np.zeros(len(x), int), np.ones((40, 3, 3), np.uint8), np.arange(40) % 2
+    )
     assert len(result.failures) == 20 and np.isfinite(result.scores).all()
 
 

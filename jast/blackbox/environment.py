@@ -1,4 +1,6 @@
-"""A Gymnasium environment as a system, by its methods ``reset`` and ``step``: nothing is imported for it. Goes to the workers by value."""
+"""A Gymnasium environment as a system, by its methods ``reset`` and ``step``: nothing is imported
+for it. Goes to the workers by value.
+"""
 
 from typing import Any, NamedTuple
 
@@ -45,7 +47,10 @@ class _Environment:
     def initialize(self, x0=None):
         seed = self.system.seed if x0 is None else x0
         if np.shape(seed) != () or np.asarray(seed).dtype.kind not in "iu":
-            raise ValueError(f"gymnasium_system: x0 is the seed of the environment, a whole number, received {seed!r}")
+            raise ValueError(
+                "gymnasium_system: x0 is the seed of the environment, a whole number, received"
+                f" {seed!r}"
+            )
         observation, info = self.env.reset(seed=int(seed))
         self.now = Moment(observation, 0.0, 0.0, False, False, info, self.env)
 
@@ -56,7 +61,15 @@ class _Environment:
         action = s.agent(now.observation) if s.agent is not None else None
         action = s.apply(action, x) if s.apply is not None else x
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.now = Moment(observation, float(reward), now.total + float(reward), bool(terminated), bool(truncated), info, self.env)
+        self.now = Moment(
+            observation,
+            float(reward),
+            now.total + float(reward),
+            bool(terminated),
+            bool(truncated),
+            info,
+            self.env,
+        )
 
     def is_event(self):
         return bool(self.system.event(self.now))
@@ -72,23 +85,39 @@ class _Environment:
 
 
 def gymnasium_system(make, distance, *, event=None, agent=None, apply=None, seed=0):
-    """A system for `from_python` from a Gymnasium environment: the agent is under test, the disturbances are what happens to its actions.
+    """A system for `from_python` from a Gymnasium environment: the agent is under test, the
+    disturbances are what happens to its actions.
 
-    ``make``: () -> environment, e.g. ``lambda: gymnasium.make("Pendulum-v1")``. ``distance``: `Moment` -> float, the miss distance; ``event``: `Moment` ->
-    bool, the failure, by default that the environment has terminated. ``agent``: observation -> action, and ``apply``: (action, disturbance) -> action, what
-    is done in its place; with neither of them the disturbance is the action, and without an agent the action that ``apply`` gets is None. The environment is
-    reset with ``seed``, or with x0 where the start is random (``start=jast.distributions.seeds``). Terminated or truncated ends the episode; transitions after
-    that do nothing. Observations that are arrays of numbers are observed.
+    ``make``: () -> environment, e.g. ``lambda: gymnasium.make("Pendulum-v1")``. ``distance``:
+    `Moment` -> float, the miss distance; ``event``: `Moment` -> bool, the failure, by default that
+    the environment has terminated. ``agent``: observation -> action, and ``apply``: (action,
+    disturbance) -> action, what is done in its place; with neither of them the disturbance is the
+    action, and without an agent the action that ``apply`` gets is None. The environment is reset
+    with ``seed``, or with x0 where the start is random (``start=jast.distributions.seeds``).
+    Terminated or truncated ends the episode; transitions after that do nothing. Observations that
+    are arrays of numbers are observed.
 
-    Raises ValueError for what is no function, and an agent without ``apply``: no disturbance would reach the environment.
+    Raises ValueError for what is no function, and an agent without ``apply``: no disturbance would
+    reach the environment.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"gymnasium_system: seed must be a whole number of at least 0, received {seed!r}")
-    for name, value, optional in (("make", make, False), ("distance", distance, False), ("event", event, True), ("agent", agent, True), ("apply", apply, True)):
+        raise ValueError(
+            f"gymnasium_system: seed must be a whole number of at least 0, received {seed!r}"
+        )
+    for name, value, optional in (
+        ("make", make, False),
+        ("distance", distance, False),
+        ("event", event, True),
+        ("agent", agent, True),
+        ("apply", apply, True),
+    ):
         if not (callable(value) or optional and value is None):
             raise ValueError(f"gymnasium_system: {name} must be a function, received {value!r}")
     if agent is not None and apply is None:
-        raise ValueError("gymnasium_system: an agent needs apply, (action, disturbance) -> action: else no disturbance reaches the environment")
+        raise ValueError(
+            "gymnasium_system: an agent needs apply, (action, disturbance) -> action: else no"
+            " disturbance reaches the environment"
+        )
     return _System(make, agent, apply, _terminated if event is None else event, distance, int(seed))
 
 

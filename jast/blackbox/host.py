@@ -1,4 +1,6 @@
-"""The host's side of a black box: batches of rows in, outcomes out, with counts, incidents and a memory of past outcomes. NumPy only, never JAX."""
+"""The host's side of a black box: batches of rows in, outcomes out, with counts, incidents and a
+memory of past outcomes. NumPy only, never JAX.
+"""
 
 import functools
 import threading
@@ -32,7 +34,10 @@ class Calls(NamedTuple):
 
     def __str__(self):
         each = self.seconds / max(self.rows, 1) * 1e3
-        return f"{self.episodes} episodes and {self.transitions} transitions in {self.calls} calls, {self.seconds:.3g} s: {each:.3g} ms an outcome"
+        return (
+            f"{self.episodes} episodes and {self.transitions} transitions in {self.calls} calls,"
+            f" {self.seconds:.3g} s: {each:.3g} ms an outcome"
+        )
 
 
 class Host:
@@ -54,22 +59,32 @@ class Host:
         return self.done
 
     def __call__(self, dtype, size, live, t, *leaves):
-        """Outcomes (event, distance, terminal, seen [..., size]) with the leading axes of ``live``, a bool a row; zeros where it is False.
+        """Outcomes (event, distance, terminal, seen [..., size]) with the leading axes of ``live``,
+        a bool a row; zeros where it is False.
 
-        ``t``: disturbances so far; ``leaves``: those of x0, then those of the disturbances. The leading axes of each may be 1 where those of another are not.
+        ``t``: disturbances so far; ``leaves``: those of x0, then those of the disturbances. The
+        leading axes of each may be 1 where those of another are not.
         """
         n = live.ndim
         batch = np.broadcast_shapes(live.shape, t.shape, *(a.shape[:n] for a in leaves))
         flat = lambda a: np.broadcast_to(a, (*batch, *a.shape[n:])).reshape((-1, *a.shape[n:]))
         live = flat(live)
         rows = np.flatnonzero(live)
-        out = np.zeros(len(live), bool), np.zeros(len(live), dtype), np.zeros(len(live), bool), np.zeros((len(live), size), dtype)
+        out = (
+            np.zeros(len(live), bool),
+            np.zeros(len(live), dtype),
+            np.zeros(len(live), bool),
+            np.zeros((len(live), size), dtype),
+        )
         if len(rows):
             t, *leaves = (flat(a)[rows] for a in (t, *leaves))
             with self.lock:
                 begin = time.perf_counter()
                 found = self._answer(rows, t, leaves[: self.starts], leaves[self.starts :], dtype)
-                self.done = self.done._replace(calls=self.done.calls + 1, seconds=self.done.seconds + time.perf_counter() - begin)
+                self.done = self.done._replace(
+                    calls=self.done.calls + 1,
+                    seconds=self.done.seconds + time.perf_counter() - begin,
+                )
             for whole, part in zip(out, found):
                 whole[rows] = part
         return tuple(a.reshape((*batch, *a.shape[1:])) for a in out)
@@ -77,8 +92,17 @@ class Host:
     def _answer(self, lanes, t, x0, xs, dtype):
         reply = self.runner(t, x0, xs, lanes)
         count = self.done
-        self.done = count._replace(rows=count.rows + len(t), episodes=count.episodes + reply.episodes, transitions=count.transitions + reply.transitions)
-        example = lambda i: lambda: (fill(self.spec.x0, [a[i] for a in x0]), fill(self.x, [a[i, : t[i]] for a in xs]))
+        self.done = count._replace(
+            rows=count.rows + len(t),
+            episodes=count.episodes + reply.episodes,
+            transitions=count.transitions + reply.transitions,
+        )
+        example = lambda i: (
+            lambda: (
+                fill(self.spec.x0, [a[i] for a in x0]),
+                fill(self.x, [a[i, : t[i]] for a in xs]),
+            )
+        )
         wrong = np.zeros(len(t), bool)
         for i, kind, message in reply.problems:
             wrong[i] = True
@@ -87,11 +111,26 @@ class Host:
             distance, seen = reply.distance.astype(dtype), reply.seen.astype(dtype)
         for i in np.flatnonzero(~np.isfinite(distance) & ~wrong):
             wrong[i] = True
-            self.log.add("NaN", f"distance is {reply.distance[i]:g}, beyond {np.dtype(dtype).name}", example(i))
+            self.log.add(
+                "NaN",
+                f"distance is {reply.distance[i]:g}, beyond {np.dtype(dtype).name}",
+                example(i),
+            )
         event, terminal = reply.event & ~wrong, reply.terminal | wrong
         distance[wrong] = np.nan
         for i in np.flatnonzero(~wrong):
-            self._compare(hash((int(t[i]), *(a[i].tobytes() for a in x0), *(a[i, : t[i]].tobytes() for a in xs))), event[i], reply.distance[i], example(i))
+            self._compare(
+                hash(
+                    (
+                        int(t[i]),
+                        *(a[i].tobytes() for a in x0),
+                        *(a[i, : t[i]].tobytes() for a in xs),
+                    )
+                ),
+                event[i],
+                reply.distance[i],
+                example(i),
+            )
         return event, distance, terminal, seen
 
     def _compare(self, key, event, distance, example):

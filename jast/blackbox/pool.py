@@ -1,4 +1,6 @@
-"""Worker processes that run a system: one loky executor of one process each, so that the death or hang of one leaves the others alone."""
+"""Worker processes that run a system: one loky executor of one process each, so that the death or
+hang of one leaves the others alone.
+"""
 
 import pickle
 import pkgutil
@@ -53,17 +55,24 @@ SERVE, PROBE, CONFIGURE = map(_Remote, ("serve", "probe", "configure"))
 
 
 def packed(system, spec):
-    """The system as bytes; this package's part of them by value, so that a worker need not import it. Raises ValueError for one that cannot be sent."""
+    """The system as bytes; this package's part of them by value, so that a worker need not import
+    it. Raises ValueError for one that cannot be sent.
+    """
     cloudpickle = _imported("cloudpickle")
-    own = [m for m in (worker, programs, environment) if m.__name__ not in cloudpickle.list_registry_pickle_by_value()]
+    own = [
+        m
+        for m in (worker, programs, environment)
+        if m.__name__ not in cloudpickle.list_registry_pickle_by_value()
+    ]
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
         return cloudpickle.dumps(_Install(system, spec))
     except Exception as error:
         raise ValueError(
-            f"from_python: system cannot be sent to a worker process: {type(error).__name__}: {error}; define it at the top of a module, and open files, "
-            "locks and connections inside of it, not around it"
+            f"from_python: system cannot be sent to a worker process: {type(error).__name__}:"
+            f" {error}; define it at the top of a module, and open files, locks and connections"
+            " inside of it, not around it"
         ) from error
     finally:
         for module in own:
@@ -74,7 +83,9 @@ def _imported(name):
     try:
         return __import__(name)
     except ImportError:
-        raise ImportError(f"jast.blackbox needs {name} for workers >= 1: pip install 'jast[blackbox]'") from None
+        raise ImportError(
+            f"jast.blackbox needs {name} for workers >= 1: pip install 'jast[blackbox]'"
+        ) from None
 
 
 class Worker:
@@ -106,9 +117,11 @@ def _close(workers):
 class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
 
-    Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their worker. A worker that dies, or does not answer within its
-    rows' time limits and `GRACE`, is replaced; its rows then run one by one, and the one that does it again is the culprit. So a system that hangs in code that
-    nothing can interrupt costs each row its time limit and a start of a process.
+    Episodes go in pieces to whoever is free; the rows of a system of kept objects stay with their
+    worker. A worker that dies, or does not answer within its rows' time limits and `GRACE`, is
+    replaced; its rows then run one by one, and the one that does it again is the culprit. So a
+    system that hangs in code that nothing can interrupt costs each row its time limit and a start
+    of a process.
     """
 
     def __init__(self, payload, workers, spec):
@@ -133,26 +146,60 @@ class Pool:
             return _cause(error)
 
     def __call__(self, t, x0, xs, lanes):
-        """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the batch, which a search keeps from step to step."""
+        """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the
+        batch, which a search keeps from step to step.
+        """
         n = len(t)
-        event, distance, terminal, seen = np.zeros(n, bool), np.full(n, np.nan), np.zeros(n, bool), np.zeros((n, self.size))
+        event, distance, terminal, seen = (
+            np.zeros(n, bool),
+            np.full(n, np.nan),
+            np.zeros(n, bool),
+            np.zeros((n, self.size)),
+        )
         reply = worker.Reply(event, distance, terminal, seen, [], 0, 0, 0.0)
         queues = self._pieces(lanes)
         free, busy = set(self.workers), {}
         try:
             while busy or any(queues):
-                given = [(w, queue, queue.popleft()) for w, queue in zip(self.workers, queues) if w in free and queue]
+                given = [
+                    (w, queue, queue.popleft())
+                    for w, queue in zip(self.workers, queues)
+                    if w in free and queue
+                ]
                 self._start([w for w, _, _ in given])
                 for w, queue, rows in given:
-                    task = w.submit(SERVE, t[rows], [a[rows] for a in x0], [a[rows, : t[rows].max()] for a in xs])
+                    task = w.submit(
+                        SERVE,
+                        t[rows],
+                        [a[rows] for a in x0],
+                        [a[rows, : t[rows].max()] for a in xs],
+                    )
                     busy[task] = w, queue, rows, self._deadline(t[rows])
                     free.remove(w)
-                done = wait(busy, max(0.0, min(b[3] for b in busy.values()) - time.monotonic()) if self.spec.limit else None, FIRST_COMPLETED).done
-                late = [task for task in busy if task not in done and self.spec.limit and time.monotonic() > busy[task][3]]
+                done = wait(
+                    busy,
+                    (
+                        max(0.0, min(b[3] for b in busy.values()) - time.monotonic())
+                        if self.spec.limit
+                        else None
+                    ),
+                    FIRST_COMPLETED,
+                ).done
+                late = [
+                    task
+                    for task in busy
+                    if task not in done and self.spec.limit and time.monotonic() > busy[task][3]
+                ]
                 for task in [*done, *late]:
                     w, queue, rows, _ = busy.pop(task)
                     free.add(w)
-                    problem = "timed out", f"no answer within {self.spec.limit or 0:g} s, and could not be interrupted"
+                    problem = (
+                        "timed out",
+                        (
+                            f"no answer within {self.spec.limit or 0:g} s, and could not be"
+                            " interrupted"
+                        ),
+                    )
                     if task in done:
                         try:
                             reply = _merged(reply, rows, worker.Reply(*task.result()))
@@ -185,7 +232,9 @@ class Pool:
         return [deque(rows[i : i + size] for i in range(0, n, size))] * count
 
     def _deadline(self, t):
-        """When these rows must be done: each has its limit, and each transition of a history that may have to be repeated."""
+        """When these rows must be done: each has its limit, and each transition of a history that
+        may have to be repeated.
+        """
         if self.spec.limit:
             parts = len(t) if self.spec.episodic else np.sum(t + 2)
             return time.monotonic() + float(parts) * self.spec.limit + GRACE
@@ -198,14 +247,20 @@ class Pool:
                 w.submit(CONFIGURE, self.x, self.size)
         except Exception as error:
             _close(self.workers)
-            raise Unloadable(f"a worker process could not load the system: {_cause(error)}") from error
+            raise Unloadable(
+                f"a worker process could not load the system: {_cause(error)}"
+            ) from error
 
 
 def _merged(all, rows, part):
     for name in ("event", "distance", "terminal", "seen"):
         getattr(all, name)[rows] = getattr(part, name)
     all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)
-    return all._replace(episodes=all.episodes + part.episodes, transitions=all.transitions + part.transitions, seconds=all.seconds + part.seconds)
+    return all._replace(
+        episodes=all.episodes + part.episodes,
+        transitions=all.transitions + part.transitions,
+        seconds=all.seconds + part.seconds,
+    )
 
 
 def _cause(error):

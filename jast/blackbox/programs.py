@@ -1,4 +1,6 @@
-"""An external program as a system: one process an episode, JSON in and out. Goes to the workers by value: the standard library and NumPy only."""
+"""An external program as a system: one process an episode, JSON in and out. Goes to the workers by
+value: the standard library and NumPy only.
+"""
 
 import json
 import os
@@ -25,7 +27,9 @@ class Program(NamedTuple):
         task = json.dumps({"x0": _plain(x0), "disturbances": _plain(disturbances)})
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         # a session of its own, so that what the program has started can be ended with it
-        with subprocess.Popen(self.command, **pipes, cwd=self.folder, text=True, start_new_session=True) as process:
+        with subprocess.Popen(
+            self.command, **pipes, cwd=self.folder, text=True, start_new_session=True
+        ) as process:
             try:
                 out, errors = process.communicate(task)
             except BaseException:  # the time limit
@@ -39,27 +43,37 @@ class Program(NamedTuple):
             answer = json.loads(last)
             return answer["event"], answer["distance"]
         except (ValueError, TypeError, KeyError):
-            raise WrongAnswer(f'the last line of standard output must be {{"event": true or false, "distance": number}}, received {last[:80]!r}') from None
+            raise WrongAnswer(
+                'the last line of standard output must be {"event": true or false, "distance":'
+                f" number}}, received {last[:80]!r}"
+            ) from None
 
 
 def program(command, *, folder=None):
     """A system for `from_python` that runs an external program, once for each episode.
 
-    ``command``: the program and its arguments, a list or one string (split as by a POSIX shell, without one). It reads one JSON object from standard input,
-    ``{"x0": ..., "disturbances": [...]}`` (the horizon's rows; lists and objects as the disturbance is; x0 is null with one start), and prints as the last
-    line of its standard output ``{"event": false, "distance": 1.5}``. Another exit status than 0, another last line, and where a time limit is set no answer
+    ``command``: the program and its arguments, a list or one string (split as by a POSIX shell,
+    without one). It reads one JSON object from standard input, ``{"x0": ..., "disturbances":
+    [...]}`` (the horizon's rows; lists and objects as the disturbance is; x0 is null with one
+    start), and prints as the last line of its standard output ``{"event": false, "distance":
+    1.5}``. Another exit status than 0, another last line, and where a time limit is set no answer
     within it, are incidents, not errors. ``folder``: where it runs.
 
-    Raises ValueError for an empty command, and a program that is not found or is no executable file.
+    Raises ValueError for an empty command, and a program that is not found or is no executable
+    file.
     """
     parts = tuple(shlex.split(command) if isinstance(command, str) else map(os.fspath, command))
     if not parts:
         raise ValueError(f"program: command must name a program, received {command!r}")
     if folder is not None and not os.path.isdir(folder):
         raise ValueError(f"program: folder must be a directory, received {folder!r}")
-    near = folder is not None and os.path.dirname(parts[0])  # a relative path with a folder in it is looked up from where the program runs
+    # a relative path with a folder in it is looked up from where the program runs
+    near = folder is not None and os.path.dirname(parts[0])
     if shutil.which(os.path.join(folder, parts[0]) if near else parts[0]) is None:
-        raise ValueError(f"program: command must name an executable program, and {parts[0]!r} is not found or is none")
+        raise ValueError(
+            f"program: command must name an executable program, and {parts[0]!r} is not found or is"
+            " none"
+        )
     return Program(parts, None if folder is None else os.fspath(folder))
 
 

@@ -1,4 +1,6 @@
-"""from_python: a system that is not written in JAX as a `jast.Simulator`. Its state is the record of its disturbances; only an outcome asks the host."""
+"""from_python: a system that is not written in JAX as a `jast.Simulator`. Its state is the record
+of its disturbances; only an outcome asks the host.
+"""
 
 import inspect
 from functools import partial
@@ -52,43 +54,77 @@ class Standing(NamedTuple):
     """[k] float: what the object's ``observe`` returned; empty where it has none"""
 
 
-def from_python(system, *, horizon, disturbance=None, start=fixed, episodic=True, workers=0, time_limit=None, observe=None, like=None):
-    """A system in plain Python, NumPy or another language as a `jast.Simulator`: it is called on the host, once for all lanes of a batch.
+def from_python(
+    system,
+    *,
+    horizon,
+    disturbance=None,
+    start=fixed,
+    episodic=True,
+    workers=0,
+    time_limit=None,
+    observe=None,
+    like=None,
+):
+    """A system in plain Python, NumPy or another language as a `jast.Simulator`: it is called on
+    the host, once for all lanes of a batch.
 
     ``system``: one of
-     - a function ``run(disturbances) -> (event, distance)``, or ``run(disturbances, x0)`` where ``start`` is random: a whole episode at once, ``disturbances``
-       [horizon, ...] in NumPy (a pytree where a disturbance is one); `jast.blackbox.program` makes one of an external program;
-     - a class, or a function without arguments that makes an object, with the methods ``initialize()`` (``initialize(x0)`` where the start is random),
-       ``transition(x)``, ``miss_distance() -> float``, ``is_event() -> bool``, and if there are any ``evaluate()`` (runs the system under test),
-       ``is_terminal() -> bool`` and ``observe() -> vector``: Table 3.1 of the thesis. ``initialize`` puts an object back to the start, as it serves many
+     - a function ``run(disturbances) -> (event, distance)``, or ``run(disturbances, x0)`` where
+       ``start`` is random: a whole episode at once, ``disturbances`` [horizon, ...] in NumPy (a
+       pytree where a disturbance is one); `jast.blackbox.program` makes one of an external program;
+     - a class, or a function without arguments that makes an object, with the methods
+       ``initialize()`` (``initialize(x0)`` where the start is random), ``transition(x)``,
+       ``miss_distance() -> float``, ``is_event() -> bool``, and if there are any ``evaluate()``
+       (runs the system under test), ``is_terminal() -> bool`` and ``observe() -> vector``: Table
+       3.1 of the thesis. ``initialize`` puts an object back to the start, as it serves many
        episodes; `jast.blackbox.gymnasium_system` makes one of an environment.
 
-    ``disturbance``: a distribution of `jast.distributions`, the same at each step, or a function state -> distribution in JAX of the state `Record` or
-    `Standing` (``like``: a value of it, where it cannot tell its shape without one); None: `distributions.seeds`, one uint32 a step of unknown density.
-    ``start``: p(x0) likewise, () -> distribution. ``observe``: state -> float vector; by default what the object's ``observe`` returns, else t / horizon and
-    the last disturbance (an unsigned integer over its greatest value), 64 numbers at most.
+    ``disturbance``: a distribution of `jast.distributions`, the same at each step, or a function
+    state -> distribution in JAX of the state `Record` or `Standing` (``like``: a value of it, where
+    it cannot tell its shape without one); None: `distributions.seeds`, one uint32 a step of unknown
+    density. ``start``: p(x0) likewise, () -> distribution. ``observe``: state -> float vector; by
+    default what the object's ``observe`` returns, else t / horizon and the last disturbance (an
+    unsigned integer over its greatest value), 64 numbers at most.
 
-    ``episodic=True``: the system is run once, at the end of an episode, which always has ``horizon`` disturbances (fewer are an invalid episode):
-    ``initialize``, each ``transition``, then ``evaluate``. False, objects only: ``evaluate``, ``is_event``, ``miss_distance`` and ``is_terminal`` after
-    ``initialize`` and after each transition. An object is kept under its history for the next disturbance; a tree that comes back to an older state repeats
-    the history in another one.
+    ``episodic=True``: the system is run once, at the end of an episode, which always has
+    ``horizon`` disturbances (fewer are an invalid episode): ``initialize``, each ``transition``,
+    then ``evaluate``. False, objects only: ``evaluate``, ``is_event``, ``miss_distance`` and
+    ``is_terminal`` after ``initialize`` and after each transition. An object is kept under its
+    history for the next disturbance; a tree that comes back to an older state repeats the history
+    in another one.
 
-    ``workers``: 0 runs the system in this process; n >= 1 in so many processes of their own (``pip install 'jast[blackbox]'``), started on first use and ended
-    with this one. ``time_limit``: seconds for a run, or for a transition; needs a worker. One that hangs where nothing interrupts it costs its limit, about a
-    second more and the start of a process. What goes wrong (an exception, no answer in time, a process that dies, another answer than a bool and a finite
-    number) makes an episode invalid, never a failure, and does not stop the search: see `jast.incidents.incidents`. Outcomes have no gradient: NaN.
+    ``workers``: 0 runs the system in this process; n >= 1 in so many processes of their own (``pip
+    install 'jast[blackbox]'``), started on first use and ended with this one. ``time_limit``:
+    seconds for a run, or for a transition; needs a worker. One that hangs where nothing interrupts
+    it costs its limit, about a second more and the start of a process. What goes wrong (an
+    exception, no answer in time, a process that dies, another answer than a bool and a finite
+    number) makes an episode invalid, never a failure, and does not stop the search: see
+    `jast.incidents.incidents`. Outcomes have no gradient: NaN.
 
-    A simulator is known by its identity: make it once. Raises ValueError for a system that is none of these (what it lacks is named), that cannot be sent to a
-    worker, or whose first object cannot be made; for another horizon, disturbance, start, number of workers or time limit. RuntimeError inside of a search
-    where a worker process cannot load the system.
+    A simulator is known by its identity: make it once. Raises ValueError for a system that is none
+    of these (what it lacks is named), that cannot be sent to a worker, or whose first object cannot
+    be made; for another horizon, disturbance, start, number of workers or time limit. RuntimeError
+    inside of a search where a worker process cannot load the system.
     """
     horizon, workers = whole(NAME, "horizon", horizon), whole(NAME, "workers", workers, 0)
     if not isinstance(episodic, bool):
         raise ValueError(f"{NAME}: episodic must be True or False, received {episodic!r}")
     if time_limit is not None:
-        time_limit = float(real(NAME, "time_limit", time_limit, lambda s: 0 < s < np.inf, "of seconds above 0, or None"))
+        time_limit = float(
+            real(
+                NAME,
+                "time_limit",
+                time_limit,
+                lambda s: 0 < s < np.inf,
+                "of seconds above 0, or None",
+            )
+        )
         if not workers:
-            raise ValueError(f"{NAME}: time_limit needs workers of at least 1, received workers=0: a run in this process cannot be stopped")
+            raise ValueError(
+                f"{NAME}: time_limit needs workers of at least 1, received workers=0: a run in this"
+                " process cannot be stopped"
+            )
     if observe is not None and not callable(observe):
         raise ValueError(f"{NAME}: observe must be a function of the state, received {observe!r}")
     start = _start(start)
@@ -102,7 +138,10 @@ def from_python(system, *, horizon, disturbance=None, start=fixed, episodic=True
     disturbance = D.seeds() if disturbance is None else disturbance
     constant = _is_distribution(disturbance)
     if not (constant or callable(disturbance)):
-        raise ValueError(f"{NAME}: disturbance must be a distribution, or a function state -> distribution, received {disturbance!r}")
+        raise ValueError(
+            f"{NAME}: disturbance must be a distribution, or a function state -> distribution,"
+            f" received {disturbance!r}"
+        )
     blank = partial(_blank, episodic, horizon, like0, size)
     like = D.event_like(disturbance) if constant else _shape(disturbance, blank, like)
     x = _structure("disturbance", like)
@@ -110,20 +149,34 @@ def from_python(system, *, horizon, disturbance=None, start=fixed, episodic=True
     host = Host(runner, spec, x, len(jax.tree.leaves(like0)))
     begin = lambda x0: blank(like)._replace(begun=jnp.ones((), bool), x0=x0)
     fields = dict(
-        disturbance=(lambda state: disturbance) if constant else disturbance, horizon=horizon, start=start, episodic=episodic,
+        disturbance=(lambda state: disturbance) if constant else disturbance,
+        horizon=horizon,
+        start=start,
+        episodic=episodic,
         observe=_observe if observe is None else observe,
-    )  # fmt: skip
+    )
     if episodic:
         return Simulator(begin, _extended, evaluate=_Asking(host, _ended), **fields)
     init = lambda x0: _found(host, begin(x0))
-    return Simulator(init, _Asking(host, _moved), evaluate=_stands, is_terminal=lambda state: state.terminal, **fields)
+    return Simulator(
+        init,
+        _Asking(host, _moved),
+        evaluate=_stands,
+        is_terminal=lambda state: state.terminal,
+        **fields,
+    )
 
 
 def calls(sim):
-    """`Calls`: how often the system behind a black box has run so far, and for how long. ValueError for a simulator without one."""
+    """`Calls`: how often the system behind a black box has run so far, and for how long. ValueError
+    for a simulator without one.
+    """
     counts = [source.calls() for source in sources(sim, "calls")]
     if not counts:
-        raise ValueError("calls: sim must be a simulator of jast.blackbox.from_python, received one that runs nothing on the host")
+        raise ValueError(
+            "calls: sim must be a simulator of jast.blackbox.from_python, received one that runs"
+            " nothing on the host"
+        )
     return Calls(*map(sum, zip(*counts)))
 
 
@@ -131,7 +184,12 @@ class _Asking:
     """A field of a simulator that asks the host."""
 
     def __init__(self, host, function):
-        self.host, self.function, self.incidents, self.calls = host, function, host.incidents, host.calls
+        self.host, self.function, self.incidents, self.calls = (
+            host,
+            function,
+            host.incidents,
+            host.calls,
+        )
 
     def __call__(self, *args):
         return self.function(self.host, *args)
@@ -145,7 +203,9 @@ def _ended(host, state):
 
 
 def _extended(state, x):
-    rows = jax.tree.map(lambda a, v: a.at[state.t].set(jnp.asarray(v, a.dtype)), state.disturbances, x)
+    rows = jax.tree.map(
+        lambda a, v: a.at[state.t].set(jnp.asarray(v, a.dtype)), state.disturbances, x
+    )
     return state._replace(t=state.t + 1, disturbances=rows)
 
 
@@ -158,7 +218,9 @@ def _moved(host, state, x):
 
 def _found(host, state, live=True):
     """``state`` with its outcome."""
-    event, distance, terminal, seen = _asked(host, state.seen.shape[0], state.begun & live, state.t, state.x0, state.disturbances)
+    event, distance, terminal, seen = _asked(
+        host, state.seen.shape[0], state.begun & live, state.t, state.x0, state.disturbances
+    )
     return state._replace(event=event, distance=distance, terminal=terminal, seen=seen)
 
 
@@ -173,26 +235,43 @@ def _observe(state):
     dtype = jnp.zeros(()).dtype
     last = [jnp.ravel(a[jnp.maximum(state.t - 1, 0)]) for a in rows]
     # a seed is an unsigned number of any size
-    last = [a.astype(dtype) / (float(jnp.iinfo(a.dtype).max) if jnp.issubdtype(a.dtype, jnp.unsignedinteger) else 1.0) for a in last]
+    last = [
+        a.astype(dtype)
+        / (float(jnp.iinfo(a.dtype).max) if jnp.issubdtype(a.dtype, jnp.unsignedinteger) else 1.0)
+        for a in last
+    ]
     return jnp.concatenate([(state.t / rows[0].shape[0]).astype(dtype)[None], *last])[:OBSERVED]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _asked(host, size, live, t, x0, disturbances):
-    """Event, distance, terminal and [size] observed numbers from the host, where ``live``; one call for a batch, under any number of `jax.vmap`."""
+    """Event, distance, terminal and [size] observed numbers from the host, where ``live``; one call
+    for a batch, under any number of `jax.vmap`.
+    """
     flag, number = (jax.ShapeDtypeStruct((), d) for d in (bool, jnp.zeros(()).dtype))
     shapes = flag, number, flag, jax.ShapeDtypeStruct((size,), number.dtype)
-    return ask(host.callback(number.dtype, size), shapes, live, t, *jax.tree.leaves((x0, disturbances)))
+    return ask(
+        host.callback(number.dtype, size), shapes, live, t, *jax.tree.leaves((x0, disturbances))
+    )
 
 
 @_asked.defjvp
 def _(host, size, primals, tangents):
     """No gradient: NaN, whatever the direction."""
     event, distance, terminal, seen = _asked(host, size, *primals)
-    moved = [jnp.sum(a).astype(distance.dtype) for a in jax.tree.leaves(tangents) if a.dtype != jax.dtypes.float0]
+    moved = [
+        jnp.sum(a).astype(distance.dtype)
+        for a in jax.tree.leaves(tangents)
+        if a.dtype != jax.dtypes.float0
+    ]
     unknown = sum(moved, jnp.zeros_like(distance)) * jnp.nan
     none = np.zeros((), jax.dtypes.float0)
-    return (event, distance, terminal, seen), (none, unknown, none, jnp.broadcast_to(unknown, seen.shape))
+    return (event, distance, terminal, seen), (
+        none,
+        unknown,
+        none,
+        jnp.broadcast_to(unknown, seen.shape),
+    )
 
 
 def _blank(episodic, horizon, like0, size, like):
@@ -204,9 +283,15 @@ def _blank(episodic, horizon, like0, size, like):
 
 
 def _shape(disturbance, blank, like):
-    """Shapes and dtypes of a value of ``disturbance``, whose state holds such values: found by trying until it returns what it was given."""
+    """Shapes and dtypes of a value of ``disturbance``, whose state holds such values: found by
+    trying until it returns what it was given.
+    """
     given = like is not None
-    like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), like) if given else jax.ShapeDtypeStruct((), jnp.zeros(()).dtype)
+    like = (
+        jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), like)
+        if given
+        else jax.ShapeDtypeStruct((), jnp.zeros(()).dtype)
+    )
 
     def value():
         dist = disturbance(blank(like))
@@ -218,12 +303,18 @@ def _shape(disturbance, blank, like):
         try:
             found = jax.eval_shape(value)
         except Exception as error:
-            tried = f"on a state with disturbances {_text(blank(like).disturbances)}{'' if given else '; give like=, a value of it'}"
-            raise ValueError(f"{NAME}: disturbance: {type(error).__name__}: {error} ({tried})") from error
+            hint = "" if given else "; give like=, a value of it"
+            tried = f"on a state with disturbances {_text(blank(like).disturbances)}{hint}"
+            raise ValueError(
+                f"{NAME}: disturbance: {type(error).__name__}: {error} ({tried})"
+            ) from error
         if found == like:
             return like
         like = found
-    raise ValueError(f"{NAME}: disturbance returns values of other shapes for each shape of the state's disturbances, the last {_text(like)}; give like=")
+    raise ValueError(
+        f"{NAME}: disturbance returns values of other shapes for each shape of the state's"
+        f" disturbances, the last {_text(like)}; give like="
+    )
 
 
 def _text(tree):
@@ -237,11 +328,15 @@ def _structure(name, like):
     def plain(s):
         if isinstance(s, dict):
             return all(map(plain, s.values()))
-        return s is None or isinstance(s, int) or (isinstance(s, tuple | list) and all(map(plain, s)))
+        return (
+            s is None or isinstance(s, int) or (isinstance(s, tuple | list) and all(map(plain, s)))
+        )
 
     structure = tree.unflatten(range(len(leaves)))
     if not plain(structure):
-        raise ValueError(f"{NAME}: {name} must be an array or dicts, lists and tuples of arrays, received {tree}")
+        raise ValueError(
+            f"{NAME}: {name} must be an array or dicts, lists and tuples of arrays, received {tree}"
+        )
     return structure
 
 
@@ -249,35 +344,67 @@ def _start(start):
     if _is_distribution(start):
         return lambda: start
     if not callable(start) or not _is_distribution(start()):
-        raise ValueError(f"{NAME}: start must be a distribution, or a function () -> distribution, received {start!r}")
+        raise ValueError(
+            f"{NAME}: start must be a distribution, or a function () -> distribution, received"
+            f" {start!r}"
+        )
     return start
 
 
 def _is_distribution(d):
-    return not inspect.isclass(d) and callable(getattr(d, "sample", None)) and callable(getattr(d, "log_prob", None))
+    return (
+        not inspect.isclass(d)
+        and callable(getattr(d, "sample", None))
+        and callable(getattr(d, "log_prob", None))
+    )
 
 
 def _is_run(system, random, episodic):
-    """Whether ``system`` is a function of whole episodes; else it makes objects. ValueError where it is neither."""
+    """Whether ``system`` is a function of whole episodes; else it makes objects. ValueError where
+    it is neither.
+    """
     if inspect.isclass(system):
         missing = [name for name in METHODS if not callable(getattr(system, name, None))]
         if missing:
-            raise ValueError(f"{NAME}: system must be a class with the methods {', '.join(METHODS)}; {system.__name__} lacks {', '.join(missing)}")
+            raise ValueError(
+                f"{NAME}: system must be a class with the methods {', '.join(METHODS)};"
+                f" {system.__name__} lacks {', '.join(missing)}"
+            )
         return False
     if not callable(system):
-        hint = "; give its class, or a function that makes it" if any(hasattr(system, m) for m in METHODS) else ""
-        raise ValueError(f"{NAME}: system must be a function of the disturbances, or a class, received {system!r}{hint}")
+        hint = (
+            "; give its class, or a function that makes it"
+            if any(hasattr(system, m) for m in METHODS)
+            else ""
+        )
+        raise ValueError(
+            f"{NAME}: system must be a function of the disturbances, or a class, received"
+            f" {system!r}{hint}"
+        )
     try:
         parameters = inspect.signature(system).parameters.values()
     except (TypeError, ValueError):  # one that Python knows nothing of
         parameters = None
-    if parameters is not None and not any(p.kind == p.VAR_POSITIONAL or (p.default is p.empty and p.kind != p.VAR_KEYWORD) for p in parameters):
+    if parameters is not None and not any(
+        p.kind == p.VAR_POSITIONAL or (p.default is p.empty and p.kind != p.VAR_KEYWORD)
+        for p in parameters
+    ):
         return False
     if not takes(system, 1 + random):
-        expected = "(disturbances, x0), as start is random" if random else "(disturbances), as there is one start"
-        raise ValueError(f"{NAME}: system must be a function of {expected}, received {_name(system)}{inspect.signature(system)}")
+        expected = (
+            "(disturbances, x0), as start is random"
+            if random
+            else "(disturbances), as there is one start"
+        )
+        raise ValueError(
+            f"{NAME}: system must be a function of {expected}, received"
+            f" {_name(system)}{inspect.signature(system)}"
+        )
     if not episodic:
-        raise ValueError(f"{NAME}: episodic=False needs a class with the methods {', '.join(METHODS)}; {_name(system)} is a function of whole episodes")
+        raise ValueError(
+            f"{NAME}: episodic=False needs a class with the methods {', '.join(METHODS)};"
+            f" {_name(system)} is a function of whole episodes"
+        )
     return True
 
 
@@ -286,11 +413,15 @@ def _name(system):
 
 
 def _probed(runner, start):
-    """The length of an observation, by a first object where all others will be. ValueError where it does not work."""
+    """The length of an observation, by a first object where all others will be. ValueError where it
+    does not work.
+    """
     x0 = [np.asarray(a) for a in jax.tree.leaves(D.sample(start(), jax.random.key(0)))]
     found = runner.probe(x0)
     if isinstance(found, str):
         raise ValueError(f"{NAME}: system: {found}")
     if found > OBSERVED:
-        raise ValueError(f"{NAME}: system: observe returns {found} numbers, expected at most {OBSERVED}")
+        raise ValueError(
+            f"{NAME}: system: observe returns {found} numbers, expected at most {OBSERVED}"
+        )
     return found

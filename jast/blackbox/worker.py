@@ -1,6 +1,8 @@
-"""Runs a system, in this process or in a worker's: a row is an episode, or one transition of an object that is kept.
+"""Runs a system, in this process or in a worker's: a row is an episode, or one transition of an
+object that is kept.
 
-This module goes to the workers by value, so that they need neither JAX nor this package: it imports NumPy and the standard library only.
+This module goes to the workers by value, so that they need neither JAX nor this package: it imports
+NumPy and the standard library only.
 """
 
 import contextlib
@@ -82,7 +84,9 @@ def fill(structure, leaves):
 
 
 def takes(function, count):
-    """Whether ``function`` can be called with so many arguments; True where Python does not know."""
+    """Whether ``function`` can be called with so many arguments; True where Python does not
+    know.
+    """
     try:
         inspect.signature(function).bind(*[None] * count)
     except TypeError:
@@ -103,19 +107,28 @@ class Runner:
         self.alarm = Alarm(spec.limit)
 
     def configure(self, x, size):
-        """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers ``observe`` returns."""
+        """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
+        ``observe`` returns.
+        """
         self.x, self.size = x, size
 
     def probe(self, x0):
-        """How many numbers ``observe`` returns, or a sentence (str) that says what is wrong with the objects."""
+        """How many numbers ``observe`` returns, or a sentence (str) that says what is wrong with
+        the objects.
+        """
         size = 0
         try:
             thing = self._fresh()
             missing = [name for name in METHODS if not callable(getattr(thing, name, None))]
             if missing:
-                return f"expected an object with the methods {', '.join(METHODS)}; {type(thing).__name__} lacks {', '.join(missing)}"
+                return (
+                    f"expected an object with the methods {', '.join(METHODS)};"
+                    f" {type(thing).__name__} lacks {', '.join(missing)}"
+                )
             if not takes(thing.initialize, int(self.spec.random)):
-                return f"initialize must take {'x0, as start is random' if self.spec.random else 'no argument, as there is one start'}"
+                one = "x0, as start is random"
+                none = "no argument, as there is one start"
+                return f"initialize must take {one if self.spec.random else none}"
             if not takes(thing.transition, 1):
                 return "transition must take one argument, a disturbance"
             if not self.spec.episodic and callable(getattr(thing, "observe", None)):
@@ -130,14 +143,23 @@ class Runner:
         return size
 
     def __call__(self, t, x0, xs, lanes=None):
-        """`Reply` for rows of ``t`` [n] disturbances each; ``x0``: leaves [n, ...], ``xs``: leaves [n, >= t, ...]."""
+        """`Reply` for rows of ``t`` [n] disturbances each; ``x0``: leaves [n, ...], ``xs``: leaves
+        [n, >= t, ...].
+        """
         n = len(t)
-        event, distance, terminal, seen = np.zeros(n, bool), np.full(n, np.nan), np.zeros(n, bool), np.zeros((n, self.size))
+        event, distance, terminal, seen = (
+            np.zeros(n, bool),
+            np.full(n, np.nan),
+            np.zeros(n, bool),
+            np.zeros((n, self.size)),
+        )
         problems, self.episodes, self.transitions, begin = [], 0, 0, time.perf_counter()
         one = self._episode if self.spec.episodic else self._standing
         for i in range(n):
             try:
-                event[i], distance[i], terminal[i], observed = one(int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs])
+                event[i], distance[i], terminal[i], observed = one(
+                    int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
+                )
                 if self.size:
                     seen[i] = observed
             except KeyboardInterrupt:
@@ -145,7 +167,16 @@ class Runner:
             except BaseException as error:  # SystemExit too: the system's, not ours
                 terminal[i] = True
                 problems.append((i, *_said(error)))
-        return Reply(event, distance, terminal, seen, problems, self.episodes, self.transitions, time.perf_counter() - begin)
+        return Reply(
+            event,
+            distance,
+            terminal,
+            seen,
+            problems,
+            self.episodes,
+            self.transitions,
+            time.perf_counter() - begin,
+        )
 
     def _episode(self, t, x0, xs):
         self.episodes += 1
@@ -168,7 +199,9 @@ class Runner:
         return *outcome, False, None
 
     def _standing(self, t, x0, xs):
-        """Event, distance, terminal and observation of the object with this history, which is moved on from the last one where it is kept."""
+        """Event, distance, terminal and observation of the object with this history, which is moved
+        on from the last one where it is kept.
+        """
         thing, at = self._taken(_history(x0, xs, t - 1)) if t else None, t - 1
         if thing is None:
             thing, at = self._fresh(), 0
@@ -181,7 +214,11 @@ class Runner:
                 thing.transition(fill(self.x, [a[k] for a in xs]))
                 _evaluate(thing)
         with self.alarm:
-            outcome = _event(thing.is_event()), _distance(thing.miss_distance()), hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
+            outcome = (
+                _event(thing.is_event()),
+                _distance(thing.miss_distance()),
+                hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal"),
+            )
             observed = _observed(thing.observe(), self.size) if self.size else None
         if outcome[0] or outcome[2] or t >= self.spec.horizon:
             self.spare.append(thing)
@@ -214,7 +251,9 @@ class Runner:
 
 
 class Alarm(contextlib.AbstractContextManager):
-    """Raises `TimedOut` in what runs for longer than ``seconds``, where signals exist and the code can be interrupted; None: never."""
+    """Raises `TimedOut` in what runs for longer than ``seconds``, where signals exist and the code
+    can be interrupted; None: never.
+    """
 
     def __init__(self, seconds):
         self.seconds = seconds if seconds is not None and hasattr(signal, "setitimer") else None
@@ -269,7 +308,10 @@ def _distance(value):
 def _observed(value, size):
     a = _array(value)
     if a.ndim != 1 or a.dtype.kind not in "fiub" or (size is not None and len(a) != size):
-        raise WrongAnswer(f"observe must return a vector of {'' if size is None else f'{size} '}numbers, received {_show(value)}")
+        raise WrongAnswer(
+            f"observe must return a vector of {'' if size is None else f'{size} '}numbers, received"
+            f" {_show(value)}"
+        )
     return a
 
 
@@ -295,7 +337,11 @@ def _said(error):
         return "NaN", str(error)
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
     libraries = os.path.dirname(os.__file__), "<frozen"
-    own = [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(libraries)] or frames
+    own = [
+        f
+        for f in frames
+        if "site-packages" not in f.filename and not f.filename.startswith(libraries)
+    ] or frames
     where = f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
     text = " ".join(str(error).split())[:200]
     return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{where}"
@@ -304,11 +350,13 @@ def _said(error):
 def install(system, spec):
     """Keep the system in this worker process, where calls of `NAME` find it."""
     if hasattr(signal, "SIGINT"):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a search that is interrupted ends its workers itself
+        # a search that is interrupted ends its workers itself
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     module = types.ModuleType(NAME)
     module.runner = runner = Runner(system, spec)
-    module.serve = lambda *rows: tuple(runner(*rows))  # a plain tuple: the class would travel with it
+    # a plain tuple: the class would travel with it
+    module.serve = lambda *rows: tuple(runner(*rows))
     module.probe, module.configure = runner.probe, runner.configure
     sys.modules[NAME] = module
 

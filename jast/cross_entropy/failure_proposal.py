@@ -1,6 +1,7 @@
 """The cross-entropy method for rare events: a proposal for importance sampling of failures.
 
-De Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy method, section 3.1 (the multi-level algorithm), on sequences of disturbances.
+De Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy method, section 3.1
+(the multi-level algorithm), on sequences of disturbances.
 """
 
 from functools import partial
@@ -25,7 +26,9 @@ __all__ = ["FailureProposal", "failure_proposal"]
 
 
 class FailureProposal(NamedTuple):
-    """A proposal and how it was found. K iterations; with a leading axis everywhere after `jax.vmap`."""
+    """A proposal and how it was found. K iterations; with a leading axis everywhere after
+    `jax.vmap`.
+    """
 
     policy: Any
     """`Policy`: the simulator's disturbances, tilted step by step"""
@@ -34,7 +37,9 @@ class FailureProposal(NamedTuple):
     steps: Any
     """`Steps` [horizon, ...] of the latents of x_1 .. x_T"""
     levels: Any
-    """[K]: the miss distance gamma_k that the elites of an iteration reached, 0 where they failed; inf where no episode counted"""
+    """[K]: the miss distance gamma_k that the elites of an iteration reached, 0 where they failed;
+    inf where no episode counted
+    """
     failures: Any
     """[K] int32: failing episodes of an iteration"""
     ess: Any
@@ -44,13 +49,21 @@ class FailureProposal(NamedTuple):
     invalid: Any
     """int: those in which the simulator returned a number that is not finite"""
     reached: Any
-    """bool: all of the last elites fail, and for two effective episodes or more; else the proposal is fitted to near misses as well"""
+    """bool: all of the last elites fail, and for two effective episodes or more; else the proposal
+    is fitted to near misses as well
+    """
 
     def __str__(self):
         reached, levels = np.asarray(self.reached), np.asarray(self.levels)
         if reached.ndim:
-            return f"{reached.size} runs of {np.ravel(self.evaluations)[0]} evaluations: {int(reached.sum())} reached failures"
-        rows = "\n".join(f"{i:9d} {g:11.6g} {n:9d} {e:10.1f}" for i, (g, n, e) in enumerate(zip(levels, self.failures, self.ess, strict=True), 1))
+            return (
+                f"{reached.size} runs of {np.ravel(self.evaluations)[0]} evaluations:"
+                f" {int(reached.sum())} reached failures"
+            )
+        rows = "\n".join(
+            f"{i:9d} {g:11.6g} {n:9d} {e:10.1f}"
+            for i, (g, n, e) in enumerate(zip(levels, self.failures, self.ess, strict=True), 1)
+        )
         note = "" if reached else "\nthe last elites do not fail: more iterations, or more samples"
         return f"{'iteration':>9} {'level':>11} {'failures':>9} {'ess':>10}\n{rows}{note}"
 
@@ -63,23 +76,35 @@ class Settings(NamedTuple):
     floor: Any
 
 
-def failure_proposal(key, sim, *, samples=1000, iterations=10, quantile=0.1, smoothing=0.3, floor=0.7):
-    """Find a proposal under which the failures of ``sim`` are frequent: `FailureProposal`, whose ``policy`` is for `jast.rollout` and importance sampling.
+def failure_proposal(
+    key, sim, *, samples=1000, iterations=10, quantile=0.1, smoothing=0.3, floor=0.7
+):
+    """Find a proposal under which the failures of ``sim`` are frequent: `FailureProposal`, whose
+    ``policy`` is for `jast.rollout` and importance sampling.
 
-    Each of ``iterations`` simulates ``samples`` episodes, whose disturbances are x_t = Q(Phi(z_t)), Q the quantile function of p(x | s) and
-    z_t ~ N(m_t, s_t^2), from N(0, 1), the model itself, on. The share ``quantile`` of least miss distance are the elites, all failing episodes once that
-    many fail. m_t and s_t are fitted to the elites with importance ratios for weights, over the steps that an episode took; the share ``smoothing`` of the
-    last ones is kept, s_t >= ``floor``. A random start is tilted likewise where it has a quantile function, else it is drawn from its own distribution.
-    A proposal that is much narrower than the model in many steps gives weights with heavy tails; in one or two dimensions a lower floor is sharper.
+    Each of ``iterations`` simulates ``samples`` episodes, whose disturbances are x_t = Q(Phi(z_t)),
+    Q the quantile function of p(x | s) and z_t ~ N(m_t, s_t^2), from N(0, 1), the model itself, on.
+    The share ``quantile`` of least miss distance are the elites, all failing episodes once that
+    many fail. m_t and s_t are fitted to the elites with importance ratios for weights, over the
+    steps that an episode took; the share ``smoothing`` of the last ones is kept, s_t >= ``floor``.
+    A random start is tilted likewise where it has a quantile function, else it is drawn from its
+    own distribution. A proposal that is much narrower than the model in many steps gives weights
+    with heavy tails; in one or two dimensions a lower floor is sharper.
 
-    The result is a proposal, not an estimate: estimate with new episodes, under it alone. It is one Gaussian, its steps independent: where failures lie in
-    several places it may settle on one of them, or between, and an estimate misses the others without a sign of it. Look at ``reached`` first.
+    The result is a proposal, not an estimate: estimate with new episodes, under it alone. It is one
+    Gaussian, its steps independent: where failures lie in several places it may settle on one of
+    them, or between, and an estimate misses the others without a sign of it. Look at ``reached``
+    first.
 
-    Counts are static, real-valued settings (``quantile`` above 0 and below 1, ``smoothing`` from 0 to below 1, ``floor`` above 0) traced; one program, works
-    under `jax.jit` and `jax.vmap`. The key is consumed. An invalid episode is counted and never an elite. Raises ValueError for a count below 1, a setting
-    outside its range, and a disturbance that cannot be tilted.
+    Counts are static, real-valued settings (``quantile`` above 0 and below 1, ``smoothing`` from 0
+    to below 1, ``floor`` above 0) traced; one program, works under `jax.jit` and `jax.vmap`. The
+    key is consumed. An invalid episode is counted and never an elite. Raises ValueError for a count
+    below 1, a setting outside its range, and a disturbance that cannot be tilted.
     """
-    samples, iterations = whole("failure_proposal", "samples", samples, 2), whole("failure_proposal", "iterations", iterations)
+    samples, iterations = (
+        whole("failure_proposal", "samples", samples, 2),
+        whole("failure_proposal", "iterations", iterations),
+    )
     settings = Settings(
         real("failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"),
         real("failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"),
@@ -92,35 +117,73 @@ def failure_proposal(key, sim, *, samples=1000, iterations=10, quantile=0.1, smo
 @partial(jax.jit, static_argnums=(3, 4, 5))
 def _search(key, sim, settings, tilt_start, samples, iterations):
     like0, like = jax.eval_shape(_shapes, sim)
-    first = sequences.standard(like0, 1) if tilt_start else (), sequences.standard(like, sim.horizon)
+    first = (
+        sequences.standard(like0, 1) if tilt_start else (),
+        sequences.standard(like, sim.horizon),
+    )
 
     def iterate(proposal, key):
-        z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(jax.random.split(key, samples))
+        z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(
+            jax.random.split(key, samples)
+        )
         valid = jnp.isfinite(e.distance)
         level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), settings.quantile)
         ess = jnp.sum(counts)
         reached = jnp.arange(sim.horizon, dtype=jnp.int32)[None, :] < e.length[:, None]
         fitted = (
-            sequences.fit(proposal[0], z0, counts[:, None], settings.smoothing, settings.floor) if tilt_start else (),
-            sequences.fit(proposal[1], z, jnp.where(reached, counts[:, None], 0), settings.smoothing, settings.floor),
+            (
+                sequences.fit(proposal[0], z0, counts[:, None], settings.smoothing, settings.floor)
+                if tilt_start
+                else ()
+            ),
+            sequences.fit(
+                proposal[1],
+                z,
+                jnp.where(reached, counts[:, None], 0),
+                settings.smoothing,
+                settings.floor,
+            ),
         )
-        return fitted, (level, jnp.sum(e.failure, dtype=jnp.int32), ess, jnp.sum(~valid, dtype=jnp.int32), fails)
+        return fitted, (
+            level,
+            jnp.sum(e.failure, dtype=jnp.int32),
+            ess,
+            jnp.sum(~valid, dtype=jnp.int32),
+            fails,
+        )
 
-    last, (levels, failures, ess, invalid, fails) = lax.scan(iterate, first, jax.random.split(key, iterations))
-    policy = Policy(Partial(_start, sim.start, last[0]) if tilt_start else sim.start, Partial(_disturbance, sim.disturbance, last[1]))
+    last, (levels, failures, ess, invalid, fails) = lax.scan(
+        iterate, first, jax.random.split(key, iterations)
+    )
+    policy = Policy(
+        Partial(_start, sim.start, last[0]) if tilt_start else sim.start,
+        Partial(_disturbance, sim.disturbance, last[1]),
+    )
     evaluations = jnp.asarray(samples * iterations, jnp.int32)
-    return FailureProposal(policy, *last, levels, failures, ess, evaluations, jnp.sum(invalid, dtype=jnp.int32), fails[-1] & (ess[-1] >= 2))
+    return FailureProposal(
+        policy,
+        *last,
+        levels,
+        failures,
+        ess,
+        evaluations,
+        jnp.sum(invalid, dtype=jnp.int32),
+        fails[-1] & (ess[-1] >= 2),
+    )
 
 
 def _play(key, sim, proposal):
-    """One episode: its latents ((1, ...), (T, ...)), itself, and the log of its importance ratio."""
+    """One episode: its latents ((1, ...), (T, ...)), itself, and the log of its importance
+    ratio.
+    """
     for_noise, for_start = jax.random.split(key)
     start, steps = proposal
     z0 = sequences.noise(for_noise, start, 0) if start != () else ()
     z = sequences.noise(for_noise, steps, 1)
     player = sequences.player(sim, choices.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
     e = rollout(for_start, sim, player)._replace(states=None, disturbances=None)
-    # W = f(X; u) / f(X; v) in the latents, in which f is N(0, 1); to the end of the episode, as later steps decide nothing
+    # W = f(X; u) / f(X; v) in the latents, in which f is N(0, 1); to the end of the episode, as
+    # later steps decide nothing
     ratios = sequences.log_ratio(steps, z)
     log_w = jnp.sum(jnp.where(jnp.arange(sim.horizon, dtype=jnp.int32) < e.length, ratios, 0))
     if start != ():
@@ -129,20 +192,26 @@ def _play(key, sim, proposal):
 
 
 def _elites(e, log_w, quantile):
-    """(gamma_k, whether it is that of failures, for how many effective episodes each one counts [n]); -inf in ``log_w``: does not count."""
+    """(gamma_k, whether it is that of failures, for how many effective episodes each one counts
+    [n]); -inf in ``log_w``: does not count.
+    """
     usable = jnp.isfinite(log_w)
     score = jnp.where(usable, jnp.where(e.failure, -jnp.inf, e.distance), jnp.inf)
     n = jnp.sum(usable, dtype=score.dtype)
     # gamma_k: the sample quantile of the performances, and 0 once it fails
-    place = jnp.clip(jnp.ceil(quantile.astype(score.dtype) * n) - 1, 0, max(len(score) - 1, 0)).astype(jnp.int32)
+    place = jnp.clip(
+        jnp.ceil(quantile.astype(score.dtype) * n) - 1, 0, max(len(score) - 1, 0)
+    ).astype(jnp.int32)
     level = jnp.sort(score)[place]
     elite = usable & (score <= level)
-    # I{S(X) <= gamma} W(X), whose sums are those of the weighted likelihood equations; over its greatest, so that none overflows
+    # I{S(X) <= gamma} W(X), whose sums are those of the weighted likelihood equations; over its
+    # greatest, so that none overflows
     log_w = jnp.where(elite, log_w, -jnp.inf)
     top = jnp.max(log_w)
     w = jnp.where(elite, jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0)), 0)
     total, squares = jnp.sum(w), jnp.sum(w**2)
-    counts = w * jnp.where(squares > 0, total / jnp.where(squares > 0, squares, 1), 0)  # they sum to the effective number
+    # they sum to the effective number
+    counts = w * jnp.where(squares > 0, total / jnp.where(squares > 0, squares, 1), 0)
     return jnp.maximum(level, 0), jnp.isneginf(level), counts
 
 
@@ -151,14 +220,18 @@ def _start(start, steps):
 
 
 def _disturbance(disturbance, steps, state, t):
-    return tilted(disturbance(state), *jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], steps))
+    return tilted(
+        disturbance(state), *jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], steps)
+    )
 
 
 def _tilts_start(sim):
     """Whether x0 is tilted; ValueError where x cannot be."""
 
     def build(dist):
-        full = lambda v: jax.tree.map(lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist))
+        full = lambda v: jax.tree.map(
+            lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist)
+        )
         tilted(dist, full(0), full(1))
 
     def step():

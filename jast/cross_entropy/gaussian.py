@@ -1,4 +1,6 @@
-"""The multivariate normal distribution as a cross-entropy method needs it: drawn from, scored, and refitted to weighted samples."""
+"""The multivariate normal distribution as a cross-entropy method needs it: drawn from, scored, and
+refitted to weighted samples.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -9,7 +11,19 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
-__all__ = ["Gaussian", "as_gaussian", "check_covariance", "fit", "float_of", "is_definite", "log_prob", "moments", "normal", "numbers", "sample"]
+__all__ = [
+    "Gaussian",
+    "as_gaussian",
+    "check_covariance",
+    "fit",
+    "float_of",
+    "is_definite",
+    "log_prob",
+    "moments",
+    "normal",
+    "numbers",
+    "sample",
+]
 
 
 class Gaussian(NamedTuple):
@@ -22,36 +36,54 @@ class Gaussian(NamedTuple):
 
 
 def normal(mean, covariance):
-    """The `Gaussian` of a ``mean`` [d] and a ``covariance``: a number (times the identity), the variances [d], or a matrix [d, d].
+    """The `Gaussian` of a ``mean`` [d] and a ``covariance``: a number (times the identity), the
+    variances [d], or a matrix [d, d].
 
-    The dtype is that of the float arrays given, the wider one, else the default. Raises ValueError unless both are finite and the matrix symmetric and
-    positive definite; of traced values only the shapes are looked at.
+    The dtype is that of the float arrays given, the wider one, else the default. Raises ValueError
+    unless both are finite and the matrix symmetric and positive definite; of traced values only the
+    shapes are looked at.
     """
     return _normal("normal", mean, covariance)
 
 
 def as_gaussian(proposal):
-    """The `Gaussian` that is meant by one, by a pair (mean, covariance), or by a distribution with ``mean()`` and ``covariance()``, as distrax's are.
+    """The `Gaussian` that is meant by one, by a pair (mean, covariance), or by a distribution with
+    ``mean()`` and ``covariance()``, as distrax's are.
 
     Raises ValueError, naming ``proposal``, for anything else and for what `normal` refuses.
     """
     if isinstance(proposal, tuple | list) and len(proposal) == 2:
         return _normal("proposal", *proposal)
-    if callable(getattr(proposal, "mean", None)) and callable(getattr(proposal, "covariance", None)):
+    if callable(getattr(proposal, "mean", None)) and callable(
+        getattr(proposal, "covariance", None)
+    ):
         return _normal("proposal", proposal.mean(), proposal.covariance())
-    raise ValueError(f"proposal: expected a Gaussian, a pair (mean, covariance), or a distribution with mean() and covariance(), received {proposal!r}")
+    raise ValueError(
+        "proposal: expected a Gaussian, a pair (mean, covariance), or a distribution with mean()"
+        f" and covariance(), received {proposal!r}"
+    )
 
 
 def _normal(name, mean, covariance):
     given, dtype = (mean, covariance), float_of(mean, covariance)
-    traced = [any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in given]
-    parts = [jnp.asarray(value) if skip else numbers(name, part, value, dtype) for part, value, skip in zip(("mean", "covariance"), given, traced, strict=True)]
+    traced = [
+        any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in given
+    ]
+    parts = [
+        jnp.asarray(value) if skip else numbers(name, part, value, dtype)
+        for part, value, skip in zip(("mean", "covariance"), given, traced, strict=True)
+    ]
     m, c = parts
     if m.ndim != 1 or m.size == 0:
-        raise ValueError(f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}")
+        raise ValueError(
+            f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}"
+        )
     d = m.size
     if c.shape not in ((), (d,), (d, d)):
-        raise ValueError(f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received shape {c.shape}")
+        raise ValueError(
+            f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received"
+            f" shape {c.shape}"
+        )
     if not traced[1]:
         check_covariance(name, c)
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
@@ -59,20 +91,30 @@ def _normal(name, mean, covariance):
 
 
 def float_of(*values):
-    """The float dtype of these arrays, the widest, as far as JAX has it; the default where none is of floats."""
-    floats = [v.dtype for v in values if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    return jax.dtypes.canonicalize_dtype(max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype))
+    """The float dtype of these arrays, the widest, as far as JAX has it; the default where none is
+    of floats.
+    """
+    floats = [
+        v.dtype for v in values if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)
+    ]
+    return jax.dtypes.canonicalize_dtype(
+        max(floats, key=lambda t: t.itemsize, default=jnp.zeros(()).dtype)
+    )
 
 
 def numbers(name, part, value, dtype):
-    """``value`` on the host, in the dtype in which it will be used; ValueError unless it is finite there."""
+    """``value`` on the host, in the dtype in which it will be used; ValueError unless it is finite
+    there.
+    """
     try:
         with np.errstate(over="ignore", under="ignore"):
             array = np.asarray(value, np.float64).astype(dtype)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {part} must be numbers, received {value!r}") from None
     if not np.isfinite(array).all():
-        raise ValueError(f"{name}: {part} must be finite in {np.dtype(dtype).name}, received {value}")
+        raise ValueError(
+            f"{name}: {part} must be finite in {np.dtype(dtype).name}, received {value}"
+        )
     return array
 
 
@@ -86,14 +128,19 @@ def check_covariance(name, c):
     spread = np.sqrt(np.abs(np.diagonal(c)))
     if not (np.abs(c - c.T) <= 16 * eps * np.outer(spread, spread)).all():
         raise ValueError(f"{name}: covariance must be symmetric, received\n{c}")
-    if not ((np.diagonal(c) > 0).all() and np.linalg.eigvalsh(c / np.outer(spread, spread))[0] > 4 * len(c) * eps):
+    if not (
+        (np.diagonal(c) > 0).all()
+        and np.linalg.eigvalsh(c / np.outer(spread, spread))[0] > 4 * len(c) * eps
+    ):
         raise ValueError(f"{name}: covariance must be positive definite, received\n{c}")
 
 
 def sample(key, g, n):
     """``n`` draws [n, d]: mean + L z, L the Cholesky factor of the covariance."""
     z = jax.random.normal(key, (n, *g.mean.shape), g.mean.dtype)
-    return g.mean[None] + jnp.matmul(z, jnp.linalg.cholesky(g.covariance).T, precision=Precision.HIGHEST)
+    return g.mean[None] + jnp.matmul(
+        z, jnp.linalg.cholesky(g.covariance).T, precision=Precision.HIGHEST
+    )
 
 
 def log_prob(g, x):
@@ -106,13 +153,18 @@ def log_prob(g, x):
 
 
 def fit(g, x, weights):
-    """The `Gaussian` of greatest likelihood for ``x`` [n, d] with ``weights`` [n], at least 0: the covariance is divided by their sum.
+    """The `Gaussian` of greatest likelihood for ``x`` [n, d] with ``weights`` [n], at least 0: the
+    covariance is divided by their sum.
 
-    The old ``g`` stays where that has no answer: total weight 0, at most d rows of positive weight, a covariance that `is_definite` refuses, a number that
-    is not finite. Rows of weight 0 may hold anything, NaN too. Only the weights' ratios matter. ValueError for shapes that do not fit.
+    The old ``g`` stays where that has no answer: total weight 0, at most d rows of positive weight,
+    a covariance that `is_definite` refuses, a number that is not finite. Rows of weight 0 may hold
+    anything, NaN too. Only the weights' ratios matter. ValueError for shapes that do not fit.
     """
     if x.ndim != 2 or x.shape[1:] != g.mean.shape or weights.shape != x.shape[:1]:
-        raise ValueError(f"gaussian.fit: x must be [n, {g.mean.size}] and weights [n], received {x.shape} and {weights.shape}")
+        raise ValueError(
+            f"gaussian.fit: x must be [n, {g.mean.size}] and weights [n], received {x.shape} and"
+            f" {weights.shape}"
+        )
     n, d = x.shape
     if n == 0:
         return g
@@ -130,7 +182,8 @@ def moments(x, w):
     """Mean [d] and covariance [d, d] of ``x`` [n, d] with weights ``w`` [n] that sum to 1."""
     average = lambda a: jnp.matmul(w, a, precision=Precision.HIGHEST)
     mean = average(x)
-    # The mean is rounded relative to its own size, which may be far above the spread: the second pass takes the remainder out
+    # The mean is rounded relative to its own size, which may be far above the spread: the second
+    # pass takes the remainder out
     c = x - mean[None]
     rest = average(c)
     c = c - rest[None]
@@ -139,15 +192,22 @@ def moments(x, w):
 
 
 def is_definite(covariance, mean, rows):
-    """Whether the covariance [d, d] of ``rows`` samples about ``mean`` [d] is positive definite beyond its rounding errors; False if it is not finite.
+    """Whether the covariance [d, d] of ``rows`` samples about ``mean`` [d] is positive definite
+    beyond its rounding errors; False if it is not finite.
 
-    No standard deviation may be below 4 eps times the mean, about which samples are stored no finer. For the rest the correlation matrix R = L L^T is judged,
-    so units do not matter. A singular R comes out with a least eigenvalue of the size of rounding errors, and often with a Cholesky factor whose pivots look
-    sound, when it is ill-conditioned before the last one. So the trace of R^-1, the sum of the inverse eigenvalues and of the squares of L^-1, is asked to be
+    No standard deviation may be below 4 eps times the mean, about which samples are stored no
+    finer. For the rest the correlation matrix R = L L^T is judged, so units do not matter. A
+    singular R comes out with a least eigenvalue of the size of rounding errors, and often with a
+    Cholesky factor whose pivots look sound, when it is ill-conditioned before the last one. So the
+    trace of R^-1, the sum of the inverse eigenvalues and of the squares of L^-1, is asked to be
     below 1 / (4 (d + sqrt(rows)) eps).
     """
     d, eps = covariance.shape[-1], float(jnp.finfo(covariance.dtype).eps)
     spread = jnp.sqrt(jnp.diagonal(covariance))
     correlation = covariance / spread[:, None] / spread[None, :]
-    inverse = solve_triangular(jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True)
-    return (jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1) & jnp.all(spread > 4 * eps * jnp.abs(mean))  # False for NaN
+    inverse = solve_triangular(
+        jnp.linalg.cholesky(correlation), jnp.eye(d, dtype=covariance.dtype), lower=True
+    )
+    return (jnp.sum(inverse**2) * (4 * (d + math.sqrt(rows)) * eps) < 1) & jnp.all(
+        spread > 4 * eps * jnp.abs(mean)
+    )  # False for NaN

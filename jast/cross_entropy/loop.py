@@ -1,6 +1,8 @@
-"""One iteration of a cross-entropy method as two pure functions, ask and tell, and their loop in one program for objectives in JAX.
+"""One iteration of a cross-entropy method as two pure functions, ask and tell, and their loop in
+one program for objectives in JAX.
 
-Every evaluation is kept in one log, in order; an iteration reads the rows that it may remember from there. Batches are padded to the largest one, with masks.
+Every evaluation is kept in one log, in order; an iteration reads the rows that it may remember from
+there. Batches are padded to the largest one, with masks.
 """
 
 from functools import partial
@@ -35,16 +37,22 @@ class Plan(NamedTuple):
     best: int = 0
     """... and so many of the best before"""
     evaluated: int = 0
-    """Points of the last iteration's searches on the surrogate that are truly evaluated, of at most half a batch"""
+    """Points of the last iteration's searches on the surrogate that are truly evaluated, of at most
+    half a batch
+    """
     current: bool = False
     """Those searches have the current covariance, not the initial one"""
     surrogate: str = ""
     kernel: str = ""
     warp: str = ""
     frame: str = ""
-    """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the initial proposal"""
+    """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the
+    initial proposal
+    """
     optimistic: bool = False
-    """Those searches minimise the model's mean less ``Settings.optimism`` of its standard deviations"""
+    """Those searches minimise the model's mean less ``Settings.optimism`` of its standard
+    deviations
+    """
     judged: int = 0
     """Samples that only the surrogate judges, in each iteration"""
     chosen: tuple = ()
@@ -53,7 +61,9 @@ class Plan(NamedTuple):
     """Samples, elites and iterations of a search on the surrogate"""
     components: int = 0
     start: str = ""
-    """Where a mixture's fit begins: "elites" with the searches' first covariance, or "searches", as these ended"""
+    """Where a mixture's fit begins: "elites" with the searches' first covariance, or "searches", as
+    these ended
+    """
     em_iterations: int = 10
 
 
@@ -106,9 +116,13 @@ def begin(key, plan, proposal):
 
 
 def ask(plan, state):
-    """The points of the next iteration, [max(m), d], of which the first ``plan.counts[k]`` count."""
+    """The points of the next iteration, [max(m), d], of which the first ``plan.counts[k]``
+    count.
+    """
     x = refit.draw(_key(state, 0), state.proposal, max(plan.counts))
-    known = (state.k > 0) & (jnp.arange(plan.evaluated, dtype=jnp.int32) < _of(plan.counts, state.k) // 2)
+    known = (state.k > 0) & (
+        jnp.arange(plan.evaluated, dtype=jnp.int32) < _of(plan.counts, state.k) // 2
+    )
     return x.at[: plan.evaluated].set(jnp.where(known[:, None], state.pending, x[: plan.evaluated]))
 
 
@@ -120,15 +134,22 @@ def tell(plan, settings, state, x, value):
     live = rows < count
     value = jnp.where(live, value, jnp.inf)
     places = jnp.where(live, at + rows, len(state.value))
-    state = state._replace(x=state.x.at[places].set(x, mode="drop"), value=state.value.at[places].set(value, mode="drop"))
-    elites = _best(*((state.x, state.value) if plan.elitism else (x, value)), kept, max(plan.elites))
+    state = state._replace(
+        x=state.x.at[places].set(x, mode="drop"),
+        value=state.value.at[places].set(value, mode="drop"),
+    )
+    elites = _best(
+        *((state.x, state.value) if plan.elitism else (x, value)), kept, max(plan.elites)
+    )
     proposal, pending = state.proposal, state.pending
     if plan.method == "ce_method":
         proposal = refit.to_elites(proposal, elites)
     else:
         since = _of([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
         seen = _remembered(plan, state, since, at + count)
-        proposal, better, judged = refit.to_model(_key(state, 1), plan, settings, proposal, state.first, elites, seen, _of(plan.chosen, k))
+        proposal, better, judged = refit.to_model(
+            _key(state, 1), plan, settings, proposal, state.first, elites, seen, _of(plan.chosen, k)
+        )
         pending = better[: plan.evaluated]
         state = state._replace(model_x=state.model_x.at[k].set(judged))
     proposals = jax.tree.map(lambda a, b: a.at[k + 1].set(b), state.proposals, proposal)
@@ -144,7 +165,9 @@ def _of(sizes, k):
 
 
 def _best(x, value, count, most):
-    """`Points`: the ``count`` best of finite value, of at most ``most``, best first; the others have weight 0."""
+    """`Points`: the ``count`` best of finite value, of at most ``most``, best first; the others
+    have weight 0.
+    """
     finite = jnp.isfinite(value)
     _, i = lax.top_k(-jnp.where(finite, value, jnp.inf), min(most, len(value)))
     weights = finite[i] & (jnp.arange(len(i), dtype=jnp.int32) < count)
@@ -152,9 +175,13 @@ def _best(x, value, count, most):
 
 
 def _remembered(plan, state, since, until):
-    """What the surrogate is fitted to, (x, values, mask): rows ``since`` to ``until`` of the log, and the best before."""
+    """What the surrogate is fitted to, (x, values, mask): rows ``since`` to ``until`` of the log,
+    and the best before.
+    """
     n, begins = len(state.value), np.cumsum((0, *plan.counts))
-    width = max(begins[i + 1] - begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts)))
+    width = max(
+        begins[i + 1] - begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))
+    )
     rows = since + jnp.arange(width, dtype=jnp.int32)
     mask = rows < until
     if older := min(plan.best, n - width):
@@ -171,18 +198,25 @@ def finish(plan, state):
     finite = jnp.isfinite(state.value)
     value = jnp.where(finite, state.value, jnp.inf)
     order = jnp.arange(len(value), dtype=jnp.int32)
-    place = jnp.argmin(jnp.where(order[None, :] <= jnp.asarray(last, jnp.int32)[:, None], value[None, :], jnp.inf), axis=1)
+    place = jnp.argmin(
+        jnp.where(order[None, :] <= jnp.asarray(last, jnp.int32)[:, None], value[None, :], jnp.inf),
+        axis=1,
+    )
     best = value[place]
     x = jnp.where(jnp.isfinite(best)[:, None], state.x[place], jnp.nan)
     evaluated = order < _of(np.cumsum((0, *plan.counts)), state.k)
     iteration = jnp.asarray(np.repeat(np.arange(len(plan.counts), dtype=np.int32), plan.counts))
     history = History(state.x, state.value, iteration, x, best, state.proposals, state.model_x)
-    return CEResult(state.proposal, x[-1], best[-1], history, jnp.sum(evaluated & ~finite, dtype=jnp.int32))
+    return CEResult(
+        state.proposal, x[-1], best[-1], history, jnp.sum(evaluated & ~finite, dtype=jnp.int32)
+    )
 
 
 @partial(jax.jit, static_argnums=1)
 def run(key, plan, settings, objective, proposal):
-    """All iterations in one program: `CEResult`. ``objective`` is a pytree that is called, [d] -> scalar."""
+    """All iterations in one program: `CEResult`. ``objective`` is a pytree that is called, [d] ->
+    scalar.
+    """
 
     def iterate(state, _):
         x = ask(plan, state)

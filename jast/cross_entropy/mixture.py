@@ -1,4 +1,6 @@
-"""Mixtures of multivariate normal distributions and their fit to weighted samples by expectation maximisation (Bishop 2006, section 9.2)."""
+"""Mixtures of multivariate normal distributions and their fit to weighted samples by expectation
+maximisation (Bishop 2006, section 9.2).
+"""
 
 import operator
 from typing import Any, NamedTuple
@@ -12,11 +14,21 @@ from jax.scipy.special import logsumexp
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
 
-__all__ = ["Mixture", "as_mixture", "em", "log_likelihood", "log_prob", "responsibilities", "sample"]
+__all__ = [
+    "Mixture",
+    "as_mixture",
+    "em",
+    "log_likelihood",
+    "log_prob",
+    "responsibilities",
+    "sample",
+]
 
 
 class Mixture(NamedTuple):
-    """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is positive definite."""
+    """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is
+    positive definite.
+    """
 
     weights: Any
     """[k]"""
@@ -27,16 +39,24 @@ class Mixture(NamedTuple):
 
 
 def as_mixture(proposal):
-    """The `Mixture` with float arrays of one dtype and weights of sum 1. ValueError, naming ``proposal``, for one that is none; of traced parts only shapes."""
+    """The `Mixture` with float arrays of one dtype and weights of sum 1. ValueError, naming
+    ``proposal``, for one that is none; of traced parts only shapes.
+    """
     if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(proposal)):
         weights, means, covariances = (jnp.asarray(v) for v in proposal)
     else:
         dtype = gaussian.float_of(*proposal)
-        weights, means, covariances = (gaussian.numbers("proposal", part, value, dtype) for part, value in zip(Mixture._fields, proposal, strict=True))
-    (k, d) = means.shape if means.ndim == 2 else (0, 0)
+        weights, means, covariances = (
+            gaussian.numbers("proposal", part, value, dtype)
+            for part, value in zip(Mixture._fields, proposal, strict=True)
+        )
+    k, d = means.shape if means.ndim == 2 else (0, 0)
     if not k or not d or weights.shape != (k,) or covariances.shape != (k, d, d):
         received = weights.shape, means.shape, covariances.shape
-        raise ValueError(f"proposal: weights must be [k], means [k, d] and covariances [k, d, d], received shapes {received}")
+        raise ValueError(
+            "proposal: weights must be [k], means [k, d] and covariances [k, d, d], received"
+            f" shapes {received}"
+        )
     if isinstance(means, jax.Array):
         return Mixture(weights, means, covariances)
     if not ((weights >= 0).all() and weights.sum() > 0):
@@ -61,7 +81,9 @@ def log_prob(m, x):
 
 
 def responsibilities(m, x):
-    """[..., k]: with what probability each component made ``x`` [..., d] (Bishop eq. 9.23). Where no density is a number above 0, the weights."""
+    """[..., k]: with what probability each component made ``x`` [..., d] (Bishop eq. 9.23). Where
+    no density is a number above 0, the weights.
+    """
     joint = _log_joint(m, x)
     total = logsumexp(joint, axis=-1, keepdims=True)
     known = jnp.isfinite(total)
@@ -70,7 +92,9 @@ def responsibilities(m, x):
 
 
 def log_likelihood(m, x, weights):
-    """The sum of weights [n] times the log densities at ``x`` [n, d]; a row of weight 0 may hold anything, NaN too. ValueError for shapes that do not fit."""
+    """The sum of weights [n] times the log densities at ``x`` [n, d]; a row of weight 0 may hold
+    anything, NaN too. ValueError for shapes that do not fit.
+    """
     _check("log_likelihood", m, x, weights)
     weights = weights.astype(x.dtype)
     counted = weights > 0
@@ -79,14 +103,18 @@ def log_likelihood(m, x, weights):
 
 
 def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
-    """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted ``weights[i]`` times: a `Mixture` without NaN.
+    """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted
+    ``weights[i]`` times: a `Mixture` without NaN.
 
-    ``iterations``: static. ``regularisation`` is added to the diagonals of the new covariances. A component with a soft count, the sum of its weighted
-    responsibilities, below ``least`` (default d, the rule of R. J. Moss's thesis) keeps its covariance, as does one whose new covariance
-    `gaussian.is_definite` refuses; with a count of 0, or data that are not finite, its mean as well. So weights are multiplicities, not only ratios. With no
-    regularisation no iteration lowers the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
+    ``iterations``: static. ``regularisation`` is added to the diagonals of the new covariances. A
+    component with a soft count, the sum of its weighted responsibilities, below ``least`` (default
+    d, the rule of R. J. Moss's thesis) keeps its covariance, as does one whose new covariance
+    `gaussian.is_definite` refuses; with a count of 0, or data that are not finite, its mean as
+    well. So weights are multiplicities, not only ratios. With no regularisation no iteration lowers
+    the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
 
-    Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0, and a negative regularisation or least (unless traced).
+    Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0,
+    and a negative regularisation or least (unless traced).
     """
     _check("em", m, x, weights)
     try:
@@ -94,16 +122,25 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
     except TypeError:
         steps = -1
     if steps < 0:
-        raise ValueError(f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}")
+        raise ValueError(
+            f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}"
+        )
     least = x.shape[1] if least is None else least
     for name, value in dict(regularisation=regularisation, least=least).items():
         if jnp.shape(value) != () or not (isinstance(value, jax.core.Tracer) or value >= 0):
-            raise ValueError(f"mixture.em: {name} must be a number of at least 0, received {value!r}")
+            raise ValueError(
+                f"mixture.em: {name} must be a number of at least 0, received {value!r}"
+            )
     weights = weights.astype(x.dtype)
     counted = weights > 0
     x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
-    regularisation, least = jnp.asarray(regularisation).astype(x.dtype), jnp.asarray(least).astype(x.dtype)
-    return lax.fori_loop(0, steps, lambda _, m: _iterate(m, x, w, counted, regularisation, least), m)
+    regularisation, least = (
+        jnp.asarray(regularisation).astype(x.dtype),
+        jnp.asarray(least).astype(x.dtype),
+    )
+    return lax.fori_loop(
+        0, steps, lambda _, m: _iterate(m, x, w, counted, regularisation, least), m
+    )
 
 
 def _iterate(m, x, w, counted, regularisation, least):
@@ -115,10 +152,16 @@ def _iterate(m, x, w, counted, regularisation, least):
     r = r / jnp.where(count > 0, count, 1)[None]
     means, covariances = jax.vmap(gaussian.moments, (None, 1))(x, r)  # eq. 9.24, 9.25
     covariances = covariances + regularisation * jnp.eye(d, dtype=x.dtype)[None]
-    moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)  # below, the sums of underflowing numbers are no longer averages
-    spread = moved & (count >= least) & jax.vmap(lambda c, mean: gaussian.is_definite(c, mean, n))(covariances, means)
+    # below, the sums of underflowing numbers are no longer averages
+    moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)
+    spread = (
+        moved
+        & (count >= least)
+        & jax.vmap(lambda c, mean: gaussian.is_definite(c, mean, n))(covariances, means)
+    )
     total = jnp.sum(count)
-    share = jnp.maximum(count / jnp.where(total > 0, total, 1), tiny)  # eq. 9.26; its log stays finite
+    # eq. 9.26; its log stays finite
+    share = jnp.maximum(count / jnp.where(total > 0, total, 1), tiny)
     return Mixture(
         jnp.where(jnp.isfinite(total) & (total > 0), share / jnp.sum(share), m.weights),
         jnp.where(moved[:, None], means, m.means),
@@ -128,7 +171,9 @@ def _iterate(m, x, w, counted, regularisation, least):
 
 def _log_joint(m, x):
     """[..., k]: log of weight times density."""
-    values = jax.vmap(lambda mean, covariance: gaussian.log_prob(Gaussian(mean, covariance), x), out_axes=-1)(m.means, m.covariances)
+    values = jax.vmap(
+        lambda mean, covariance: gaussian.log_prob(Gaussian(mean, covariance), x), out_axes=-1
+    )(m.means, m.covariances)
     return values + jnp.log(m.weights).reshape((1,) * (values.ndim - 1) + (-1,))
 
 
@@ -136,6 +181,12 @@ def _check(function, m, x, weights):
     k, d = m.means.shape if m.means.ndim == 2 else (None, None)
     if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
         received = [a.shape for a in m]
-        raise ValueError(f"mixture.{function}: weights must be [k], means [k, d] and covariances [k, d, d], received {received}")
+        raise ValueError(
+            f"mixture.{function}: weights must be [k], means [k, d] and covariances [k, d, d],"
+            f" received {received}"
+        )
     if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
-        raise ValueError(f"mixture.{function}: x must be [n, {d}] and its weights [n], received {x.shape} and {weights.shape}")
+        raise ValueError(
+            f"mixture.{function}: x must be [n, {d}] and its weights [n], received {x.shape} and"
+            f" {weights.shape}"
+        )

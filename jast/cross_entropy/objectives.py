@@ -1,6 +1,8 @@
-"""Functions to minimise, x [d] -> scalar: sierra, Branin's and Ackley's functions (Kochenderfer and Wheeler 2019, appendix B), a paraboloid.
+"""Functions to minimise, x [d] -> scalar: sierra, Branin's and Ackley's functions (Kochenderfer and
+Wheeler 2019, appendix B), a paraboloid.
 
-Each works in the dtype of x, under jit, vmap and grad, and raises ValueError for an x of another shape.
+Each works in the dtype of x, under jit, vmap and grad, and raises ValueError for an x of another
+shape.
 """
 
 import math
@@ -22,30 +24,42 @@ _PATHS = {  # p of the source; the i-th has covariance i^decay Sigma / eta, so t
 }
 
 
-def sierra(mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0, order="code", log=False):
-    """Less the density at x [2] of 49 Gaussians of equal weight: a mountain range upside down, for optimisers (R. J. Moss's thesis, chapter 2).
+def sierra(
+    mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0, order="code", log=False
+):
+    """Less the density at x [2] of 49 Gaussians of equal weight: a mountain range upside down, for
+    optimisers (R. J. Moss's thesis, chapter 2).
 
-    The central one has covariance I / ``sharpness`` (eta) about ``mean`` (mu). Around it are four corners, (+-spacing, +-spacing) (delta); of each, six
-    components go out both ways, p in (0,0), (1,1), (2,0), (3,1), (0,2), (1,3), to mean + corner +- variance p, the i-th of covariance
-    i^decay variance / sharpness I. ``variance`` is sigma, and the length of a path's step too. ``order="thesis"`` has (3,1) and (0,2) in each other's
-    place, as printed; the default is that of the published code.
+    The central one has covariance I / ``sharpness`` (eta) about ``mean`` (mu). Around it are four
+    corners, (+-spacing, +-spacing) (delta); of each, six components go out both ways, p in (0,0),
+    (1,1), (2,0), (3,1), (0,2), (1,3), to mean + corner +- variance p, the i-th of covariance
+    i^decay variance / sharpness I. ``variance`` is sigma, and the length of a path's step too.
+    ``order="thesis"`` has (3,1) and (0,2) in each other's place, as printed; the default is that of
+    the published code.
 
-    Minima with the default settings: -0.0220023684 at 0 (the next is -0.0154475), or -0.0219510551 with the thesis's order; 17 in all.
+    Minima with the default settings: -0.0220023684 at 0 (the next is -0.0154475), or -0.0219510551
+    with the thesis's order; 17 in all.
 
-    ``log=True`` returns less the log of the density: the same order of values, so the same minima, and it does not underflow. Use it where values are only
-    compared, above all in float32, in which sierra itself is 0 from about 23 away from all its centres.
+    ``log=True`` returns less the log of the density: the same order of values, so the same minima,
+    and it does not underflow. Use it where values are only compared, above all in float32, in which
+    sierra itself is 0 from about 23 away from all its centres.
 
-    The dtype is that of the float arrays given, the wider one, else the default; the value's is that of x.
+    The dtype is that of the float arrays given, the wider one, else the default; the value's is
+    that of x.
 
-    Returns a `jax.tree_util.Partial` that binds the components: the settings are traced, and another sierra is no new program. Every setting but the last two
-    may be traced. Raises ValueError for a mean that is not two finite numbers, a variance or sharpness that is not positive and an unknown order.
+    Returns a `jax.tree_util.Partial` that binds the components: the settings are traced, and
+    another sierra is no new program. Every setting but the last two may be traced. Raises
+    ValueError for a mean that is not two finite numbers, a variance or sharpness that is not
+    positive and an unknown order.
     """
     if order not in _PATHS:
         raise ValueError(f'sierra: order must be "code" or "thesis", received {order!r}')
     if not isinstance(log, bool):
         raise ValueError(f"sierra: log must be True or False, received {log!r}")
     _finite("mean", mean, (2,))
-    for name, value in dict(variance=variance, spacing=spacing, sharpness=sharpness, decay=decay).items():
+    for name, value in dict(
+        variance=variance, spacing=spacing, sharpness=sharpness, decay=decay
+    ).items():
         _finite(name, value, (), positive=name in ("variance", "sharpness"))
     given = (mean, variance, spacing, sharpness, decay)
     dtype = float_of(*given)
@@ -55,7 +69,11 @@ def sierra(mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0,
     paths = jnp.asarray(_PATHS[order][None, :, None], dtype)
     ways = jnp.asarray(np.array([1, -1])[None, None, :, None], dtype)
     around = (spacing * corners + variance * ways * paths).reshape(-1, 2)
-    spread = jnp.broadcast_to(jnp.arange(1, 7, dtype=dtype)[None, :, None] ** decay, (4, 6, 2)).ravel() * variance / sharpness
+    spread = (
+        jnp.broadcast_to(jnp.arange(1, 7, dtype=dtype)[None, :, None] ** decay, (4, 6, 2)).ravel()
+        * variance
+        / sharpness
+    )
     means = jnp.concatenate([mean[None], mean[None] + around])
     variances = jnp.concatenate([1 / sharpness[None], spread])  # Sigma / (sigma eta) = I / eta
     return Partial(_log_sierra if log else _sierra, means, variances)
@@ -71,26 +89,36 @@ def _log_sierra(means, variances, x):
     x = _vector("sierra", x, 2)
     means, variances = means.astype(x.dtype), variances.astype(x.dtype)
     r2 = jnp.sum((x[None] - means) ** 2, axis=1)
-    return math.log(means.shape[0]) - logsumexp(-0.5 * r2 / variances - jnp.log(2 * math.pi * variances))
+    return math.log(means.shape[0]) - logsumexp(
+        -0.5 * r2 / variances - jnp.log(2 * math.pi * variances)
+    )
 
 
 def branin(x):
-    """Branin's function of x [2]: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8 pi)) cos x1 + 10.
+    """Branin's function of x [2]: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8
+    pi)) cos x1 + 10.
 
-    Usually on [-5, 10] x [0, 15]. Three minima of 5 / (4 pi) = 0.397887: (-pi, 12.275), (pi, 2.275) and (3 pi, 2.475).
+    Usually on [-5, 10] x [0, 15]. Three minima of 5 / (4 pi) = 0.397887: (-pi, 12.275), (pi, 2.275)
+    and (3 pi, 2.475).
     """
     x1, x2 = _vector("branin", x, 2)
-    return (x2 - 5.1 / (4 * math.pi**2) * x1**2 + 5 / math.pi * x1 - 6) ** 2 + 10 * (1 - 1 / (8 * math.pi)) * jnp.cos(x1) + 10
+    return (
+        (x2 - 5.1 / (4 * math.pi**2) * x1**2 + 5 / math.pi * x1 - 6) ** 2
+        + 10 * (1 - 1 / (8 * math.pi)) * jnp.cos(x1)
+        + 10
+    )
 
 
 def ackley(x):
     """Ackley's function of x [d]: 20 - 20 exp(-0.2 sqrt(mean x_i^2)) + e - exp(mean cos(2 pi x_i)).
 
-    Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0); a local minimum near every point of whole numbers.
+    Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0); a local
+    minimum near every point of whole numbers.
     """
     x = _vector("ackley", x)
     r2 = jnp.mean(x**2)
-    r = jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1)), 0)  # the square root has no derivative at 0
+    # the square root has no derivative at 0
+    r = jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1)), 0)
     # cos(2 a) - 1 = -2 sin(a)^2 and expm1: no cancellation near the minimum
     return -20 * jnp.expm1(-0.2 * r) - math.e * jnp.expm1(-2 * jnp.mean(jnp.sin(math.pi * x) ** 2))
 
@@ -104,13 +132,22 @@ def _vector(function, x, d=None):
     """``x`` as a vector of floats, of ``d`` numbers where d is given."""
     x = jnp.asarray(x)
     if x.ndim != 1 or x.size == 0 or d not in (None, x.size):
-        raise ValueError(f"{function}: x must be a vector of {d or 'one or more'} numbers, received shape {x.shape}; for more points use jax.vmap")
+        raise ValueError(
+            f"{function}: x must be a vector of {d or 'one or more'} numbers, received shape"
+            f" {x.shape}; for more points use jax.vmap"
+        )
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.zeros(()).dtype)
 
 
 def _finite(name, value, shape, positive=False):
-    """ValueError unless ``value`` is finite, of this shape and, if so wanted, positive; of a traced value only the shape is looked at."""
-    expected = f"{'a positive' if positive else 'a finite'} number" if shape == () else f"{shape[0]} finite numbers"
+    """ValueError unless ``value`` is finite, of this shape and, if so wanted, positive; of a traced
+    value only the shape is looked at.
+    """
+    expected = (
+        f"{'a positive' if positive else 'a finite'} number"
+        if shape == ()
+        else f"{shape[0]} finite numbers"
+    )
     try:
         if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)):
             good = jnp.asarray(value).shape == shape

@@ -1,4 +1,6 @@
-"""How a proposal moves to the elites: those that were truly evaluated, those of the surrogate, and those of short searches on it."""
+"""How a proposal moves to the elites: those that were truly evaluated, those of the surrogate, and
+those of short searches on it.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -35,11 +37,15 @@ def moments(proposal):
     w = proposal.weights / jnp.sum(proposal.weights)
     mean = w @ proposal.means
     z = proposal.means - mean[None]
-    return Gaussian(mean, jnp.einsum("k,kde->de", w, proposal.covariances) + jnp.einsum("k,kd,ke->de", w, z, z))
+    return Gaussian(
+        mean, jnp.einsum("k,kde->de", w, proposal.covariances) + jnp.einsum("k,kd,ke->de", w, z, z)
+    )
 
 
 def to_elites(proposal, elites):
-    """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are too few for a covariance."""
+    """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are
+    too few for a covariance.
+    """
     return gaussian.fit(proposal, elites.x, elites.weights)
 
 
@@ -55,7 +61,9 @@ class Sub(NamedTuple):
 
 
 def search_around(key, model, centres, covariance, samples, elites, iterations):
-    """`Sub`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from N(centre, covariance), for each of ``centres`` [n, d] (Algorithm 4)."""
+    """`Sub`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from N(centre,
+    covariance), for each of ``centres`` [n, d] (Algorithm 4).
+    """
 
     def search(key, centre):
         def iterate(carry, key):
@@ -75,10 +83,12 @@ def search_around(key, model, centres, covariance, samples, elites, iterations):
 
 
 def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
-    """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that the surrogate judged [m, d]).
+    """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that
+    the surrogate judged [m, d]).
 
-    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values, mask) that the surrogate is fitted to; ``chosen``: how
-    many of the judged samples are elites, traced.
+    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values,
+    mask) that the surrogate is fitted to; ``chosen``: how many of the judged samples are elites,
+    traced.
     """
     for_samples, for_searches = jax.random.split(key)
     x, y, mask = seen
@@ -86,7 +96,11 @@ def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
     at = surrogates.frame(x, mask) if plan.frame == "window" else _round(moments(first))
     model = surrogates.fit(plan.surrogate, x, y, mask, at, plan.kernel)
     mean = partial(surrogates.predict, plan.surrogate, model)
-    aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism) if plan.optimistic else mean
+    aim = (
+        partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)
+        if plan.optimistic
+        else mean
+    )
 
     judged = draw(for_samples, proposal, plan.judged)  # Algorithm 3
     _, i = lax.top_k(-mean(judged), max(plan.chosen))
@@ -94,27 +108,46 @@ def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
 
     spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
     sub = search_around(for_searches, aim, elites.x, spread, *plan.sub)
-    everything = (jnp.concatenate(part) for part in zip(elites, model_elites, (sub.x, elites.weights), strict=True))
+    everything = (
+        jnp.concatenate(part)
+        for part in zip(elites, model_elites, (sub.x, elites.weights), strict=True)
+    )
     together = Points(*everything)  # Algorithm 2: true, model and sub-elites
     best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
     if isinstance(proposal, Gaussian):
         return to_elites(proposal, together), sub.x[best], judged
-    return _to_components(plan, settings, proposal, elites, sub, spread, together), sub.x[best], judged
+    return (
+        _to_components(plan, settings, proposal, elites, sub, spread, together),
+        sub.x[best],
+        judged,
+    )
 
 
 def _to_components(plan, settings, proposal, elites, sub, spread, together):
-    """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of them."""
+    """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of
+    them.
+    """
     k = plan.components
     there = elites.weights[:k]
     weights = there / jnp.maximum(jnp.sum(there), 1)
     means, covariances = (
-        (sub.fitted.mean[:k], sub.fitted.covariance[:k]) if plan.start == "searches" else (elites.x[:k], jnp.broadcast_to(spread[None], (k, *spread.shape)))
+        (sub.fitted.mean[:k], sub.fitted.covariance[:k])
+        if plan.start == "searches"
+        else (elites.x[:k], jnp.broadcast_to(spread[None], (k, *spread.shape)))
     )
-    new = mixture.em(Mixture(weights, means, covariances), *together, iterations=plan.em_iterations, regularisation=settings.regularisation)
+    new = mixture.em(
+        Mixture(weights, means, covariances),
+        *together,
+        iterations=plan.em_iterations,
+        regularisation=settings.regularisation,
+    )
     return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
 
 
 def _round(proposal):
     """The frame of one scale for all coordinates: the root of the mean variance."""
     d = proposal.mean.size
-    return surrogates.Frame(proposal.mean, jnp.sqrt(jnp.trace(proposal.covariance) / d) * jnp.eye(d, dtype=proposal.mean.dtype))
+    return surrogates.Frame(
+        proposal.mean,
+        jnp.sqrt(jnp.trace(proposal.covariance) / d) * jnp.eye(d, dtype=proposal.mean.dtype),
+    )

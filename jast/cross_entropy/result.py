@@ -8,7 +8,9 @@ __all__ = ["CEResult", "History", "Scores", "scores"]
 
 
 class History(NamedTuple):
-    """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand together, in order."""
+    """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand
+    together, in order.
+    """
 
     x: Any
     """[n, d]: every point that was truly evaluated, in order"""
@@ -21,7 +23,8 @@ class History(NamedTuple):
     best_value: Any
     """[K]; inf while no value was finite"""
     proposals: Any
-    """A `Gaussian` or a `Mixture` with a leading axis [K + 1]: that of each iteration, and the last"""
+    """A `Gaussian` or a `Mixture` with a leading axis [K + 1]: that of each iteration, and the last
+    """
     model_x: Any
     """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
@@ -47,14 +50,30 @@ class CEResult(NamedTuple):
         if value.ndim == 0:
             done = ~np.isnan(self.history.x).any(axis=1)  # of a search that is not at its end
             evaluations = np.cumsum(np.bincount(self.history.iteration[done]))
-            rows = zip(evaluations, np.asarray(self.history.best_value), np.asarray(self.history.best_x), strict=False)
-            table = "\n".join(f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}" for i, (evaluations, b, x) in enumerate(rows, 1))
+            rows = zip(
+                evaluations,
+                np.asarray(self.history.best_value),
+                np.asarray(self.history.best_x),
+                strict=False,
+            )
+            table = "\n".join(
+                f"{i:9d} {evaluations:11d} {b:14.6g}   {_point(x)}"
+                for i, (evaluations, b, x) in enumerate(rows, 1)
+            )
             return f"iteration evaluations  best value   at\n{table}{note}"
         found = value[np.isfinite(value)]
         if found.size < value.size:
-            note += f"\n{value.size - found.size} runs have no finite value, and are left out of the mean"
-        mean = f"{found.mean() if found.size else np.inf:.6g}" + (f" +- {found.std(ddof=1) / np.sqrt(found.size):.2g}" if found.size > 1 else "")
-        return f"{value.size} runs of {n} evaluations: best value {mean} (mean and its standard error), the best of them {value.min():.6g}{note}"
+            note += (
+                f"\n{value.size - found.size} runs have no finite value, and are left out of the"
+                " mean"
+            )
+        mean = f"{found.mean() if found.size else np.inf:.6g}" + (
+            f" +- {found.std(ddof=1) / np.sqrt(found.size):.2g}" if found.size > 1 else ""
+        )
+        return (
+            f"{value.size} runs of {n} evaluations: best value {mean} (mean and its standard"
+            f" error), the best of them {value.min():.6g}{note}"
+        )
 
 
 def _point(x):
@@ -63,7 +82,9 @@ def _point(x):
 
 
 class Scores(NamedTuple):
-    """Of several runs, the means over them; distances are Euclidean, from the best point to the optimum."""
+    """Of several runs, the means over them; distances are Euclidean, from the best point to the
+    optimum.
+    """
 
     best_value: Any
     """b_v"""
@@ -73,22 +94,34 @@ class Scores(NamedTuple):
     rms_distance: Any
     """Root of the mean squared distance"""
     frobenius: Any
-    """sqrt(50) times ``rms_distance``: the size of the 2 x 50 matrix of errors of 50 runs, which the thesis's b_d most likely is"""
+    """sqrt(50) times ``rms_distance``: the size of the 2 x 50 matrix of errors of 50 runs, which
+    the thesis's b_d most likely is
+    """
 
 
 def scores(result, optimum):
-    """The `Scores` of a batch of runs, a `CEResult` with a leading axis [runs], after each iteration: arrays [K], the last of which is the outcome.
+    """The `Scores` of a batch of runs, a `CEResult` with a leading axis [runs], after each
+    iteration: arrays [K], the last of which is the outcome.
 
-    ``optimum`` [d]: where the objective is least. On the host. ValueError for a result of one run, and an optimum of another dimension.
+    ``optimum`` [d]: where the objective is least. On the host. ValueError for a result of one run,
+    and an optimum of another dimension.
     """
-    x, value = np.asarray(result.history.best_x, float), np.asarray(result.history.best_value, float)
+    x, value = (
+        np.asarray(result.history.best_x, float),
+        np.asarray(result.history.best_value, float),
+    )
     if x.ndim != 3:
-        raise ValueError(f"scores: result must be a batch of runs, its history.best_x [runs, iterations, d], received {x.shape}")
+        raise ValueError(
+            "scores: result must be a batch of runs, its history.best_x [runs, iterations, d],"
+            f" received {x.shape}"
+        )
     optimum = np.asarray(optimum, float)
     if optimum.shape != x.shape[2:]:
         raise ValueError(f"scores: optimum must be [{x.shape[2]}], received shape {optimum.shape}")
     runs = len(x)
     distance = np.sqrt(np.sum((x - optimum) ** 2, axis=2))
-    error = value.std(axis=0, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(value.shape[1], np.nan)
+    error = (
+        value.std(axis=0, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(value.shape[1], np.nan)
+    )
     rms = np.sqrt(np.mean(distance**2, axis=0))
     return Scores(value.mean(axis=0), error, distance.mean(axis=0), rms, np.sqrt(50) * rms)

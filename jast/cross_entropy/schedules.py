@@ -1,7 +1,8 @@
 """Evaluation schedules: how many samples each iteration gets of a budget.
 
-A schedule is a function ``(budget, iterations) -> counts``, a tuple of ``iterations`` whole numbers that sum to ``budget``; a user's own may be given as well.
-Sizes are static: they are worked out on the host.
+A schedule is a function ``(budget, iterations) -> counts``, a tuple of ``iterations`` whole numbers
+that sum to ``budget``; a user's own may be given as well. Sizes are static: they are worked out on
+the host.
 """
 
 import math
@@ -23,22 +24,27 @@ def uniform():
 
 
 def geometric(p=0.1, normaliser="before"):
-    """Most in the first iteration, and ever fewer: floor(budget pmf(k)) in iteration k = 1 .. K - 1, the rest in the last (R. J. Moss's thesis, Algorithm 6).
+    """Most in the first iteration, and ever fewer: floor(budget pmf(k)) in iteration k = 1 .. K -
+    1, the rest in the last (R. J. Moss's thesis, Algorithm 6).
 
-    pmf(k) is proportional to p (1 - p)^k and sums to one over 1 .. K with ``normaliser="before"``, over 0 .. K with "after": a truncated geometric
-    distribution by Distributions.jl before and after 2021-08-27. "After" leaves the share of k = 0 to the last iteration, which then gets most of all.
-    Raises ValueError for a p that is not between 0 and 1 and an unknown normaliser.
+    pmf(k) is proportional to p (1 - p)^k and sums to one over 1 .. K with ``normaliser="before"``,
+    over 0 .. K with "after": a truncated geometric distribution by Distributions.jl before and
+    after 2021-08-27. "After" leaves the share of k = 0 to the last iteration, which then gets most
+    of all. Raises ValueError for a p that is not between 0 and 1 and an unknown normaliser.
     """
     if isinstance(p, bool) or not isinstance(p, int | float) or not 0 < p < 1:
         raise ValueError(f"geometric: p must be a number between 0 and 1, received {p!r}")
     if normaliser not in ("before", "after"):
-        raise ValueError(f'geometric: normaliser must be "before" or "after", received {normaliser!r}')
+        raise ValueError(
+            f'geometric: normaliser must be "before" or "after", received {normaliser!r}'
+        )
 
     def schedule(budget, iterations):
         mass = [p * (1 - p) ** k for k in range(iterations + 1)]
         total = math.fsum(mass[1:] if normaliser == "before" else mass)
-        # A share that is a whole number may come out just below it. The source gives the last iteration min(N - the others, N - its own floor), which is
-        # the rest, save for one iteration alone, where it would be less
+        # A share that is a whole number may come out just below it. The source gives the last
+        # iteration min(N - the others, N - its own floor), which is the rest, save for one
+        # iteration alone, where it would be less
         first = [math.floor(budget * share / total + 1e-9) for share in mass[1:iterations]]
         return (*first, budget - sum(first))
 
@@ -46,12 +52,17 @@ def geometric(p=0.1, normaliser="before"):
 
 
 def manual(counts):
-    """These very ``counts``; ValueError when they are not as many as the iterations, or do not sum to the budget. That of the source: 20, 15, 9, 8 x 7."""
+    """These very ``counts``; ValueError when they are not as many as the iterations, or do not sum
+    to the budget. That of the source: 20, 15, 9, 8 x 7.
+    """
     sizes = _whole(counts)
 
     def schedule(budget, iterations):
         if (len(sizes), sum(sizes)) != (iterations, budget):
-            raise ValueError(f"schedule: expected {iterations} counts that sum to {budget}, received {len(sizes)} that sum to {sum(sizes)}: {sizes}")
+            raise ValueError(
+                f"schedule: expected {iterations} counts that sum to {budget}, received"
+                f" {len(sizes)} that sum to {sum(sizes)}: {sizes}"
+            )
         return sizes
 
     return schedule
@@ -60,25 +71,38 @@ def manual(counts):
 def counts(schedule, samples, iterations):
     """How many samples each iteration gets, a tuple of ints, by what a user gives as ``schedule``.
 
-    None or "uniform": ``samples`` in each of ``iterations``. A function, such as `geometric` returns: what it makes of ``samples * iterations`` and
-    ``iterations``, which must sum to that budget. A sequence of counts: these, whatever ``samples`` and ``iterations`` are. A count may be 0, not all of them.
-    Raises ValueError, naming ``samples``, ``iterations`` or ``schedule``.
+    None or "uniform": ``samples`` in each of ``iterations``. A function, such as `geometric`
+    returns: what it makes of ``samples * iterations`` and ``iterations``, which must sum to that
+    budget. A sequence of counts: these, whatever ``samples`` and ``iterations`` are. A count may be
+    0, not all of them. Raises ValueError, naming ``samples``, ``iterations`` or ``schedule``.
     """
     if not callable(schedule) and not isinstance(schedule, str) and schedule is not None:
         return _whole(schedule)
-    samples, iterations = whole("schedule", "samples", samples), whole("schedule", "iterations", iterations)
+    samples, iterations = (
+        whole("schedule", "samples", samples),
+        whole("schedule", "iterations", iterations),
+    )
     if schedule is None or (isinstance(schedule, str) and schedule == "uniform"):
         return (samples,) * iterations
     if isinstance(schedule, str):
-        raise ValueError(f'schedule: expected None, "uniform", a function (budget, iterations) -> counts, or a sequence of counts, received {schedule!r}')
+        raise ValueError(
+            'schedule: expected None, "uniform", a function (budget, iterations) -> counts, or a'
+            f" sequence of counts, received {schedule!r}"
+        )
     budget = samples * iterations
     try:
         sizes = schedule(budget, iterations)
     except TypeError as error:
-        raise ValueError(f"schedule: expected a function (budget, iterations) -> counts, received {schedule!r}, which raised: {error}") from error
+        raise ValueError(
+            f"schedule: expected a function (budget, iterations) -> counts, received {schedule!r},"
+            f" which raised: {error}"
+        ) from error
     sizes = _whole(sizes)
     if (len(sizes), sum(sizes)) != (iterations, budget):
-        raise ValueError(f"schedule: expected {iterations} counts that sum to the budget {budget}, received {len(sizes)} that sum to {sum(sizes)}: {sizes}")
+        raise ValueError(
+            f"schedule: expected {iterations} counts that sum to the budget {budget}, received"
+            f" {len(sizes)} that sum to {sum(sizes)}: {sizes}"
+        )
     return sizes
 
 
@@ -87,9 +111,16 @@ def _whole(values):
     try:
         values = tuple(values)
         sizes = tuple(operator.index(v) for v in values)
-        good = not any(isinstance(v, bool) for v in values) and min(sizes, default=-1) >= 0 and sum(sizes) > 0
+        good = (
+            not any(isinstance(v, bool) for v in values)
+            and min(sizes, default=-1) >= 0
+            and sum(sizes) > 0
+        )
     except TypeError:
         good = False
     if not good:
-        raise ValueError(f"schedule: counts must be whole numbers of at least 0, and not all 0, received {values!r}")
+        raise ValueError(
+            "schedule: counts must be whole numbers of at least 0, and not all 0, received"
+            f" {values!r}"
+        )
     return sizes

@@ -18,8 +18,30 @@ from jast.rewards import as_pytree
 __all__ = ["MODES", "checked", "settled"]
 
 _MODEL = dict(surrogate="gaussian process", kernel="squared exponential", alpha=1.0)
-_THESIS = dict(elitism=False, memory=3, best=0, evaluated=0.0, current=False, warp="raw", frame="initial", optimism=0.0, selection="elites", **_MODEL)
-_DEFAULT = dict(elitism=True, memory=3, best=10, evaluated=0.1, current=True, warp="rank", frame="window", optimism=1.0, selection="dimension", **_MODEL)
+_THESIS = dict(
+    elitism=False,
+    memory=3,
+    best=0,
+    evaluated=0.0,
+    current=False,
+    warp="raw",
+    frame="initial",
+    optimism=0.0,
+    selection="elites",
+    **_MODEL,
+)
+_DEFAULT = dict(
+    elitism=True,
+    memory=3,
+    best=10,
+    evaluated=0.1,
+    current=True,
+    warp="rank",
+    frame="window",
+    optimism=1.0,
+    selection="dimension",
+    **_MODEL,
+)
 MODES = {
     "ce_method": {"thesis": dict(elitism=False), "default": dict(elitism=True)},
     "ce_surrogate": {"thesis": _THESIS, "default": _DEFAULT},
@@ -31,53 +53,100 @@ MODES = {
 """What each method does where the user does not say; no ``components``: as many as elites."""
 
 
-def settled(method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, **given):
-    """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the mode's serves. Raises ValueError, as the methods say."""
+def settled(
+    method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, **given
+):
+    """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the
+    mode's serves. Raises ValueError, as the methods say.
+    """
     if mode not in list(MODES[method]):
-        raise ValueError(f"{method}: mode must be one of {sorted(MODES[method])}, received {mode!r}")
+        raise ValueError(
+            f"{method}: mode must be one of {sorted(MODES[method])}, received {mode!r}"
+        )
     if unknown := sorted(set(given) - set(MODES[method][mode])):
-        raise ValueError(f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}")
-    chosen = {name: value if given.get(name) is None else given[name] for name, value in MODES[method][mode].items()}
+        raise ValueError(
+            f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}"
+        )
+    chosen = {
+        name: value if given.get(name) is None else given[name]
+        for name, value in MODES[method][mode].items()
+    }
     sizes = counts(schedule, samples, iterations)
     mean_size = max(1, round(sum(sizes) / len(sizes)))
     sizes = tuple(n for n in sizes if n)  # an iteration without evaluations teaches nothing
     elites = whole(method, "elites", elites, 1)
     if elites > max(sizes):
-        raise ValueError(f"{method}: elites must be at most the samples of an iteration, {max(sizes)}, received {elites}")
+        raise ValueError(
+            f"{method}: elites must be at most the samples of an iteration, {max(sizes)}, received"
+            f" {elites}"
+        )
     kept = [min(elites, n) for n in sizes]
     if ratchet:
         kept = [min(kept[: i + 1]) for i in range(len(kept))]
-    for name, allowed in dict(surrogate=SURROGATES, kernel=KERNELS, warp=WARPS, frame=("initial", "window"), start=("elites", "searches")).items():
+    for name, allowed in dict(
+        surrogate=SURROGATES,
+        kernel=KERNELS,
+        warp=WARPS,
+        frame=("initial", "window"),
+        start=("elites", "searches"),
+    ).items():
         if name in chosen and chosen[name] not in allowed:
-            raise ValueError(f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}")
-    for name, value in dict(elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet).items():
+            raise ValueError(
+                f"{method}: {name} must be one of {list(allowed)}, received {chosen[name]!r}"
+            )
+    for name, value in dict(
+        elitism=chosen["elitism"], current=chosen.get("current", False), ratchet=ratchet
+    ).items():
         if not isinstance(value, bool):
             raise ValueError(f"{method}: {name} must be True or False, received {value!r}")
     given_optimism = chosen.get("optimism", 0.0)
-    positive, other = (lambda v: 0 < v < math.inf, "above 0"), (lambda v: 0 <= v < math.inf, "of at least 0")
+    positive, other = (
+        (lambda v: 0 < v < math.inf, "above 0"),
+        (lambda v: 0 <= v < math.inf, "of at least 0"),
+    )
     numbers = [
         real(method, name, chosen.pop(name, default), *check)
-        for name, default, check in (("alpha", 1.0, positive), ("optimism", 0.0, other), ("regularisation", 0.0, other))
+        for name, default, check in (
+            ("alpha", 1.0, positive),
+            ("optimism", 0.0, other),
+            ("regularisation", 0.0, other),
+        )
     ]
     if method == "ce_mixture":
-        proposal = _mixture(method, proposal, max(kept), chosen["components"], given.get("components"))
+        proposal = _mixture(
+            method, proposal, max(kept), chosen["components"], given.get("components")
+        )
         chosen["components"] = len(proposal.weights)
     else:
         proposal = as_gaussian(proposal)
     mean = jax.tree.leaves(proposal)[-2]
     if method != "ce_method":
-        chosen |= _model(method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1])
+        chosen |= _model(
+            method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1]
+        )
     settings = Settings(*(value.astype(mean.dtype) for value in numbers))
-    return Plan(method, sizes, tuple(kept), **{name: value for name, value in chosen.items() if name != "selection"}), settings, proposal
+    return (
+        Plan(
+            method,
+            sizes,
+            tuple(kept),
+            **{name: value for name, value in chosen.items() if name != "selection"},
+        ),
+        settings,
+        proposal,
+    )
 
 
 def _model(method, chosen, optimism, most, each, kept, d):
-    """The static settings of a surrogate, as `Plan` has them; ``most``, ``each``: the evaluations of the largest and of the mean iteration."""
+    """The static settings of a surrogate, as `Plan` has them; ``most``, ``each``: the evaluations
+    of the largest and of the mean iteration.
+    """
     share = chosen["evaluated"]
     if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= share <= 0.5:
         raise ValueError(f"{method}: evaluated must be a share from 0 to 0.5, received {share!r}")
     judged = 10 * each
-    fewest, elites = min(2 * d, judged), max(10, 2 * d)  # a covariance needs more than d points; up to five dimensions the published numbers
+    # a covariance needs more than d points; up to five dimensions the published numbers
+    fewest, elites = min(2 * d, judged), max(10, 2 * d)
     return dict(
         evaluated=min(math.ceil(round(float(share) * most, 9)), max(kept), most // 2),
         memory=whole(method, "memory", chosen["memory"], 1),
@@ -85,7 +154,10 @@ def _model(method, chosen, optimism, most, each, kept, d):
         optimistic=isinstance(optimism, jax.core.Tracer) or bool(optimism != 0),
         judged=judged,
         sub=(10 * elites, elites, 2),
-        chosen=tuple(max(fewest, round(s * judged)) for s in _selection(method, chosen["selection"], each, kept, d)),
+        chosen=tuple(
+            max(fewest, round(s * judged))
+            for s in _selection(method, chosen["selection"], each, kept, d)
+        ),
         kernel=chosen["kernel"] if chosen["surrogate"] == "gaussian process" else "",
     )
 
@@ -93,26 +165,44 @@ def _model(method, chosen, optimism, most, each, kept, d):
 def checked(method, objective, d, dtype):
     """``objective`` as a pytree, once it is a function [d] -> scalar that JAX can trace."""
     if not callable(objective):
-        raise ValueError(f"{method}: objective must be a function x [{d}] -> scalar, received {objective!r}")
+        raise ValueError(
+            f"{method}: objective must be a function x [{d}] -> scalar, received {objective!r}"
+        )
     objective = as_pytree(objective)
     try:
         out = jax.eval_shape(objective, jax.ShapeDtypeStruct((d,), dtype))
     except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
-        raise ValueError(f"{method}: objective must be written in JAX; for any other program use start, ask and tell. It raised: {error}") from error
-    if not isinstance(out, jax.ShapeDtypeStruct) or out.shape != () or out.dtype == bool or jnp.issubdtype(out.dtype, jnp.complexfloating):
-        raise ValueError(f"{method}: objective must return one real number for x of shape ({d},), it returns {out}")
+        raise ValueError(
+            f"{method}: objective must be written in JAX; for any other program use start, ask and"
+            f" tell. It raised: {error}"
+        ) from error
+    if (
+        not isinstance(out, jax.ShapeDtypeStruct)
+        or out.shape != ()
+        or out.dtype == bool
+        or jnp.issubdtype(out.dtype, jnp.complexfloating)
+    ):
+        raise ValueError(
+            f"{method}: objective must return one real number for x of shape ({d},), it returns"
+            f" {out}"
+        )
     return objective
 
 
 def _selection(method, given, each, kept, d):
-    """The share of judged samples that are elites, in each iteration: a number, that of the evaluated ones, or at most one in d (`_model` takes 2 d at least).
+    """The share of judged samples that are elites, in each iteration: a number, that of the
+    evaluated ones, or at most one in d (`_model` takes 2 d at least).
 
-    One in d, as a share s shrinks a Gaussian of d dimensions by about s^(1/d) a side: with half of the samples, ten dimensions would halve in ten iterations.
+    One in d, as a share s shrinks a Gaussian of d dimensions by about s^(1/d) a side: with half of
+    the samples, ten dimensions would halve in ten iterations.
     """
     if given in ("elites", "dimension"):
         return [min(e / each, 1.0 if given == "elites" else 1 / d) for e in kept]
     if isinstance(given, bool) or not isinstance(given, Real) or not 0 < given <= 1:
-        raise ValueError(f'{method}: selection must be "elites", "dimension", or a share above 0, at most 1, received {given!r}')
+        raise ValueError(
+            f'{method}: selection must be "elites", "dimension", or a share above 0, at most 1,'
+            f" received {given!r}"
+        )
     return [given] * len(kept)
 
 
@@ -122,12 +212,25 @@ def _mixture(method, proposal, elites, components, asked):
         proposal = as_mixture(proposal)
         k = len(proposal.weights)
         if asked not in (None, k):
-            raise ValueError(f"{method}: components must be those of the proposal, {k}, received {asked!r}")
+            raise ValueError(
+                f"{method}: components must be those of the proposal, {k}, received {asked!r}"
+            )
     else:
         g = as_gaussian(proposal)
-        k = whole(method, "components", asked, 1) if asked is not None else min(components or elites, elites)
+        k = (
+            whole(method, "components", asked, 1)
+            if asked is not None
+            else min(components or elites, elites)
+        )
         d = g.mean.size
-        proposal = Mixture(jnp.full((k,), 1 / k, g.mean.dtype), jnp.broadcast_to(g.mean[None], (k, d)), jnp.broadcast_to(g.covariance[None], (k, d, d)))
+        proposal = Mixture(
+            jnp.full((k,), 1 / k, g.mean.dtype),
+            jnp.broadcast_to(g.mean[None], (k, d)),
+            jnp.broadcast_to(g.covariance[None], (k, d, d)),
+        )
     if k > elites:
-        raise ValueError(f"{method}: components must be at most the elites, {elites}, as each begins at one, received {k}")
+        raise ValueError(
+            f"{method}: components must be at most the elites, {elites}, as each begins at one,"
+            f" received {k}"
+        )
     return proposal

@@ -1,4 +1,6 @@
-"""Stress testing as a function of a vector to minimise: the bridge from a simulator to the cross-entropy methods."""
+"""Stress testing as a function of a vector to minimise: the bridge from a simulator to the
+cross-entropy methods.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -44,61 +46,83 @@ class Stress:
 
     @property
     def objective(self):
-        """z [D] -> scalar, to be minimised: a `jax.tree_util.Partial`. NaN where the episode's numbers are not finite."""
+        """z [D] -> scalar, to be minimised: a `jax.tree_util.Partial`. NaN where the episode's
+        numbers are not finite.
+        """
         return Partial(_value, self.sim, self.reward, self.actions)
 
     @property
     def proposal(self):
-        """N(0, I) over z [D], the `Gaussian` to begin with: under it disturbances are draws of the model, or uniform in the box."""
+        """N(0, I) over z [D], the `Gaussian` to begin with: under it disturbances are draws of the
+        model, or uniform in the box.
+        """
         z, _ = _flat(self.sim)
         return normal(jnp.zeros_like(z), 1)
 
     def episode(self, z):
-        """The `jast.Episode` at the point ``z`` [D], replayed, with its states. ValueError for another shape."""
+        """The `jast.Episode` at the point ``z`` [D], replayed, with its states. ValueError for
+        another shape.
+        """
         return rollout(jax.random.key(0), self.sim, _policy(self.sim, self.actions, z), self.reward)
 
     def failures(self, result, top=64):
-        """The ``top`` best distinct failures among all points that ``result``, a `CEResult`, evaluated: `jast.failures.Failures`, each replayed.
+        """The ``top`` best distinct failures among all points that ``result``, a `CEResult`,
+        evaluated: `jast.failures.Failures`, each replayed.
 
-        Ranked by the reward, or where none was given by likelihood, as by the objective. ``simulation`` is the number of the evaluation, from 0; of a batch
-        of runs (a leading axis), ``tree`` is the run. On the host. ValueError for points of another dimension.
+        Ranked by the reward, or where none was given by likelihood, as by the objective.
+        ``simulation`` is the number of the evaluation, from 0; of a batch of runs (a leading axis),
+        ``tree`` is the run. On the host. ValueError for points of another dimension.
         """
         x = np.asarray(result.history.x)
         rows = x.reshape(-1, x.shape[-1])
-        known = np.flatnonzero(np.isfinite(rows).all(axis=1))  # a search that goes on has rows to come
+        # a search that goes on has rows to come
+        known = np.flatnonzero(np.isfinite(rows).all(axis=1))
         if not known.size:
             return archive.empty(self.sim)
         episodes = jax.device_get(_episodes(self.sim, self.reward, self.actions, jnp.asarray(rows)))
         failing = known[episodes.failure[known] & np.isfinite(episodes.reward[known])]
         kept = jax.tree.map(lambda a: a[failing], episodes)
-        return archive.collect(self.sim, self.reward, kept, failing // x.shape[-2], failing % x.shape[-2], top=top)
+        return archive.collect(
+            self.sim, self.reward, kept, failing // x.shape[-2], failing % x.shape[-2], top=top
+        )
 
 
 def over(sim, *, reward=None, actions=None):
-    """The search for failures of ``sim`` as a minimisation: `Stress`, with ``objective`` and ``proposal`` for the methods of `jast.cross_entropy`.
+    """The search for failures of ``sim`` as a minimisation: `Stress`, with ``objective`` and
+    ``proposal`` for the methods of `jast.cross_entropy`.
 
-        stress = over(sim)
-        result = ce_surrogate(key, stress.objective, stress.proposal, samples=100, elites=30, iterations=10)
-        print(stress.failures(result))
+        stress = over(sim) result = ce_surrogate(key, stress.objective, stress.proposal,
+        samples=100, elites=30, iterations=10) print(stress.failures(result))
 
-    A point z [D] holds normal numbers: first those of x0, where the start is random, then those of x_1 .. x_horizon; D is ``stress.proposal.mean.size``.
-    Each x_t is the quantile of p(x | s) at Phi(z_t) (``actions.quantiles()``, the default), or that point of a box (``actions.uniform(low, high)``; a start
-    is never of the box). A Gaussian needs more elites than D for its covariance; with tens of dimensions and few evaluations that of `ce_method` collapses
-    before a failure is found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
+    A point z [D] holds normal numbers: first those of x0, where the start is random, then those of
+    x_1 .. x_horizon; D is ``stress.proposal.mean.size``. Each x_t is the quantile of p(x | s) at
+    Phi(z_t) (``actions.quantiles()``, the default), or that point of a box (``actions.uniform(low,
+    high)``; a start is never of the box). A Gaussian needs more elites than D for its covariance;
+    with tens of dimensions and few evaluations that of `ce_method` collapses before a failure is
+    found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
 
-    Without a ``reward`` the order is lexicographic, whatever the units. An episode that does not fail has its miss distance, at least 0. One that fails has
-    -1 / (1 + c), where c >= 0 is how far its log density is below that of the mode at each of its steps: any failure is below all else, a likelier one below
-    a less likely one. (Where a distribution names no mode, c is less the raw log density, and -1 + c where c < 0, which goes on smoothly.) With a ``reward``
-    (`jast.rewards`) the objective is less the reward. An episode whose numbers are not finite, or that is impossible, has NaN, which a method counts.
+    Without a ``reward`` the order is lexicographic, whatever the units. An episode that does not
+    fail has its miss distance, at least 0. One that fails has -1 / (1 + c), where c >= 0 is how far
+    its log density is below that of the mode at each of its steps: any failure is below all else, a
+    likelier one below a less likely one. (Where a distribution names no mode, c is less the raw log
+    density, and -1 + c where c < 0, which goes on smoothly.) With a ``reward`` (`jast.rewards`) the
+    objective is less the reward. An episode whose numbers are not finite, or that is impossible,
+    has NaN, which a method counts.
 
-    Pure JAX, for `jax.jit`, `jax.vmap` (over simulators too) and ask and tell. Raises ValueError for actions that are neither of the two, a distribution
-    without quantile function where one is needed, and what `jast.check` finds in the simulator's functions by tracing them.
+    Pure JAX, for `jax.jit`, `jax.vmap` (over simulators too) and ask and tell. Raises ValueError
+    for actions that are neither of the two, a distribution without quantile function where one is
+    needed, and what `jast.check` finds in the simulator's functions by tracing them.
     """
     if reward is not None and not callable(reward):
-        raise ValueError(f"over: reward must be a function, one of jast.rewards or yours, received {reward!r}")
+        raise ValueError(
+            f"over: reward must be a function, one of jast.rewards or yours, received {reward!r}"
+        )
     actions = choices.quantiles() if actions is None else actions
     if not isinstance(actions, choices.Quantiles | choices.UniformBox):
-        raise ValueError(f"over: actions must be jast.actions.quantiles() or uniform(low, high), received {actions!r}")
+        raise ValueError(
+            "over: actions must be jast.actions.quantiles() or uniform(low, high), received"
+            f" {actions!r}"
+        )
     contract(sim, observed=False)
     found = {}
 
@@ -106,14 +130,25 @@ def over(sim, *, reward=None, actions=None):
         start = sim.start()
         dist = sim.disturbance(sim.init(D.sample(start, jax.random.key(0))))
         found["mode"] = D.has_mode(start) and D.has_mode(dist)
-        for name, d, other in (("start", start, ""), ("disturbance", dist, "; give actions=jast.actions.uniform(low, high)")):
-            needed = random_start(sim) if name == "start" else isinstance(actions, choices.Quantiles)
+        for name, d, other in (
+            ("start", start, ""),
+            ("disturbance", dist, "; give actions=jast.actions.uniform(low, high)"),
+        ):
+            needed = (
+                random_start(sim) if name == "start" else isinstance(actions, choices.Quantiles)
+            )
             if needed and not D.has_quantile(d):
-                raise ValueError(f"over: {name}: {_without_quantile(d)} has no quantile function{other}")
+                raise ValueError(
+                    f"over: {name}: {_without_quantile(d)} has no quantile function{other}"
+                )
 
     jax.eval_shape(look)
     contract(sim, actions, observed=False)
-    return Stress(sim, LogLikelihood("mode" if found["mode"] else "raw") if reward is None else as_pytree(reward), actions)
+    return Stress(
+        sim,
+        LogLikelihood("mode" if found["mode"] else "raw") if reward is None else as_pytree(reward),
+        actions,
+    )
 
 
 def _value(sim, reward, actions, z):
@@ -129,7 +164,9 @@ def _value(sim, reward, actions, z):
 
 @jax.jit
 def _episodes(sim, reward, actions, rows):
-    play = lambda z: rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)._replace(states=None)
+    play = lambda z: rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)._replace(
+        states=None
+    )
     return jax.vmap(play)(rows)
 
 
@@ -143,9 +180,13 @@ def _policy(sim, actions, z):
 
 
 def _flat(sim):
-    """Zeros [D], in the widest float dtype of x0 and x, and the function from a point to the latents (of x0, of x [horizon, ...])."""
+    """Zeros [D], in the widest float dtype of x0 and x, and the function from a point to the
+    latents (of x0, of x [horizon, ...]).
+    """
     x0, x = jax.eval_shape(_shapes, sim)
-    full = lambda like, *rows: jax.tree.map(lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like)
+    full = lambda like, *rows: jax.tree.map(
+        lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like
+    )
     return ravel_pytree((full(x0), full(x, sim.horizon)))
 
 
@@ -154,4 +195,8 @@ def _without_quantile(dist):
     if isinstance(dist, D.Joint):
         parts = jax.tree.leaves(dist.distributions, is_leaf=lambda d: isinstance(d, D.Distribution))
         return _without_quantile(next(d for d in parts if not D.has_quantile(d)))
-    return _without_quantile(dist.distribution) if isinstance(dist, D.Independent) else type(dist).__name__
+    return (
+        _without_quantile(dist.distribution)
+        if isinstance(dist, D.Independent)
+        else type(dist).__name__
+    )

@@ -1,6 +1,8 @@
-"""Cheap models of an objective, fitted to the masked points that were truly evaluated: a Gaussian process, or least squares on a few basis functions.
+"""Cheap models of an objective, fitted to the masked points that were truly evaluated: a Gaussian
+process, or least squares on a few basis functions.
 
-Points are centred and scaled first, and values may be warped. What is predicted is only good for ranking points, which is all that a cross-entropy method does.
+Points are centred and scaled first, and values may be warped. What is predicted is only good for
+ranking points, which is all that a cross-entropy method does.
 """
 
 from itertools import combinations_with_replacement
@@ -48,12 +50,19 @@ def _linear(x, centres, mask):
 
 
 def _quadratic(x, centres, mask):
-    pairs = [x[:, i : i + 1] * x[:, j : j + 1] for i, j in combinations_with_replacement(range(x.shape[1]), 2)]
+    pairs = [
+        x[:, i : i + 1] * x[:, j : j + 1]
+        for i, j in combinations_with_replacement(range(x.shape[1]), 2)
+    ]
     return jnp.concatenate([_linear(x, centres, mask), *pairs], axis=1)
 
 
 def _radial(x, centres, mask):
-    return jnp.where(mask[None, :], jnp.exp(-0.5 * gaussian_process.squared_distances(x, centres) / x.shape[1]), 0)
+    return jnp.where(
+        mask[None, :],
+        jnp.exp(-0.5 * gaussian_process.squared_distances(x, centres) / x.shape[1]),
+        0,
+    )
 
 
 BASES = {"linear": _linear, "polynomial": _quadratic, "radial basis": _radial}
@@ -74,7 +83,9 @@ def _standard(y, mask):
 
 
 def _rank(y, mask):
-    """Normal scores: Phi^-1((r + 1/2) / n) of the rank r from 0; equal values share the mean of their ranks."""
+    """Normal scores: Phi^-1((r + 1/2) / n) of the rank r from 0; equal values share the mean of
+    their ranks.
+    """
     n = jnp.maximum(jnp.sum(mask, dtype=y.dtype), 1)
     less = jnp.sum((y[None, :] < y[:, None]) & mask[None, :], axis=1, dtype=y.dtype)
     equal = jnp.sum((y[None, :] == y[:, None]) & mask[None, :], axis=1, dtype=y.dtype)
@@ -85,7 +96,9 @@ WARPS = {"raw": _raw, "standard": _standard, "rank": _rank}
 
 
 def warped(warp, y, mask):
-    """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where they are the worst."""
+    """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where
+    they are the worst.
+    """
     finite = mask & jnp.isfinite(y)
     if warp == "rank":
         return _rank(jnp.where(finite, y, jnp.inf), mask), mask
@@ -93,7 +106,9 @@ def warped(warp, y, mask):
 
 
 def frame(x, mask):
-    """The `Frame` in which masked points ``x`` [n, d] have mean 0 and about the identity for covariance; a tenth of it is kept round, so that few points do."""
+    """The `Frame` in which masked points ``x`` [n, d] have mean 0 and about the identity for
+    covariance; a tenth of it is kept round, so that few points do.
+    """
     d = x.shape[1]
     n = jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
     x = jnp.where(mask[:, None], x, 0)
@@ -101,7 +116,8 @@ def frame(x, mask):
     z = jnp.where(mask[:, None], x - centre[None], 0)
     variances = jnp.sum(z**2, axis=0) / n
     largest = jnp.maximum(jnp.max(variances), jnp.finfo(x.dtype).tiny ** 0.5)
-    spread = variances > (4 * jnp.finfo(x.dtype).eps * centre) ** 2  # else a coordinate whose points differ by their rounding, or not at all
+    # else a coordinate whose points differ by their rounding, or not at all
+    spread = variances > (4 * jnp.finfo(x.dtype).eps * centre) ** 2
     variances = jnp.where(spread, variances, largest)
     u = z / jnp.sqrt(variances)[None]
     correlation = 0.9 * u.T @ u / n + 0.1 * jnp.eye(d, dtype=x.dtype)
@@ -109,15 +125,25 @@ def frame(x, mask):
 
 
 def fit(kind, x, y, mask, frame, kernel="squared exponential"):
-    """The `Surrogate` of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values ``y`` [n], where ``mask`` [n]."""
+    """The `Surrogate` of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values
+    ``y`` [n], where ``mask`` [n].
+    """
     z = jnp.where(mask[:, None], _framed(frame, jnp.where(mask[:, None], x, 0)), 0)
     if kind == "gaussian process":
-        return Surrogate(frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=kernel))
+        return Surrogate(
+            frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=kernel)
+        )
     features = jnp.where(mask[:, None], BASES[kind](z, z, mask), 0)
     normal = features.T @ features
-    live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)  # a masked centre is no feature
-    ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny) * jnp.eye(len(normal), dtype=x.dtype)
-    return Surrogate(frame, Basis(z, mask, cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))))
+    # a masked centre is no feature
+    live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)
+    ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny) * jnp.eye(
+        len(normal), dtype=x.dtype
+    )
+    return Surrogate(
+        frame,
+        Basis(z, mask, cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))),
+    )
 
 
 def predict(kind, surrogate, x):
@@ -133,7 +159,9 @@ def lower_bound(kind, surrogate, optimism, x):
     """[m]: the mean less ``optimism`` standard deviations; only a Gaussian process knows any."""
     if kind != "gaussian process":
         return predict(kind, surrogate, x)
-    mean, variance = gaussian_process.predict(surrogate.model, _framed(surrogate.frame, x), variance=True)
+    mean, variance = gaussian_process.predict(
+        surrogate.model, _framed(surrogate.frame, x), variance=True
+    )
     return mean - optimism * jnp.sqrt(variance)
 
 

@@ -1,4 +1,6 @@
-"""A distribution seen through its latent normal number and moved there: x = Q(Phi(z)) with z ~ N(mean, deviation^2) in place of N(0, 1)."""
+"""A distribution seen through its latent normal number and moved there: x = Q(Phi(z)) with z ~
+N(mean, deviation^2) in place of N(0, 1).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ __all__ = ["Tilted", "tilted"]
 
 
 class Tilted(D.Distribution):
-    """What `tilted` makes of a distribution of floats that has a quantile function and its inverse, taken number by number."""
+    """What `tilted` makes of a distribution of floats that has a quantile function and its inverse,
+    taken number by number.
+    """
 
     def __init__(self, distribution, mean, deviation):
         super().__init__()
@@ -26,11 +30,15 @@ class Tilted(D.Distribution):
         return self._distribution.batch_shape
 
     def _sample_n(self, key, n):
-        z = self._mean[None] + self._deviation[None] * jax.random.normal(key, (n, *self._mean.shape), self._mean.dtype)
+        z = self._mean[None] + self._deviation[None] * jax.random.normal(
+            key, (n, *self._mean.shape), self._mean.dtype
+        )
         return jax.vmap(lambda z: quantile(self._distribution, z))(z)
 
     def log_prob(self, value):
-        """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is the same in both."""
+        """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is
+        the same in both.
+        """
         log_p = self._distribution.log_prob(value)
         z = latent(self._distribution, value)
         e = (z - self._mean) / self._deviation
@@ -39,32 +47,58 @@ class Tilted(D.Distribution):
 
 
 def tilted(dist, mean, deviation):
-    """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of ``dist``; ``mean`` and ``deviation`` are like a value, floats.
+    """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of
+    ``dist``; ``mean`` and ``deviation`` are like a value, floats.
 
-    It has samples and log densities. Normal distributions are shifted and scaled, of the whole numbers of a Categorical or Bernoulli only the probabilities
-    change: these are exact. Otherwise Phi(z) is a float below 1, so that in float32 all z > 5.4 are one x. ValueError names a distribution that cannot.
+    It has samples and log densities. Normal distributions are shifted and scaled, of the whole
+    numbers of a Categorical or Bernoulli only the probabilities change: these are exact. Otherwise
+    Phi(z) is a float below 1, so that in float32 all z > 5.4 are one x. ValueError names a
+    distribution that cannot.
     """
     if isinstance(dist, D.Fixed):
         return dist
     if isinstance(dist, D.Normal):
         return D.Normal(dist.loc + dist.scale * mean, dist.scale * deviation)
     if isinstance(dist, D.MultivariateNormalDiag):
-        return D.MultivariateNormalDiag(dist.loc + dist.scale_diag * mean, dist.scale_diag * deviation)
+        return D.MultivariateNormalDiag(
+            dist.loc + dist.scale_diag * mean, dist.scale_diag * deviation
+        )
     if isinstance(dist, D.MultivariateNormalTri):
-        return D.MultivariateNormalTri(dist.loc + dist.scale_tri @ mean, dist.scale_tri * deviation[None, :], is_lower=dist.is_lower)
+        return D.MultivariateNormalTri(
+            dist.loc + dist.scale_tri @ mean,
+            dist.scale_tri * deviation[None, :],
+            is_lower=dist.is_lower,
+        )
     if isinstance(dist, D.Independent):
-        return D.Independent(tilted(dist.distribution, mean, deviation), dist.reinterpreted_batch_ndims)
+        return D.Independent(
+            tilted(dist.distribution, mean, deviation), dist.reinterpreted_batch_ndims
+        )
     if isinstance(dist, D.Joint):
-        return D.Joint(jax.tree.map(tilted, dist.distributions, mean, deviation, is_leaf=lambda d: isinstance(d, D.Distribution)))
+        return D.Joint(
+            jax.tree.map(
+                tilted,
+                dist.distributions,
+                mean,
+                deviation,
+                is_leaf=lambda d: isinstance(d, D.Distribution),
+            )
+        )
     if isinstance(dist, D.Where):
-        return D.Where(dist._pred, tilted(dist._a, mean, deviation), tilted(dist._b, mean, deviation))
+        return D.Where(
+            dist._pred, tilted(dist._a, mean, deviation), tilted(dist._b, mean, deviation)
+        )
     if isinstance(dist, D.Bernoulli):
         return D.Bernoulli(probs=_above(-ndtri(dist.probs), mean, deviation), dtype=dist.dtype)
     if isinstance(dist, D.Categorical):
         return D.Categorical(probs=_cells(dist.probs, mean, deviation), dtype=dist.dtype)
     like = D.event_like(dist)
-    if not D.has_cdf(dist) or not (hasattr(like, "dtype") and jnp.issubdtype(like.dtype, jnp.floating)):
-        raise ValueError(f"{type(dist).__name__} cannot be tilted: expected floats with a quantile function and a distribution function that inverts it")
+    if not D.has_cdf(dist) or not (
+        hasattr(like, "dtype") and jnp.issubdtype(like.dtype, jnp.floating)
+    ):
+        raise ValueError(
+            f"{type(dist).__name__} cannot be tilted: expected floats with a quantile function and"
+            " a distribution function that inverts it"
+        )
     return Tilted(dist, mean, deviation)
 
 

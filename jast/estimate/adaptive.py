@@ -1,4 +1,6 @@
-"""failure_probability: an estimate from a proposal that is found within the budget, and the plainer methods beside it."""
+"""failure_probability: an estimate from a proposal that is found within the budget, and the plainer
+methods beside it.
+"""
 
 import math
 from functools import partial
@@ -26,21 +28,30 @@ LEAST = 5000
 APART = 0.6
 
 
-def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95, progress=False, callback=None):
-    """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its own finding: `Estimate`.
+def failure_probability(
+    key, sim, budget=100_000, *, gradients=True, level=0.95, progress=False, callback=None
+):
+    """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its
+    own finding: `Estimate`.
 
-    An episode is a point of normal numbers (x_t the quantile of p(x | s) at Phi(z_t)). Design points come from gradients of the miss distance (``gradients``;
-    where they lead nowhere, nothing depends on them) and from noise that is wide first and then cooled; a population from subset simulation where gradients
-    did not help. Mixtures of Gaussians are fitted to weighted failures of a few batches. A guard, a population that is kept out of what the proposal covers,
-    looks for lost failure modes, which are taken in, or else the estimate is UNRELIABLE. What is left of the budget, about half, is drawn from the proposal as
-    it then stands: the estimate and its interval are of these episodes alone. Where plain Monte Carlo would be more exact, these are drawn from the model.
+    An episode is a point of normal numbers (x_t the quantile of p(x | s) at Phi(z_t)). Design
+    points come from gradients of the miss distance (``gradients``; where they lead nowhere, nothing
+    depends on them) and from noise that is wide first and then cooled; a population from subset
+    simulation where gradients did not help. Mixtures of Gaussians are fitted to weighted failures
+    of a few batches. A guard, a population that is kept out of what the proposal covers, looks for
+    lost failure modes, which are taken in, or else the estimate is UNRELIABLE. What is left of the
+    budget, about half, is drawn from the proposal as it then stands: the estimate and its interval
+    are of these episodes alone. Where plain Monte Carlo would be more exact, these are drawn from
+    the model.
 
-    A failure mode that all explorers miss is missing without a sign. ``modes`` are parts of the estimate by direction. ``proposal`` serves
-    `jast.estimate.failure_samples`; ``history`` tells how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
+    A failure mode that all explorers miss is missing without a sign. ``modes`` are parts of the
+    estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`; ``history`` tells
+    how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
 
-    The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done, total)`` and a KeyboardInterrupt as in `importance`, for
-    the last part. Raises ValueError for a budget below 5000, a level outside (0, 1), disturbances without a quantile function, and where the simulator's
-    functions do not fit together.
+    The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
+    total)`` and a KeyboardInterrupt as in `importance`, for the last part. Raises ValueError for a
+    budget below 5000, a level outside (0, 1), disturbances without a quantile function, and where
+    the simulator's functions do not fit together.
     """
     name = "failure_probability"
     budget = whole(name, "budget", budget, LEAST)
@@ -55,17 +66,29 @@ def failure_probability(key, sim, budget=100_000, *, gradients=True, level=0.95,
         simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
         about["reasons"] = ()  # which are about the proposal
-        return of_counts(name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about)
+        return of_counts(
+            name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
+        )
     simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, s.q, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
     groups = _by_direction(s.q) if total.first > 0 else []
-    return estimate(name, total, notes=notes, evaluations=s.spent + total.samples, groups=groups, proposal=s.q, **about)
+    return estimate(
+        name,
+        total,
+        notes=notes,
+        evaluations=s.spent + total.samples,
+        groups=groups,
+        proposal=s.q,
+        **about,
+    )
 
 
 def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callback=None):
-    """Crude Monte Carlo, the baseline: `Estimate` with an exact interval, and Chernoff's and Jeffreys' upper bounds also where no failure was seen.
+    """Crude Monte Carlo, the baseline: `Estimate` with an exact interval, and Chernoff's and
+    Jeffreys' upper bounds also where no failure was seen.
 
-    Any simulator. In float32 the normal numbers of a step end at 5.42 standard deviations. Arguments and errors as in `importance`.
+    Any simulator. In float32 the normal numbers of a step end at 5.42 standard deviations.
+    Arguments and errors as in `importance`.
     """
     name = "monte_carlo"
     samples = whole(name, "samples", samples)
@@ -78,44 +101,79 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
 
 
 def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
-    """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of ``samples``: `Estimate`, the mean of theirs.
+    """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
+    ``samples``: `Estimate`, the mean of theirs.
 
-    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too, ``samples`` counts the members of the last populations. It
-    needs a miss distance that leads to failures, and no gradient; a mode that few members reach is lost at times, and the others do not show it. A population
-    gives up below a probability of 1e-300. Raises ValueError for fewer than 100 samples or 3 replicates, and as `failure_probability`.
+    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too,
+    ``samples`` counts the members of the last populations. It needs a miss distance that leads to
+    failures, and no gradient; a mode that few members reach is lost at times, and the others do not
+    show it. A population gives up below a probability of 1e-300. Raises ValueError for fewer than
+    100 samples or 3 replicates, and as `failure_probability`.
     """
     name = "subset_simulation"
-    samples, replicates = whole(name, "samples", samples, 100), whole(name, "replicates", replicates, 3)
+    samples, replicates = (
+        whole(name, "samples", samples, 100),
+        whole(name, "replicates", replicates, 3),
+    )
     level = checked_level(name, level)
     latent.check(name, sim)
     runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
     logs = np.array([r.log_mean for r in runs])
     evaluations, invalid = sum(r.evaluations for r in runs), sum(r.invalid for r in runs)
-    history = tuple(f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations" for r in runs)
+    history = tuple(
+        f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
+        for r in runs
+    )
     seen, found = int(np.isfinite(logs).sum()), []
     if seen < replicates:
         found.append(f"{replicates - seen} of {replicates} populations reached no failure")
     top = logs.max() if seen else 0.0
     p = np.exp(logs - top)
-    log_mean, relative = (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())) if seen else (math.nan, math.nan)
+    log_mean, relative = (
+        (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean()))
+        if seen
+        else (math.nan, math.nan)
+    )
     if relative > 0.5:
         found.append(f"the replicates disagree: relative standard error {relative:.0%}")
     # few replicates: Student's t in place of the normal quantile, as a wider error
-    interval = log_normal(log_mean, relative * _student(replicates - 1, level), level) if seen else (0.0, 1.0)
+    interval = (
+        log_normal(log_mean, relative * _student(replicates - 1, level), level)
+        if seen
+        else (0.0, 1.0)
+    )
     mean = math.exp(log_mean)
     return Estimate(
-        method=name, log_mean=log_mean, mean=mean, standard_error=mean * relative, relative_error=relative, interval=interval, level=level,
-        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0, k_hat=math.nan, max_share=float(p.max() / p.sum()) if seen else math.nan,
-        failures_seen=sum(len(r.points) for r in runs), samples=sum(max(len(r.points), samples) for r in runs), evaluations=evaluations, steps=0,
-        invalid=invalid, modes=None, reliable=not found, warnings=tuple(found), history=history,
-    )  # fmt: skip
+        method=name,
+        log_mean=log_mean,
+        mean=mean,
+        standard_error=mean * relative,
+        relative_error=relative,
+        interval=interval,
+        level=level,
+        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0,
+        k_hat=math.nan,
+        max_share=float(p.max() / p.sum()) if seen else math.nan,
+        failures_seen=sum(len(r.points) for r in runs),
+        samples=sum(max(len(r.points), samples) for r in runs),
+        evaluations=evaluations,
+        steps=0,
+        invalid=invalid,
+        modes=None,
+        reliable=not found,
+        warnings=tuple(found),
+        history=history,
+    )
 
 
 def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
-    """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one Gaussian, then importance sampling with the rest: `Estimate`.
+    """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one
+    Gaussian, then importance sampling with the rest: `Estimate`.
 
-    Of ``budget``, ``budget // 100`` episodes in each of 20 iterations find the proposal (`jast.cross_entropy.failure_proposal`). It settles on one failure mode
-    without a sign of the others: a baseline, and quick where there is one. ValueError for a budget below 5000 and as `failure_proposal`.
+    Of ``budget``, ``budget // 100`` episodes in each of 20 iterations find the proposal
+    (`jast.cross_entropy.failure_proposal`). It settles on one failure mode without a sign of the
+    others: a baseline, and quick where there is one. ValueError for a budget below 5000 and as
+    `failure_proposal`.
     """
     name = "adaptive_cross_entropy"
     budget = whole(name, "budget", budget, LEAST)
@@ -125,25 +183,41 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     result = importance(key, sim, found.policy, budget - int(found.evaluations), level=level)
     against = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
     return result._replace(
-        method=name, evaluations=budget, reliable=result.reliable and not against, warnings=(*against, *result.warnings), history=tuple(str(found).splitlines())
+        method=name,
+        evaluations=budget,
+        reliable=result.reliable and not against,
+        warnings=(*against, *result.warnings),
+        history=tuple(str(found).splitlines()),
     )
 
 
 def _plain_is_better(s):
-    """Whether counting failures of the model has less variance than weighing those of the proposal."""
+    """Whether counting failures of the model has less variance than weighing those of the
+    proposal.
+    """
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
     return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
 
 
 def _by_direction(q):
-    """Groups of the components whose means point the same way: failure modes, as lists of numbers."""
-    means, left, out = np.asarray(q.means, np.float64), list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))), []
+    """Groups of the components whose means point the same way: failure modes, as lists of
+    numbers.
+    """
+    means, left, out = (
+        np.asarray(q.means, np.float64),
+        list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))),
+        [],
+    )
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     while left:
         group, grown = {left[0]}, True
         while grown:
-            new = {j for j in left if j not in group and max(float(unit[i] @ unit[j]) for i in group) > APART}
+            new = {
+                j
+                for j in left
+                if j not in group and max(float(unit[i] @ unit[j]) for i in group) > APART
+            }
             group, grown = group | new, bool(new)
         out.append(sorted(group))
         left = [i for i in left if i not in group]
@@ -151,11 +225,17 @@ def _by_direction(q):
 
 
 def _student(degrees, level):
-    """The quantile of Student's t over that of the normal distribution (Cornish and Fisher's expansion; to 2 % from 2 degrees on)."""
+    """The quantile of Student's t over that of the normal distribution (Cornish and Fisher's
+    expansion; to 2 % from 2 degrees on).
+    """
     from statistics import NormalDist
 
     z = NormalDist().inv_cdf((1 + level) / 2)
-    terms = (z**3 + z) / 4 / degrees + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / degrees**2 + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / degrees**3
+    terms = (
+        (z**3 + z) / 4 / degrees
+        + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / degrees**2
+        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / degrees**3
+    )
     return 1 + terms / z
 
 

@@ -1,4 +1,6 @@
-"""Batches of a search: points drawn from a proposal, and their weights by the proposals of all batches."""
+"""Batches of a search: points drawn from a proposal, and their weights by the proposals of all
+batches.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -23,7 +25,9 @@ class Batch(NamedTuple):
 
 
 def balanced(batches):
-    """Log weights of the failing points of all ``batches``, p over the mean of their proposals (the balance heuristic), and which points those are."""
+    """Log weights of the failing points of all ``batches``, p over the mean of their proposals (the
+    balance heuristic), and which points those are.
+    """
     failing = np.concatenate([b.failure for b in batches])
     logs = np.stack([over_batches(c.q, batches)[failing] for c in batches])
     top = logs.max(axis=0)
@@ -32,7 +36,12 @@ def balanced(batches):
 
 def over_batches(q, batches):
     """log q - log p of the points of all ``batches``."""
-    return np.concatenate([-b.log_weight if b.q is q else np.asarray(log_ratio(q, b.z, b.used), np.float64) for b in batches])
+    return np.concatenate(
+        [
+            -b.log_weight if b.q is q else np.asarray(log_ratio(q, b.z, b.used), np.float64)
+            for b in batches
+        ]
+    )
 
 
 @jax.jit
@@ -43,7 +52,9 @@ def log_ratio(q, z, used):
 
 @jax.jit
 def drawn(sim, q, u, e):
-    """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`, log p - log q, log shares of the components [n, K]."""
+    """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`,
+    log p - log q, log shares of the components [n, K].
+    """
     z = latent.place(q, u, e)
     o = latent.outcomes(sim, z)
     joint = latent.log_ratios(q, z, o.used) + q.log_weights[None]
@@ -55,4 +66,6 @@ def drawn(sim, q, u, e):
 def numbers(key, n, d, dtype):
     """Uniform [n] and normal [n, d] numbers for `drawn`."""
     for_component, for_noise = jax.random.split(key)
-    return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(for_noise, (n, d), dtype)
+    return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(
+        for_noise, (n, d), dtype
+    )

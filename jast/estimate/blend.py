@@ -1,4 +1,6 @@
-"""A finite mixture of distributions over one kind of value: what makes a proposal cover the model (defensive mixing)."""
+"""A finite mixture of distributions over one kind of value: what makes a proposal cover the model
+(defensive mixing).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +26,22 @@ class Blend(D.Distribution):
     def sample(self, *, seed, sample_shape=()):
         """One value; ``sample_shape`` must be ()."""
         if sample_shape != ():
-            raise ValueError(f"Blend: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys")
-        # the coin is drawn with a key folded from the value's, one hash less than of a split; only one of the draws is seen, so that one key serves all
-        u = jax.random.uniform(jax.random.fold_in(jax.random.clone(seed), COIN), (), self._log_weights.dtype)
+            raise ValueError(
+                f"Blend: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys"
+            )
+        # the coin is drawn with a key folded from the value's, one hash less than of a split; only
+        # one of the draws is seen, so that one key serves all
+        u = jax.random.uniform(
+            jax.random.fold_in(jax.random.clone(seed), COIN), (), self._log_weights.dtype
+        )
         edges = jnp.cumsum(jnp.exp(self._log_weights))[:-1]
         value = D.sample(self._parts[0], seed)
         for part, edge in zip(self._parts[1:], edges, strict=True):
-            value = jax.tree.map(lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)), value, D.sample(part, jax.random.clone(seed)))  # noqa: B023
+            value = jax.tree.map(
+                lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)),  # noqa: B023
+                value,
+                D.sample(part, jax.random.clone(seed)),
+            )
         return value
 
     def _sample_n(self, key, n):
@@ -50,5 +61,7 @@ class Blend(D.Distribution):
 
 
 def blend(weights, *parts):
-    """The mixture of the distributions ``parts`` with ``weights`` [len(parts)] that sum to 1: samples one at a time, exact log densities."""
+    """The mixture of the distributions ``parts`` with ``weights`` [len(parts)] that sum to 1:
+    samples one at a time, exact log densities.
+    """
     return Blend(jnp.log(jnp.asarray(weights)), parts)

@@ -1,7 +1,9 @@
-"""Most probable failure points by gradients: the points of least norm on the boundary of failure, from many starts.
+"""Most probable failure points by gradients: the points of least norm on the boundary of failure,
+from many starts.
 
-Each step goes to the nearest point of the linearised boundary (Hasofer and Lind 1974; Rackwitz and Fiessler 1978). A miss distance is flat once a system
-fails, so a step that arrives among the failures is halved back to the boundary.
+Each step goes to the nearest point of the linearised boundary (Hasofer and Lind 1974; Rackwitz and
+Fiessler 1978). A miss distance is flat once a system fails, so a step that arrives among the
+failures is halved back to the boundary.
 """
 
 from functools import partial
@@ -32,7 +34,9 @@ class DesignPoints(NamedTuple):
 
 
 def design_points(key, sim, starts=48, limit=16):
-    """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none where the miss distance has no useful gradient."""
+    """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
+    where the miss distance has no useful gradient.
+    """
     z = jax.random.normal(key, (starts, dimension(sim)), normal_numbers(sim))
     points, failing = jax.device_get(_descend(sim, z))
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
@@ -44,7 +48,9 @@ def distinct(points, limit):
     points = points[np.argsort((points**2).sum(axis=1), kind="stable")]
     kept = []
     for z in points:
-        if len(kept) < limit and all(np.linalg.norm(z - other) > APART * np.linalg.norm(other) for other in kept):
+        if len(kept) < limit and all(
+            np.linalg.norm(z - other) > APART * np.linalg.norm(other) for other in kept
+        ):
             kept.append(z)
     return np.array(kept).reshape(-1, points.shape[-1])
 
@@ -59,15 +65,24 @@ def _one(sim, z):
 
     def step(carry, _):
         z, best, found = carry
-        g, slope = jax.value_and_grad(lambda z: rollout(jax.random.key(0), sim, _policy(sim, z), raw).distance)(z)
+        g, slope = jax.value_and_grad(
+            lambda z: rollout(jax.random.key(0), sim, _policy(sim, z), raw).distance
+        )(z)
         square = jnp.sum(slope**2)
         usable = jnp.isfinite(g) & jnp.isfinite(square) & (square > 0)
-        aim = jnp.where(usable, (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1), 0) * jnp.where(usable, slope, 0)
+        aim = jnp.where(
+            usable, (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1), 0
+        ) * jnp.where(usable, slope, 0)
         aim = jnp.where(usable, aim, z)
-        # a linear extrapolation of a curved function can be wild: no step ends farther out than the last one by more than half
+        # a linear extrapolation of a curved function can be wild: no step ends farther out than the
+        # last one by more than half
         length = jnp.linalg.norm(aim)
         most = 1.5 * jnp.linalg.norm(z) + 3
-        aim = aim * jnp.minimum(1, most / jnp.maximum(length, 1e-6)) * jnp.asarray(1.0 + 1e-4, z.dtype)
+        aim = (
+            aim
+            * jnp.minimum(1, most / jnp.maximum(length, 1e-6))
+            * jnp.asarray(1.0 + 1e-4, z.dtype)
+        )
 
         def halve(ends, _):
             outside, inside = ends
@@ -78,7 +93,11 @@ def _one(sim, z):
         fails = outcome(sim, aim).failure
         (outside, inside), _ = jax.lax.scan(halve, (z, aim), length=HALVINGS)
         better = fails & (~found | (jnp.sum(inside**2) < jnp.sum(best**2)))
-        return (jnp.where(fails, outside, aim), jnp.where(better, inside, best), found | fails), None
+        return (
+            jnp.where(fails, outside, aim),
+            jnp.where(better, inside, best),
+            found | fails,
+        ), None
 
     (_, best, found), _ = jax.lax.scan(step, (z, z, jnp.zeros((), bool)), length=STEPS)
     return best, found

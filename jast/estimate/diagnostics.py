@@ -1,4 +1,6 @@
-"""When a weighted estimate must not be believed: effective sample size, the Pareto shape of the greatest weights, and the rules made of them."""
+"""When a weighted estimate must not be believed: effective sample size, the Pareto shape of the
+greatest weights, and the rules made of them.
+"""
 
 import numpy as np
 
@@ -8,11 +10,13 @@ K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
 def pareto_k(log_weights, samples, failures=None):
-    """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those above 0, of ``samples`` in all): a float.
+    """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those
+    above 0, of ``samples`` in all): a float.
 
-    Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The tail is
-    min(n / 5, 3 sqrt(n)) weights, and at most a fifth of ``failures``, how many are above 0 in all
-    (default: of those given). NaN for fewer than 5, and where one is NaN; -inf where the greatest are all equal.
+    Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted
+    (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The tail is min(n / 5, 3 sqrt(n)) weights, and
+    at most a fifth of ``failures``, how many are above 0 in all (default: of those given). NaN for
+    fewer than 5, and where one is NaN; -inf where the greatest are all equal.
     """
     log_w = np.sort(np.asarray(log_weights, np.float64))
     if np.isnan(log_w).any():
@@ -34,7 +38,9 @@ def pareto_k(log_weights, samples, failures=None):
 
 
 def _shape(x):
-    """The estimate of Zhang and Stephens (2009) from rising excesses ``x`` above 0, with the weak prior of PSIS (10 observations at 0.5)."""
+    """The estimate of Zhang and Stephens (2009) from rising excesses ``x`` above 0, with the weak
+    prior of PSIS (10 observations at 0.5).
+    """
     n = len(x)
     m = 30 + int(np.sqrt(n))
     quartile = x[int(n / 4 + 0.5) - 1]
@@ -47,18 +53,27 @@ def _shape(x):
 
 
 def by_mode(sums, groups):
-    """(share of the estimate, effective sample size) of groups of components, greatest share first: [m], [m]."""
+    """(share of the estimate, effective sample size) of groups of components, greatest share first:
+    [m], [m].
+    """
     first = np.array([sums.by_component[g].sum() for g in groups])
     second = np.array([sums.squares[g].sum() for g in groups])
     order = np.argsort(-first, kind="stable")
-    return first[order] / sums.first, np.where(second > 0, first**2 / np.where(second > 0, second, 1), 0)[order]
+    return (
+        first[order] / sums.first,
+        np.where(second > 0, first**2 / np.where(second > 0, second, 1), 0)[order],
+    )
 
 
 def thin_modes(shares, sizes):
     """Texts for the modes that matter and that few effective episodes speak for."""
     if len(shares) < 2:
         return []
-    return [f"a mode of {v:.1%} of the estimate has an effective sample size of {n:.3g}" for v, n in zip(shares, sizes, strict=True) if v > MATTERS and n < FEW]
+    return [
+        f"a mode of {v:.1%} of the estimate has an effective sample size of {n:.3g}"
+        for v, n in zip(shares, sizes, strict=True)
+        if v > MATTERS and n < FEW
+    ]
 
 
 def reasons(failures, ess, k_hat, max_share):
@@ -69,9 +84,14 @@ def reasons(failures, ess, k_hat, max_share):
     if np.isnan(k_hat):
         found.append(f"{failures} failures are too few to look at the tail of the weights")
     elif k_hat > K_HAT:
-        found.append(f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the greatest weights have no variance to speak of")
+        found.append(
+            f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the greatest weights have no variance to"
+            " speak of"
+        )
     if max_share > SHARE:
         found.append(f"one episode carries {max_share:.0%} of the estimate, above {SHARE:.0%}")
     if ess < PER_FAILURE * failures:
-        found.append(f"effective sample size {ess:.3g} of {failures} failures, below {PER_FAILURE:.0%}")
+        found.append(
+            f"effective sample size {ess:.3g} of {failures} failures, below {PER_FAILURE:.0%}"
+        )
     return found

@@ -14,14 +14,18 @@ INVALID = 0.01
 
 
 class Estimate(NamedTuple):
-    """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why before any number where it must not be believed.
+    """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why
+    before any number where it must not be believed.
 
-    Good diagnostics are necessary, not sufficient: a proposal that never reaches a failure mode gives weights that look perfect.
+    Good diagnostics are necessary, not sufficient: a proposal that never reaches a failure mode
+    gives weights that look perfect.
     """
 
     method: str
     log_mean: float
-    """Natural logarithm of the estimate; NaN where no failure was seen, as 0 is not known to be the answer"""
+    """Natural logarithm of the estimate; NaN where no failure was seen, as 0 is not known to be the
+    answer
+    """
     mean: float
     """The estimate; NaN likewise, 0 where it is below the least double"""
     standard_error: float
@@ -29,7 +33,9 @@ class Estimate(NamedTuple):
     relative_error: float
     """standard_error / mean, also where both are below the least double"""
     interval: tuple
-    """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is); of plain counts Clopper and Pearson's"""
+    """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is); of plain counts
+    Clopper and Pearson's
+    """
     level: float
     ess: float
     """Effective sample size of the failing episodes, (sum w)^2 / sum w^2"""
@@ -46,7 +52,9 @@ class Estimate(NamedTuple):
     steps: int
     """Simulator steps of ``samples``"""
     invalid: int
-    """Episodes in which the simulator returned a number that is not finite; they count as not failing"""
+    """Episodes in which the simulator returned a number that is not finite; they count as not
+    failing
+    """
     modes: Any
     """[K] the part of the estimate that each component or failure mode carries, of sum 1"""
     reliable: bool
@@ -71,27 +79,77 @@ class Estimate(NamedTuple):
         rows, low, high = [], *self.interval
         if not math.isnan(self.log_mean):
             value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
-            rows.append(("probability", f"{value}   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"))
-            rows.append(("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}"))
+            rows.append(
+                ("probability", f"{value}   {self.level:.4g} interval [{low:.4g}, {high:.4g}]")
+            )
+            rows.append(
+                ("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}")
+            )
         else:
             known = f"below {high:.4g} at {self.level:.4g}" if high < 1 else "nothing is known"
             rows.append(("probability", f"no failure seen: {known}"))
         if self.chernoff is not None:
-            rows.append(("upper bounds", f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)   one-sided {self.level:.4g}"))
-        rows.append(("failures", f"{self.failures_seen} of {self.samples} episodes   {self.evaluations} evaluations"))
+            rows.append(
+                (
+                    "upper bounds",
+                    (
+                        f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)  "
+                        f" one-sided {self.level:.4g}"
+                    ),
+                )
+            )
+        rows.append(
+            (
+                "failures",
+                f"{self.failures_seen} of {self.samples} episodes   {self.evaluations} evaluations",
+            )
+        )
         if self.chernoff is None and self.failures_seen:
-            rows.append(("weights", f"ESS {self.ess:.4g}   k-hat {self.k_hat:.2f}   greatest share {100 * self.max_share:.2g} %"))
+            rows.append(
+                (
+                    "weights",
+                    (
+                        f"ESS {self.ess:.4g}   k-hat {self.k_hat:.2f}   greatest share"
+                        f" {100 * self.max_share:.2g} %"
+                    ),
+                )
+            )
         if self.modes is not None and len(self.modes) > 1 and self.failures_seen:
-            rows.append(("modes", "  ".join(f"{100 * v:.1f} %" for v in self.modes[:12]) + (" ..." if len(self.modes) > 12 else "")))
+            rows.append(
+                (
+                    "modes",
+                    "  ".join(f"{100 * v:.1f} %" for v in self.modes[:12])
+                    + (" ..." if len(self.modes) > 12 else ""),
+                )
+            )
         if self.invalid:
             rows.append(("invalid", f"{self.invalid}"))
         head = [] if self.reliable else ["UNRELIABLE: " + f"\n{'':12}".join(self.warnings)]
         tail = [f"{'remark':<14} {text}" for text in self.warnings] if self.reliable else []
-        return "\n".join([*head, f"{'method':<14} {self.method}", *(f"{name:<14} {text}" for name, text in rows), *tail])
+        return "\n".join(
+            [
+                *head,
+                f"{'method':<14} {self.method}",
+                *(f"{name:<14} {text}" for name, text in rows),
+                *tail,
+            ]
+        )
 
 
-def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, groups=None, proposal=None, history=None):
-    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside, ``notes`` are remarks.
+def estimate(
+    method,
+    sums,
+    *,
+    level=0.95,
+    reasons=(),
+    notes=(),
+    evaluations=None,
+    groups=None,
+    proposal=None,
+    history=None,
+):
+    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside,
+    ``notes`` are remarks.
 
     ``groups``: lists of components that are one failure mode (default: each by itself).
     """
@@ -103,11 +161,17 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
     found += _if_invalid_failed(sums)
     log_mean = sums.top + math.log(sums.first / n) if seen else math.nan
     # eq. 14 over the square of the mean; n - 1 for an unbiased variance
-    relative = math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1)) if seen and n > 1 else math.nan
+    relative = (
+        math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1))
+        if seen and n > 1
+        else math.nan
+    )
     ess = sums.first**2 / sums.second if seen else 0.0
     k_hat = diagnostics.pareto_k(sums.tail, n, sums.failures)
     share = math.exp(sums.tail[0] - sums.top) / sums.first if seen else math.nan
-    found += diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
+    found += (
+        diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
+    )
     modes = None
     if seen:
         groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
@@ -140,31 +204,66 @@ def estimate(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None
     )
 
 
-def of_counts(method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, proposal=None, history=None):
+def of_counts(
+    method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, proposal=None, history=None
+):
     """The `Estimate` of episodes of the model itself: exact interval and upper bounds."""
     level = checked_level(method, level)
     n, k = sums.samples, sums.failures
     mean = k / n if k else math.nan
-    found = [*reasons, *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",))]
+    found = [
+        *reasons,
+        *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",)),
+    ]
     found += _if_invalid_failed(sums._replace(first=float(k), invalid_first=float(sums.invalid)))
     relative = math.sqrt((1 - mean) / k) if k else math.nan
     return Estimate(
-        method=method, log_mean=math.log(mean) if k else math.nan, mean=mean, standard_error=mean * relative, relative_error=relative,
-        interval=clopper_pearson(k, n, level), level=level, ess=float(k), k_hat=math.nan, max_share=1 / k if k else math.nan, failures_seen=k, samples=n,
-        evaluations=n if evaluations is None else evaluations, steps=sums.steps, invalid=sums.invalid, modes=np.ones(1) if k else None, reliable=not found,
-        warnings=(*found, *_remarks(sums), *notes), chernoff=chernoff(k, n, level), jeffreys=jeffreys(k, n, level), proposal=proposal, history=history,
-    )  # fmt: skip
+        method=method,
+        log_mean=math.log(mean) if k else math.nan,
+        mean=mean,
+        standard_error=mean * relative,
+        relative_error=relative,
+        interval=clopper_pearson(k, n, level),
+        level=level,
+        ess=float(k),
+        k_hat=math.nan,
+        max_share=1 / k if k else math.nan,
+        failures_seen=k,
+        samples=n,
+        evaluations=n if evaluations is None else evaluations,
+        steps=sums.steps,
+        invalid=sums.invalid,
+        modes=np.ones(1) if k else None,
+        reliable=not found,
+        warnings=(*found, *_remarks(sums), *notes),
+        chernoff=chernoff(k, n, level),
+        jeffreys=jeffreys(k, n, level),
+        proposal=proposal,
+        history=history,
+    )
 
 
 def _if_invalid_failed(sums):
     """Texts: where the episodes without a finite number would matter if they were failures."""
     if not sums.invalid_first > INVALID * sums.first:
         return []
-    share = f"{sums.invalid_first / sums.first:.2g} times the estimate" if sums.first > 0 else "all of it"
-    return [f"{sums.invalid} episodes are invalid (a number that is not finite): if they failed, they would add {share}"]
+    share = (
+        f"{sums.invalid_first / sums.first:.2g} times the estimate"
+        if sums.first > 0
+        else "all of it"
+    )
+    return [
+        f"{sums.invalid} episodes are invalid (a number that is not finite): if they failed, they"
+        f" would add {share}"
+    ]
 
 
 def _remarks(sums):
     if not sums.invalid:
         return ()
-    return (f"{sums.invalid} of {sums.samples} episodes are invalid (a number that is not finite) and count as not failing",)
+    return (
+        (
+            f"{sums.invalid} of {sums.samples} episodes are invalid (a number that is not finite)"
+            " and count as not failing"
+        ),
+    )

@@ -1,4 +1,6 @@
-"""The failure distribution p(x | failure): independent failures as they would happen, which is what a user looks at."""
+"""The failure distribution p(x | failure): independent failures as they would happen, which is what
+a user looks at.
+"""
 
 import math
 from typing import NamedTuple
@@ -37,17 +39,26 @@ class FailureSamples(NamedTuple):
 
     def __str__(self):
         n, e = len(self.episodes.length), self.episodes
-        steps = f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to {np.max(e.log_prob):.4g}"
-        return f"{n} failures from {self.distinct} distinct ones (ESS {self.ess:.4g}), {self.accepted:.0%} of the last moves accepted; {steps}"
+        steps = (
+            f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to"
+            f" {np.max(e.log_prob):.4g}"
+        )
+        return (
+            f"{n} failures from {self.distinct} distinct ones (ESS {self.ess:.4g}),"
+            f" {self.accepted:.0%} of the last moves accepted; {steps}"
+        )
 
 
 def failure_samples(key, sim, source, samples=1000, *, moves=20):
-    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are resampled, each then makes Markov moves: `FailureSamples`.
+    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are
+    resampled, each then makes Markov moves: `FailureSamples`.
 
-    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The
-    ``moves`` change the latent normal numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that the proposal lacks,
-    and the shares of modes are those of the weights. Raises ValueError for a source without a proposal or without a failure among its episodes, a count below
-    1, and disturbances without a quantile function.
+    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with
+    densities; ``10 * samples`` episodes are drawn from it. The ``moves`` change the latent normal
+    numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that
+    the proposal lacks, and the shares of modes are those of the weights. Raises ValueError for a
+    source without a proposal or without a failure among its episodes, a count below 1, and
+    disturbances without a quantile function.
     """
     name = "failure_samples"
     samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
@@ -55,12 +66,19 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     key, for_draws, for_rows = jax.random.split(key, 3)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
-        raise ValueError(f"{name}: source must hold a proposal, received one of {source.method} without one")
+        raise ValueError(
+            f"{name}: source must hold a proposal, received one of {source.method} without one"
+        )
     n = PER_SAMPLE * samples
     if isinstance(q, latent.Latent):
         if (received := q.means.shape[1]) != latent.dimension(sim):
-            raise ValueError(f"{name}: source must be of this simulator, of {latent.dimension(sim)} numbers, received one of {received}")
-        z, o, log_w, _ = jax.device_get(drawn(sim, q, *numbers(for_draws, n, latent.dimension(sim), q.means.dtype)))
+            raise ValueError(
+                f"{name}: source must be of this simulator, of {latent.dimension(sim)} numbers,"
+                f" received one of {received}"
+            )
+        z, o, log_w, _ = jax.device_get(
+            drawn(sim, q, *numbers(for_draws, n, latent.dimension(sim), q.means.dtype))
+        )
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
@@ -68,7 +86,10 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         z, failure, log_w = jax.device_get((z, e.failure, log_w))
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
-        raise ValueError(f"{name}: source gave no failure in {n} episodes: expected a proposal under which failures are frequent")
+        raise ValueError(
+            f"{name}: source gave no failure in {n} episodes: expected a proposal under which"
+            " failures are frequent"
+        )
     w = np.exp(log_w - log_w.max())
     at = (np.arange(samples) + float(jax.random.uniform(for_rows))) / samples
     rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
@@ -76,6 +97,9 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     people = chain.judge(jnp.asarray(z[rows], chain.dtype))
     people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
     episodes = jax.device_get(latent.episodes(sim, people.z))
-    # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other side in another program
+    # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
+    # side in another program
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
-    return FailureSamples(episodes, effective(log_w), len(np.unique(rows)), chain.accepted, n + chain.evaluations)
+    return FailureSamples(
+        episodes, effective(log_w), len(np.unique(rows)), chain.accepted, n + chain.evaluations
+    )

@@ -1,7 +1,9 @@
-"""Mixtures of Gaussians fitted to weighted failures, for proposals: expectation maximisation with covariances that only say what the sample can know.
+"""Mixtures of Gaussians fitted to weighted failures, for proposals: expectation maximisation with
+covariances that only say what the sample can know.
 
-On the host, in double precision. The cross-entropy optimum among mixtures is the maximum of the weighted likelihood (de Boer, Kroese, Mannor and Rubinstein
-2005); the number of components is the one that the other half of the sample likes best.
+On the host, in double precision. The cross-entropy optimum among mixtures is the maximum of the
+weighted likelihood (de Boer, Kroese, Mannor and Rubinstein 2005); the number of components is the
+one that the other half of the sample likes best.
 """
 
 from typing import NamedTuple
@@ -21,7 +23,9 @@ SIZE = 40
 
 
 class Gaussians(NamedTuple):
-    """K Gaussians by the eigensystems of their covariances: vectors[k] diag(values[k]) vectors[k]^T."""
+    """K Gaussians by the eigensystems of their covariances: vectors[k] diag(values[k])
+    vectors[k]^T.
+    """
 
     weights: np.ndarray
     """[K]"""
@@ -34,21 +38,30 @@ class Gaussians(NamedTuple):
 
 
 def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
-    """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``count`` independent ones; of at most ``limit`` components.
+    """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``count``
+    independent ones; of at most ``limit`` components.
 
     ``anchors`` [m, D]: design points, which means near to them are shrunk to by what may be noise.
 
-    ``known``: how many they count for as to covariances, where that is less. Of many points ``MOST`` are looked at.
+    ``known``: how many they count for as to covariances, where that is less. Of many points
+    ``MOST`` are looked at.
     """
     known = count if known is None else known
     if len(points) > MOST:
         chosen = rng.choice(len(points), MOST, replace=False)
         points, weights, part = points[chosen], weights[chosen], weights[chosen].sum()
-        weights, count, known = weights / part, *(min(v, MOST, v * max(part, 0.1)) for v in (count, known))
+        weights, count, known = (
+            weights / part,
+            *(min(v, MOST, v * max(part, 0.1)) for v in (count, known)),
+        )
     n = len(points)
     half = rng.permutation(n) < n // 2
     best, score = 1, -np.inf
-    starts = [k for k in COMPONENTS if k <= limit and count / 2 >= 10 * k and np.count_nonzero(weights) >= 4 * k] or [1]
+    starts = [
+        k
+        for k in COMPONENTS
+        if k <= limit and count / 2 >= 10 * k and np.count_nonzero(weights) >= 4 * k
+    ] or [1]
     for k in starts:
         value = 0.0
         for part in (half, ~half):
@@ -66,26 +79,43 @@ def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
 
 
 def as_latent(parts, dtype):
-    """The `Latent` of [(share, Gaussians), ...]: its ``SIZE`` greatest components, padded with ones of weight 0, so that programs are compiled once."""
+    """The `Latent` of [(share, Gaussians), ...]: its ``SIZE`` greatest components, padded with ones
+    of weight 0, so that programs are compiled once.
+    """
     weights = np.concatenate([share * g.weights for share, g in parts])
     kept = np.argsort(-weights, kind="stable")[:SIZE]
-    weights, (means, values, vectors) = weights[kept], (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3))
+    weights, (means, values, vectors) = (
+        weights[kept],
+        (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3)),
+    )
     factors = np.linalg.cholesky(np.einsum("kij,kj,klj->kil", vectors, values, vectors))
     k, d = means.shape
     pad = lambda a, fill: np.concatenate([a, np.broadcast_to(fill, (SIZE - k, *a.shape[1:]))])
     with np.errstate(divide="ignore"):
         log_weights = np.log(pad(weights / weights.sum(), 0.0))
-    arrays = log_weights, pad(means, 0.0), pad(factors, np.eye(d)), pad(np.tril(np.linalg.inv(factors)), np.eye(d))
+    arrays = (
+        log_weights,
+        pad(means, 0.0),
+        pad(factors, np.eye(d)),
+        pad(np.tril(np.linalg.inv(factors)), np.eye(d)),
+    )
     return Latent(*(jnp.asarray(a, dtype) for a in arrays))
 
 
 def together(a, b, share):
-    """The mixture of two `Latent`, ``share`` of the second; of their components the least give way."""
-    weights = np.concatenate([np.exp(np.asarray(q.log_weights, np.float64)) * s for q, s in ((a, 1 - share), (b, share))])
+    """The mixture of two `Latent`, ``share`` of the second; of their components the least give
+    way.
+    """
+    weights = np.concatenate(
+        [np.exp(np.asarray(q.log_weights, np.float64)) * s for q, s in ((a, 1 - share), (b, share))]
+    )
     kept = np.argsort(-weights, kind="stable")[:SIZE]
     with np.errstate(divide="ignore"):
         log_weights = np.log(weights[kept] / weights[kept].sum())
-    return Latent(jnp.asarray(log_weights, a.means.dtype), *(jnp.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)))
+    return Latent(
+        jnp.asarray(log_weights, a.means.dtype),
+        *(jnp.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)),
+    )
 
 
 def effective(log_weights):
@@ -95,9 +125,11 @@ def effective(log_weights):
 
 
 def shrunk(values, count):
-    """Eigenvalues [D] of a sample covariance with what is noise of ``count`` independent points taken out.
+    """Eigenvalues [D] of a sample covariance with what is noise of ``count`` independent points
+    taken out.
 
-    Those within the band that a covariance s I would show (Marchenko and Pastur 1967) are set to their mean s, found by repetition; the others are kept.
+    Those within the band that a covariance s I would show (Marchenko and Pastur 1967) are set to
+    their mean s, found by repetition; the others are kept.
     """
     d = len(values)
     ratio = np.sqrt(min(d / max(count, 1.0), 1.0))
@@ -114,7 +146,9 @@ def shrunk(values, count):
 
 
 def _em(rng, z, w, count, k, anchors):
-    """Expectation maximisation from far-apart points on; components that almost nothing belongs to end."""
+    """Expectation maximisation from far-apart points on; components that almost nothing belongs to
+    end.
+    """
     live = w > 0
     z, w = z[live], w[live]
     g = _start(rng, z, w, k)
@@ -131,14 +165,20 @@ def _start(rng, z, w, k):
     centres = z[rng.choice(len(z), 1, p=w)]
     for _ in range(1, k):
         gap = ((z[:, None] - centres[None]) ** 2).sum(-1).min(axis=1) * w
-        centres = np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]]) if gap.sum() > 0 else centres
+        centres = (
+            np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]])
+            if gap.sum() > 0
+            else centres
+        )
     return unit(centres)
 
 
 def unit(centres):
     """Equal `Gaussians` of unit covariance at ``centres`` [k, D]."""
     k, d = centres.shape
-    return Gaussians(np.full(k, 1 / k), centres, np.ones((k, d)), np.broadcast_to(np.eye(d), (k, d, d)))
+    return Gaussians(
+        np.full(k, 1 / k), centres, np.ones((k, d)), np.broadcast_to(np.eye(d), (k, d, d))
+    )
 
 
 def _maximise(z, r, count, anchors):
@@ -153,7 +193,11 @@ def _maximise(z, r, count, anchors):
             # what a mean differs from its design point may be noise alone (James and Stein 1961)
             gaps = mean - anchors
             gap = gaps[np.argmin((gaps**2).sum(axis=1))]
-            mean = mean - gap * min((z.shape[1] - 2) / (count * total[i] * (gap**2).sum() + 1e-12), 1) if z.shape[1] > 2 else mean
+            mean = (
+                mean - gap * min((z.shape[1] - 2) / (count * total[i] * (gap**2).sum() + 1e-12), 1)
+                if z.shape[1] > 2
+                else mean
+            )
         e = z - mean
         values, vectors = np.linalg.eigh((e * r[:, i : i + 1]).T @ e / total[i])
         parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))
@@ -165,7 +209,11 @@ def _log_joint(g, z):
     out = []
     for weight, mean, values, vectors in zip(*g, strict=True):
         e = (z - mean) @ vectors
-        out.append(np.log(weight) - 0.5 * (e**2 / values).sum(axis=1) - 0.5 * np.log(2 * np.pi * values).sum())
+        out.append(
+            np.log(weight)
+            - 0.5 * (e**2 / values).sum(axis=1)
+            - 0.5 * np.log(2 * np.pi * values).sum()
+        )
     return np.stack(out, axis=1)
 
 

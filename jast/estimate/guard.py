@@ -1,4 +1,6 @@
-"""The guard of `jast.estimate.seek`: populations that the proposal was not fitted to look for failure modes that it lost."""
+"""The guard of `jast.estimate.seek`: populations that the proposal was not fitted to look for
+failure modes that it lost.
+"""
 
 import math
 
@@ -12,33 +14,55 @@ from jast.estimate.populations import LAST, QUANTILE, Chain, explore
 __all__ = ["guarded"]
 
 LOST = 0.005
-"""A share of the probability that may lie where the proposal is thin, beyond what its own batches see there."""
+"""A share of the probability that may lie where the proposal is thin, beyond what its own batches
+see there.
+"""
 CUT = 0.3
-"""How far on the way to a known mode the first population may go, as a share of the log density ratio there."""
+"""How far on the way to a known mode the first population may go, as a share of the log density
+ratio there.
+"""
 MOST = 0.85
 """Of the budget, where the search ends."""
 LEAST, MOVES = 50, 10
 
 
 def guarded(s, i, last):
-    """Whether the search of the `Seeker` ``s`` may end. What was lost is taken into the proposal, or in round ``last`` becomes a reason against the estimate.
+    """Whether the search of the `Seeker` ``s`` may end. What was lost is taken into the proposal,
+    or in round ``last`` becomes a reason against the estimate.
 
-    Populations go down the levels of the miss distance, one kept far from all known modes, one from what the proposal covers; those of the search itself, which
-    the proposal may have forgotten, are looked at again; and in the first round so are the failures that wider noise led to, wherever they are.
+    Populations go down the levels of the miss distance, one kept far from all known modes, one from
+    what the proposal covers; those of the search itself, which the proposal may have forgotten, are
+    looked at again; and in the first round so are the failures that wider noise led to, wherever
+    they are.
     """
     found, least = [], s.log_mean + math.log(LOST)
     # as many as can afford the levels down to there, in steps so that programs are shared
     room = max(min(0.3, MOST - s.spent / s.budget), 0) * s.budget / 2
     size = min(s.size // 2, int(room / (least / math.log(QUANTILE) + LAST + 4)) // LEAST * LEAST)
     for name, q, threshold in (("far", _unit(s), -s.log_mean * CUT), ("thin", s.q, s.thin())):
-        p = explore(s.next_key(), s.sim, size, covered=(q, jnp.asarray(threshold, s.dtype)), least=least, most=int(room)) if size else None
+        p = (
+            explore(
+                s.next_key(),
+                s.sim,
+                size,
+                covered=(q, jnp.asarray(threshold, s.dtype)),
+                least=least,
+                most=int(room),
+            )
+            if size
+            else None
+        )
         if p is None or not p.complete:
             s.note(f"guard ({name}): ended by the budget", p.evaluations if p else 0)
             s.reasons.append("the budget did not last to look for lost failure modes")
             break
         share = math.exp(min(p.log_mean - s.log_mean, 50)) if p.reached else 0.0
         rows = _bare(s, p.points, p.used)
-        s.note(f"guard ({name}): {share:.2%} of the probability, {rows.mean() if len(rows) else 0:.0%} of it not covered", p.evaluations)
+        s.note(
+            f"guard ({name}): {share:.2%} of the probability, {rows.mean() if len(rows) else 0:.0%}"
+            " of it not covered",
+            p.evaluations,
+        )
         found.append((share * rows.mean() if len(rows) else 0.0, p.points[rows], p.used[rows]))
     for p in s.populations:
         rows = _bare(s, p.points, p.used)
@@ -47,14 +71,19 @@ def guarded(s, i, last):
     w = np.exp(log_w - log_w.max())
     thin = w[log_w > -s.thin()].sum() / w.sum()
     asked = max((share for share, *_ in found), default=0.0)
-    s.note(f"guard: {asked:.2%} of the probability where the proposal is thin, {thin:.2%} by its own batches")
+    s.note(
+        f"guard: {asked:.2%} of the probability where the proposal is thin, {thin:.2%} by its own"
+        " batches"
+    )
     found = [f for f in found if len(f[1]) and f[0] > 2 * (thin + LOST)]
     if i == 0 and len(s.seeds):
         found += _forgotten(s)
     if not found:
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
-        s.reasons.append(f"failures that the proposal hardly draws may carry {asked:.0%} of what it found")
+        s.reasons.append(
+            f"failures that the proposal hardly draws may carry {asked:.0%} of what it found"
+        )
         return True
     for share, points, used in found:
         s.add(s.fitted(points, used), min(max(share / (1 + share), 0.15), 0.85))
@@ -67,12 +96,18 @@ def _bare(s, points, used):
 
 
 def _forgotten(s):
-    """Failures near the seeds, drawn from the model given failure, that the proposal does not cover; what they weigh is left to the next batches."""
+    """Failures near the seeds, drawn from the model given failure, that the proposal does not
+    cover; what they weigh is left to the next batches.
+    """
     chain = Chain(s.next_key(), s.sim, len(s.seeds))
-    people = chain.move(chain.judge(jnp.asarray(s.seeds, s.dtype)), np.arange(len(s.seeds)), -math.inf, 1.0, MOVES)
+    people = chain.move(
+        chain.judge(jnp.asarray(s.seeds, s.dtype)), np.arange(len(s.seeds)), -math.inf, 1.0, MOVES
+    )
     z, used = np.asarray(people.z), np.asarray(people.used)
     rows = _bare(s, z, used) & (np.asarray(people.score) == -np.inf)
-    s.note(f"guard (cooled): {rows.mean():.0%} of {len(rows)} failures not covered", chain.evaluations)
+    s.note(
+        f"guard (cooled): {rows.mean():.0%} of {len(rows)} failures not covered", chain.evaluations
+    )
     return [(0.0, z[rows], used[rows])] if rows.sum() > 2 else []
 
 

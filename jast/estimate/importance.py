@@ -1,7 +1,9 @@
-"""Importance resampling: episodes drawn from a proposal, each weighted by how much likelier the model makes it (the paper's eq. 6-8).
+"""Importance resampling: episodes drawn from a proposal, each weighted by how much likelier the
+model makes it (the paper's eq. 6-8).
 
-Weights are kept as logarithms and summed step by step as log p - log q, so that neither density overflows. Episodes are simulated in chunks of constant size;
-a chunk's log weights go to the host, where they are summed in double precision.
+Weights are kept as logarithms and summed step by step as log p - log q, so that neither density
+overflows. Episodes are simulated in chunks of constant size; a chunk's log weights go to the host,
+where they are summed in double precision.
 """
 
 from functools import partial
@@ -46,28 +48,51 @@ class Traces(NamedTuple):
 
 
 def log_weights(key, sim, proposal, samples, *, mode="default"):
-    """``samples`` episodes drawn from ``proposal`` (a `Proposal` or a `Policy` with densities): `Traces`, for estimates of your own.
+    """``samples`` episodes drawn from ``proposal`` (a `Proposal` or a `Policy` with densities):
+    `Traces`, for estimates of your own.
 
-    A trace's component is drawn once, and it is weighted by the full mixture (eq. 20): w = p(x) / sum_k a_k q_k(x). Pure, for `jax.jit` and `jax.vmap`; all in
-    memory. ``mode="default"`` weighs x0 and the steps to the end of the episode, as what comes after decides nothing; ``"paper"`` goes on to the horizon, as
-    the paper does. Both are unbiased. ValueError for another mode or proposal.
+    A trace's component is drawn once, and it is weighted by the full mixture (eq. 20): w = p(x) /
+    sum_k a_k q_k(x). Pure, for `jax.jit` and `jax.vmap`; all in memory. ``mode="default"`` weighs
+    x0 and the steps to the end of the episode, as what comes after decides nothing; ``"paper"``
+    goes on to the horizon, as the paper does. Both are unbiased. ValueError for another mode or
+    proposal.
     """
     if mode not in ("default", "paper"):
         raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
-    return traces(key, sim, as_proposal("log_weights", sim, proposal), whole("log_weights", "samples", samples), mode == "paper")
+    return traces(
+        key,
+        sim,
+        as_proposal("log_weights", sim, proposal),
+        whole("log_weights", "samples", samples),
+        mode == "paper",
+    )
 
 
-def importance(key, sim, proposal, samples=100_000, *, mode="default", level=0.95, progress=False, callback=None):
-    """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal: `Estimate`.
+def importance(
+    key,
+    sim,
+    proposal,
+    samples=100_000,
+    *,
+    mode="default",
+    level=0.95,
+    progress=False,
+    callback=None,
+):
+    """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal:
+    `Estimate`.
 
-    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities. Unbiased where it can draw all that the model can: one that
-    holds no share of the model is tried on a few of the model's own episodes. It says nothing of failures that it hardly draws: `Estimate` on how to know.
-    ``mode`` as in `log_weights`; ``level`` of the interval. Memory does not grow with ``samples``. The key is consumed; chunk i is drawn with
-    ``jax.random.fold_in(key, i)``. ``progress=True`` shows a bar, ``callback(done, total)`` is called after each chunk; a KeyboardInterrupt ends it with the
-    estimate of the whole chunks, and a word in ``warnings``. Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
+    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities.
+    Unbiased where it can draw all that the model can: one that holds no share of the model is tried
+    on a few of the model's own episodes. It says nothing of failures that it hardly draws:
+    `Estimate` on how to know. ``mode`` as in `log_weights`; ``level`` of the interval. Memory does
+    not grow with ``samples``. The key is consumed; chunk i is drawn with ``jax.random.fold_in(key,
+    i)``. ``progress=True`` shows a bar, ``callback(done, total)`` is called after each chunk; a
+    KeyboardInterrupt ends it with the estimate of the whole chunks, and a word in ``warnings``.
+    Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
 
-    Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal without a density, and where the simulator's functions do not
-    fit together.
+    Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
+    without a density, and where the simulator's functions do not fit together.
     """
     samples = whole("importance", "samples", samples, 2)
     if mode not in ("default", "paper"):
@@ -89,7 +114,9 @@ def even(samples):
 
 
 def chunks(simulate, lanes, samples, progress=False, callback=None, name="importance"):
-    """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces`` [lanes]; of the last chunk the first ones count."""
+    """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces``
+    [lanes]; of the last chunk the first ones count.
+    """
     bar = None
     if progress:
         from tqdm import tqdm  # slow to import
@@ -129,14 +156,25 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
     for_component, for_start, for_steps = jax.random.split(key, 3)
     own = drawn
     if drawn is None:
-        k = jax.random.categorical(for_component, proposal.log_weights) if len(proposal.log_weights) > 1 else 0
+        k = (
+            jax.random.categorical(for_component, proposal.log_weights)
+            if len(proposal.log_weights) > 1
+            else 0
+        )
         own = jax.tree.map(lambda a: a[k], proposal.policies)
     dtype, (components,) = accumulator(sim), proposal.log_weights.shape
 
     def weigh(ratio, p, make, x):  # of log q_k - log p [K], and whether p is 0
         ratios, impossible = ratio
-        log_q, log_p = jax.vmap(lambda policy: make(policy).log_prob(x), axis_size=components)(proposal.policies), p.log_prob(x)
-        return ratios + (log_q.astype(dtype) - log_p.astype(dtype)), impossible | (log_p == -jnp.inf)
+        log_q, log_p = (
+            jax.vmap(lambda policy: make(policy).log_prob(x), axis_size=components)(
+                proposal.policies
+            ),
+            p.log_prob(x),
+        )
+        return ratios + (log_q.astype(dtype) - log_p.astype(dtype)), impossible | (
+            log_p == -jnp.inf
+        )
 
     x0 = D.sample(own.start(), for_start)
     first = begin(sim, raw, x0)
@@ -146,7 +184,12 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
     def body(carry):
         progress, ratio, t, length = carry
         x = D.sample(own.disturbance(progress.state, t), jax.random.fold_in(for_steps, t))
-        ratio = weigh(ratio, sim.disturbance(progress.state), lambda policy: policy.disturbance(progress.state, t), x)
+        ratio = weigh(
+            ratio,
+            sim.disturbance(progress.state),
+            lambda policy: policy.disturbance(progress.state, t),
+            x,
+        )
         after = advance(sim, raw, progress, x, t + 1 >= sim.horizon)
         if to_horizon:  # the state of an ended episode stays, while drawing and weighing go on
             after = jax.tree.map(lambda a, b: jnp.where(progress.done, a, b), progress, after)
@@ -154,28 +197,45 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
 
     goes_on = (lambda c: c[2] < sim.horizon) if to_horizon else (lambda c: ~c[0].done)
     zero = jnp.zeros((), jnp.int32)
-    last, (ratios, impossible), _, length = lax.while_loop(goes_on, body, (first, ratio, zero, zero))
+    last, (ratios, impossible), _, length = lax.while_loop(
+        goes_on, body, (first, ratio, zero, zero)
+    )
     last, prior = conclude(sim, raw, last), proposal.log_weights.astype(dtype)
     log_q = logsumexp(prior + ratios)
-    return Traces(jnp.where(impossible, -jnp.inf, -log_q), jnp.where(impossible, prior, prior + ratios - log_q), last.failure, last.invalid, length)
+    return Traces(
+        jnp.where(impossible, -jnp.inf, -log_q),
+        jnp.where(impossible, prior, prior + ratios - log_q),
+        last.failure,
+        last.invalid,
+        length,
+    )
 
 
 @partial(jax.jit, static_argnames="n")
 def played(key, sim, proposal, n):
-    """``n`` episodes drawn from ``proposal``, with their disturbances but without states, and their log weights to the end of each."""
+    """``n`` episodes drawn from ``proposal``, with their disturbances but without states, and their
+    log weights to the end of each.
+    """
 
     def one(key):
         for_component, for_episode = jax.random.split(key)
         k = jax.random.categorical(for_component, proposal.log_weights)
         e = rollout(for_episode, sim, jax.tree.map(lambda a: a[k], proposal.policies), raw)
-        t, states = jnp.arange(sim.horizon, dtype=jnp.int32), jax.tree.map(lambda a: a[:-1], e.states)
+        t, states = (
+            jnp.arange(sim.horizon, dtype=jnp.int32),
+            jax.tree.map(lambda a: a[:-1], e.states),
+        )
 
         def log_q(policy):
-            steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(states, t, e.disturbances)
+            steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
+                states, t, e.disturbances
+            )
             return jnp.sum(jnp.where(t < e.length, steps, 0)) + policy.start().log_prob(e.x0)
 
         logs = jax.vmap(log_q, axis_size=len(proposal.log_weights))(proposal.policies)
-        return e._replace(states=None), e.log_prob - logsumexp(proposal.log_weights.astype(logs.dtype) + logs).astype(e.log_prob.dtype)
+        return e._replace(states=None), e.log_prob - logsumexp(
+            proposal.log_weights.astype(logs.dtype) + logs
+        ).astype(e.log_prob.dtype)
 
     return jax.vmap(one)(jax.random.split(key, n))
 
@@ -190,4 +250,11 @@ def _uncovered(key, sim, proposal):
     """Why the proposal cannot be right, tried on episodes of the model."""
     seen = jax.device_get(_probe(key, sim, proposal, PROBES))
     missing = int((~seen.invalid & ~(seen.log_weight < np.inf)).sum())
-    return [f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: what it cannot draw is missing"] if missing else []
+    return (
+        [
+            f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: what"
+            " it cannot draw is missing"
+        ]
+        if missing
+        else []
+    )

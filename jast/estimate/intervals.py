@@ -9,14 +9,17 @@ __all__ = ["checked_level", "chernoff", "clopper_pearson", "jeffreys", "log_norm
 
 
 def clopper_pearson(k, n, level=0.95):
-    """Exact (low, high) of a binomial probability after ``k`` events in ``n`` trials: covers at least ``level`` of the time (Clopper and Pearson, 1934).
+    """Exact (low, high) of a binomial probability after ``k`` events in ``n`` trials: covers at
+    least ``level`` of the time (Clopper and Pearson, 1934).
 
-    low is the alpha/2 quantile of Beta(k, n - k + 1), high the 1 - alpha/2 quantile of Beta(k + 1, n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n.
-    Raises ValueError unless 0 <= k <= n, n >= 1 and 0 < level < 1.
+    low is the alpha/2 quantile of Beta(k, n - k + 1), high the 1 - alpha/2 quantile of Beta(k + 1,
+    n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n. Raises ValueError unless 0 <= k <= n, n >= 1
+    and 0 < level < 1.
     """
     _counts("clopper_pearson", k, n, level)
     k, n, tail = int(k), int(n), (1 - level) / 2
-    # P(X >= k; p) = I_p(k, n - k + 1) and P(X <= k; p) = I_(1-p)(n - k, k + 1): each tail is solved as itself, none as 1 less the other
+    # P(X >= k; p) = I_p(k, n - k + 1) and P(X <= k; p) = I_(1-p)(n - k, k + 1): each tail is solved
+    # as itself, none as 1 less the other
     low = 0.0 if k == 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
     high = 1.0 if k == n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
     return low, high
@@ -52,9 +55,17 @@ def _betainc(a, b, x):
     """Regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
     if not 0 < x < 1:
         return float(x >= 1)
-    if x > (a + 1) / (a + b + 2):  # beyond the bulk the fraction of the mirror image converges faster
+    # beyond the bulk the fraction of the mirror image converges faster
+    if x > (a + 1) / (a + b + 2):
         return 1 - _betainc(b, a, 1 - x)
-    log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x) - math.log(a)
+    log_front = (
+        math.lgamma(a + b)
+        - math.lgamma(a)
+        - math.lgamma(b)
+        + a * math.log(x)
+        + b * math.log1p(-x)
+        - math.log(a)
+    )
     tiny = 1e-300
     c, d = 1.0, 1 / (1 - (a + b) * x / (a + 1) or tiny)  # modified Lentz
     value = d
@@ -71,10 +82,11 @@ def _betainc(a, b, x):
 
 
 def chernoff(k, n, level=0.95):
-    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u above k/n with n KL(k/n || u) = log(1 / (1 - level)).
+    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u
+    above k/n with n KL(k/n || u) = log(1 / (1 - level)).
 
-    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of the time, and is not below Clopper and Pearson's. Raises
-    ValueError as `clopper_pearson`.
+    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of
+    the time, and is not below Clopper and Pearson's. Raises ValueError as `clopper_pearson`.
     """
     _counts("chernoff", k, n, level)
     k, n = int(k), int(n)
@@ -86,15 +98,19 @@ def chernoff(k, n, level=0.95):
 
 
 def jeffreys(k, n, level=0.95):
-    """Upper end of the one-sided interval of ``level`` under Jeffreys' prior (Lipkis and Agogino, eq. 18): that quantile of Beta(k + 1/2, n - k + 1/2).
+    """Upper end of the one-sided interval of ``level`` under Jeffreys' prior (Lipkis and Agogino,
+    eq. 18): that quantile of Beta(k + 1/2, n - k + 1/2).
 
-    A Bayesian bound: below the exact one, and not promised to cover in each case. Raises ValueError as `clopper_pearson`.
+    A Bayesian bound: below the exact one, and not promised to cover in each case. Raises ValueError
+    as `clopper_pearson`.
     """
     _counts("jeffreys", k, n, level)
     return _solve(lambda p: _betainc(int(k) + 0.5, int(n) - int(k) + 0.5, p) - level)
 
 
 def log_normal(log_mean, relative_error, level=0.95):
-    """(low, high) above 0, as skewed as a mean of weights is: exp(log_mean -+ z s), s^2 = log(1 + relative_error^2)."""
+    """(low, high) above 0, as skewed as a mean of weights is: exp(log_mean -+ z s), s^2 = log(1 +
+    relative_error^2).
+    """
     half = NormalDist().inv_cdf((1 + level) / 2) * math.sqrt(math.log1p(relative_error**2))
     return tuple(math.exp(min(log_mean + sign * half, 0.0)) for sign in (-1, 1))

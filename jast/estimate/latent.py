@@ -1,7 +1,10 @@
-"""A simulator as a limit state of normal numbers: an episode is a point z [D], under the model z ~ N(0, I), and proposals are mixtures of Gaussians there.
+"""A simulator as a limit state of normal numbers: an episode is a point z [D], under the model z ~
+N(0, I), and proposals are mixtures of Gaussians there.
 
-z holds the latents of x0 first, then those of x_1, x_2 ..: x_t is the quantile of p(x | s) at Phi(z_t). An episode that ends after n steps has used the first
-``used`` numbers; the others decide nothing, so densities are taken over the used ones. With Cholesky factors, lower triangular, these are a cumulative sum.
+z holds the latents of x0 first, then those of x_1, x_2 ..: x_t is the quantile of p(x | s) at
+Phi(z_t). An episode that ends after n steps has used the first ``used`` numbers; the others decide
+nothing, so densities are taken over the used ones. With Cholesky factors, lower triangular, these
+are a cumulative sum.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +21,19 @@ from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, conclude, random_start, rollout
 from jast.heads.heads import unflat
 
-__all__ = ["Latent", "Outcomes", "check", "dimension", "episodes", "flat", "log_ratios", "normal_numbers", "outcome", "outcomes", "place"]
+__all__ = [
+    "Latent",
+    "Outcomes",
+    "check",
+    "dimension",
+    "episodes",
+    "flat",
+    "log_ratios",
+    "normal_numbers",
+    "outcome",
+    "outcomes",
+    "place",
+]
 
 
 class Outcomes(NamedTuple):
@@ -37,7 +52,9 @@ class Outcomes(NamedTuple):
 
     @property
     def score(self):
-        """What a search minimises: the miss distance, -inf for a failure, inf for an invalid episode."""
+        """What a search minimises: the miss distance, -inf for a failure, inf for an invalid
+        episode.
+        """
         return jnp.where(self.failure, -jnp.inf, jnp.where(self.invalid, jnp.inf, self.distance))
 
 
@@ -55,18 +72,25 @@ class Latent(NamedTuple):
 
 
 def check(function, sim):
-    """ValueError unless the simulator fits the contract and its disturbances have a quantile function."""
+    """ValueError unless the simulator fits the contract and its disturbances have a quantile
+    function.
+    """
     contract(sim, observed=False)
     missing = []
 
     def look():
         start = sim.start()
-        dists = [("disturbance", sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))] + ([("start", start)] if random_start(sim) else [])
+        dists = [("disturbance", sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))] + (
+            [("start", start)] if random_start(sim) else []
+        )
         missing.extend(f"{name}: {type(d).__name__}" for name, d in dists if not D.has_quantile(d))
 
     jax.eval_shape(look)
     if missing:
-        raise ValueError(f"{function}: {missing[0]} has no quantile function; jast.estimate.monte_carlo needs none")
+        raise ValueError(
+            f"{function}: {missing[0]} has no quantile function; jast.estimate.monte_carlo needs"
+            " none"
+        )
 
 
 def dimension(sim):
@@ -88,7 +112,12 @@ def outcome(sim, z):
 
     def body(carry):
         progress, t = carry
-        return advance(sim, raw, progress, D.mode(policy.disturbance(progress.state, t)), t + 1 >= last), t + 1
+        return (
+            advance(
+                sim, raw, progress, D.mode(policy.disturbance(progress.state, t)), t + 1 >= last
+            ),
+            t + 1,
+        )
 
     end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
     end = conclude(sim, raw, end)
@@ -105,13 +134,20 @@ def outcomes(sim, z):
 @jax.jit
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
-    return jax.vmap(lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None))(z)
+    return jax.vmap(
+        lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None)
+    )(z)
 
 
 def place(q, u, e):
-    """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and normal ones ``e`` [n, D]."""
+    """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and
+    normal ones ``e`` [n, D].
+    """
     live = _live(q)
-    k = jnp.minimum(jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1, dtype=jnp.int32), live - 1)
+    k = jnp.minimum(
+        jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1, dtype=jnp.int32),
+        live - 1,
+    )
 
     def component(i, z):
         return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)
@@ -145,7 +181,12 @@ def raw(log_p, event, distance, terminal, approach=0.0):
 def _policy(sim, z):
     like0, like = jax.eval_shape(_shapes, sim)
     size0, _ = _sizes(sim)
-    return player(sim, choices.quantiles(), unflat(z[:size0], like0), jax.vmap(lambda row: unflat(row, like))(z[size0:].reshape(sim.horizon, -1)))
+    return player(
+        sim,
+        choices.quantiles(),
+        unflat(z[:size0], like0),
+        jax.vmap(lambda row: unflat(row, like))(z[size0:].reshape(sim.horizon, -1)),
+    )
 
 
 def flat(sim, z0, z):
@@ -153,7 +194,13 @@ def flat(sim, z0, z):
     rows = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
     first = [a.reshape(a.shape[0], -1) for a in jax.tree.leaves(z0)]
     n = rows[0].shape[0]
-    return jnp.concatenate([a.astype(normal_numbers(sim)) for a in (*first, jnp.concatenate(rows, axis=2).reshape(n, -1))], axis=1)
+    return jnp.concatenate(
+        [
+            a.astype(normal_numbers(sim))
+            for a in (*first, jnp.concatenate(rows, axis=2).reshape(n, -1))
+        ],
+        axis=1,
+    )
 
 
 def _sizes(sim):

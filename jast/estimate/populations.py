@@ -1,7 +1,10 @@
-"""Populations that find failures: down the levels of the miss distance (subset simulation, Au and Beck 2001), or from wider noise inwards.
+"""Populations that find failures: down the levels of the miss distance (subset simulation, Au and
+Beck 2001), or from wider noise inwards.
 
-The Markov moves are those of conditional sampling in the space of normal numbers (Papaioannou, Betz, Zwirglmaier and Straub 2015), with the size of the moves
-adapted. One population serves as an estimator of its own; as an explorer it may be kept out of the failures that a proposal covers already.
+The Markov moves are those of conditional sampling in the space of normal numbers (Papaioannou,
+Betz, Zwirglmaier and Straub 2015), with the size of the moves adapted. One population serves as an
+estimator of its own; as an explorer it may be kept out of the failures that a proposal covers
+already.
 """
 
 import math
@@ -53,7 +56,8 @@ class Population(NamedTuple):
 class Chain:
     """A population on its way: the moves, their size and the counts, which all explorers share.
 
-    Random numbers are NumPy's, from the key: programs without a generator compile in a third of the time, and nothing of it enters an estimate's own draws.
+    Random numbers are NumPy's, from the key: programs without a generator compile in a third of the
+    time, and nothing of it enters an estimate's own draws.
     """
 
     def __init__(self, key, sim, size, covered=None):
@@ -75,11 +79,22 @@ class Chain:
     def move(self, people, rows, level, width, times):
         """``people[rows]`` after Markov moves that keep N(0, width^2 I) given score <= level."""
         for _ in range(times):
-            numbers = (jnp.asarray(v, d) for v, d in ((level, people.score.dtype), (self.scale, self.dtype), (width, self.dtype)))
-            people, accepted = _move(self.sim, people, jnp.asarray(rows, jnp.int32), self.noise(), *numbers, self.covered)
+            numbers = (
+                jnp.asarray(v, d)
+                for v, d in (
+                    (level, people.score.dtype),
+                    (self.scale, self.dtype),
+                    (width, self.dtype),
+                )
+            )
+            people, accepted = _move(
+                self.sim, people, jnp.asarray(rows, jnp.int32), self.noise(), *numbers, self.covered
+            )
             self.count(people)
             self.accepted = float(accepted)
-            self.scale = float(np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0))
+            self.scale = float(
+                np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0)
+            )
             rows = np.arange(self.size)
         return people
 
@@ -90,16 +105,32 @@ class Chain:
 
     def end(self, people, log_mean, levels):
         if people is None:
-            return Explored(np.zeros((0, self.dimension)), np.zeros(0, np.int32), -math.inf, tuple(levels), self.evaluations, self.invalid)
-        return Explored(np.asarray(people.z), np.asarray(people.used), log_mean, tuple(levels), self.evaluations, self.invalid)
+            return Explored(
+                np.zeros((0, self.dimension)),
+                np.zeros(0, np.int32),
+                -math.inf,
+                tuple(levels),
+                self.evaluations,
+                self.invalid,
+            )
+        return Explored(
+            np.asarray(people.z),
+            np.asarray(people.used),
+            log_mean,
+            tuple(levels),
+            self.evaluations,
+            self.invalid,
+        )
 
 
 def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
-    """Subset simulation: take a population of ``size`` points down the levels of the miss distance to the failures of ``sim``: `Explored`.
+    """Subset simulation: take a population of ``size`` points down the levels of the miss distance
+    to the failures of ``sim``: `Explored`.
 
-    ``covered``: (`Latent` q, log threshold): points with log q - log p above it are left out, so that the population looks for failures that q does not
-    draw, and the estimate is of those alone. It gives up below the log probability ``least``, where it would take more than ``most`` evaluations, or where no
-    level falls further.
+    ``covered``: (`Latent` q, log threshold): points with log q - log p above it are left out, so
+    that the population looks for failures that q does not draw, and the estimate is of those alone.
+    It gives up below the log probability ``least``, where it would take more than ``most``
+    evaluations, or where no level falls further.
     """
     chain = Chain(key, sim, size, covered)
     people = chain.draw(1.0)
@@ -129,11 +160,14 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
 
 
 def cool(key, sim, chains):
-    """Failing points of small norm, one a chain, found without a miss distance that could mislead: `Explored`.
+    """Failing points of small norm, one a chain, found without a miss distance that could mislead:
+    `Explored`.
 
-    Under wider noise N(0, s^2 I) failures are frequent: the first width that makes a share of ``FAILING`` fail (nothing is found where none does). ``chains``
-    of these failures go on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain replaces another one, no
-    failure mode is lost on the way, however little of the probability it has.
+    Under wider noise N(0, s^2 I) failures are frequent: the first width that makes a share of
+    ``FAILING`` fail (nothing is found where none does). ``chains`` of these failures go on, each by
+    Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain
+    replaces another one, no failure mode is lost on the way, however little of the probability it
+    has.
     """
     chain = Chain(key, sim, chains)
     for width in WIDTHS:
@@ -152,7 +186,9 @@ def cool(key, sim, chains):
 
 
 def _next(score, last):
-    """The next level: the sample quantile of the scores, below the last one; None where there is none above the failures."""
+    """The next level: the sample quantile of the scores, below the last one; None where there is
+    none above the failures.
+    """
     level = np.sort(score)[math.ceil(QUANTILE * len(score)) - 1]
     if level < last:
         return float(level)
@@ -173,9 +209,13 @@ def _judge(sim, z, covered):
 
 @jax.jit
 def _move(sim, people, rows, noise, level, scale, width, covered):
-    """One Markov move of ``people[rows]``: (`Population`, with the invalid ones of the candidates, accepted share)."""
+    """One Markov move of ``people[rows]``: (`Population`, with the invalid ones of the candidates,
+    accepted share).
+    """
     people = jax.tree.map(lambda a: a[rows], people)
     new = _judge(sim, jnp.sqrt(1 - scale**2) * people.z + scale * width * noise, covered)
     good = new.score <= level
-    kept = jax.tree.map(lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people)
+    kept = jax.tree.map(
+        lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people
+    )
     return kept._replace(invalid=new.invalid), jnp.mean(good, dtype=scale.dtype)

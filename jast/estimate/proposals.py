@@ -1,6 +1,8 @@
-"""Proposals of importance resampling: recorded failure traces and failure policies, mixed with the model so that nothing is left uncovered.
+"""Proposals of importance resampling: recorded failure traces and failure policies, mixed with the
+model so that nothing is left uncovered.
 
-Lipkis and Agogino, Discovery and Analysis of Rare High-Impact Failure Modes Using Adversarial RL-Informed Sampling ("the paper").
+Lipkis and Agogino, Discovery and Analysis of Rare High-Impact Failure Modes Using Adversarial
+RL-Informed Sampling ("the paper").
 """
 
 from dataclasses import dataclass, field
@@ -29,28 +31,37 @@ MIXING = ("step", "trace")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Proposal:
-    """A mixture of K policies, one of which is drawn for a whole trace: q(trace) = sum of exp(log_weights[k]) q_k(trace). A pytree."""
+    """A mixture of K policies, one of which is drawn for a whole trace: q(trace) = sum of
+    exp(log_weights[k]) q_k(trace). A pytree.
+    """
 
     log_weights: Any
     """[K], of sum 1 as probabilities"""
     policies: Policy
     """Stacked: a leading axis [K] on every leaf"""
     covers: bool = field(default=False, metadata=dict(static=True))
-    """Known to have a density above 0 wherever the model has one, as it holds a share of the model; static."""
+    """Known to have a density above 0 wherever the model has one, as it holds a share of the model;
+    static.
+    """
 
 
 def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=True):
-    """The proposal of recorded failures, the paper's Algorithm 1 (one trace) and eq. 19-20 (several): `Proposal` of one component a trace.
+    """The proposal of recorded failures, the paper's Algorithm 1 (one trace) and eq. 19-20
+    (several): `Proposal` of one component a trace.
 
-    ``episodes``: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a list of either. Each is replayed; its disturbance x*_t
-    moves p(x | s) so that its middle is where x*_t lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq. 10-11), in general
-    `jast.cross_entropy.tilted`, which keeps within bounds and suits whole numbers too. Steps after the end of a trace are the model's own.
+    ``episodes``: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a
+    list of either. Each is replayed; its disturbance x*_t moves p(x | s) so that its middle is
+    where x*_t lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq.
+    10-11), in general `jast.cross_entropy.tilted`, which keeps within bounds and suits whole
+    numbers too. Steps after the end of a trace are the model's own.
 
-    ``epsilon``: the share of the model, above 0 and at most 1 (traced). With ``mixing="step"`` it is mixed in at each step, as in the paper (eq. 12; of T steps
-    all are moved with probability (1 - epsilon)^T only); ``"trace"``: one more component is the model itself, for long horizons. ``tilt_start=False`` draws
-    x0 from the model.
+    ``epsilon``: the share of the model, above 0 and at most 1 (traced). With ``mixing="step"`` it
+    is mixed in at each step, as in the paper (eq. 12; of T steps all are moved with probability (1
+    - epsilon)^T only); ``"trace"``: one more component is the model itself, for long horizons.
+    ``tilt_start=False`` draws x0 from the model.
 
-    Raises ValueError for another epsilon or mixing, episodes that do not fit the simulator, and a disturbance that cannot be tilted (named).
+    Raises ValueError for another epsilon or mixing, episodes that do not fit the simulator, and a
+    disturbance that cannot be tilted (named).
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
@@ -59,11 +70,19 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
         start, steps = latents(sim, recorded, tilt_start)
     except ValueError as error:
         raise ValueError(f"trace_proposal: disturbance: {error}") from None
-    if not all(isinstance(a, jax.core.Tracer) or np.isfinite(a).all() for a in jax.tree.leaves((start, steps))):
-        raise ValueError("trace_proposal: episodes must hold finite disturbances that the model can draw, received others")
+    if not all(
+        isinstance(a, jax.core.Tracer) or np.isfinite(a).all()
+        for a in jax.tree.leaves((start, steps))
+    ):
+        raise ValueError(
+            "trace_proposal: episodes must hold finite disturbances that the model can draw,"
+            " received others"
+        )
     k = len(jax.tree.leaves(steps)[0])
     if mixing == "trace":
-        start, steps = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), (start, steps))
+        start, steps = jax.tree.map(
+            lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), (start, steps)
+        )
         log_weights = jnp.log(jnp.append(jnp.full((k,), (1 - epsilon) / k), epsilon))
     else:
         log_weights = jnp.full((k,), -jnp.log(jnp.asarray(k, epsilon.dtype)))
@@ -71,55 +90,93 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     first = Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start
     many = Policy(first, Partial(_trace_step, sim.disturbance, steps, share))
     one = Policy(
-        Partial(_trace_start, sim.start, jax.tree.map(lambda a: a[0], start), share) if tilt_start else sim.start,
+        (
+            Partial(_trace_start, sim.start, jax.tree.map(lambda a: a[0], start), share)
+            if tilt_start
+            else sim.start
+        ),
         Partial(_trace_step, sim.disturbance, jax.tree.map(lambda a: a[0], steps), share),
     )
     return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
 
 
 def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"):
-    """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
+    """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's
+    value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
 
-    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from the model alone, as Algorithm 2 is printed. Where x0
-    decides whether the system fails that estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate`. ``epsilon`` and ``mixing`` as in
-    `trace_proposal`. A policy that itself draws from all failures can be given to `importance` as it is.
+    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from
+    the model alone, as Algorithm 2 is printed. Where x0 decides whether the system fails that
+    estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate`. ``epsilon``
+    and ``mixing`` as in `trace_proposal`. A policy that itself draws from all failures can be given
+    to `importance` as it is.
 
-    Raises ValueError for another epsilon or mixing, what is no `jast.Policy`, and a disturbance that cannot be tilted (named).
+    Raises ValueError for another epsilon or mixing, what is no `jast.Policy`, and a disturbance
+    that cannot be tilted (named).
     """
     epsilon = _epsilon("policy_proposal", epsilon, mixing)
     contract(sim, observed=False)
     if not isinstance(policy, Policy):
-        raise ValueError(f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}")
+        raise ValueError(
+            f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}"
+        )
     tilt_start = tilt_start and random_start(sim)
     share = epsilon if mixing == "step" else None
     on = jnp.ones((), epsilon.dtype)
     strength = on[None] if mixing == "step" else jnp.stack([on, on * 0])
     make = lambda strength: Policy(
-        Partial(_policy_start, sim.start, policy.start, strength, share) if tilt_start else sim.start,
+        (
+            Partial(_policy_start, sim.start, policy.start, strength, share)
+            if tilt_start
+            else sim.start
+        ),
         Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share),
     )
-    log_weights = jnp.zeros((1,), epsilon.dtype) if mixing == "step" else jnp.log(jnp.stack([1 - epsilon, epsilon]))
+    log_weights = (
+        jnp.zeros((1,), epsilon.dtype)
+        if mixing == "step"
+        else jnp.log(jnp.stack([1 - epsilon, epsilon]))
+    )
     many, one = make(strength), make(strength[0])
-    _try(lambda: one.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))), jnp.int32(0)), "policy_proposal")
+    _try(
+        lambda: one.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))), jnp.int32(0)),
+        "policy_proposal",
+    )
     return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
 
 
 def as_proposal(function, sim, proposal):
-    """A `Proposal`: ``proposal`` itself, or a mixture of the one `Policy` that it is. ValueError for anything else, and for a policy without a density."""
+    """A `Proposal`: ``proposal`` itself, or a mixture of the one `Policy` that it is. ValueError
+    for anything else, and for a policy without a density.
+    """
     if isinstance(proposal, Policy):
         dtype = jnp.zeros(()).dtype
-        proposal = Proposal(jnp.zeros((1,), dtype), jax.tree.map(lambda a: jnp.asarray(a)[None], proposal))
+        proposal = Proposal(
+            jnp.zeros((1,), dtype), jax.tree.map(lambda a: jnp.asarray(a)[None], proposal)
+        )
     if not isinstance(proposal, Proposal):
-        raise ValueError(f"{function}: proposal must be a Proposal or a jast.Policy, received {type(proposal).__name__}")
+        raise ValueError(
+            f"{function}: proposal must be a Proposal or a jast.Policy, received"
+            f" {type(proposal).__name__}"
+        )
 
     def look():
         policy = jax.tree.map(lambda a: a[0], proposal.policies)
         x0 = D.sample(sim.start(), jax.random.key(0))
-        pairs = (policy.start(), sim.start()), (policy.disturbance(sim.init(x0), jnp.int32(0)), None)
-        return [q for q, p in pairs if isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic)]
+        pairs = (
+            (policy.start(), sim.start()),
+            (policy.disturbance(sim.init(x0), jnp.int32(0)), None),
+        )
+        return [
+            q
+            for q, p in pairs
+            if isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic)
+        ]
 
     if _host(look):
-        raise ValueError(f"{function}: a policy that plays one value has no density; make a proposal of it with trace_proposal or policy_proposal")
+        raise ValueError(
+            f"{function}: a policy that plays one value has no density; make a proposal of it with"
+            " trace_proposal or policy_proposal"
+        )
     return proposal
 
 
@@ -131,13 +188,26 @@ def _epsilon(function, epsilon, mixing):
 
 def _stacked(sim, episodes):
     """x0, disturbances and lengths with one leading axis [K]."""
-    parts = list(episodes) if isinstance(episodes, list) or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields")) else [episodes]
+    parts = (
+        list(episodes)
+        if isinstance(episodes, list)
+        or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields"))
+        else [episodes]
+    )
     if not parts or not all(isinstance(e, Episode) for e in parts):
-        raise ValueError(f"trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received {[type(e).__name__ for e in parts]}")
+        raise ValueError(
+            "trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received"
+            f" {[type(e).__name__ for e in parts]}"
+        )
     fields = [(e.x0, e.disturbances, e.length) for e in parts]
-    batched = [f if np.ndim(f[2]) else jax.tree.map(lambda a: jnp.asarray(a)[None], f) for f in fields]
+    batched = [
+        f if np.ndim(f[2]) else jax.tree.map(lambda a: jnp.asarray(a)[None], f) for f in fields
+    ]
     if not all(len(np.shape(b[2])) == 1 and len(b[2]) for b in batched):
-        raise ValueError(f"trace_proposal: episodes must have at most one leading axis, of at least 1, received lengths {[np.shape(b[2]) for b in batched]}")
+        raise ValueError(
+            "trace_proposal: episodes must have at most one leading axis, of at least 1, received"
+            f" lengths {[np.shape(b[2]) for b in batched]}"
+        )
     like_x0, like = jax.eval_shape(_shapes, sim)
     full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like)
     for x0, x, _ in batched:
@@ -145,16 +215,23 @@ def _stacked(sim, episodes):
         try:
             _fitted("x0", one[0], like_x0), _fitted("disturbances", one[1], full)
         except ValueError as error:
-            raise ValueError(f"trace_proposal: episodes do not fit the simulator: {str(error).removeprefix('replay: ')}") from None
+            raise ValueError(
+                "trace_proposal: episodes do not fit the simulator:"
+                f" {str(error).removeprefix('replay: ')}"
+            ) from None
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
 
 
 @partial(jax.jit, static_argnums=2)
 def latents(sim, recorded, of_start):
-    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end of each."""
+    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end
+    of each.
+    """
 
     def one(x0, x, length):
-        e = replay(sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(())))
+        e = replay(
+            sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(()))
+        )
         states = jax.tree.map(lambda a: a[:-1], e.states)
         z = jax.vmap(lambda s, x: latent(sim.disturbance(s), x))(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
@@ -183,8 +260,18 @@ def _try(look, function):
 
 
 def _stack(many, one, k):
-    """``many``, whose own leaves have the axis [K], with the leaves that it shares with the simulator repeated to have it as well."""
-    return jax.tree.map(lambda a, b: jnp.asarray(a) if np.ndim(a) > np.ndim(b) else jnp.broadcast_to(jnp.asarray(a), (k, *np.shape(a))), many, one)
+    """``many``, whose own leaves have the axis [K], with the leaves that it shares with the
+    simulator repeated to have it as well.
+    """
+    return jax.tree.map(
+        lambda a, b: (
+            jnp.asarray(a)
+            if np.ndim(a) > np.ndim(b)
+            else jnp.broadcast_to(jnp.asarray(a), (k, *np.shape(a)))
+        ),
+        many,
+        one,
+    )
 
 
 def _moved(p, z):

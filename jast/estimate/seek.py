@@ -1,7 +1,9 @@
-"""The search for a proposal: design points, populations, mixtures fitted by cross-entropy, and a guard against failure modes that were lost.
+"""The search for a proposal: design points, populations, mixtures fitted by cross-entropy, and a
+guard against failure modes that were lost.
 
-Every failing point that a batch draws is weighted by the balance heuristic over all batches (Veach and Guibas 1995), and the next mixture is fitted to all of
-them. None of these points serves the estimate, which is made with the proposal as it stands at the end.
+Every failing point that a batch draws is weighted by the balance heuristic over all batches (Veach
+and Guibas 1995), and the next mixture is fitted to all of them. None of these points serves the
+estimate, which is made with the proposal as it stands at the end.
 """
 
 import math
@@ -22,8 +24,9 @@ from jast.incidents import hosted
 __all__ = ["Seeker", "seek"]
 
 WIDE, MODEL = 0.2, 0.1
-"""Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that no weight is without variance; where failures are not rare
-the model itself."""
+"""Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
+no weight is without variance; where failures are not rare the model itself.
+"""
 COVERED = 50.0
 """A failure is covered where its weight is at most so many times the mean."""
 REFITTING = 0.5
@@ -33,7 +36,9 @@ RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
 
 
 class Seeker:
-    """What the search knows so far: a proposal, the batches and populations behind it, what they cost, and in words how it went."""
+    """What the search knows so far: a proposal, the batches and populations behind it, what they
+    cost, and in words how it went.
+    """
 
     def __init__(self, key, sim, budget):
         self.key, self.sim, self.budget = key, sim, budget
@@ -55,16 +60,26 @@ class Seeker:
         self.history.append(f"{text}, {evaluations} evaluations" if evaluations else text)
 
     def add(self, g, share=None, low=0.3):
-        """Take the `Gaussians` ``g`` into the proposal, for ``share`` of it; no variance is below ``low`` times the model's."""
+        """Take the `Gaussians` ``g`` into the proposal, for ``share`` of it; no variance is below
+        ``low`` times the model's.
+        """
         new = as_latent(_defended(g, low, self.rare), self.dtype)
         self.q = new if self.q is None or share is None else together(self.q, new, share)
 
     def filled(self, z, used):
-        """The points with the numbers that decided nothing drawn anew from the model, which is what they are given the failure."""
-        return np.where(np.arange(self.dimension)[None] < used[:, None], z.astype(np.float64), self.rng.standard_normal(z.shape))
+        """The points with the numbers that decided nothing drawn anew from the model, which is what
+        they are given the failure.
+        """
+        return np.where(
+            np.arange(self.dimension)[None] < used[:, None],
+            z.astype(np.float64),
+            self.rng.standard_normal(z.shape),
+        )
 
     def fitted(self, z, used):
-        """`Gaussians` of a population, whose members are not independent: so they count for a fifth in all, and for a twentieth as to covariances."""
+        """`Gaussians` of a population, whose members are not independent: so they count for a fifth
+        in all, and for a twentieth as to covariances.
+        """
         n = len(z)
         return fit(self.rng, self.filled(z, used), np.full(n, 1 / n), n / 5, n / 20)
 
@@ -74,11 +89,16 @@ class Seeker:
 
     def centres(self):
         """The distinct means of the proposal [m, D]."""
-        return distinct(np.asarray(self.q.means, np.float64)[np.asarray(self.q.log_weights) > math.log(0.003)], POINTS)
+        return distinct(
+            np.asarray(self.q.means, np.float64)[np.asarray(self.q.log_weights) > math.log(0.003)],
+            POINTS,
+        )
 
 
 def seek(key, sim, budget, gradients=True):
-    """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was found."""
+    """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was
+    found.
+    """
     s = Seeker(key, sim, budget)
     parts = _explore(s, gradients and not hosted(sim))
     if not parts:
@@ -96,27 +116,42 @@ def seek(key, sim, budget, gradients=True):
 
 
 def _explore(s, gradients):
-    """What the first proposal is made of: a list of `Gaussians`, one for each explorer that found failures."""
+    """What the first proposal is made of: a list of `Gaussians`, one for each explorer that found
+    failures.
+    """
     parts = []
 
     def around(name, points, evaluations):
         norms = np.linalg.norm(points, axis=1)
-        s.note(f"{name}: {len(points)} points" + (f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""), evaluations)
+        s.note(
+            f"{name}: {len(points)} points"
+            + (f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""),
+            evaluations,
+        )
         if len(points):
             s.anchors = np.concatenate([s.anchors, points])
             weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + 0.05
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return len(points) > 0
 
-    found = design_points(s.next_key(), s.sim, int(np.clip(s.budget // 2000, 4, 48)), POINTS) if gradients else None
-    differentiable = found is not None and around("design points by gradients", found.points, found.evaluations)
+    found = (
+        design_points(s.next_key(), s.sim, int(np.clip(s.budget // 2000, 4, 48)), POINTS)
+        if gradients
+        else None
+    )
+    differentiable = found is not None and around(
+        "design points by gradients", found.points, found.evaluations
+    )
     cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, 8, CHAINS)))
     points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
     around("design points by cooling", distinct(points, POINTS), cold.evaluations)
     s.seeds = points[s.rng.permutation(len(points))]
     if not differentiable:
         population = explore(s.next_key(), s.sim, s.size, most=int(0.4 * s.budget))
-        s.note(f"subset simulation: {len(population.levels)} levels, log p {population.log_mean:.2f}", population.evaluations)
+        s.note(
+            f"subset simulation: {len(population.levels)} levels, log p {population.log_mean:.2f}",
+            population.evaluations,
+        )
         if population.reached:
             s.populations.append(population)
             parts.append(s.fitted(population.points, population.used))
@@ -124,10 +159,15 @@ def _explore(s, gradients):
 
 
 def _refine(s, most):
-    """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they get better."""
+    """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they
+    get better.
+    """
     before, limit = 0.0, s.spent + most * s.batch
     while s.spent < limit and (before == 0 or s.spent < REFITTING * s.budget):
-        numbers = (jnp.asarray(a, s.dtype) for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension))))
+        numbers = (
+            jnp.asarray(a, s.dtype)
+            for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension)))
+        )
         z, o, log_w, _ = jax.device_get(drawn(s.sim, s.q, *numbers))
         b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
         if not b.failure.any():
@@ -135,19 +175,27 @@ def _refine(s, most):
             return
         s.batches.append(b)
         own, (name, ess) = effective(b.log_weight[b.failure]), _fit(s)
-        s.note(f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f}, ESS {ess:.4g}; next: {name}", s.batch)
+        s.note(
+            f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f},"
+            f" ESS {ess:.4g}; next: {name}",
+            s.batch,
+        )
         if own < 1.15 * before and own > 0.1 * s.batch or name == "as it was":
             return
         before = own
 
 
 def _fit(s):
-    """The proposal becomes what promises the least variance: a mixture for all failures, one with parts for each mode, a sphere, or itself."""
+    """The proposal becomes what promises the least variance: a mixture for all failures, one with
+    parts for each mode, a sphere, or itself.
+    """
     log_w, failing = balanced(s.batches)
     w = np.exp(log_w - log_w.max())
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
     s.rare = s.log_mean < RARE
-    z, used = (np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used"))
+    z, used = (
+        np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used")
+    )
     points, centres = s.filled(z, used), s.centres()
     owner = _nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW
@@ -157,9 +205,18 @@ def _fit(s):
     choices = {"as it was": s.q, "modes": _by_owner(s, points, log_w, owner)}
     if owner.any():
         choices["one"] = _by_owner(s, points, log_w, np.zeros_like(owner))
-    # failures in all directions: no number of Gaussians elsewhere covers a sphere in many dimensions
+    # failures in all directions: no number of Gaussians elsewhere covers a sphere in many
+    # dimensions
     spread = (w @ (points**2).mean(axis=1)) / w.sum()
-    choices["all around"] = as_latent([(1.0, unit(np.zeros((1, s.dimension)))._replace(values=np.full((1, s.dimension), spread)))], s.dtype)
+    choices["all around"] = as_latent(
+        [
+            (
+                1.0,
+                unit(np.zeros((1, s.dimension)))._replace(values=np.full((1, s.dimension), spread)),
+            )
+        ],
+        s.dtype,
+    )
     name = min(choices, key=lambda name: variance(choices[name]))
     s.q = choices[name]
     return name, effective(log_w)
@@ -173,29 +230,52 @@ def _by_owner(s, points, log_w, owner):
         mass = w[rows].sum() / w.sum()
         if mass < NOTHING:
             continue
-        # few great weights would make a mixture fit their own noise: a power below 1 of them leads the same way, in more batches
+        # few great weights would make a mixture fit their own noise: a power below 1 of them leads
+        # the same way, in more batches
         power = _power(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
         v = np.exp(power * (log_w[rows] - log_w[rows].max()))
-        g = fit(s.rng, points[rows], v / v.sum(), v.sum() ** 2 / (v**2).sum(), limit=max(POINTS // len(owners), 2), anchors=s.anchors)
+        g = fit(
+            s.rng,
+            points[rows],
+            v / v.sum(),
+            v.sum() ** 2 / (v**2).sum(),
+            limit=max(POINTS // len(owners), 2),
+            anchors=s.anchors,
+        )
         parts.append(g._replace(weights=g.weights * max(mass, 0.003 if power == 1 else 0.02)))
-    return as_latent(_defended(Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), 0.0, s.rare), s.dtype)
+    return as_latent(
+        _defended(
+            Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), 0.0, s.rare
+        ),
+        s.dtype,
+    )
 
 
 def _nearest(points, centres):
-    """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n, D]."""
+    """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n,
+    D].
+    """
     return np.argmax(points @ centres.T - 0.5 * (centres**2).sum(axis=1), axis=1)
 
 
 def _defended(g, low, rare):
-    """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the model."""
+    """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the
+    model.
+    """
     d, model = g.means.shape[1], 0.0 if rare else MODEL
     wide = g._replace(values=np.maximum(g.values, 1.0))
-    parts = [(1 - WIDE - model, g._replace(values=np.maximum(g.values, low))), (WIDE, wide)] if (g.values < 1).any() else [(1 - model, g)]
+    parts = (
+        [(1 - WIDE - model, g._replace(values=np.maximum(g.values, low))), (WIDE, wide)]
+        if (g.values < 1).any()
+        else [(1 - model, g)]
+    )
     return [*parts, (model, unit(np.zeros((1, d))))] if model else parts
 
 
 def _power(log_w, least):
-    """The greatest power, at most 1, of the weights that leaves an effective number of ``least``."""
+    """The greatest power, at most 1, of the weights that leaves an effective number of
+    ``least``.
+    """
     if effective(log_w) >= least:
         return 1.0
     low, high = 0.0, 1.0

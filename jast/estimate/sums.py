@@ -1,4 +1,6 @@
-"""What an estimate needs of its weights, added chunk by chunk on the host: constant memory, double precision, any range."""
+"""What an estimate needs of its weights, added chunk by chunk on the host: constant memory, double
+precision, any range.
+"""
 
 from typing import Any, NamedTuple
 
@@ -42,7 +44,9 @@ def nothing(samples):
 
 
 def tail_size(samples):
-    """How many of the greatest weights the Pareto fit looks at: min(n / 5, 3 sqrt(n)) (Vehtari et al. 2024)."""
+    """How many of the greatest weights the Pareto fit looks at: min(n / 5, 3 sqrt(n)) (Vehtari et
+    al. 2024).
+    """
     return int(np.ceil(min(samples / 5, 3 * np.sqrt(samples)))) + 1
 
 
@@ -66,7 +70,8 @@ def add(total, traces):
         steps=total.steps + int(np.asarray(traces.length, np.int64).sum()),
         failures=total.failures + int(np.asarray(traces.failure).sum()),
         invalid=total.invalid + int(np.asarray(traces.invalid).sum()),
-        invalid_first=total.invalid_first * rescale + (np.exp(bad - top).sum() if bad.size and top > -np.inf else 0.0),
+        invalid_first=total.invalid_first * rescale
+        + (np.exp(bad - top).sum() if bad.size and top > -np.inf else 0.0),
         undefined=total.undefined + int(np.asarray(traces.failure).sum()) - len(log_w),
         top=top,
         first=total.first * rescale + w.sum(),

@@ -1,4 +1,6 @@
-"""Rollout-policy and value networks for tree searches, trained on the statistics of finished trees."""
+"""Rollout-policy and value networks for tree searches, trained on the statistics of finished
+trees.
+"""
 
 from jast.heads.heads import Heads, Moments
 from jast.heads.networks import Head, make_head
@@ -7,4 +9,16 @@ from jast.heads.settings import MODES, HeadSettings, settings
 from jast.heads.storage import load, save
 from jast.heads.training import Lesson
 
-__all__ = ["MODES", "Head", "HeadSettings", "Heads", "Lesson", "Moments", "as_policy", "load", "make_head", "save", "settings"]
+__all__ = [
+    "MODES",
+    "Head",
+    "HeadSettings",
+    "Heads",
+    "Lesson",
+    "Moments",
+    "as_policy",
+    "load",
+    "make_head",
+    "save",
+    "settings",
+]

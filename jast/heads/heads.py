@@ -1,4 +1,6 @@
-"""The two heads of a search and what they say: a histogram of the next disturbance, and the reward to come after one."""
+"""The two heads of a search and what they say: a histogram of the next disturbance, and the reward
+to come after one.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,11 +14,23 @@ from jax.tree_util import Partial
 from jast import distributions as D
 from jast.heads.networks import Head
 
-__all__ = ["Heads", "Moments", "flat", "histogram", "in_bins", "moments", "observed", "unflat", "value"]
+__all__ = [
+    "Heads",
+    "Moments",
+    "flat",
+    "histogram",
+    "in_bins",
+    "moments",
+    "observed",
+    "unflat",
+    "value",
+]
 
 
 class Moments(NamedTuple):
-    """Running mean and deviation of n numbers; with ``count`` 0 they leave what they normalise as it is."""
+    """Running mean and deviation of n numbers; with ``count`` 0 they leave what they normalise as
+    it is.
+    """
 
     count: Any
     """scalar float32."""
@@ -27,7 +41,9 @@ class Moments(NamedTuple):
 
     @classmethod
     def empty(cls, *shape):
-        return cls(np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32))
+        return cls(
+            np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32)
+        )
 
     def normalise(self, x):
         return (x - self.mean) / self._scale()
@@ -44,7 +60,9 @@ class Moments(NamedTuple):
 
 
 def moments(before, x):
-    """``before`` and the rows of ``x`` [m, n] (or [m]), on the host (the pairwise update of Chan, Golub and LeVeque)."""
+    """``before`` and the rows of ``x`` [m, n] (or [m]), on the host (the pairwise update of Chan,
+    Golub and LeVeque).
+    """
     if not len(x):
         return before
     x, mean, count = np.asarray(x, np.float64), np.float64(before.mean), before.count + len(x)
@@ -52,16 +70,20 @@ def moments(before, x):
     gap = x.mean(0) - mean
     variance = (squares + len(x) * x.var(0) + gap**2 * before.count * len(x) / count) / count
     deviation = np.where(variance > 1e-12, np.sqrt(variance), 0)
-    return Moments(*(np.asarray(a, np.float32) for a in (count, mean + gap * len(x) / count, deviation)))
+    return Moments(
+        *(np.asarray(a, np.float32) for a in (count, mean + gap * len(x) / count, deviation))
+    )
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Heads:
-    """A rollout-policy head and a value head (Lytskjold and Mengshoel, MCFS-AP): each a `Head`, or a pair (params, apply), or None; a pytree.
+    """A rollout-policy head and a value head (Lytskjold and Mengshoel, MCFS-AP): each a `Head`, or
+    a pair (params, apply), or None; a pytree.
 
-    ``policy.apply(params, s)`` gives logits [d, bins] for the normalised observation s [n], ``value.apply(params, s and x [n + d])`` a scalar; n numbers are
-    observed, a disturbance has d. A search fills in the moments that normalise what goes in and out.
+    ``policy.apply(params, s)`` gives logits [d, bins] for the normalised observation s [n],
+    ``value.apply(params, s and x [n + d])`` a scalar; n numbers are observed, a disturbance has d.
+    A search fills in the moments that normalise what goes in and out.
     """
 
     policy: Any = None
@@ -71,8 +93,9 @@ class Heads:
     returns: Any = None
     """`Moments` of the value head's targets."""
     levels: Any = 0
-    """int: the first levels of an episode that they have learned of; a default search is not guided by them deeper down. Give those that you trained yourself
-    the horizon."""
+    """int: the first levels of an episode that they have learned of; a default search is not guided
+    by them deeper down. Give those that you trained yourself the horizon.
+    """
 
     def __post_init__(self):
         for name in ("policy", "value"):
@@ -93,7 +116,9 @@ def flat(x):
 
 
 def unflat(u, event):
-    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as floats."""
+    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as
+    floats.
+    """
     leaves, treedef = jax.tree.flatten(event)
     out, at = [], 0
     for s in leaves:
@@ -105,25 +130,40 @@ def unflat(u, event):
 
 def histogram(heads, seen):
     """Logits [d, bins] of the policy head at an observation [n]."""
-    return heads.policy.apply(heads.policy.params, heads.inputs.first(seen.shape[0]).normalise(seen))
+    return heads.policy.apply(
+        heads.policy.params, heads.inputs.first(seen.shape[0]).normalise(seen)
+    )
 
 
 def in_bins(logits, u):
-    """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from uniform ``u`` [d]: the inverse of its distribution function."""
+    """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from
+    uniform ``u`` [d]: the inverse of its distribution function.
+    """
     bins = logits.shape[1]
     mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
     mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
-    u = u * sum(mass[:, k] for k in range(bins))  # summed as below, so that no rounding leads past the last bin that has mass
+    # summed as below, so that no rounding leads past the last bin that has mass
+    u = u * sum(mass[:, k] for k in range(bins))
     below = bin = beneath = jnp.zeros_like(u)
     own = mass[:, 0]
-    for k in range(1, bins):  # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
+    # unrolled: one fused loop over lanes, where a cumulative sum and a gather would be several
+    for k in range(1, bins):
         below = below + mass[:, k - 1]
         past = u >= below
-        bin, beneath, own = jnp.where(past, jnp.float32(k), bin), jnp.where(past, below, beneath), jnp.where(past, mass[:, k], own)
-    inside = jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - bins * 2.0**-22)  # of 1, so far that no rounding leads into the next bin
+        bin, beneath, own = (
+            jnp.where(past, jnp.float32(k), bin),
+            jnp.where(past, below, beneath),
+            jnp.where(past, mass[:, k], own),
+        )
+    # of 1, so far that no rounding leads into the next bin
+    inside = jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - bins * 2.0**-22)
     return (bin + inside) / bins
 
 
 def value(heads, seen, x):
-    """v(s, a), a scalar: the value head's word on the reward from the observation ``seen`` [n] on, with the disturbance ``x`` [d]."""
-    return heads.returns.restore(heads.value.apply(heads.value.params, heads.inputs.normalise(jnp.concatenate([seen, x]))))
+    """v(s, a), a scalar: the value head's word on the reward from the observation ``seen`` [n] on,
+    with the disturbance ``x`` [d].
+    """
+    return heads.returns.restore(
+        heads.value.apply(heads.value.params, heads.inputs.normalise(jnp.concatenate([seen, x])))
+    )

@@ -1,4 +1,6 @@
-"""Heads: what a search asks of a network, and the Flax network that jast makes where the user brings none."""
+"""Heads: what a search asks of a network, and the Flax network that jast makes where the user
+brings none.
+"""
 
 import functools
 import math
@@ -10,35 +12,54 @@ from jax.tree_util import Partial
 
 __all__ = ["Head", "make_head"]
 
-ACTIVATIONS = {"gelu": lambda x: jax.nn.gelu(x, approximate=False), "relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
+ACTIVATIONS = {
+    "gelu": lambda x: jax.nn.gelu(x, approximate=False),
+    "relu": jax.nn.relu,
+    "tanh": jnp.tanh,
+    "silu": jax.nn.silu,
+}
 
 
 class Head(NamedTuple):
-    """A network: ``apply(params, x)`` of one input x [n] float32. Any pair of the kind will do, of any framework."""
+    """A network: ``apply(params, x)`` of one input x [n] float32. Any pair of the kind will do, of
+    any framework.
+    """
 
     params: Any
     """A pytree of arrays: what training changes."""
     apply: Any
-    """A policy head returns logits [d, bins] for x the n numbers that ``observe`` gives; a value head a scalar for those n and the d of the disturbance."""
+    """A policy head returns logits [d, bins] for x the n numbers that ``observe`` gives; a value
+    head a scalar for those n and the d of the disturbance.
+    """
 
 
-def make_head(key, inputs, outputs=(), *, hidden=(32, 32), activation="relu", first_activation=True):
+def make_head(
+    key, inputs, outputs=(), *, hidden=(32, 32), activation="relu", first_activation=True
+):
     """A dense Flax network from [inputs] to ``outputs``, a shape: ``(params, apply)``, a `Head`.
 
-    ``outputs=()`` is a value head, ``(d, bins)`` a rollout-policy head for a disturbance of d numbers. ``hidden``: widths of the layers; ``activation``:
-    "gelu", "relu", "silu" or "tanh"; ``first_activation=False`` leaves it out after the first layer, as the published networks do, which are
-    ``hidden=(64, 124, 64)``. Weights and biases start uniform in +-1/sqrt(fan-in). The key is consumed. ValueError for sizes below 1 and unknown activations.
+    ``outputs=()`` is a value head, ``(d, bins)`` a rollout-policy head for a disturbance of d
+    numbers. ``hidden``: widths of the layers; ``activation``: "gelu", "relu", "silu" or "tanh";
+    ``first_activation=False`` leaves it out after the first layer, as the published networks do,
+    which are ``hidden=(64, 124, 64)``. Weights and biases start uniform in +-1/sqrt(fan-in). The
+    key is consumed. ValueError for sizes below 1 and unknown activations.
     """
     sizes = (inputs, *hidden, *outputs)
     if not hidden or any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in sizes):
-        raise ValueError(f"make_head: inputs, hidden and outputs must be integers of at least 1, received {inputs!r}, {hidden!r} and {outputs!r}")
+        raise ValueError(
+            "make_head: inputs, hidden and outputs must be integers of at least 1, received"
+            f" {inputs!r}, {hidden!r} and {outputs!r}"
+        )
     if activation not in ACTIVATIONS:
-        raise ValueError(f"make_head: activation must be one of {sorted(ACTIVATIONS)}, received {activation!r}")
+        raise ValueError(
+            f"make_head: activation must be one of {sorted(ACTIVATIONS)}, received {activation!r}"
+        )
     init, apply = _network(tuple(hidden), tuple(outputs), activation, first_activation)
     return Head(init(key, jnp.zeros((inputs,), jnp.float32)), apply)
 
 
-@functools.cache  # one function for networks of one shape: a program that holds it is not compiled again for the next
+# one function for networks of one shape: a program that holds it is not compiled again for the next
+@functools.cache
 def _network(hidden, outputs, activation, first_activation):
     import flax.linen as nn  # here: it takes a while, and only searches with heads need it
 
@@ -53,8 +74,15 @@ def _network(hidden, outputs, activation, first_activation):
             for i, width in enumerate((*self.hidden, math.prod(self.outputs))):
                 # both from one range: variance 1 / (3 fan-in), as a uniform of +-1/sqrt(fan-in) has
                 bound = 1 / math.sqrt(x.shape[-1])
-                bias = lambda key, shape, dtype, bound=bound: jax.random.uniform(key, shape, dtype, -bound, bound)
-                x = nn.Dense(width, kernel_init=nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform"), bias_init=bias, param_dtype=jnp.float32)(x)
+                bias = lambda key, shape, dtype, bound=bound: jax.random.uniform(
+                    key, shape, dtype, -bound, bound
+                )
+                x = nn.Dense(
+                    width,
+                    kernel_init=nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform"),
+                    bias_init=bias,
+                    param_dtype=jnp.float32,
+                )(x)
                 if i < len(self.hidden) and (i > 0 or self.first_activation):
                     x = ACTIVATIONS[self.activation](x)
             return x.reshape(self.outputs)

@@ -1,4 +1,6 @@
-"""The rollout-policy head as a `Policy`: for rollouts of its own and for estimators, which need its density."""
+"""The rollout-policy head as a `Policy`: for rollouts of its own and for estimators, which need its
+density.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,9 @@ __all__ = ["Histogram", "as_policy"]
 
 
 class Histogram(D.Distribution):
-    """Disturbances whose points in the unit cube (`jast.actions`) have a density constant in each of equal cells: ``logits`` [d, bins]."""
+    """Disturbances whose points in the unit cube (`jast.actions`) have a density constant in each
+    of equal cells: ``logits`` [d, bins].
+    """
 
     def __init__(self, logits, actions, dist):
         super().__init__()
@@ -25,10 +29,15 @@ class Histogram(D.Distribution):
     def sample(self, *, seed, sample_shape=()):
         """One disturbance; ``sample_shape`` must be ()."""
         if sample_shape != ():
-            raise ValueError(f"Histogram: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys")
+            raise ValueError(
+                f"Histogram: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
+                " keys"
+            )
         u = in_bins(self._logits, jax.random.uniform(seed, self._logits.shape[:1], jnp.float32))
         event = D.event_like(self._dist)
-        return jax.tree.map(lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event)
+        return jax.tree.map(
+            lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event
+        )
 
     def _sample_n(self, key, n):
         return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
@@ -36,24 +45,40 @@ class Histogram(D.Distribution):
     def log_prob(self, value):
         """Log density; floating disturbances only, since a cell need not hold whole integers."""
         bins = self._logits.shape[1]
-        cell = jnp.clip(jnp.floor(flat(self._actions.locate(value, self._dist)) * bins).astype(jnp.int32), 0, bins - 1)
-        logs = jnp.take_along_axis(jax.nn.log_softmax(self._logits, axis=1), cell[:, None], axis=1) + jnp.log(jnp.float32(bins))
+        cell = jnp.clip(
+            jnp.floor(flat(self._actions.locate(value, self._dist)) * bins).astype(jnp.int32),
+            0,
+            bins - 1,
+        )
+        logs = jnp.take_along_axis(
+            jax.nn.log_softmax(self._logits, axis=1), cell[:, None], axis=1
+        ) + jnp.log(jnp.float32(bins))
         base = self._actions.log_prob(value, self._dist)
         return base + jnp.sum(logs).astype(base.dtype)
 
 
 def as_policy(sim, heads, actions, power=1.0):
-    """The policy head of ``heads`` as a `jast.Policy` of ``sim``, with the ``actions`` that it was trained on; x0 is drawn from the system's own start.
+    """The policy head of ``heads`` as a `jast.Policy` of ``sim``, with the ``actions`` that it was
+    trained on; x0 is drawn from the system's own start.
 
-    ``power`` as in `jast.heads.HeadSettings`: 1 is the histogram that was learned. ValueError without a policy head, and for disturbances that hold integers.
+    ``power`` as in `jast.heads.HeadSettings`: 1 is the histogram that was learned. ValueError
+    without a policy head, and for disturbances that hold integers.
     """
     if heads.policy is None:
         raise ValueError("heads.as_policy: expected heads with a policy head, received none")
-    like = jax.eval_shape(lambda: D.sample(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))), jax.random.key(0)))
+    like = jax.eval_shape(
+        lambda: D.sample(
+            sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))), jax.random.key(0)
+        )
+    )
     if not all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like)):
         raise ValueError(f"heads.as_policy: expected a disturbance of floats, received {like}")
-    return Policy(sim.start, Partial(_disturbance, sim, heads, actions, jnp.asarray(power, jnp.float32)))
+    return Policy(
+        sim.start, Partial(_disturbance, sim, heads, actions, jnp.asarray(power, jnp.float32))
+    )
 
 
 def _disturbance(sim, heads, actions, power, state, t):
-    return Histogram(power * histogram(heads, observed(sim, state)), actions, sim.disturbance(state))
+    return Histogram(
+        power * histogram(heads, observed(sim, state)), actions, sim.disturbance(state)
+    )

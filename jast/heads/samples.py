@@ -28,11 +28,14 @@ class Samples(NamedTuple):
 
 
 def of_roots(sim, actions, roots, bins, good, first=0):
-    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from `Roots` [turns, B].
+    """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from
+    `Roots` [turns, B].
 
-    They come tree by tree, so that the groups in which trees grew do not show. Per root and number of the disturbance, the target of the policy head is the
-    share of the visits in each of ``bins`` equal cells of the unit interval that ``actions`` maps to it; only trees that are ``good`` [B] count. Without
-    ``bins`` there are none of the first kind. Roots at levels above ``first`` choose x0 and teach nothing.
+    They come tree by tree, so that the groups in which trees grew do not show. Per root and number
+    of the disturbance, the target of the policy head is the share of the visits in each of ``bins``
+    equal cells of the unit interval that ``actions`` maps to it; only trees that are ``good`` [B]
+    count. Without ``bins`` there are none of the first kind. Roots at levels above ``first`` choose
+    x0 and teach nothing.
     """
     turns = len(roots.depth)
     roots = _tree_by_tree(roots._replace(starts=()))
@@ -50,17 +53,24 @@ def of_roots(sim, actions, roots, bins, good, first=0):
 
 def joined(parts):
     """Several `Samples` as one."""
-    return Samples(*(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)), sum(p.dropped for p in parts))
+    return Samples(
+        *(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)),
+        sum(p.dropped for p in parts),
+    )
 
 
 def of_edges(edges, target="own"):
-    """`Samples` for a value head from `jast.search.edges.Edges`: Q(s, a), or the Q of the edge that leads to s, as published (``target="parent"``)."""
+    """`Samples` for a value head from `jast.search.edges.Edges`: Q(s, a), or the Q of the edge that
+    leads to s, as published (``target="parent"``).
+    """
     edges = _tree_by_tree(edges)
     return _finite(edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q)
 
 
 def of_episodes(sim, actions, episodes, bins, good):
-    """`Samples` for a policy head from whole episodes [B, ...], those of ``good`` [B]: at each state, all of the histogram in the cell of what came next."""
+    """`Samples` for a policy head from whole episodes [B, ...], those of ``good`` [B]: at each
+    state, all of the histogram in the cell of what came next.
+    """
     seen, shares, use = _steps(sim, actions, episodes._replace(states=None), bins)
     merge = lambda a: a.reshape(-1, *a.shape[2:])
     return _finite(merge(use & good[:, None]), merge(seen), np.zeros((use.size, 0)), merge(shares))
@@ -69,7 +79,9 @@ def of_episodes(sim, actions, episodes, bins, good):
 @functools.partial(jax.jit, static_argnames="bins")
 def _steps(sim, actions, episodes, bins):
     def one(episode):
-        states = play_back(sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length).states
+        states = play_back(
+            sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length
+        ).states
 
         def step(state, x):
             u = flat(actions.locate(x, sim.disturbance(state)))
@@ -94,7 +106,9 @@ def _rows(sim, actions, roots, bins):
         dist = sim.disturbance(state)
         u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
         n = visits.astype(jnp.float32)
-        shares = jnp.einsum("k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)) / jnp.maximum(jnp.sum(n), 1)
+        shares = jnp.einsum(
+            "k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+        ) / jnp.maximum(jnp.sum(n), 1)
         return observed(sim, state), jax.vmap(flat)(xs), shares
 
     return jax.vmap(one)(roots.state, roots.actions, roots.visits)

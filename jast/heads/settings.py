@@ -1,4 +1,6 @@
-"""What heads are like, how they learn and how a search uses them: the published choices and those that work, each by its name."""
+"""What heads are like, how they learn and how a search uses them: the published choices and those
+that work, each by its name.
+"""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +23,9 @@ class HeadSettings(NamedTuple):
     normalise: bool
     """Inputs and value targets, by running means and deviations."""
     loss: str
-    """Of the policy head: "cross_entropy" of the visits' shares, or "squared_shares", the squared error of the probabilities."""
+    """Of the policy head: "cross_entropy" of the visits' shares, or "squared_shares", the squared
+    error of the probabilities.
+    """
     learning_rate: Any
     """Pair: of Adam."""
     batch: Any
@@ -29,7 +33,9 @@ class HeadSettings(NamedTuple):
     steps: Any
     """Pair: steps a round; None for one pass over the round's samples and those kept."""
     replay: Any
-    """Pair: samples of earlier rounds and this one that are kept to learn from; 0: this round's alone."""
+    """Pair: samples of earlier rounds and this one that are kept to learn from; 0: this round's
+    alone.
+    """
     elite: float
     """Share of a round's trees that the policy head learns from: those of the best rewards."""
     episodes: bool
@@ -51,56 +57,121 @@ class HeadSettings(NamedTuple):
     v_weight: float
     """c2 of eq. 3, of v(s, a)."""
     candidates: str
-    """Unvisited children of a node that compete by their v(s, a): "all" that widening allows, or "one": the next comes when the last was tried."""
+    """Unvisited children of a node that compete by their v(s, a): "all" that widening allows, or
+    "one": the next comes when the last was tried.
+    """
     train: bool
     """False: heads are used as they are given."""
 
 
 MODES = {
     "paper": HeadSettings(
-        round=1, bins=10, hidden=(64, 124, 64), activation=("gelu", "relu"), first_activation=False, normalise=False, loss="squared_shares",
-        learning_rate=(0.005, 0.001), batch=(1, 1), steps=(None, None), replay=(0, 0), elite=1.0, episodes=False, target="parent", edges="all",
-        untrained_alone=True, from_start=True, power=2.0, share=1.0, q_weight=0.6, v_weight=0.4, candidates="all", train=True,
+        round=1,
+        bins=10,
+        hidden=(64, 124, 64),
+        activation=("gelu", "relu"),
+        first_activation=False,
+        normalise=False,
+        loss="squared_shares",
+        learning_rate=(0.005, 0.001),
+        batch=(1, 1),
+        steps=(None, None),
+        replay=(0, 0),
+        elite=1.0,
+        episodes=False,
+        target="parent",
+        edges="all",
+        untrained_alone=True,
+        from_start=True,
+        power=2.0,
+        share=1.0,
+        q_weight=0.6,
+        v_weight=0.4,
+        candidates="all",
+        train=True,
     ),
     "default": HeadSettings(
-        round=None, bins=40, hidden=(32,), activation=("relu", "relu"), first_activation=True, normalise=True, loss="cross_entropy",
-        learning_rate=(0.01, 0.01), batch=(64, 128), steps=(500, 200), replay=(4096, 65536), elite=0.25, episodes=True, target="own", edges="roots",
-        untrained_alone=False, from_start=False, power=3.0, share=1.0, q_weight=0.5, v_weight=0.5, candidates="one", train=True,
+        round=None,
+        bins=40,
+        hidden=(32,),
+        activation=("relu", "relu"),
+        first_activation=True,
+        normalise=True,
+        loss="cross_entropy",
+        learning_rate=(0.01, 0.01),
+        batch=(64, 128),
+        steps=(500, 200),
+        replay=(4096, 65536),
+        elite=0.25,
+        episodes=True,
+        target="own",
+        edges="roots",
+        untrained_alone=False,
+        from_start=False,
+        power=3.0,
+        share=1.0,
+        q_weight=0.5,
+        v_weight=0.5,
+        candidates="one",
+        train=True,
     ),
-}  # fmt: skip
+}
 
 
-CHOICES = dict(loss=("cross_entropy", "squared_shares"), target=("own", "parent"), edges=("roots", "all"), candidates=("one", "all"))
+CHOICES = dict(
+    loss=("cross_entropy", "squared_shares"),
+    target=("own", "parent"),
+    edges=("roots", "all"),
+    candidates=("one", "all"),
+)
 
 
 def settings(mode="default", **changes):
-    """`HeadSettings` of a mode, with changes: ``settings("paper", round=8)``. ValueError names an unknown mode or setting, and one that is out of range."""
+    """`HeadSettings` of a mode, with changes: ``settings("paper", round=8)``. ValueError names an
+    unknown mode or setting, and one that is out of range.
+    """
     if mode not in MODES:
         raise ValueError(f"heads.settings: mode must be one of {sorted(MODES)}, received {mode!r}")
     if unknown := sorted(set(changes) - set(HeadSettings._fields)):
-        raise ValueError(f"heads.settings: expected settings among {', '.join(HeadSettings._fields)}, received {', '.join(unknown)}")
+        raise ValueError(
+            f"heads.settings: expected settings among {', '.join(HeadSettings._fields)}, received"
+            f" {', '.join(unknown)}"
+        )
     return checked(MODES[mode]._replace(**changes))
 
 
 def checked(settings):
     """``settings`` themselves, or a ValueError that names the one that is out of range."""
     if not isinstance(settings, HeadSettings):
-        raise ValueError(f"head_settings must be those of jast.heads.settings(...), received {type(settings).__name__}")
+        raise ValueError(
+            "head_settings must be those of jast.heads.settings(...), received"
+            f" {type(settings).__name__}"
+        )
     s = settings
     whole = lambda v, least: isinstance(v, int) and not isinstance(v, bool) and v >= least
-    pair = lambda v, fits: isinstance(v, tuple | list) and len(v) == 2 and all(fits(each) for each in v)
-    rules = {name: (getattr(s, name) in choices, f"one of {choices}") for name, choices in CHOICES.items()}
+    pair = lambda v, fits: (
+        isinstance(v, tuple | list) and len(v) == 2 and all(fits(each) for each in v)
+    )
+    rules = {
+        name: (getattr(s, name) in choices, f"one of {choices}")
+        for name, choices in CHOICES.items()
+    }
     rules |= dict(
         round=(s.round is None or whole(s.round, 1), "None or an integer of at least 1"),
         bins=(whole(s.bins, 2), "an integer of at least 2"),
         learning_rate=(pair(s.learning_rate, lambda v: v > 0), "a pair of numbers above 0"),
         batch=(pair(s.batch, lambda v: whole(v, 1)), "a pair of integers of at least 1"),
-        steps=(pair(s.steps, lambda v: v is None or whole(v, 0)), "a pair of integers of at least 0, or None"),
+        steps=(
+            pair(s.steps, lambda v: v is None or whole(v, 0)),
+            "a pair of integers of at least 0, or None",
+        ),
         replay=(pair(s.replay, lambda v: whole(v, 0)), "a pair of integers of at least 0"),
         elite=(0 < s.elite <= 1, "above 0 and at most 1"),
         power=(s.power >= 0, "at least 0"),
     )
     for name, (fits, wanted) in rules.items():
         if not fits:
-            raise ValueError(f"heads.settings: {name} must be {wanted}, received {getattr(s, name)!r}")
+            raise ValueError(
+                f"heads.settings: {name} must be {wanted}, received {getattr(s, name)!r}"
+            )
     return settings

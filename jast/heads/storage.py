@@ -1,4 +1,6 @@
-"""Trained heads in one file: parameters, moments, levels, and of a network of `make_head` all that its function is made of."""
+"""Trained heads in one file: parameters, moments, levels, and of a network of `make_head` all that
+its function is made of.
+"""
 
 import operator
 
@@ -19,9 +21,11 @@ HEADS, MOMENTS = ("policy", "value"), ("inputs", "returns")
 def save(path, heads):
     """Write trained ``heads`` (`jast.heads.Heads`) to the one file ``path``.
 
-    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON. The function of a network of `jast.heads.make_head` is in it by its sizes and
-    its activation; a function of your own cannot be, and `load` asks for it. An older file of that name stays whole until the new one is. ValueError for
-    heads with neither head, for parameters and moments that are not arrays of numbers, and for levels that are no integer.
+    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON. The function of a
+    network of `jast.heads.make_head` is in it by its sizes and its activation; a function of your
+    own cannot be, and `load` asks for it. An older file of that name stays whole until the new one
+    is. ValueError for heads with neither head, for parameters and moments that are not arrays of
+    numbers, and for levels that are no integer.
     """
     _check("save", heads)
     try:
@@ -36,44 +40,67 @@ def save(path, heads):
     for name in MOMENTS:
         moments = getattr(heads, name)
         if moments is not None and not isinstance(moments, Moments):
-            raise ValueError(f"save: {name} must be jast.heads.Moments or None, received {type(moments).__name__}")
+            raise ValueError(
+                f"save: {name} must be jast.heads.Moments or None, received"
+                f" {type(moments).__name__}"
+            )
         parts[name] = moments
     for name, part in parts.items():
         for at, leaf in jax.tree_util.tree_leaves_with_path(part):
             if not _storable(leaf):
-                raise ValueError(f"save: {name}{jax.tree_util.keystr(at)} must be an array of numbers, received {_readable(leaf)}")
+                raise ValueError(
+                    f"save: {name}{jax.tree_util.keystr(at)} must be an array of numbers, received"
+                    f" {_readable(leaf)}"
+                )
     write(path, FORMAT, VERSION, dict(levels=levels, heads=about), named(parts))
 
 
 def load(path, heads=None):
     """Read a file of `save`: `Heads`, whose arrays are NumPy's and equal to those saved to the bit.
 
-    A network of `jast.heads.make_head` gets the very function that such networks of one shape share, so that what was compiled for them serves here too.
-    ``heads`` (`Heads`) is needed where a head has a function of your own: its functions are taken, the file's parameters must be like its own (structure,
-    shapes, kinds of number; the precision may differ), and the rest is the file's. ValueError says why a file is refused: no file of heads, a version unknown
-    here, damaged, or no fit to ``heads``.
+    A network of `jast.heads.make_head` gets the very function that such networks of one shape
+    share, so that what was compiled for them serves here too. ``heads`` (`Heads`) is needed where a
+    head has a function of your own: its functions are taken, the file's parameters must be like its
+    own (structure, shapes, kinds of number; the precision may differ), and the rest is the file's.
+    ValueError says why a file is refused: no file of heads, a version unknown here, damaged, or no
+    fit to ``heads``.
     """
     if heads is not None:
         _check("load", heads)
     header, arrays = read(path, FORMAT, VERSION, KIND)
-    loaded = {name: _head(path, name, header, arrays_of(arrays, name), getattr(heads, name, None)) for name in HEADS}
-    loaded |= {name: Moments(*numbers) if (numbers := arrays_of(arrays, name)) else None for name in MOMENTS}
+    loaded = {
+        name: _head(path, name, header, arrays_of(arrays, name), getattr(heads, name, None))
+        for name in HEADS
+    }
+    loaded |= {
+        name: Moments(*numbers) if (numbers := arrays_of(arrays, name)) else None
+        for name in MOMENTS
+    }
     return Heads(**loaded, levels=header["levels"])
 
 
 def _check(caller, heads):
     if not isinstance(heads, Heads):
-        raise ValueError(f"{caller}: heads must be jast.heads.Heads, received {type(heads).__name__}")
+        raise ValueError(
+            f"{caller}: heads must be jast.heads.Heads, received {type(heads).__name__}"
+        )
     if heads.policy is None and heads.value is None:
-        raise ValueError(f"{caller}: heads must have a policy or a value head, received Heads(None, None)")
+        raise ValueError(
+            f"{caller}: heads must have a policy or a value head, received Heads(None, None)"
+        )
     for name in HEADS:
         head = getattr(heads, name)
         if head is not None and not isinstance(head, Head):
-            raise ValueError(f"{caller}: the {name} head must be a pair (params, apply), received {type(head).__name__}")
+            raise ValueError(
+                f"{caller}: the {name} head must be a pair (params, apply), received"
+                f" {type(head).__name__}"
+            )
 
 
 def _storable(leaf):
-    array = isinstance(leaf, np.ndarray | np.generic | jax.Array) and not isinstance(leaf, jax.core.Tracer)
+    array = isinstance(leaf, np.ndarray | np.generic | jax.Array) and not isinstance(
+        leaf, jax.core.Tracer
+    )
     return array and (leaf.dtype == bool or jnp.issubdtype(leaf.dtype, np.number))
 
 
@@ -84,50 +111,88 @@ def _readable(leaf):
 
 
 def _specification(head):
-    """What `make_head` needs to make this network again, as JSON has it; None for a function of another kind, or parameters that are not its own."""
+    """What `make_head` needs to make this network again, as JSON has it; None for a function of
+    another kind, or parameters that are not its own.
+    """
     module = getattr(getattr(head.apply, "func", None), "__self__", None)
-    if type(module).__module__ != _network.__module__ or head.apply.func != module.apply or head.apply.args or head.apply.keywords:
+    if (
+        type(module).__module__ != _network.__module__
+        or head.apply.func != module.apply
+        or head.apply.args
+        or head.apply.keywords
+    ):
         return None
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(head.params)]
     # the first layer's bias, then its kernel
     if len(shapes) < 2 or len(shapes[1]) != 2:
         return None
     network = dict(
-        inputs=shapes[1][0], outputs=list(module.outputs), hidden=list(module.hidden), activation=module.activation,
+        inputs=shapes[1][0],
+        outputs=list(module.outputs),
+        hidden=list(module.hidden),
+        activation=module.activation,
         first_activation=bool(module.first_activation),
-    )  # fmt: skip
+    )
     like = _made(network).params
-    made = jax.tree.structure(like) == jax.tree.structure(head.params) and shapes == [leaf.shape for leaf in jax.tree.leaves(like)]
+    made = jax.tree.structure(like) == jax.tree.structure(head.params) and shapes == [
+        leaf.shape for leaf in jax.tree.leaves(like)
+    ]
     return network if made else None
 
 
 def _made(network):
     """The `Head` of a specification, with the shapes of its parameters in their place."""
-    init, apply = _network(tuple(network["hidden"]), tuple(network["outputs"]), network["activation"], network["first_activation"])
-    return Head(jax.eval_shape(lambda: init(jax.random.key(0), jnp.zeros((network["inputs"],), jnp.float32))), apply)
+    init, apply = _network(
+        tuple(network["hidden"]),
+        tuple(network["outputs"]),
+        network["activation"],
+        network["first_activation"],
+    )
+    return Head(
+        jax.eval_shape(
+            lambda: init(jax.random.key(0), jnp.zeros((network["inputs"],), jnp.float32))
+        ),
+        apply,
+    )
 
 
 def _head(path, name, header, leaves, given):
-    """One head of a file, None where it has none. ``given``: the head of `load`'s ``heads``, or None."""
+    """One head of a file, None where it has none. ``given``: the head of `load`'s ``heads``, or
+    None.
+    """
     about = header["heads"].get(name)
     if about is None:
         if given is not None:
-            raise ValueError(f"load: {path} does not fit heads: it holds no {name} head, expected one")
+            raise ValueError(
+                f"load: {path} does not fit heads: it holds no {name} head, expected one"
+            )
         return None
     network, structure = about["network"], about["structure"]
     if given is not None:
         expected = _specification(given)
         if None not in (network, expected) and network != expected:
-            raise ValueError(f"load: {path} does not fit heads: {name} is the network {network}, expected {expected}")
+            raise ValueError(
+                f"load: {path} does not fit heads: {name} is the network {network}, expected"
+                f" {expected}"
+            )
     elif network is None:
-        raise ValueError(f"load: {path} holds a {name} head with a function that is not in the file: load(path, heads) with Heads that have it")
+        raise ValueError(
+            f"load: {path} holds a {name} head with a function that is not in the file: load(path,"
+            " heads) with Heads that have it"
+        )
     elif network["activation"] not in ACTIVATIONS:
-        raise ValueError(f"load: {path} has the activation {network['activation']!r}, unknown here: use the jast that wrote it, {header['package']}")
+        raise ValueError(
+            f"load: {path} has the activation {network['activation']!r}, unknown here: use the jast"
+            f" that wrote it, {header['package']}"
+        )
     like, apply = _made(network) if given is None else given
     other = "its network" if given is None else "heads"
     check_structure(path, other, f"{name}.params", structure, like)
     for a, (at, s) in zip(leaves, jax.tree_util.tree_leaves_with_path(like), strict=True):
         if not hasattr(s, "shape") or not hasattr(s, "dtype"):
-            raise ValueError(f"load: {name}.params{jax.tree_util.keystr(at)} of heads must be an array of numbers, received {_readable(s)}")
+            raise ValueError(
+                f"load: {name}.params{jax.tree_util.keystr(at)} of heads must be an array of"
+                f" numbers, received {_readable(s)}"
+            )
         check_array(path, other, f"{name}.params{jax.tree_util.keystr(at)}", a, s)
     return Head(jax.tree.structure(like).unflatten(leaves), apply)

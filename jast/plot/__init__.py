@@ -1,11 +1,15 @@
-"""Pictures of episodes and searches, with matplotlib (the extra ``jast[plot]``), which is imported only when something is drawn.
+"""Pictures of episodes and searches, with matplotlib (the extra ``jast[plot]``), which is imported
+only when something is drawn.
 
-Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns the axes. The colours are Okabe and Ito's, told apart by
-colour-blind readers; what matters is told by shape or words as well.
+Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns
+the axes. The colours are Okabe and Ito's, told apart by colour-blind readers; what matters is told
+by shape or words as well.
 
-Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one simulator: `ferry`; `fms`; `colav`, `colav_story`,
-`colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `failure_fan`,
-`weights`. Of weakness recognition: `failures_found`, `roc`, `failure_grid`, `influence`.
+Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one
+simulator: `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
+`convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`,
+`failure_fan`, `weights`. Of weakness recognition: `failures_found`, `roc`, `failure_grid`,
+`influence`.
 """
 
 from jast.plot.colav import colav, colav_animation, colav_story
@@ -20,7 +24,26 @@ from jast.plot.trials import trial_distances, trials
 from jast.plot.weakness import failures_found, roc
 
 __all__ = [
-    "COLOURS", "STYLE", "colav", "colav_animation", "colav_story", "convergence", "disturbances", "distances", "failure_fan", "failure_grid",
-    "failures_found", "ferry", "fms", "history", "influence", "probability", "proposal_contours", "roc", "surrogate_samples", "trial_distances", "trials",
+    "COLOURS",
+    "STYLE",
+    "colav",
+    "colav_animation",
+    "colav_story",
+    "convergence",
+    "disturbances",
+    "distances",
+    "failure_fan",
+    "failure_grid",
+    "failures_found",
+    "ferry",
+    "fms",
+    "history",
+    "influence",
+    "probability",
+    "proposal_contours",
+    "roc",
+    "surrogate_samples",
+    "trial_distances",
+    "trials",
     "weights",
-]  # fmt: skip
+]

@@ -1,6 +1,8 @@
-"""The encounters of `jast.simulators.colav`: where both vessels are, where the ferry believes the other to be, and what it orders on that.
+"""The encounters of `jast.simulators.colav`: where both vessels are, where the ferry believes the
+other to be, and what it orders on that.
 
-Positions are in metres, times in seconds from the start; a step is 3 s. Ships are drawn 8 m long, to be seen: a collision is 1 m between the centres.
+Positions are in metres, times in seconds from the start; a step is 3 s. Ships are drawn 8 m long,
+to be seen: a collision is 1 m between the centres.
 """
 
 import math
@@ -19,28 +21,40 @@ from jast.simulators.colav.tracker import PERIOD
 
 __all__ = ["colav", "colav_animation", "colav_story"]
 
-HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])  # m ahead and to the right of the centre
+# m ahead and to the right of the centre
+HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])
 BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
 SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
 
 
 def colav(episode, sim=None, moments=3, axes=None):
-    """One colav `Episode` as the planner saw it, at some moments: a panel each, x east (m), y north (m). Returns the list of Axes.
+    """One colav `Episode` as the planner saw it, at some moments: a panel each, x east (m), y north
+    (m). Returns the list of Axes.
 
-    In a panel: the paths so far, the track that the ferry believes (dashed, a thin line from it to the truth), the safety zones around the believed adversary,
-    and, in the title, the time and the speed that the ferry orders on that picture (at the episode's end: the last order). Ships are drawn 8 m long, not to
-    the scale of a collision (1 m).
+    In a panel: the paths so far, the track that the ferry believes (dashed, a thin line from it to
+    the truth), the safety zones around the believed adversary, and, in the title, the time and the
+    speed that the ferry orders on that picture (at the episode's end: the last order). Ships are
+    drawn 8 m long, not to the scale of a collision (1 m).
 
-    ``moments``: step numbers, or how many: then the last is the closest approach (or the end, where that comes too soon for so many), the others are spread
-    evenly before it. The states are those of the episode, or of its replay on ``sim``. With ``axes``, the title is that of their figure.
+    ``moments``: step numbers, or how many: then the last is the closest approach (or the end, where
+    that comes too soon for so many), the others are spread evenly before it. The states are those
+    of the episode, or of its replay on ``sim``. With ``axes``, the title is that of their figure.
 
-    Raises ValueError for many episodes, states that are missing or another system's, moments outside the episode and too few axes.
+    Raises ValueError for many episodes, states that are missing or another system's, moments
+    outside the episode and too few axes.
     """
     states = _states("colav", episode, sim)
     log, moments = _log(states), _moments(moments, states)
     low, high = _limits(log, moments)
     height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
-    with style.axes(axes, (0.7 + 3.7 * len(moments) + 2.2, height + 1.45), 1, len(moments), sharey=True, layout="compressed") as axes:
+    with style.axes(
+        axes,
+        (0.7 + 3.7 * len(moments) + 2.2, height + 1.45),
+        1,
+        len(moments),
+        sharey=True,
+        layout="compressed",
+    ) as axes:
         axes = style.panels("colav", axes, len(moments), "moment")[: len(moments)]
         for ax, t in zip(axes, moments, strict=True):
             _Panel(ax, log, low, high).show(t)
@@ -52,29 +66,69 @@ def colav(episode, sim=None, moments=3, axes=None):
 
 
 def colav_story(episode, sim=None, axes=None):
-    """One colav `Episode` over time (s): a panel for each kind of disturbance, then the distances (m), then the ferry's speed (m/s). Returns the list of Axes.
+    """One colav `Episode` over time (s): a panel for each kind of disturbance, then the distances
+    (m), then the ferry's speed (m/s). Returns the list of Axes.
 
-    The delay is in seconds where ``sim`` is given, which knows the longest, else a share of it; steering is the turn (rad/s) on top of the route; noise is
-    the size of its errors in position (m) and velocity (m/s). States and errors as for `colav`.
+    The delay is in seconds where ``sim`` is given, which knows the longest, else a share of it;
+    steering is the turn (rad/s) on top of the route; noise is the size of its errors in position
+    (m) and velocity (m/s). States and errors as for `colav`.
     """
     states = _states("colav_story", episode, sim)
-    kinds, log, edges = _kinds(episode, states, sim), _log(states), PERIOD * np.arange(len(states.step))
+    kinds, log, edges = (
+        _kinds(episode, states, sim),
+        _log(states),
+        PERIOD * np.arange(len(states.step)),
+    )
     count = len(kinds) + 2
     with style.axes(axes, (7.4, 1.15 + 1.45 * count), count) as axes:
-        axes = style.panels("colav_story", axes, count, "kind of disturbance, the distances and the speed")[:count]
+        axes = style.panels(
+            "colav_story", axes, count, "kind of disturbance, the distances and the speed"
+        )[:count]
         *first, apart, speed = axes
         for ax, (label, rows) in zip(first, kinds.items(), strict=True):
-            for (name, values), colour, line in zip(rows.items(), (style.INK, style.PURPLE), ("-", (0, (3, 1))), strict=False):
-                ax.stairs(values, edges, baseline=None, color=colour, linestyle=line, linewidth=1.8, label=name, zorder=3, clip_on=False)
+            for (name, values), colour, line in zip(
+                rows.items(), (style.INK, style.PURPLE), ("-", (0, (3, 1))), strict=False
+            ):
+                ax.stairs(
+                    values,
+                    edges,
+                    baseline=None,
+                    color=colour,
+                    linestyle=line,
+                    linewidth=1.8,
+                    label=name,
+                    zorder=3,
+                    clip_on=False,
+                )
             ax.axhline(0, color=style.GREY, linewidth=1, zorder=1)
-            ax.set(ylabel=label, ylim=(None if any((values < 0).any() for values in rows.values()) else 0, None))
+            ax.set(
+                ylabel=label,
+                ylim=(None if any((values < 0).any() for values in rows.values()) else 0, None),
+            )
         gaps = [np.hypot(*(log.ferry - rows)[:, :2].T) for rows in (log.adversary, log.believed)]
-        apart.plot(edges, gaps[0], color=style.VERMILION, marker="o", markersize=3, label="to the adversary")
+        apart.plot(
+            edges,
+            gaps[0],
+            color=style.VERMILION,
+            marker="o",
+            markersize=3,
+            label="to the adversary",
+        )
         apart.plot(edges, gaps[1], color=BELIEF, linestyle=DASHED, label="to where it is believed")
-        apart.axhline(COLLISION, color=style.INK, linewidth=1, linestyle=":", label=f"collision: {COLLISION:g} m")
+        apart.axhline(
+            COLLISION,
+            color=style.INK,
+            linewidth=1,
+            linestyle=":",
+            label=f"collision: {COLLISION:g} m",
+        )
         apart.set(ylabel="distance (m)", ylim=(0, None))
-        speed.stairs(log.order[:-1], edges, baseline=None, color=style.INK, linewidth=1.8, label="ordered")
-        speed.plot(edges, states.velocity.u, color=style.BLUE, linestyle=DASHED, label="actual (surge)")
+        speed.stairs(
+            log.order[:-1], edges, baseline=None, color=style.INK, linewidth=1.8, label="ordered"
+        )
+        speed.plot(
+            edges, states.velocity.u, color=style.BLUE, linestyle=DASHED, label="actual (surge)"
+        )
         speed.set(ylabel="speed (m/s)", xlabel="time (s)")
         for ax in axes:
             ax.set_xlim(0, max(edges[-1], PERIOD))
@@ -86,10 +140,12 @@ def colav_story(episode, sim=None, axes=None):
 
 
 def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
-    """A panel of `colav` that moves: ``smooth`` frames a step, between states by straight lines. Returns the matplotlib FuncAnimation.
+    """A panel of `colav` that moves: ``smooth`` frames a step, between states by straight lines.
+    Returns the matplotlib FuncAnimation.
 
-    In a notebook: ``HTML(animation.to_jshtml())``. ``path``: save it too, as .html, .gif or .mp4, ``fps`` frames a second. States and errors as for `colav`;
-    ValueError too for a path that nothing here can write, and for ``fps`` and ``smooth`` that are not positive.
+    In a notebook: ``HTML(animation.to_jshtml())``. ``path``: save it too, as .html, .gif or .mp4,
+    ``fps`` frames a second. States and errors as for `colav`; ValueError too for a path that
+    nothing here can write, and for ``fps`` and ``smooth`` that are not positive.
     """
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -98,13 +154,17 @@ def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
     if not isinstance(fps, Real) or not 0 < fps < math.inf:
         raise ValueError(f"plot.colav_animation: fps must be a positive number, received {fps!r}")
     if isinstance(smooth, bool) or not isinstance(smooth, int) or smooth < 1:
-        raise ValueError(f"plot.colav_animation: smooth must be an int of at least 1, received {smooth!r}")
+        raise ValueError(
+            f"plot.colav_animation: smooth must be an int of at least 1, received {smooth!r}"
+        )
     log = _log(states)
     steps = len(states.step) - 1
     low, high = _limits(log, range(steps + 1))
     with style.styled():
-        height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40  # an even number of pixels, as films must have
-        figure = style.frugal()(figsize=(6.6, height), dpi=80, layout="compressed")  # not pyplot's: a notebook would show it a second time
+        # an even number of pixels, as films must have
+        height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40
+        # not pyplot's: a notebook would show it a second time
+        figure = style.frugal()(figsize=(6.6, height), dpi=80, layout="compressed")
         FigureCanvasAgg(figure)
         ax = figure.subplots()
         panel = _Panel(ax, log, low, high)
@@ -113,7 +173,13 @@ def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # the axes stand still from here on
-        animation = FuncAnimation(figure, panel.show, np.arange(steps * smooth + 1) / smooth, interval=1000 / fps, blit=False)
+        animation = FuncAnimation(
+            figure,
+            panel.show,
+            np.arange(steps * smooth + 1) / smooth,
+            interval=1000 / fps,
+            blit=False,
+        )
         if path is not None and path.suffix.lower() == ".html":
             path.write_text(animation.to_jshtml(fps=fps, default_mode="once"))
         elif path is not None:
@@ -137,22 +203,56 @@ class _Panel:
 
     def __init__(self, ax, log, low, high):
         self.log, self.title = log, ax.set_title(" ", loc="left")
-        ax.plot([0, 0], [0, 100], color=style.GREY, linewidth=1, label="the ferry's route", zorder=1)
+        ax.plot(
+            [0, 0], [0, 100], color=style.GREY, linewidth=1, label="the ferry's route", zorder=1
+        )
         self.ferry = ax.plot([], [], color=style.BLUE, linewidth=2.4, label="ferry", zorder=4)[0]
-        self.adversary = ax.plot([], [], color=style.VERMILION, marker="o", markersize=3, linewidth=1.2, label="adversary (a dot a step)", zorder=4)[0]
-        self.believed = ax.plot([], [], color=BELIEF, linestyle=DASHED, label="adversary as believed", zorder=5)[0]
-        self.error = ax.plot([], [], color=style.INK, linewidth=0.8, marker="o", markersize=2.5, label="from belief to truth", zorder=7)[0]
+        self.adversary = ax.plot(
+            [],
+            [],
+            color=style.VERMILION,
+            marker="o",
+            markersize=3,
+            linewidth=1.2,
+            label="adversary (a dot a step)",
+            zorder=4,
+        )[0]
+        self.believed = ax.plot(
+            [], [], color=BELIEF, linestyle=DASHED, label="adversary as believed", zorder=5
+        )[0]
+        self.error = ax.plot(
+            [],
+            [],
+            color=style.INK,
+            linewidth=0.8,
+            marker="o",
+            markersize=2.5,
+            label="from belief to truth",
+            zorder=7,
+        )[0]
         shape = lambda **how: ax.fill([], [], **how)[0]
-        looks = [dict(facecolor=(ZONE, opacity), linestyle=line, label=zone.name) for zone, (opacity, line) in zip(ZONES, SHADES, strict=True)]
+        looks = [
+            dict(facecolor=(ZONE, opacity), linestyle=line, label=zone.name)
+            for zone, (opacity, line) in zip(ZONES, SHADES, strict=True)
+        ]
         self.zones = [shape(**look, edgecolor=style.INK, linewidth=0.9, zorder=2) for look in looks]
-        looks = ((style.BLUE, "-", style.INK, 1), (style.VERMILION, "-", style.INK, 1), ("none", DASHED, BELIEF, 1.8))
-        self.hulls = [shape(facecolor=face, linestyle=line, edgecolor=edge, linewidth=width, zorder=6) for face, line, edge, width in looks]
+        looks = (
+            (style.BLUE, "-", style.INK, 1),
+            (style.VERMILION, "-", style.INK, 1),
+            ("none", DASHED, BELIEF, 1.8),
+        )
+        self.hulls = [
+            shape(facecolor=face, linestyle=line, edgecolor=edge, linewidth=width, zorder=6)
+            for face, line, edge, width in looks
+        ]
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
 
     def show(self, t):
         """The panel ``t`` steps after the start, which need not be whole."""
         now = [_at(rows, t) for rows in self.log[:3]]
-        for line, rows, here in zip((self.ferry, self.adversary, self.believed), self.log[:3], now, strict=True):
+        for line, rows, here in zip(
+            (self.ferry, self.adversary, self.believed), self.log[:3], now, strict=True
+        ):
             line.set_data(*np.concatenate([rows[: math.ceil(t)], here[None]])[:, :2].T)
         self.error.set_data(*np.stack(now[1:])[:, :2].T)
         for patch, zone in zip(self.zones, ZONES, strict=True):
@@ -160,17 +260,25 @@ class _Panel:
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
             patch.set_xy(_placed(*HULL.T, *here))
-        self.title.set_text(f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s")
+        self.title.set_text(
+            f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s"
+        )
 
 
 def _states(caller, episode, sim):
     """s_0 .. s_length as NumPy arrays."""
     states = style.one(caller, episode).states
     if states is None and sim is None:
-        raise ValueError(f"plot.{caller}: episode must have states, or sim be the simulator to replay it on, received neither")
+        raise ValueError(
+            f"plot.{caller}: episode must have states, or sim be the simulator to replay it on,"
+            " received neither"
+        )
     states = replay(sim, episode).states if states is None else states
     if not isinstance(states, ColavState):
-        raise ValueError(f"plot.{caller}: episode must be of jast.simulators.colav, received states of {type(states).__name__}")
+        raise ValueError(
+            f"plot.{caller}: episode must be of jast.simulators.colav, received states of"
+            f" {type(states).__name__}"
+        )
     return jax.tree.map(lambda a: np.asarray(a)[: int(episode.length) + 1], states)
 
 
@@ -178,9 +286,15 @@ def _log(states):
     track, adversary = states.track, states.adversary.pose
     still = np.hypot(track.v_n, track.v_e) < STILL  # as the planner has it
     course = np.where(still, 0, np.arctan2(track.v_e, track.v_n))
-    rows = ((states.pose.e, states.pose.n, states.pose.psi), (adversary.e, adversary.n, adversary.psi), (track.e, track.n, course))
+    rows = (
+        (states.pose.e, states.pose.n, states.pose.psi),
+        (adversary.e, adversary.n, adversary.psi),
+        (track.e, track.n, course),
+    )
     choice = np.concatenate([states.choice[1:], states.choice[-1:]])
-    return _Log(*(np.stack([e, n, np.unwrap(psi)], -1).astype(float) for e, n, psi in rows), SPEEDS[choice])
+    return _Log(
+        *(np.stack([e, n, np.unwrap(psi)], -1).astype(float) for e, n, psi in rows), SPEEDS[choice]
+    )
 
 
 def _at(rows, t):
@@ -189,7 +303,9 @@ def _at(rows, t):
 
 
 def zone_outline(zone, n, e, course, points=200):
-    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e, n)."""
+    """The edge of a zone around an obstacle at (n, e) on a course (radians): [points, 2] of (e,
+    n).
+    """
     angle = np.linspace(0, 2 * np.pi, points)
     ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
     right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
@@ -198,11 +314,19 @@ def zone_outline(zone, n, e, course, points=200):
 
 def _placed(ahead, right, east, north, heading):
     """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
-    return np.stack([east + ahead * np.sin(heading) + right * np.cos(heading), north + ahead * np.cos(heading) - right * np.sin(heading)], -1)
+    return np.stack(
+        [
+            east + ahead * np.sin(heading) + right * np.cos(heading),
+            north + ahead * np.cos(heading) - right * np.sin(heading),
+        ],
+        -1,
+    )
 
 
 def _limits(log, moments):
-    """Corners (east, north) that hold the paths up to the last moment, and the high penalty region at each: the low one would make the ships small."""
+    """Corners (east, north) that hold the paths up to the last moment, and the high penalty region
+    at each: the low one would make the ships small.
+    """
     ships = [rows[: max(moments) + 1, :2] for rows in log[:3]]
     zones = [zone_outline(ZONES[1], *log.believed[t][[1, 0, 2]]) for t in moments]
     points = np.concatenate(ships + zones)
@@ -211,13 +335,20 @@ def _limits(log, moments):
 
 def _moments(moments, states):
     last = len(states.step) - 1
-    wrong = ValueError(f"plot.colav: moments must be at least 1, or step numbers in 0 .. {last}, received {moments!r}")
+    wrong = ValueError(
+        f"plot.colav: moments must be at least 1, or step numbers in 0 .. {last}, received"
+        f" {moments!r}"
+    )
     try:
         if np.ndim(moments) == 0:
             count = index(moments)
             nearest = int(np.argmin(states.near))
             end = nearest if nearest >= count else last
-            chosen = np.unique(np.linspace(0, end, count + 1).round().astype(int)[-count:]) if count > 0 else ()
+            chosen = (
+                np.unique(np.linspace(0, end, count + 1).round().astype(int)[-count:])
+                if count > 0
+                else ()
+            )
         else:
             chosen = [index(t) for t in moments]
     except TypeError:
@@ -230,7 +361,10 @@ def _moments(moments, states):
 def _headline(episode, states):
     nearest = int(np.argmin(states.near))
     return style.headline(
-        "Ferry and adversary", episode, f"\nclosest approach {states.near[nearest]:.2f} m by t = {nearest * PERIOD:g} s (collision: below {COLLISION:g} m)"
+        "Ferry and adversary",
+        episode,
+        f"\nclosest approach {states.near[nearest]:.2f} m by t = {nearest * PERIOD:g} s (collision:"
+        f" below {COLLISION:g} m)",
     )
 
 
@@ -239,14 +373,35 @@ def _kinds(episode, states, sim):
     n, x = int(episode.length), episode.disturbances
     model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
     if not isinstance(x, dict):  # one kind: which, the simulator says, or what the states remember
-        steered = np.ndim(x) == 1 and np.allclose(np.clip(x[:n], 0, 1), states.steering[1:]) and not states.delay.any()
-        x = {model.kinds[0] if hasattr(model, "kinds") else "noise" if np.ndim(x) == 2 else "steering" if steered else "delay": x}
+        steered = (
+            np.ndim(x) == 1
+            and np.allclose(np.clip(x[:n], 0, 1), states.steering[1:])
+            and not states.delay.any()
+        )
+        x = {
+            (
+                model.kinds[0]
+                if hasattr(model, "kinds")
+                else "noise"
+                if np.ndim(x) == 2
+                else "steering"
+                if steered
+                else "delay"
+            ): x
+        }
     x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
     longest = getattr(model, "longest", None)
     size = lambda rows: np.hypot(*rows.T)
     of = {
-        "delay": lambda a: ("delay (share)", {"": a}) if longest is None else ("delay (s)", {"": a * float(longest)}),
+        "delay": lambda a: (
+            ("delay (share)", {"": a})
+            if longest is None
+            else ("delay (s)", {"": a * float(longest)})
+        ),
         "steering": lambda a: ("steering (rad/s)", {"": a - 0.5}),
-        "noise": lambda a: ("size of noise", {"position (m)": size(a[:, :2]), "velocity (m/s)": size(a[:, 2:])}),
+        "noise": lambda a: (
+            "size of noise",
+            {"position (m)": size(a[:, :2]), "velocity (m/s)": size(a[:, 2:])},
+        ),
     }
     return dict(of[kind](x[kind]) for kind in of if kind in x)

@@ -1,4 +1,6 @@
-"""Runs of `jast.cross_entropy`: how the proposal moves over the objective, where its surrogate looked, and how fast several runs converge."""
+"""Runs of `jast.cross_entropy`: how the proposal moves over the objective, where its surrogate
+looked, and how fast several runs converge.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +17,22 @@ SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
 
 
 def proposal_contours(result, objective, axes=None, iterations=None, bounds=None, elites=5):
-    """How the proposal of one run moved over an objective of two numbers, a panel an iteration (figure 2.2 of the thesis). Returns the list of Axes.
+    """How the proposal of one run moved over an objective of two numbers, a panel an iteration
+    (figure 2.2 of the thesis). Returns the list of Axes.
 
-    In a panel: the objective (the darker the lower), the 1 and 2 standard deviation ellipses of the proposal that the iteration drew from (of a `Mixture`,
-    those of each component, fainter where its weight is small), the points evaluated in it, and of all evaluated so far the ``elites`` best and the very best.
+    In a panel: the objective (the darker the lower), the 1 and 2 standard deviation ellipses of the
+    proposal that the iteration drew from (of a `Mixture`, those of each component, fainter where
+    its weight is small), the points evaluated in it, and of all evaluated so far the ``elites``
+    best and the very best.
 
-    ``result``: a `CEResult` without leading axes. ``objective``: x [2] -> number, in JAX or not, or None to leave it out. ``iterations``: which ones, counted
-    from 1 as ``print(result)`` does; default: four of those that were run. ``bounds``: ((low, high), (low, high)) of all panels, which then say how many points
-    lie outside; default: each panel holds its points, and has at least a twentieth of the widest one's side.
+    ``result``: a `CEResult` without leading axes. ``objective``: x [2] -> number, in JAX or not, or
+    None to leave it out. ``iterations``: which ones, counted from 1 as ``print(result)`` does;
+    default: four of those that were run. ``bounds``: ((low, high), (low, high)) of all panels,
+    which then say how many points lie outside; default: each panel holds its points, and has at
+    least a twentieth of the widest one's side.
 
-    Raises ValueError for many runs, dimensions other than 2, iterations that were not run, bounds that are none, elites below 1 and too few axes.
+    Raises ValueError for many runs, dimensions other than 2, iterations that were not run, bounds
+    that are none, elites below 1 and too few axes.
     """
     import matplotlib.pyplot as plt
 
@@ -33,15 +41,32 @@ def proposal_contours(result, objective, axes=None, iterations=None, bounds=None
     if isinstance(elites, bool) or not isinstance(elites, int) or elites < 1:
         raise ValueError(f"plot.{caller}: elites must be an int of at least 1, received {elites!r}")
     run = len(_sizes(log))
-    chosen = np.unique(np.geomspace(1, run, min(4, run)).round().astype(int)) if iterations is None else np.atleast_1d(np.asarray(iterations, object))
+    chosen = (
+        np.unique(np.geomspace(1, run, min(4, run)).round().astype(int))
+        if iterations is None
+        else np.atleast_1d(np.asarray(iterations, object))
+    )
     chosen = [style.iteration(caller, "iterations", k, run) for k in chosen]
     if not chosen:
         raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
-    boxes = _boxes(caller, bounds, [np.concatenate([log.x[log.iteration == k - 1], _best(log, k, elites)]) for k in chosen])
+    boxes = _boxes(
+        caller,
+        bounds,
+        [np.concatenate([log.x[log.iteration == k - 1], _best(log, k, elites)]) for k in chosen],
+    )
     columns = len(chosen) if len(chosen) <= 4 else -(-len(chosen) // 2)
     rows = -(-len(chosen) // columns)
     with style.styled():
-        drawn = plt.subplots(rows, columns, figsize=(2.75 * columns + 2.0, 2.75 * rows + 0.3), layout="compressed")[1] if axes is None else axes
+        drawn = (
+            plt.subplots(
+                rows,
+                columns,
+                figsize=(2.75 * columns + 2.0, 2.75 * rows + 0.3),
+                layout="compressed",
+            )[1]
+            if axes is None
+            else axes
+        )
         every = style.panels(caller, drawn, len(chosen), "iteration")
         for spare in every[len(chosen) :] if axes is None else ():
             spare.set_axis_off()
@@ -51,7 +76,16 @@ def proposal_contours(result, objective, axes=None, iterations=None, bounds=None
             _ground(ax, objective, box, log.x.dtype)
             _proposal(ax, result, k - 1)
             _points(ax, now, "evaluated in\nthe iteration")
-            ax.plot(*best.T, linestyle="", marker="D", markersize=5.5, color=style.ORANGE, **EDGE, label=f"the {elites} best so far", zorder=6)
+            ax.plot(
+                *best.T,
+                linestyle="",
+                marker="D",
+                markersize=5.5,
+                color=style.ORANGE,
+                **EDGE,
+                label=f"the {elites} best so far",
+                zorder=6,
+            )
             _star(ax, log.best_x[k - 1])
             _outside(ax, now, box)
             ax.set_title(f"iteration {k}")
@@ -64,12 +98,15 @@ def proposal_contours(result, objective, axes=None, iterations=None, bounds=None
 
 
 def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
-    """One iteration of a run with a surrogate, for an objective of two numbers (figure 2.4 of the thesis). Returns the list of two Axes.
+    """One iteration of a run with a surrogate, for an objective of two numbers (figure 2.4 of the
+    thesis). Returns the list of two Axes.
 
-    Left: the points that were truly evaluated, and the proposal. Right: those that only the surrogate judged, and the next proposal.
+    Left: the points that were truly evaluated, and the proposal. Right: those that only the
+    surrogate judged, and the next proposal.
 
-    ``result``, ``objective`` and ``bounds`` as for `proposal_contours`, but the default bounds leave out the farthest points; ``iteration`` counts from 1.
-    Raises ValueError as that does, and for a run without a surrogate.
+    ``result``, ``objective`` and ``bounds`` as for `proposal_contours`, but the default bounds
+    leave out the farthest points; ``iteration`` counts from 1. Raises ValueError as that does, and
+    for a run without a surrogate.
     """
     caller = "surrogate_samples"
     log = _log(caller, result)
@@ -77,10 +114,21 @@ def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
     judged = np.asarray(result.history.model_x, float)[k - 1]
     judged = judged[np.isfinite(judged).all(1)]
     if not len(judged):
-        raise ValueError(f"plot.{caller}: result must be of a method with a surrogate, received one whose history.model_x is empty")
+        raise ValueError(
+            f"plot.{caller}: result must be of a method with a surrogate, received one whose"
+            " history.model_x is empty"
+        )
     now = log.x[log.iteration == k - 1]
     low, high = np.quantile(judged, [0.01, 0.99], axis=0)
-    [box] = _boxes(caller, bounds, [np.concatenate([np.clip(np.concatenate([judged, now]), low, high), log.best_x[k - 1 : k]])])
+    [box] = _boxes(
+        caller,
+        bounds,
+        [
+            np.concatenate(
+                [np.clip(np.concatenate([judged, now]), low, high), log.best_x[k - 1 : k]]
+            )
+        ],
+    )
     with style.axes(axes, (8.6, 3.5), 1, 2, sharey=True, layout="compressed") as drawn:
         panels = style.panels(caller, drawn, 2, "kind of sample")[:2]
         for ax, which in zip(panels, (k - 1, k), strict=True):
@@ -89,9 +137,16 @@ def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
             ax.set_xlabel("$x_1$")
         left, right = panels
         _points(left, now, "truly evaluated")
-        look = dict(linestyle="", marker=".", markersize=6, color=style.ORANGE) | EDGE | dict(markeredgewidth=0.5)
+        look = (
+            dict(linestyle="", marker=".", markersize=6, color=style.ORANGE)
+            | EDGE
+            | dict(markeredgewidth=0.5)
+        )
         right.plot(*judged.T, **look, label="judged by\nthe surrogate", zorder=4)
-        for ax, points, title in ((left, now, "truly evaluated"), (right, judged, "judged; next proposal")):
+        for ax, points, title in (
+            (left, now, "truly evaluated"),
+            (right, judged, "judged; next proposal"),
+        ):
             _star(ax, log.best_x[k - 1])
             _outside(ax, points, box)
             ax.set_title(f"{len(points)} {title}")
@@ -101,43 +156,79 @@ def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
 
 
 def convergence(results, optimum=None, axes=None):
-    """Best value so far by true evaluations: the mean over runs and its 95 % band, 1.96 standard errors (figure 2.3 of the thesis). Returns the list of Axes.
+    """Best value so far by true evaluations: the mean over runs and its 95 % band, 1.96 standard
+    errors (figure 2.3 of the thesis). Returns the list of Axes.
 
-    ``results``: a batch of runs, a `CEResult` with a leading axis as `jax.vmap` makes it, or a dict of name -> batch. ``optimum`` [d]: where the objective is
-    least; with it, a second panel with the mean distance of the best point to it, on a logarithmic axis. Means are those of `jast.cross_entropy.scores`;
-    nothing is drawn while a run has no finite value. Raises ValueError for what is no batch of runs, an optimum of another dimension and too few axes.
+    ``results``: a batch of runs, a `CEResult` with a leading axis as `jax.vmap` makes it, or a dict
+    of name -> batch. ``optimum`` [d]: where the objective is least; with it, a second panel with
+    the mean distance of the best point to it, on a logarithmic axis. Means are those of
+    `jast.cross_entropy.scores`; nothing is drawn while a run has no finite value. Raises ValueError
+    for what is no batch of runs, an optimum of another dimension and too few axes.
     """
     caller = "convergence"
     results = results if isinstance(results, dict) else {"": results}
     if not results:
-        raise ValueError("plot.convergence: results must hold at least one batch of runs, received none")
+        raise ValueError(
+            "plot.convergence: results must hold at least one batch of runs, received none"
+        )
     for name, result in results.items():
         if not isinstance(result, CEResult) or np.ndim(result.best_value) != 1:
-            received = f"leading axes {np.shape(result.best_value)}" if isinstance(result, CEResult) else type(result).__name__
-            raise ValueError(f"plot.{caller}: results must be CEResults with one leading axis, received {received}{f' for {name!r}' if name else ''}")
+            received = (
+                f"leading axes {np.shape(result.best_value)}"
+                if isinstance(result, CEResult)
+                else type(result).__name__
+            )
+            raise ValueError(
+                f"plot.{caller}: results must be CEResults with one leading axis, received"
+                f" {received}{f' for {name!r}' if name else ''}"
+            )
     count = 1 if optimum is None else 2
     with style.axes(axes, (5.2 * count, 3.8), 1, count) as drawn:
         panels = style.panels(caller, drawn, count, "quantity")[:count]
         for i, (name, result) in enumerate(results.items()):
             runs, d = np.shape(result.best_x)
             value = np.asarray(result.history.best_value, float)
-            known = result._replace(history=result.history._replace(best_value=np.where(np.isfinite(value), value, np.nan)))
+            known = result._replace(
+                history=result.history._replace(
+                    best_value=np.where(np.isfinite(value), value, np.nan)
+                )
+            )
             score = scores(known, np.zeros(d) if optimum is None else optimum)
             evaluations = np.cumsum(np.bincount(np.asarray(result.history.iteration)[0]))
-            colour, marker = style.COLOURS[i % len(style.COLOURS)], style.MARKERS[i % len(style.MARKERS)]
-            look = dict(color=colour, marker=marker, markersize=4.5, label=name or f"mean of {runs} runs")
+            colour, marker = (
+                style.COLOURS[i % len(style.COLOURS)],
+                style.MARKERS[i % len(style.MARKERS)],
+            )
+            look = dict(
+                color=colour, marker=marker, markersize=4.5, label=name or f"mean of {runs} runs"
+            )
             quantities = [(score.best_value, score.standard_error)]
             if optimum is not None:
-                distance = np.linalg.norm(np.asarray(result.history.best_x, float) - np.asarray(optimum, float), axis=2)
-                error = distance.std(0, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(distance.shape[1], np.nan)
+                distance = np.linalg.norm(
+                    np.asarray(result.history.best_x, float) - np.asarray(optimum, float), axis=2
+                )
+                error = (
+                    distance.std(0, ddof=1) / np.sqrt(runs)
+                    if runs > 1
+                    else np.full(distance.shape[1], np.nan)
+                )
                 quantities.append((score.mean_distance, error))
             for ax, (mean, error) in zip(panels, quantities, strict=True):
                 there = np.isfinite(mean)
                 ax.plot(evaluations[there], mean[there], zorder=3, **look)
                 if there.any() and runs > 1:
                     low, high = (mean + sign * 1.96 * error for sign in (-1, 1))
-                    ax.fill_between(evaluations[there], low[there], high[there], color=look["color"], alpha=0.2, linewidth=0)
-        for ax, title in zip(panels, ("mean best value", "mean distance to the optimum"), strict=False):
+                    ax.fill_between(
+                        evaluations[there],
+                        low[there],
+                        high[there],
+                        color=look["color"],
+                        alpha=0.2,
+                        linewidth=0,
+                    )
+        for ax, title in zip(
+            panels, ("mean best value", "mean distance to the optimum"), strict=False
+        ):
             ax.set(xlabel="true evaluations", xlim=(0, None))
             ax.set_title(title)
         if optimum is not None:
@@ -152,18 +243,28 @@ class _Log:
 
     def __init__(self, history):
         told = np.isfinite(np.asarray(history.x)).all(1)
-        self.x, self.value, self.iteration = (np.asarray(a)[told] for a in (history.x, history.value, history.iteration))
+        self.x, self.value, self.iteration = (
+            np.asarray(a)[told] for a in (history.x, history.value, history.iteration)
+        )
         self.best_x = np.asarray(history.best_x)
 
 
 def _log(caller, result):
     """The `_Log` of one run in the plane, or a ValueError."""
     if not isinstance(result, CEResult):
-        raise ValueError(f"plot.{caller}: result must be a CEResult, received {type(result).__name__}")
+        raise ValueError(
+            f"plot.{caller}: result must be a CEResult, received {type(result).__name__}"
+        )
     if np.ndim(result.best_value):
-        raise ValueError(f"plot.{caller}: result must be one run, received one with leading axes {np.shape(result.best_value)}")
+        raise ValueError(
+            f"plot.{caller}: result must be one run, received one with leading axes"
+            f" {np.shape(result.best_value)}"
+        )
     if np.size(result.best_x) != 2:
-        raise ValueError(f"plot.{caller}: result must be of an objective of 2 numbers, received {np.size(result.best_x)}")
+        raise ValueError(
+            f"plot.{caller}: result must be of an objective of 2 numbers, received"
+            f" {np.size(result.best_x)}"
+        )
     log = _Log(result.history)
     if not len(log.x):
         raise ValueError(f"plot.{caller}: result must have evaluations, received none")
@@ -181,16 +282,25 @@ def _best(log, k, count):
 
 
 def _boxes(caller, bounds, panels):
-    """[panels, 2, (low, high)]: the bounds given, or for each panel's points [n, 2] a square that holds them, with a margin."""
+    """[panels, 2, (low, high)]: the bounds given, or for each panel's points [n, 2] a square that
+    holds them, with a margin.
+    """
     if bounds is not None:
         box = np.asarray(bounds, float)
         if box.shape != (2, 2) or not np.isfinite(box).all() or not (box[:, 0] < box[:, 1]).all():
-            raise ValueError(f"plot.{caller}: bounds must be ((low, high), (low, high)), received {bounds!r}")
+            raise ValueError(
+                f"plot.{caller}: bounds must be ((low, high), (low, high)), received {bounds!r}"
+            )
         return [box] * len(panels)
     panels = [x[np.isfinite(x).all(1)] for x in panels]
     sides = np.array([np.max(np.ptp(x, axis=0)) for x in panels])
-    sides = 1.25 * np.maximum(sides, max(sides.max() / 20, 1e-6 * max(1.0, *(np.abs(x).max() for x in panels))))
-    return [((x.min(0) + x.max(0)) / 2)[:, None] + np.array([-0.5, 0.5]) * side for x, side in zip(panels, sides, strict=True)]
+    sides = 1.25 * np.maximum(
+        sides, max(sides.max() / 20, 1e-6 * max(1.0, *(np.abs(x).max() for x in panels)))
+    )
+    return [
+        ((x.min(0) + x.max(0)) / 2)[:, None] + np.array([-0.5, 0.5]) * side
+        for x, side in zip(panels, sides, strict=True)
+    ]
 
 
 def _ground(ax, objective, box, dtype):
@@ -200,10 +310,24 @@ def _ground(ax, objective, box, dtype):
 
     if objective is not None:
         x, y = (np.linspace(*side, GRID) for side in box)
-        values = np.ma.masked_invalid(_values(objective, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(dtype)).reshape(GRID, GRID))
-        low, high = (values.min(), np.quantile(values.compressed(), 0.98)) if values.count() else (0, 0)
+        values = np.ma.masked_invalid(
+            _values(
+                objective, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(dtype)
+            ).reshape(GRID, GRID)
+        )
+        low, high = (
+            (values.min(), np.quantile(values.compressed(), 0.98)) if values.count() else (0, 0)
+        )
         if high > low:  # a few great values must not flatten the rest
-            ax.contourf(x, y, values, np.linspace(low, high, LEVELS + 1), cmap=LinearSegmentedColormap.from_list("", SHADES), extend="max", zorder=0)
+            ax.contourf(
+                x,
+                y,
+                values,
+                np.linspace(low, high, LEVELS + 1),
+                cmap=LinearSegmentedColormap.from_list("", SHADES),
+                extend="max",
+                zorder=0,
+            )
     ax.grid(False)
     ax.set(xlim=box[0], ylim=box[1], aspect="equal")
     for axis in (ax.xaxis, ax.yaxis):
@@ -227,27 +351,65 @@ def _proposal(ax, result, k):
         weights, means, covariances = proposal
         strengths, width = 0.25 + 0.75 * weights / max(weights.max(), np.finfo(float).tiny), 1.1
     else:
-        means, covariances, strengths, width = proposal.mean[None], proposal.covariance[None], np.ones(1), 1.6
+        means, covariances, strengths, width = (
+            proposal.mean[None],
+            proposal.covariance[None],
+            np.ones(1),
+            1.6,
+        )
     for strength, mean, covariance in zip(strengths, means, covariances, strict=True):
         values, vectors = np.linalg.eigh(covariance)
         sides, angle = 2 * np.sqrt(np.maximum(values, 0)), np.degrees(np.arctan2(*vectors[::-1, 0]))
         for deviations, line in DEVIATIONS.items():
-            how = dict(fill=False, edgecolor=style.VERMILION, linewidth=width, linestyle=line, alpha=float(strength), zorder=3)
+            how = dict(
+                fill=False,
+                edgecolor=style.VERMILION,
+                linewidth=width,
+                linestyle=line,
+                alpha=float(strength),
+                zorder=3,
+            )
             ax.add_patch(Ellipse(mean, *deviations * sides, angle=angle, **how))
 
 
 def _points(ax, x, label):
-    ax.plot(*x.T, linestyle="", marker="o", markersize=5, color="white", **EDGE | dict(markeredgewidth=1.0), label=label, zorder=5)
+    ax.plot(
+        *x.T,
+        linestyle="",
+        marker="o",
+        markersize=5,
+        color="white",
+        **EDGE | dict(markeredgewidth=1.0),
+        label=label,
+        zorder=5,
+    )
 
 
 def _star(ax, x):
-    ax.plot(*x, linestyle="", marker="*", markersize=13, color=style.VERMILION, **EDGE, label="best so far", zorder=7)
+    ax.plot(
+        *x,
+        linestyle="",
+        marker="*",
+        markersize=13,
+        color=style.VERMILION,
+        **EDGE,
+        label="best so far",
+        zorder=7,
+    )
 
 
 def _outside(ax, x, box):
     """Says how many points the panel does not show."""
     if count := int(((x < box[:, 0]) | (x > box[:, 1])).any(1).sum()):
-        ax.text(0.03, 0.03, f"{count} of {len(x)} outside", transform=ax.transAxes, fontsize=8.5, zorder=8, path_effects=style.halo())
+        ax.text(
+            0.03,
+            0.03,
+            f"{count} of {len(x)} outside",
+            transform=ax.transAxes,
+            fontsize=8.5,
+            zorder=8,
+            path_effects=style.halo(),
+        )
 
 
 def _legend(ax, objective, *others):
@@ -255,12 +417,25 @@ def _legend(ax, objective, *others):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = {label: handle for other in (*others, ax) for handle, label in zip(*other.get_legend_handles_labels(), strict=True)}
+    handles = {
+        label: handle
+        for other in (*others, ax)
+        for handle, label in zip(*other.get_legend_handles_labels(), strict=True)
+    }
     for deviations, line in DEVIATIONS.items():
-        handles[f"proposal, {deviations} sd"] = Line2D([], [], color=style.VERMILION, linewidth=1.6, linestyle=line)
+        handles[f"proposal, {deviations} sd"] = Line2D(
+            [], [], color=style.VERMILION, linewidth=1.6, linestyle=line
+        )
     if objective is not None:
         handles["objective:\ndarker is lower"] = Patch(facecolor=SHADES[1])
-    ax.legend(handles.values(), handles, loc="upper left", bbox_to_anchor=(1.02, 1.02), fontsize=9, labelspacing=0.7)
+    ax.legend(
+        handles.values(),
+        handles,
+        loc="upper left",
+        bbox_to_anchor=(1.02, 1.02),
+        fontsize=9,
+        labelspacing=0.7,
+    )
 
 
 def _plain(ax):

@@ -15,14 +15,17 @@ EFFECTS = {1: ("raises", style.VERMILION), -1: ("lowers", style.BLUE), 0: ("neit
 
 
 def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
-    """The first failures found, a tile each: what the system said, what it is, and the input's number (figure 4.5 of the thesis).
+    """The first failures found, a tile each: what the system said, what it is, and the input's
+    number (figure 4.5 of the thesis).
 
-    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter 4. ``inputs`` and ``labels`` [n]: those of the validation;
-    images [n, height, width], or [n, height, width, channels] of 1, 3 or 4 channels. Numbers of colours are shares of 1, or of 255 where whole. ``names``: of
-    the classes. Returns the list of Axes, one a tile; a single one that says so where no failure was found.
+    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
+    4. ``inputs`` and ``labels`` [n]: those of the validation; images [n, height, width], or [n,
+    height, width, channels] of 1, 3 or 4 channels. Numbers of colours are shares of 1, or of 255
+    where whole. ``names``: of the classes. Returns the list of Axes, one a tile; a single one that
+    says so where no failure was found.
 
-    ValueError for what is no `jast.weakness.Result`, other numbers of inputs or labels, rows of a table, labels by which its failures are none, too few names,
-    and too few axes.
+    ValueError for what is no `jast.weakness.Result`, other numbers of inputs or labels, rows of a
+    table, labels by which its failures are none, too few names, and too few axes.
     """
     import matplotlib.pyplot as plt
 
@@ -31,19 +34,34 @@ def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
     count = whole(f"plot.{caller}", "count", count)
     inputs, labels, _ = arrays(f"plot.{caller}", inputs, labels)
     if len(inputs) != n:
-        raise ValueError(f"plot.{caller}: inputs must be those of the result, {n}, received {len(inputs)}")
+        raise ValueError(
+            f"plot.{caller}: inputs must be those of the result, {n}, received {len(inputs)}"
+        )
     if inputs.ndim not in (3, 4) or inputs.ndim == 4 and inputs.shape[3] not in (1, 3, 4):
-        received = f"rows of a table, shape {inputs.shape}: reshape them if they are images" if inputs.ndim == 2 else f"shape {inputs.shape}"
-        raise ValueError(f"plot.{caller}: inputs must be images [n, height, width] or [n, height, width, 1, 3 or 4 channels], received {received}")
+        received = (
+            f"rows of a table, shape {inputs.shape}: reshape them if they are images"
+            if inputs.ndim == 2
+            else f"shape {inputs.shape}"
+        )
+        raise ValueError(
+            f"plot.{caller}: inputs must be images [n, height, width] or [n, height, width, 1, 3 or"
+            f" 4 channels], received {received}"
+        )
     said, true = np.asarray(result.predicted)[failures], labels[failures]
     if (same := int(np.sum(said == true))) > 0:
-        raise ValueError(f"plot.{caller}: labels must be those of the result, received some by which {same} of its {len(failures)} failures are none")
+        raise ValueError(
+            f"plot.{caller}: labels must be those of the result, received some by which {same} of"
+            f" its {len(failures)} failures are none"
+        )
     words = _words(caller, names, max([*said, *true], default=-1))
     tiles = failures[:count]
     columns = min(5, max(len(tiles), 1))
     lines = -(-max(len(tiles), 1) // columns)
     tall = 1.45 * np.clip(inputs.shape[1] / inputs.shape[2], 0.4, 2.5)
-    titles = [(f"said {words(a)}", f"is {words(b)}") for a, b in zip(said[:count], true[:count], strict=True)]
+    titles = [
+        (f"said {words(a)}", f"is {words(b)}")
+        for a, b in zip(said[:count], true[:count], strict=True)
+    ]
     joint = ", " if max((len("".join(pair)) for pair in titles), default=0) <= 12 else "\n"
     with style.styled():
         own = axes is None
@@ -60,7 +78,11 @@ def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
             ax.set_title(joint.join(title), loc="left", fontsize=10, pad=4)
             ax.set_xlabel(f"input {i}", loc="left", fontsize=8, color=style.GREY, labelpad=3)
         if own and len(tiles):
-            first = f"the first {f'{len(tiles)} ' * (len(tiles) > 1)}of " if len(tiles) < len(failures) else ""
+            first = (
+                f"the first {f'{len(tiles)} ' * (len(tiles) > 1)}of "
+                if len(tiles) < len(failures)
+                else ""
+            )
             found = f"{first}{len(failures):,} failure{'s' * (len(failures) > 1)} found"
             axes[0].figure.get_layout_engine().set(h_pad=0.07)
             axes[0].figure.suptitle(found[0].upper() + found[1:], x=0.01, ha="left", fontsize=11)
@@ -68,23 +90,33 @@ def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
 
 
 def influence(values, names=None, background=None, ax=None):
-    """Which features mark the weakness: the mean magnitude of their contributions to the log odds of failure (figure 4.6 of the thesis). Returns the Axes.
+    """Which features mark the weakness: the mean magnitude of their contributions to the log odds
+    of failure (figure 4.6 of the thesis). Returns the Axes.
 
-    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter 4. ``values`` [k, ...]: the signed contributions of each
-    feature, for k inputs (`jast.weakness.influence`). Of images [k, height, width] or [k, height, width, channels], whose magnitudes are summed over the
-    channels: a map, over ``background`` [height, width(, channels)], in grey, for example the mean image. Of rows of a table [k, columns]: the 15 columns of
-    the greatest mean magnitude, by their ``names``, with the mean of the signed contributions, which raises the odds of failure or lowers them.
-    Of k = 0, as a result without failures gives: axes that say so.
+    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
+    4. ``values`` [k, ...]: the signed contributions of each feature, for k inputs
+    (`jast.weakness.influence`). Of images [k, height, width] or [k, height, width, channels], whose
+    magnitudes are summed over the channels: a map, over ``background`` [height, width(, channels)],
+    in grey, for example the mean image. Of rows of a table [k, columns]: the 15 columns of the
+    greatest mean magnitude, by their ``names``, with the mean of the signed contributions, which
+    raises the odds of failure or lowers them. Of k = 0, as a result without failures gives: axes
+    that say so.
 
-    ValueError for values of another shape or that are not finite, names or a background that do not fit or are for the other kind of inputs.
+    ValueError for values of another shape or that are not finite, names or a background that do not
+    fit or are for the other kind of inputs.
     """
     caller = "influence"
     values = _numbers(values)
     if values is None or values.ndim not in (2, 3, 4) or 0 in values.shape[1:]:
         received = "no such array" if values is None else f"shape {values.shape}"
-        raise ValueError(f"plot.{caller}: values must be [k, columns], [k, height, width] or [k, height, width, channels], received {received}")
+        raise ValueError(
+            f"plot.{caller}: values must be [k, columns], [k, height, width] or [k, height, width,"
+            f" channels], received {received}"
+        )
     if not np.isfinite(values).all():
-        raise ValueError(f"plot.{caller}: values must be finite, {int(np.sum(~np.isfinite(values)))} are not")
+        raise ValueError(
+            f"plot.{caller}: values must be finite, {int(np.sum(~np.isfinite(values)))} are not"
+        )
     if not len(values):
         with style.axes(ax, (3.2, 1.6)) as ax:
             _say(ax, "no inputs to explain")
@@ -96,10 +128,15 @@ def _bars(caller, values, names, background, ax):
     """`influence` of the columns of a table."""
     k, d = values.shape
     if background is not None:
-        raise ValueError(f"plot.{caller}: background must be None for rows of a table, received {type(background).__name__}")
+        raise ValueError(
+            f"plot.{caller}: background must be None for rows of a table, received"
+            f" {type(background).__name__}"
+        )
     names = [f"column {i}" for i in range(d)] if names is None else [str(name) for name in names]
     if len(names) != d:
-        raise ValueError(f"plot.{caller}: names must be {d}, one for each column, received {len(names)}")
+        raise ValueError(
+            f"plot.{caller}: names must be {d}, one for each column, received {len(names)}"
+        )
     size, mean = np.abs(values).mean(0), values.mean(0)
     chosen = np.argsort(-size, kind="stable")[:BARS]
     with style.axes(ax, (6.8, 1.2 + 0.3 * len(chosen))) as ax:
@@ -107,13 +144,28 @@ def _bars(caller, values, names, background, ax):
             word, colour = EFFECTS[int(np.sign(mean[i]))]
             ax.barh(y, size[i], height=0.66, color=colour, alpha=0.9, zorder=2)
             text = f"{word}, mean {mean[i]:+.2g}" if mean[i] else word
-            ax.annotate(text, (size[i], y), (5, 0), textcoords="offset points", va="center", fontsize=9, color=colour)
-        ax.set(xlabel=f"mean magnitude of the contribution to the log odds of failure, {_inputs(k)}", ylim=(len(chosen) - 0.4, -0.6), yticks=range(len(chosen)))
+            ax.annotate(
+                text,
+                (size[i], y),
+                (5, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=9,
+                color=colour,
+            )
+        ax.set(
+            xlabel=f"mean magnitude of the contribution to the log odds of failure, {_inputs(k)}",
+            ylim=(len(chosen) - 0.4, -0.6),
+            yticks=range(len(chosen)),
+        )
         ax.set_yticklabels([names[i] for i in chosen])
         ax.set_xlim(0, 1.3 * size.max() or 1.0)  # room for the words
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
-        ax.set_title(f"Which columns mark the failures{f': the {BARS} greatest of {d:,}' if d > BARS else ''}")
+        ax.set_title(
+            "Which columns mark the"
+            f" failures{f': the {BARS} greatest of {d:,}' if d > BARS else ''}"
+        )
     return ax
 
 
@@ -122,27 +174,53 @@ def _map(caller, values, names, background, ax):
     from matplotlib.colors import LinearSegmentedColormap
 
     if names is not None:
-        raise ValueError(f"plot.{caller}: names must be None for images, received {type(names).__name__}")
+        raise ValueError(
+            f"plot.{caller}: names must be None for images, received {type(names).__name__}"
+        )
     size = np.abs(values).mean(0)
     size = size.sum(2) if size.ndim == 3 else size
     if background is not None:
         given = _numbers(background)
-        if given is None or given.ndim not in (2, 3) or given.shape[:2] != size.shape or not np.isfinite(given).all():
-            received = "no such array" if given is None else f"shape {given.shape}{'' if np.isfinite(given).all() else ' with numbers that are not'}"
-            raise ValueError(f"plot.{caller}: background must be finite {list(size.shape)} or with channels, received {received}")
+        if (
+            given is None
+            or given.ndim not in (2, 3)
+            or given.shape[:2] != size.shape
+            or not np.isfinite(given).all()
+        ):
+            received = "no such array"
+            if given is not None:
+                broken = "" if np.isfinite(given).all() else " with numbers that are not"
+                received = f"shape {given.shape}{broken}"
+            raise ValueError(
+                f"plot.{caller}: background must be finite {list(size.shape)} or with channels,"
+                f" received {received}"
+            )
         background = given.mean(2) if given.ndim == 3 else given
     tall = float(np.clip(size.shape[0] / size.shape[1], 0.3, 2.0))
     with style.axes(ax, (5.0, max(3.75 * tall + 0.5, 3.2)), layout="compressed") as ax:
         if background is not None:
             low, high = background.min(), background.max()
-            ax.imshow(background, cmap="gray_r", vmin=low, vmax=low + 3 * (high - low) if high > low else low + 1, interpolation="nearest", zorder=1)
+            ax.imshow(
+                background,
+                cmap="gray_r",
+                vmin=low,
+                vmax=low + 3 * (high - low) if high > low else low + 1,
+                interpolation="nearest",
+                zorder=1,
+            )
         heat = LinearSegmentedColormap.from_list("", HEAT)
-        drawn = ax.imshow(size, cmap=heat, vmin=0, vmax=size.max() or 1, interpolation="nearest", zorder=2)
+        drawn = ax.imshow(
+            size, cmap=heat, vmin=0, vmax=size.max() or 1, interpolation="nearest", zorder=2
+        )
         _bare(ax)
         ax.spines[:].set_visible(True)
         ax.set_title("Which pixels mark the failures")
         bar = ax.figure.colorbar(drawn, ax=ax, fraction=0.05, pad=0.03)
-        bar.set_label(f"mean magnitude of the contribution\nto the log odds of failure, {_inputs(len(values))}", fontsize=9)
+        bar.set_label(
+            "mean magnitude of the contribution\nto the log odds of failure,"
+            f" {_inputs(len(values))}",
+            fontsize=9,
+        )
         bar.ax.grid(False)
         bar.outline.set_edgecolor(style.GREY)
     return ax
@@ -153,8 +231,13 @@ def _words(caller, names, largest):
     if names is None:
         return str
     if not isinstance(names, list | tuple | np.ndarray) or len(names) <= largest:
-        received = len(names) if isinstance(names, list | tuple | np.ndarray) else type(names).__name__
-        raise ValueError(f"plot.{caller}: names must be a list of one for each class, at least {largest + 1}, received {received}")
+        received = (
+            len(names) if isinstance(names, list | tuple | np.ndarray) else type(names).__name__
+        )
+        raise ValueError(
+            f"plot.{caller}: names must be a list of one for each class, at least {largest + 1},"
+            f" received {received}"
+        )
     return lambda label: str(names[label])
 
 
@@ -166,7 +249,13 @@ def _image(ax, image, every):
         ax.imshow((image.astype(float) - low) / (float(high) - low), interpolation="nearest")
     else:
         grey = image.reshape(image.shape[:2]).astype(float)
-        ax.imshow(grey, cmap="gray", vmin=float(every.min()), vmax=float(every.max()), interpolation="nearest")
+        ax.imshow(
+            grey,
+            cmap="gray",
+            vmin=float(every.min()),
+            vmax=float(every.max()),
+            interpolation="nearest",
+        )
     _bare(ax)
 
 

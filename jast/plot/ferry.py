@@ -11,18 +11,26 @@ __all__ = ["ferry"]
 
 
 def ferry(episode, sim=None, ax=None):
-    """Both vessels of one ferry `Episode`: their paths with a dot a step and a number every fifth, and the closest approach.
+    """Both vessels of one ferry `Episode`: their paths with a dot a step and a number every fifth,
+    and the closest approach.
 
-    The states are those of the episode, or of its replay on ``sim`` (default: `jast.simulators.ferry` S0). Returns the Axes. ValueError for an episode of
-    another system or for many episodes.
+    The states are those of the episode, or of its replay on ``sim`` (default:
+    `jast.simulators.ferry` S0). Returns the Axes. ValueError for an episode of another system or
+    for many episodes.
     """
     states = style.one("ferry", episode).states
     if states is None:
         states = replay(ferry_simulator() if sim is None else sim, episode).states
     if not isinstance(states, FerryState):
-        raise ValueError(f"plot.ferry: episode must be of jast.simulators.ferry, received states of {type(states).__name__}")
+        raise ValueError(
+            "plot.ferry: episode must be of jast.simulators.ferry, received states of"
+            f" {type(states).__name__}"
+        )
     n = int(episode.length)
-    paths = [np.stack([x, y], -1)[: n + 1] for x, y in ((states.ferry_x, states.ferry_y), (states.x, states.y))]
+    paths = [
+        np.stack([x, y], -1)[: n + 1]
+        for x, y in ((states.ferry_x, states.ferry_y), (states.x, states.y))
+    ]
     gaps = np.linalg.norm(paths[0] - paths[1], axis=-1)
     nearest = int(np.argmin(gaps))
 
@@ -30,29 +38,77 @@ def ferry(episode, sim=None, ax=None):
     height = np.clip(6.2 * (high - low)[1] / (high - low)[0], 3.0, 8.0) + 0.8
 
     with style.axes(ax, (6.2, height)) as ax:
-        for path, name, colour, offset in ((paths[0], "ferry", style.BLUE, (-4, 9)), (paths[1], "adversary", style.VERMILION, (10, -4))):
+        for path, name, colour, offset in (
+            (paths[0], "ferry", style.BLUE, (-4, 9)),
+            (paths[1], "adversary", style.VERMILION, (10, -4)),
+        ):
             ax.plot(*path.T, color=colour, marker="o", markersize=3, zorder=3)
             ax.plot(*path[0], color=colour, marker="s", markersize=8, zorder=4)
-            ax.annotate(name, path[0], offset, textcoords="offset points", color=colour, weight="bold", path_effects=style.halo(), zorder=6)
+            ax.annotate(
+                name,
+                path[0],
+                offset,
+                textcoords="offset points",
+                color=colour,
+                weight="bold",
+                path_effects=style.halo(),
+                zorder=6,
+            )
             for t in range(5, n + 1, 5):
                 if abs(t - nearest) < 3:  # room for the closest approach
                     continue
                 along = path[t] - path[t - 1]
-                side = np.array([along[1], -along[0]]) / max(np.linalg.norm(along), 1e-9)  # to the right of the way
+                # to the right of the way
+                side = np.array([along[1], -along[0]]) / max(np.linalg.norm(along), 1e-9)
                 place = dict(textcoords="offset points", ha="center", va="center")
-                ax.annotate(str(t), path[t], side * 11, **place, color=colour, fontsize=8, path_effects=style.halo(), zorder=6)
+                ax.annotate(
+                    str(t),
+                    path[t],
+                    side * 11,
+                    **place,
+                    color=colour,
+                    fontsize=8,
+                    path_effects=style.halo(),
+                    zorder=6,
+                )
         meet = np.stack([paths[0][nearest], paths[1][nearest]])
         ax.add_patch(_circle(meet[0], COLLISION))
         ax.plot(*meet.T, color=style.INK, linewidth=1.4, marker="o", markersize=4, zorder=5)
-        wide = gaps[nearest] > 3 * COLLISION  # then the number stands on the line, else above the circle
+        # then the number stands on the line, else above the circle
+        wide = gaps[nearest] > 3 * COLLISION
         at = meet.mean(0) if wide else meet[0] + [0, COLLISION + 2.5]
-        ax.annotate(f"{gaps[nearest]:.2f}", at, ha="center", va="center", weight="bold", path_effects=style.halo(), zorder=7)
-        ax.set_title(style.headline("Ferry", episode, f"\nclosest approach {gaps[nearest]:.2f} at step {nearest} (circle: radius {COLLISION:g})"))
-        ax.set(xlabel="x", ylabel="y", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        ax.annotate(
+            f"{gaps[nearest]:.2f}",
+            at,
+            ha="center",
+            va="center",
+            weight="bold",
+            path_effects=style.halo(),
+            zorder=7,
+        )
+        ax.set_title(
+            style.headline(
+                "Ferry",
+                episode,
+                f"\nclosest approach {gaps[nearest]:.2f} at step {nearest} (circle: radius"
+                f" {COLLISION:g})",
+            )
+        )
+        ax.set(
+            xlabel="x", ylabel="y", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal"
+        )
     return ax
 
 
 def _circle(centre, radius):
     from matplotlib.patches import Circle
 
-    return Circle(tuple(centre), radius, facecolor=style.BLUE, alpha=0.15, edgecolor=style.BLUE, linewidth=1.0, zorder=2)
+    return Circle(
+        tuple(centre),
+        radius,
+        facecolor=style.BLUE,
+        alpha=0.15,
+        edgecolor=style.BLUE,
+        linewidth=1.0,
+        zorder=2,
+    )

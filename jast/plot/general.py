@@ -1,4 +1,6 @@
-"""Pictures that any system has: how a search went, what disturbed an episode, how close many came."""
+"""Pictures that any system has: how a search went, what disturbed an episode, how close many
+came.
+"""
 
 import jax
 import numpy as np
@@ -10,11 +12,14 @@ __all__ = ["disturbances", "distances", "history"]
 
 
 def history(results, ax=None, total=False):
-    """How the best reward grew with the episodes of a tree: the mean over trees with its 95 % band, and (dashed) the best over trees.
+    """How the best reward grew with the episodes of a tree: the mean over trees with its 95 % band,
+    and (dashed) the best over trees.
 
-    ``total=True``: the best over trees with the episodes of all trees, by which searches of different numbers of trees compare.
+    ``total=True``: the best over trees with the episodes of all trees, by which searches of
+    different numbers of trees compare.
 
-    ``results``: a search result, or a dict of name -> result, whose ``history`` has ``simulations`` [C] and ``best_reward`` [C, trees]. Returns the Axes.
+    ``results``: a search result, or a dict of name -> result, whose ``history`` has ``simulations``
+    [C] and ``best_reward`` [C, trees]. Returns the Axes.
     """
     from matplotlib.ticker import EngFormatter
 
@@ -22,32 +27,62 @@ def history(results, ax=None, total=False):
     with style.axes(ax, (6.8, 4.2)) as ax:
         means, bests = [], []
         for i, (name, result) in enumerate(results.items()):
-            episodes, best = np.asarray(result.history.simulations), np.asarray(result.history.best_reward, float)
+            episodes, best = (
+                np.asarray(result.history.simulations),
+                np.asarray(result.history.best_reward, float),
+            )
             best = np.where(np.isfinite(best), best, np.nan)  # no valid episode yet: not drawn
             if best.ndim != 2 or episodes.shape != best.shape[:1]:
-                raise ValueError(f"plot.history: history must have simulations [C] and best_reward [C, trees], received {episodes.shape} and {best.shape}")
+                raise ValueError(
+                    "plot.history: history must have simulations [C] and best_reward [C, trees],"
+                    f" received {episodes.shape} and {best.shape}"
+                )
             colour, trees = style.COLOURS[i % len(style.COLOURS)], best.shape[1]
             if total:
                 episodes, best, trees = episodes * trees, np.fmax.reduce(best, 1, keepdims=True), 1
             mean = best.mean(1)
-            label = name if total else f"{name + ': ' if name else ''}mean of {trees} tree{'s' * (trees > 1)}"
+            label = (
+                name
+                if total
+                else f"{name + ': ' if name else ''}mean of {trees} tree{'s' * (trees > 1)}"
+            )
             means += ax.plot(episodes, mean, color=colour, label=label, zorder=3)
             if trees > 1:
                 half = 1.96 * best.std(1, ddof=1) / np.sqrt(trees)
-                ax.fill_between(episodes, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
-                bests += ax.plot(episodes, best.max(1), color=colour, linestyle=(0, (4, 2)), linewidth=1.3, label="best of them")
+                ax.fill_between(
+                    episodes, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0
+                )
+                bests += ax.plot(
+                    episodes,
+                    best.max(1),
+                    color=colour,
+                    linestyle=(0, (4, 2)),
+                    linewidth=1.3,
+                    label="best of them",
+                )
         ax.set(xlabel="episodes" if total else "episodes a tree", ylabel="best reward so far")
         if total:
             ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-        ax.legend([*means, *bests], [line.get_label() for line in (*means, *bests)], loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
+        ax.legend(
+            [*means, *bests],
+            [line.get_label() for line in (*means, *bests)],
+            loc="lower left",
+            bbox_to_anchor=(-0.02, 1.0),
+            ncols=2,
+        )
     return ax
 
 
 def disturbances(episode, axes=None):
-    """The disturbances of one `Episode` over its steps, a panel for each array of x, a line for each of its numbers. Returns the list of Axes."""
+    """The disturbances of one `Episode` over its steps, a panel for each array of x, a line for
+    each of its numbers. Returns the list of Axes.
+    """
     style.one("disturbances", episode)
     n = int(episode.length)
-    panels = [(jax.tree_util.keystr(path) or "x", np.asarray(a)) for path, a in jax.tree_util.tree_leaves_with_path(episode.disturbances)]
+    panels = [
+        (jax.tree_util.keystr(path) or "x", np.asarray(a))
+        for path, a in jax.tree_util.tree_leaves_with_path(episode.disturbances)
+    ]
     with style.axes(axes, (6.8, 1.4 + 2.0 * max(len(panels), 1)), max(len(panels), 1)) as axes:
         axes = style.panels("disturbances", axes, len(panels), "array of x")
         for ax, (name, a) in zip(axes, panels, strict=False):
@@ -55,7 +90,15 @@ def disturbances(episode, axes=None):
             few = rows.shape[1] <= len(style.COLOURS)
             for i, row in enumerate(rows.T):
                 colour = style.COLOURS[i] if few else style.shade(i / (rows.shape[1] - 1))
-                ax.plot(np.arange(1, n + 1), row, color=colour, marker="o", markersize=3.5 if few else 0, label=f"{i}", linewidth=1.6 if few else 0.9)
+                ax.plot(
+                    np.arange(1, n + 1),
+                    row,
+                    color=colour,
+                    marker="o",
+                    markersize=3.5 if few else 0,
+                    label=f"{i}",
+                    linewidth=1.6 if few else 0.9,
+                )
             if few and 1 < rows.shape[1] and n:
                 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="entry")
             ax.set(ylabel=f"x{name}" if name != "x" else "x", xlim=(0.5, max(n, 1) + 0.5))
@@ -66,16 +109,25 @@ def disturbances(episode, axes=None):
 
 
 def distances(*episodes, labels=None, bins=40, ax=None):
-    """Histogram of the miss distances of one or several batches of episodes (each an `Episode` with leading axes); failures are ticks on the axis.
+    """Histogram of the miss distances of one or several batches of episodes (each an `Episode` with
+    leading axes); failures are ticks on the axis.
 
-    ``labels``: one name a batch. Episodes whose distance is not finite are left out. Returns the Axes. ValueError where no episode or no label fits.
+    ``labels``: one name a batch. Episodes whose distance is not finite are left out. Returns the
+    Axes. ValueError where no episode or no label fits.
     """
     if not episodes or not all(isinstance(e, Episode) for e in episodes):
-        raise ValueError(f"plot.distances: episodes must be one or more Episodes, received {[type(e).__name__ for e in episodes]}")
+        raise ValueError(
+            "plot.distances: episodes must be one or more Episodes, received"
+            f" {[type(e).__name__ for e in episodes]}"
+        )
     labels = [f"batch {i + 1}" for i in range(len(episodes))] if labels is None else list(labels)
     if len(labels) != len(episodes):
-        raise ValueError(f"plot.distances: labels must be {len(episodes)} names, received {len(labels)}")
-    batches = [(np.ravel(e.distance).astype(float), np.ravel(e.failure).astype(bool)) for e in episodes]
+        raise ValueError(
+            f"plot.distances: labels must be {len(episodes)} names, received {len(labels)}"
+        )
+    batches = [
+        (np.ravel(e.distance).astype(float), np.ravel(e.failure).astype(bool)) for e in episodes
+    ]
     finite = np.concatenate([d[np.isfinite(d)] for d, _ in batches])
     edges = np.histogram_bin_edges(finite, bins) if finite.size else np.linspace(0, 1, 2)
     with style.axes(ax, (6.8, 3.8)) as ax:
@@ -84,9 +136,27 @@ def distances(*episodes, labels=None, bins=40, ax=None):
             share = np.histogram(d[np.isfinite(d)], edges)[0] / max(len(d), 1)
             name = f"{label}: {len(d)} episode{'s' * (len(d) != 1)}, {int(failure.sum())} fail"
             ax.stairs(share, edges, color=colour, fill=True, alpha=0.2)
-            ax.stairs(share, edges, color=colour, linewidth=1.6, label=name if len(episodes) > 1 or labels[0] != "batch 1" else name.removeprefix("batch 1: "))
+            ax.stairs(
+                share,
+                edges,
+                color=colour,
+                linewidth=1.6,
+                label=(
+                    name
+                    if len(episodes) > 1 or labels[0] != "batch 1"
+                    else name.removeprefix("batch 1: ")
+                ),
+            )
             hits = d[failure & np.isfinite(d)]
-            ax.plot(hits, np.full(len(hits), -0.02 - 0.03 * i), "|", color=colour, markersize=8, transform=ax.get_xaxis_transform(), clip_on=False)
+            ax.plot(
+                hits,
+                np.full(len(hits), -0.02 - 0.03 * i),
+                "|",
+                color=colour,
+                markersize=8,
+                transform=ax.get_xaxis_transform(),
+                clip_on=False,
+            )
         ax.set(xlabel="miss distance", ylabel="share of episodes", ylim=(0, None))
         ax.tick_params(axis="x", pad=6 + 6 * len(episodes), length=0)
         ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0))

@@ -1,4 +1,6 @@
-"""Pictures of `jast.estimate`: probabilities and their intervals, what failures look like, and whether the weights can be trusted."""
+"""Pictures of `jast.estimate`: probabilities and their intervals, what failures look like, and
+whether the weights can be trusted.
+"""
 
 import jax
 import numpy as np
@@ -12,10 +14,12 @@ __all__ = ["failure_fan", "probability", "weights"]
 
 
 def probability(estimates, truth=None, ax=None):
-    """Failure probabilities with their intervals on a logarithmic axis, a row each; an UNRELIABLE one is a dashed line and a cross, and named so.
+    """Failure probabilities with their intervals on a logarithmic axis, a row each; an UNRELIABLE
+    one is a dashed line and a cross, and named so.
 
-    ``estimates``: an `Estimate` or a dict of name -> `Estimate` or list of them, which share a row (several seeds). Where no failure was seen an arrow points
-    down from the upper bound. ``truth``: the known probability, a vertical line. Returns the Axes.
+    ``estimates``: an `Estimate` or a dict of name -> `Estimate` or list of them, which share a row
+    (several seeds). Where no failure was seen an arrow points down from the upper bound. ``truth``:
+    the known probability, a vertical line. Returns the Axes.
 
     ValueError for anything else, a truth outside (0, 1] and estimates below the least double.
     """
@@ -25,36 +29,71 @@ def probability(estimates, truth=None, ax=None):
     found = [e for row in rows.values() for e in row]
     if not found or not all(isinstance(e, Estimate) for e in found):
         received = sorted({type(e).__name__ for e in found}) or "none"
-        raise ValueError(f"plot.{caller}: estimates must be an Estimate or a dict of name -> Estimate or list of them, received {received}")
+        raise ValueError(
+            f"plot.{caller}: estimates must be an Estimate or a dict of name -> Estimate or list of"
+            f" them, received {received}"
+        )
     if any(e.mean == 0 for e in found):
-        raise ValueError(f"plot.{caller}: estimates must be above the least double, received log10 {min(e.log10_mean for e in found if e.mean == 0):.4g}")
+        raise ValueError(
+            f"plot.{caller}: estimates must be above the least double, received log10"
+            f" {min(e.log10_mean for e in found if e.mean == 0):.4g}"
+        )
     if truth is not None and not 0 < truth <= 1:
         raise ValueError(f"plot.{caller}: truth must be above 0 and at most 1, received {truth!r}")
     with style.axes(ax, (7.2, 1.3 + 0.46 * len(rows))) as ax:
         levels = sorted({e.level for e in found})
         interval = f"{levels[0]:.4g} interval" if len(levels) == 1 else "interval"
         if truth is not None:
-            ax.axvline(float(truth), color=style.INK, linewidth=1.2, linestyle=(0, (1, 1.5)), label=f"truth {float(truth):.4g}")
+            ax.axvline(
+                float(truth),
+                color=style.INK,
+                linewidth=1.2,
+                linestyle=(0, (1, 1.5)),
+                label=f"truth {float(truth):.4g}",
+            )
         for y, row in enumerate(rows.values()):
-            for at, e in zip(y + (np.linspace(-0.3, 0.3, len(row)) if len(row) > 1 else np.zeros(1)), row, strict=True):
+            for at, e in zip(
+                y + (np.linspace(-0.3, 0.3, len(row)) if len(row) > 1 else np.zeros(1)),
+                row,
+                strict=True,
+            ):
                 _row(ax, e, at, interval)
-            ax.text(1.02, y, _words(row), transform=ax.get_yaxis_transform(), va="center", fontsize=9)
-        ax.set(xscale="log", xlabel="failure probability", yticks=range(len(rows)), ylim=(len(rows) - 0.5, -0.5))
+            ax.text(
+                1.02, y, _words(row), transform=ax.get_yaxis_transform(), va="center", fontsize=9
+            )
+        ax.set(
+            xscale="log",
+            xlabel="failure probability",
+            yticks=range(len(rows)),
+            ylim=(len(rows) - 0.5, -0.5),
+        )
         ax.set_yticklabels([e.method if name is None else name for name, (e, *_) in rows.items()])
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
-        handles = {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        handles = {
+            label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        }
         if handles:
-            ax.legend(handles.values(), handles, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
+            ax.legend(
+                handles.values(),
+                handles,
+                loc="lower left",
+                bbox_to_anchor=(-0.02, 1.0),
+                ncols=3,
+                fontsize=9,
+            )
     return ax
 
 
 def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
-    """How a number of the state runs to failure, a line an episode with a mark where it fails, in two colours where some end above 0 and others below.
+    """How a number of the state runs to failure, a line an episode with a mark where it fails, in
+    two colours where some end above 0 and others below.
 
-    ``samples``: `jast.estimate.FailureSamples` or a batch of `Episode` with one leading axis; each is replayed. ``value``: state -> number (default: the miss
-    distance). ``nominal``: a batch of other episodes, grey and behind. At most ``most`` of a batch are drawn, evenly taken. Returns the Axes. ValueError
-    for samples of another kind, a value that is not one number and ``most`` below 1.
+    ``samples``: `jast.estimate.FailureSamples` or a batch of `Episode` with one leading axis; each
+    is replayed. ``value``: state -> number (default: the miss distance). ``nominal``: a batch of
+    other episodes, grey and behind. At most ``most`` of a batch are drawn, evenly taken. Returns
+    the Axes. ValueError for samples of another kind, a value that is not one number and ``most``
+    below 1.
     """
     caller = "failure_fan"
     samples = samples.episodes if isinstance(samples, FailureSamples) else samples
@@ -62,17 +101,42 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
     behind = [] if nominal is None else _lines(caller, "nominal", sim, nominal, value, most)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, line in enumerate(behind):
-            ax.plot(line, color=style.GREY, linewidth=0.6, alpha=0.5, zorder=2, label="_" if i else f"{len(behind)} nominal episodes")
+            ax.plot(
+                line,
+                color=style.GREY,
+                linewidth=0.6,
+                alpha=0.5,
+                zorder=2,
+                label="_" if i else f"{len(behind)} nominal episodes",
+            )
         up = np.array([line[-1] > 0 for line in lines], bool)
         both = up.any() and (~up & (np.array([line[-1] for line in lines]) < 0)).any()
-        for side, colour, marker in ((True, style.BLUE, "^"), (False, style.VERMILION, "v")) if both else ((None, style.BLUE, "o"),):
-            own = [line for line, above in zip(lines, up, strict=True) if side is None or above == side]
-            name = f"{len(own)} failures" if side is None else f"{len(own)} of {len(lines)} failures {'above' if side else 'below'} 0"
+        for side, colour, marker in (
+            ((True, style.BLUE, "^"), (False, style.VERMILION, "v"))
+            if both
+            else ((None, style.BLUE, "o"),)
+        ):
+            own = [
+                line for line, above in zip(lines, up, strict=True) if side is None or above == side
+            ]
+            name = (
+                f"{len(own)} failures"
+                if side is None
+                else f"{len(own)} of {len(lines)} failures {'above' if side else 'below'} 0"
+            )
             alpha = float(np.clip(12 / len(own), 0.12, 0.8))
             for line in own:
                 ax.plot(line, color=colour, linewidth=0.8, alpha=alpha, zorder=3)
             ends = [len(line) - 1 for line in own], [line[-1] for line in own]
-            ax.plot(*ends, linestyle="", marker=marker, markersize=3.5, color=colour, alpha=min(2 * alpha, 1), zorder=4)
+            ax.plot(
+                *ends,
+                linestyle="",
+                marker=marker,
+                markersize=3.5,
+                color=colour,
+                alpha=min(2 * alpha, 1),
+                zorder=4,
+            )
             ax.plot([], [], color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
         ax.set(xlabel="step", ylabel="miss distance" if value is None else "value", xlim=(0, None))
         ax.xaxis.get_major_locator().set_params(integer=True)
@@ -81,12 +145,15 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
 
 
 def weights(traces, ax=None):
-    """The greatest weights of an estimate: which share of the episodes has a weight above so many times the mean, both axes logarithmic. Returns the Axes.
+    """The greatest weights of an estimate: which share of the episodes has a weight above so many
+    times the mean, both axes logarithmic. Returns the Axes.
 
-    Black over the tail: the Pareto distribution of the shape k-hat (`jast.estimate.pareto_k`) through the tail's median. Its slope falls to -1/k-hat: the
-    flatter, the fewer episodes decide; above 0.7 no standard error is to be trusted. A failure mode that is missing does not show.
+    Black over the tail: the Pareto distribution of the shape k-hat (`jast.estimate.pareto_k`)
+    through the tail's median. Its slope falls to -1/k-hat: the flatter, the fewer episodes decide;
+    above 0.7 no standard error is to be trusted. A failure mode that is missing does not show.
 
-    ``traces``: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`. ValueError for anything else, and with fewer than 2 failures.
+    ``traces``: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`.
+    ValueError for anything else, and with fewer than 2 failures.
     """
     from matplotlib.ticker import LogLocator
 
@@ -94,27 +161,56 @@ def weights(traces, ax=None):
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (name, t) in enumerate(traces.items()):
             if not isinstance(t, Traces) or np.ndim(t.log_weight) != 1:
-                raise ValueError(f"plot.weights: traces must be Traces with one leading axis or a dict of them, received {type(t).__name__}")
+                raise ValueError(
+                    "plot.weights: traces must be Traces with one leading axis or a dict of them,"
+                    f" received {type(t).__name__}"
+                )
             log_w, n = np.asarray(t.log_weight, float)[np.asarray(t.failure)], len(t.failure)
             log_w = np.sort(log_w[np.isfinite(log_w)])[::-1]
             if len(log_w) < 2:
-                raise ValueError(f"plot.weights: traces must hold at least 2 failures, received {len(log_w)}{f' for {name!r}' if name else ''}")
+                raise ValueError(
+                    "plot.weights: traces must hold at least 2 failures, received"
+                    f" {len(log_w)}{f' for {name!r}' if name else ''}"
+                )
             k = pareto_k(log_w, n)
             w = np.exp(log_w - log_w[0])
             w, share = w * n / w.sum(), np.arange(1, len(w) + 1) / n
-            colour, words = style.COLOURS[i % len(style.COLOURS)], f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else "")
-            m = min(int(np.ceil(min(n / 5, 3 * np.sqrt(n)))), len(w) - 1)  # the tail that pareto_k looks at
-            few = np.unique(np.geomspace(1, min(4 * m, len(w)), 200).astype(int)) - 1  # evenly along the axis
+            colour, words = (
+                style.COLOURS[i % len(style.COLOURS)],
+                f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else ""),
+            )
+            # the tail that pareto_k looks at
+            m = min(int(np.ceil(min(n / 5, 3 * np.sqrt(n)))), len(w) - 1)
+            # evenly along the axis
+            few = np.unique(np.geomspace(1, min(4 * m, len(w)), 200).astype(int)) - 1
             look = dict(linestyle="", marker=style.MARKERS[i % len(style.MARKERS)], markersize=4)
-            ax.plot(w[few], share[few], color=colour, label=f"{name}: {words}" if name else words, zorder=3, **look)
+            ax.plot(
+                w[few],
+                share[few],
+                color=colour,
+                label=f"{name}: {words}" if name else words,
+                zorder=3,
+                **look,
+            )
             if np.isfinite(k) and w[0] > w[m]:
                 x = np.geomspace(w[m], w[0], 100)
                 k = k if abs(k) > 1e-6 else 1e-6
                 scale = k * (np.median(w[:m]) - w[m]) / (2**k - 1)
                 above = np.maximum(1 + k * (x - w[m]) / scale, 0)
                 tail = m / n * np.where(above > 0, above, np.nan) ** (-1 / k)
-                ax.plot(x, np.where(tail >= 0.3 / n, tail, np.nan), color=style.INK, linewidth=1.2, zorder=4)
-        ax.set(xscale="log", yscale="log", xlabel="weight over the mean weight", ylabel="share of episodes above it")
+                ax.plot(
+                    x,
+                    np.where(tail >= 0.3 / n, tail, np.nan),
+                    color=style.INK,
+                    linewidth=1.2,
+                    zorder=4,
+                )
+        ax.set(
+            xscale="log",
+            yscale="log",
+            xlabel="weight over the mean weight",
+            ylabel="share of episodes above it",
+        )
         ax.yaxis.set_major_locator(LogLocator(numticks=8))
         ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
     return ax
@@ -125,12 +221,35 @@ def _row(ax, e, y, interval):
     low, high = e.interval
     if np.isnan(e.mean):  # an upper bound is all that is known
         if high < 1:
-            ax.plot(high, y, linestyle="", marker=8, markersize=9, color=style.PURPLE, label="no failure seen: upper bound", zorder=3)
+            ax.plot(
+                high,
+                y,
+                linestyle="",
+                marker=8,
+                markersize=9,
+                color=style.PURPLE,
+                label="no failure seen: upper bound",
+                zorder=3,
+            )
         return
-    look = dict(color=style.BLUE, linestyle="-") if e.reliable else dict(color=style.VERMILION, linestyle=(0, (2, 1.5)))
+    look = (
+        dict(color=style.BLUE, linestyle="-")
+        if e.reliable
+        else dict(color=style.VERMILION, linestyle=(0, (2, 1.5)))
+    )
     ax.plot([max(low, np.finfo(float).tiny), high], [y, y], **look, linewidth=1.6, zorder=3)
     marker, label = ("o", f"estimate, {interval}") if e.reliable else ("X", "UNRELIABLE")
-    ax.plot(e.mean, y, **look, marker=marker, markersize=6, markeredgecolor="white", markeredgewidth=0.7, label=label, zorder=4)
+    ax.plot(
+        e.mean,
+        y,
+        **look,
+        marker=marker,
+        markersize=6,
+        markeredgecolor="white",
+        markeredgewidth=0.7,
+        label=label,
+        zorder=4,
+    )
 
 
 def _words(row):
@@ -146,13 +265,30 @@ def _words(row):
 
 def _lines(caller, name, sim, episodes, value, most):
     """[steps + 1] of the value for each episode."""
-    if not isinstance(episodes, Episode) or np.ndim(episodes.length) != 1 or not len(episodes.length):
-        received = f"leading axes {np.shape(episodes.length)}" if isinstance(episodes, Episode) else type(episodes).__name__
-        raise ValueError(f"plot.{caller}: {name} must be FailureSamples or Episodes with one leading axis, received {received}")
-    rows = np.unique(np.linspace(0, len(episodes.length) - 1, whole(f"plot.{caller}", "most", most)).astype(int))
+    if (
+        not isinstance(episodes, Episode)
+        or np.ndim(episodes.length) != 1
+        or not len(episodes.length)
+    ):
+        received = (
+            f"leading axes {np.shape(episodes.length)}"
+            if isinstance(episodes, Episode)
+            else type(episodes).__name__
+        )
+        raise ValueError(
+            f"plot.{caller}: {name} must be FailureSamples or Episodes with one leading axis,"
+            f" received {received}"
+        )
+    rows = np.unique(
+        np.linspace(0, len(episodes.length) - 1, whole(f"plot.{caller}", "most", most)).astype(int)
+    )
     few = jax.tree.map(lambda a: np.asarray(a)[rows], episodes._replace(states=None))
     number = value if value is not None else lambda s: sim.evaluate(s)[1]
-    out = np.asarray(jax.jit(jax.vmap(lambda e: jax.vmap(number)(replay(sim, e).states)))(few), float)
+    out = np.asarray(
+        jax.jit(jax.vmap(lambda e: jax.vmap(number)(replay(sim, e).states)))(few), float
+    )
     if out.ndim != 2:
-        raise ValueError(f"plot.{caller}: value must return one number, received shape {out.shape[2:]}")
+        raise ValueError(
+            f"plot.{caller}: value must return one number, received shape {out.shape[2:]}"
+        )
     return [row[: int(n) + 1] for row, n in zip(out, few.length, strict=True)]

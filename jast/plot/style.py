@@ -10,20 +10,64 @@ import numpy as np
 from jast.episode import Episode
 
 __all__ = [
-    "BLUE", "COLOURS", "GREEN", "GREY", "INK", "MARKERS", "ORANGE", "PURPLE", "SKY", "STYLE", "VERMILION", "WRITERS",
-    "axes", "frugal", "halo", "headline", "iteration", "one", "panels", "shade", "styled", "writable",
-]  # fmt: skip
+    "BLUE",
+    "COLOURS",
+    "GREEN",
+    "GREY",
+    "INK",
+    "MARKERS",
+    "ORANGE",
+    "PURPLE",
+    "SKY",
+    "STYLE",
+    "VERMILION",
+    "WRITERS",
+    "axes",
+    "frugal",
+    "halo",
+    "headline",
+    "iteration",
+    "one",
+    "panels",
+    "shade",
+    "styled",
+    "writable",
+]
 
-BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+)
 INK, GREY = "#222222", "#8A8A8A"
 MARKERS = ("o", "s", "^", "D", "v", "P")
 STYLE = {
-    "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left", "axes.titlepad": 10, "axes.labelcolor": INK, "text.color": INK, "axes.edgecolor": GREY,
-    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#E6E6E6", "grid.linewidth": 0.8,
-    "xtick.color": GREY, "ytick.color": GREY, "xtick.labelcolor": INK, "ytick.labelcolor": INK, "legend.frameon": False, "lines.linewidth": 1.8,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 10,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "axes.edgecolor": GREY,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.8,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "legend.frameon": False,
+    "lines.linewidth": 1.8,
     "figure.dpi": 110,
-}  # fmt: skip
-WRITERS = {".mp4": "ffmpeg", ".gif": "pillow", ".html": "html"}  # an animation's suffix: what writes it
+}
+# an animation's suffix: what writes it
+WRITERS = {".mp4": "ffmpeg", ".gif": "pillow", ".html": "html"}
 
 
 @contextmanager
@@ -32,12 +76,20 @@ def axes(given, size, rows=1, columns=1, sharey=False, layout="constrained"):
     import matplotlib.pyplot as plt
 
     with styled():
-        yield given if given is not None else plt.subplots(rows, columns, figsize=size, sharex=True, sharey=sharey, layout=layout)[1]
+        yield (
+            given
+            if given is not None
+            else plt.subplots(
+                rows, columns, figsize=size, sharex=True, sharey=sharey, layout=layout
+            )[1]
+        )
 
 
 @contextmanager
 def styled():
-    """The style of these pictures. Only what it sets is put back: `rc_context` would also undo what a notebook sets when it makes its first figure."""
+    """The style of these pictures. Only what it sets is put back: `rc_context` would also undo what
+    a notebook sets when it makes its first figure.
+    """
     from matplotlib import rcParams
 
     before = {name: rcParams[name] for name in STYLE}
@@ -57,20 +109,29 @@ def halo():
 
 def headline(what, episode, more=""):
     """What happened, and the numbers that identify the episode."""
-    outcome = f"{'failure at step' if episode.failure else 'no failure, steps:'} {int(episode.length)}"
-    return f"{what}: {outcome}\nreward {float(episode.reward):.3f},  log p {float(episode.log_prob):.3f}{more}"
+    outcome = (
+        f"{'failure at step' if episode.failure else 'no failure, steps:'} {int(episode.length)}"
+    )
+    return (
+        f"{what}: {outcome}\nreward {float(episode.reward):.3f},  log p"
+        f" {float(episode.log_prob):.3f}{more}"
+    )
 
 
 def one(caller, episode):
     """``episode``, or a ValueError where it is not one `Episode`."""
     if not isinstance(episode, Episode) or np.ndim(episode.length):
-        received = type(episode).__name__ + (f" with leading axes {np.shape(episode.length)}" if isinstance(episode, Episode) else "")
+        received = type(episode).__name__ + (
+            f" with leading axes {np.shape(episode.length)}" if isinstance(episode, Episode) else ""
+        )
         raise ValueError(f"plot.{caller}: episode must be one Episode, received {received}")
     return episode
 
 
 def iteration(caller, name, k, run):
-    """``k``, the argument ``name``, as an int, or a ValueError where that iteration of ``run`` was not run."""
+    """``k``, the argument ``name``, as an int, or a ValueError where that iteration of ``run`` was
+    not run.
+    """
     try:
         number = index(k)
     except TypeError:
@@ -81,15 +142,22 @@ def iteration(caller, name, k, run):
 
 
 def panels(caller, axes, least, each):
-    """The axes as a flat list, or a ValueError where they are fewer than ``least``, one for ``each``."""
+    """The axes as a flat list, or a ValueError where they are fewer than ``least``, one for
+    ``each``.
+    """
     axes = np.atleast_1d(np.asarray(axes, object)).ravel().tolist()
     if len(axes) < least:
-        raise ValueError(f"plot.{caller}: axes must be at least {least}, one for each {each}, received {len(axes)}")
+        raise ValueError(
+            f"plot.{caller}: axes must be at least {least}, one for each {each}, received"
+            f" {len(axes)}"
+        )
     return axes
 
 
 def frugal():
-    """A `Figure` whose PNGs have 256 colours, which are all that one needs: a third of the bytes in an animation's HTML."""
+    """A `Figure` whose PNGs have 256 colours, which are all that one needs: a third of the bytes in
+    an animation's HTML.
+    """
     from matplotlib.figure import Figure
     from PIL import Image
 
@@ -116,5 +184,8 @@ def writable(caller, path):
 
     able = [suffix for suffix, writer in WRITERS.items() if writers.is_available(writer)]
     if path is not None and Path(path).suffix.lower() not in able:
-        raise ValueError(f"plot.{caller}: path must end in one of {able}, which can be written here, received {str(path)!r}")
+        raise ValueError(
+            f"plot.{caller}: path must end in one of {able}, which can be written here, received"
+            f" {str(path)!r}"
+        )
     return None if path is None else Path(path)

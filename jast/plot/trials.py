@@ -1,7 +1,8 @@
-"""Every evaluation of one or several searches: how near to a failure they came as they went on (figure 3.7 of Moss's thesis), and all in all (figure 3.8).
+"""Every evaluation of one or several searches: how near to a failure they came as they went on
+(figure 3.7 of Moss's thesis), and all in all (figure 3.8).
 
-They read ``result.trials``, which a search keeps with ``record=True``. Left out are episodes that were invalid, and those that a tree did not simulate as it
-had come to their end before.
+They read ``result.trials``, which a search keeps with ``record=True``. Left out are episodes that
+were invalid, and those that a tree did not simulate as it had come to their end before.
 """
 
 import numpy as np
@@ -14,10 +15,13 @@ MOST = 2000  # points of a line
 
 
 def trials(results, axes=None):
-    """Over the simulations of a tree: the mean miss distance so far, the least so far, and how many failures so far, a panel each. Returns the list of Axes.
+    """Over the simulations of a tree: the mean miss distance so far, the least so far, and how many
+    failures so far, a panel each. Returns the list of Axes.
 
-    ``results``: a search result, or a dict of name -> result, searched with ``record=True``. Of several trees: each tree's running figure averaged over the
-    trees, with a light band from quartile to quartile; drawn from where every tree has a valid episode. ValueError for a result without trials.
+    ``results``: a search result, or a dict of name -> result, searched with ``record=True``. Of
+    several trees: each tree's running figure averaged over the trees, with a light band from
+    quartile to quartile; drawn from where every tree has a valid episode. ValueError for a result
+    without trials.
     """
     results = _named("trials", results)
     with style.axes(axes, (7.2, 7.4), 3) as axes:
@@ -27,13 +31,25 @@ def trials(results, axes=None):
             n, trees = distance.shape
             figures = _running(distance, failure, counts)
             at = np.unique(np.linspace(0, n - 1, min(n, MOST)).astype(int))
-            colour, label = style.COLOURS[i % len(style.COLOURS)], name + (f"{': ' if name else ''}mean of {trees} trees" if trees > 1 else "")
+            colour, label = (
+                style.COLOURS[i % len(style.COLOURS)],
+                name + (f"{': ' if name else ''}mean of {trees} trees" if trees > 1 else ""),
+            )
             for ax, rows in zip(axes, figures, strict=True):
                 rows = rows[at]
                 ax.plot(at + 1, rows.mean(1), color=colour, label=label, zorder=3)
                 if trees > 1:
-                    ax.fill_between(at + 1, *np.quantile(rows, (0.25, 0.75), 1), color=colour, alpha=0.2, linewidth=0, zorder=2)
-        for ax, label in zip(axes, ("mean miss distance", "least miss distance", "failures"), strict=True):
+                    ax.fill_between(
+                        at + 1,
+                        *np.quantile(rows, (0.25, 0.75), 1),
+                        color=colour,
+                        alpha=0.2,
+                        linewidth=0,
+                        zorder=2,
+                    )
+        for ax, label in zip(
+            axes, ("mean miss distance", "least miss distance", "failures"), strict=True
+        ):
             ax.set_ylabel(f"{label} so far")
         axes[2].set(xlabel="simulations of a tree", ylim=(0, None))
         axes[2].yaxis.get_major_locator().set_params(integer=True)
@@ -44,10 +60,11 @@ def trials(results, axes=None):
 
 
 def trial_distances(results, bins=60, axes=None):
-    """Histograms over all trees: the miss distances of the episodes, and log p of those that failed, a panel each. Returns the list of Axes.
+    """Histograms over all trees: the miss distances of the episodes, and log p of those that
+    failed, a panel each. Returns the list of Axes.
 
-    ``results`` as for `trials`, and so the errors; ``bins``: the most of a histogram, shared by the searches. log p depends on the units of the disturbances:
-    compare differences, not ratios.
+    ``results`` as for `trials`, and so the errors; ``bins``: the most of a histogram, shared by the
+    searches. log p depends on the units of the disturbances: compare differences, not ratios.
     """
     import matplotlib.pyplot as plt
 
@@ -55,13 +72,29 @@ def trial_distances(results, bins=60, axes=None):
     for name, result in _named("trial_distances", results).items():
         distance, log_p, failure, counts = _columns("trial_distances", result)
         failure = failure & counts
-        of[name] = distance[counts], log_p[failure & np.isfinite(log_p)], f"{counts.sum():,} episodes, {failure.sum():,} fail"
+        of[name] = (
+            distance[counts],
+            log_p[failure & np.isfinite(log_p)],
+            f"{counts.sum():,} episodes, {failure.sum():,} fail",
+        )
     with style.styled():
-        axes = plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained")[1] if axes is None else axes
+        axes = (
+            plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained")[1]
+            if axes is None
+            else axes
+        )
         axes = style.panels("trial_distances", axes, 2, "histogram")[:2]
-        for column, (ax, what) in enumerate(zip(axes, ("miss distance", "log p of failures"), strict=True)):
+        for column, (ax, what) in enumerate(
+            zip(axes, ("miss distance", "log p of failures"), strict=True)
+        ):
             every = np.concatenate([rows[column] for rows in of.values()])
-            edges = np.histogram_bin_edges(every, bins if column == 0 else min(bins, 5 + every.size // 4)) if every.size else np.linspace(0, 1, 2)
+            edges = (
+                np.histogram_bin_edges(
+                    every, bins if column == 0 else min(bins, 5 + every.size // 4)
+                )
+                if every.size
+                else np.linspace(0, 1, 2)
+            )
             for i, (name, rows) in enumerate(of.items()):
                 these, colour = rows[column], style.COLOURS[i % len(style.COLOURS)]
                 if not these.size:
@@ -69,19 +102,34 @@ def trial_distances(results, bins=60, axes=None):
                 share = np.histogram(these, edges)[0] / these.size
                 words = rows[2] if column == 0 else f"mean {these.mean():,.1f}"
                 ax.stairs(share, edges, color=colour, fill=True, alpha=0.15)
-                ax.stairs(share, edges, color=colour, linewidth=1.6, label=f"{name}: {words}" if name else words)
-            ax.set(xlabel=what, ylabel="share of failures" if column else "share of episodes", yscale="linear" if column else "log")  # failures may be rare
+                ax.stairs(
+                    share,
+                    edges,
+                    color=colour,
+                    linewidth=1.6,
+                    label=f"{name}: {words}" if name else words,
+                )
+            ax.set(
+                xlabel=what,
+                ylabel="share of failures" if column else "share of episodes",
+                yscale="linear" if column else "log",
+            )  # failures may be rare
             if every.size:
                 ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
             else:
-                ax.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=style.GREY)
+                ax.annotate(
+                    "none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=style.GREY
+                )
     return axes
 
 
 def _named(caller, results):
     results = results if isinstance(results, dict) else {"": results}
     if not results:
-        raise ValueError(f"plot.{caller}: results must be a search result, or a dict of name -> result, received an empty dict")
+        raise ValueError(
+            f"plot.{caller}: results must be a search result, or a dict of name -> result, received"
+            " an empty dict"
+        )
     return results
 
 
@@ -89,16 +137,32 @@ def _columns(caller, result):
     """Distance, log p, failure and whether the episode counts, [n, trees] each."""
     found = getattr(result, "trials", None)
     if found is None:
-        raise ValueError(f"plot.{caller}: results must be of searches with record=True, received a {type(result).__name__} without trials")
-    distance, log_p, failure = np.asarray(found.distance, float), np.asarray(found.log_prob, float), np.asarray(found.failure, bool)
+        raise ValueError(
+            f"plot.{caller}: results must be of searches with record=True, received a"
+            f" {type(result).__name__} without trials"
+        )
+    distance, log_p, failure = (
+        np.asarray(found.distance, float),
+        np.asarray(found.log_prob, float),
+        np.asarray(found.failure, bool),
+    )
     if distance.ndim != 2 or not distance.size:
-        raise ValueError(f"plot.{caller}: trials must be arrays [n, trees], received distances of shape {distance.shape}")
+        raise ValueError(
+            f"plot.{caller}: trials must be arrays [n, trees], received distances of shape"
+            f" {distance.shape}"
+        )
     return distance, log_p, failure, np.isfinite(distance) & np.asarray(found.ran, bool)
 
 
 def _running(distance, failure, counts):
-    """Running mean, running least (NaN before the first episode that counts) and number of failures, [n, trees] each."""
+    """Running mean, running least (NaN before the first episode that counts) and number of
+    failures, [n, trees] each.
+    """
     number = np.cumsum(counts, 0)
-    mean = np.where(number > 0, np.cumsum(np.where(counts, distance, 0), 0) / np.maximum(number, 1), np.nan)
-    least = np.where(number > 0, np.minimum.accumulate(np.where(counts, distance, np.inf), 0), np.nan)
+    mean = np.where(
+        number > 0, np.cumsum(np.where(counts, distance, 0), 0) / np.maximum(number, 1), np.nan
+    )
+    least = np.where(
+        number > 0, np.minimum.accumulate(np.where(counts, distance, np.inf), 0), np.nan
+    )
     return mean, least, np.cumsum(failure & counts, 0)

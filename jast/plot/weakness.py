@@ -12,13 +12,17 @@ LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
 
 def failures_found(results, failed=None, ax=None):
-    """Failures found against calls of the system, call by call, and beside them the most that can be found: each call a failure. Returns the Axes.
+    """Failures found against calls of the system, call by call, and beside them the most that can
+    be found: each call a failure. Returns the Axes.
 
-    ``results``: a `jast.weakness.Result`, a list of them (several seeds: their mean, and a band from the least to the greatest, as far as all of them go), or
-    a dict of name -> either. ``failed`` [n] bool: which of all n inputs fail, as only an exhaustive study knows; with it, the number of all failures, and a
-    random choice: its mean, and 2 standard deviations (hypergeometric) to both sides.
+    ``results``: a `jast.weakness.Result`, a list of them (several seeds: their mean, and a band
+    from the least to the greatest, as far as all of them go), or a dict of name -> either.
+    ``failed`` [n] bool: which of all n inputs fail, as only an exhaustive study knows; with it, the
+    number of all failures, and a random choice: its mean, and 2 standard deviations
+    (hypergeometric) to both sides.
 
-    ValueError for what is no result, for results of different n, and for a ``failed`` of another shape or type, or that contradicts what the calls found.
+    ValueError for what is no result, for results of different n, and for a ``failed`` of another
+    shape or type, or that contradicts what the calls found.
     """
     caller = "failures_found"
     rows = _rows(caller, results)
@@ -27,8 +31,14 @@ def failures_found(results, failed=None, ax=None):
     for result in [] if truth is None else [result for row in rows.values() for result in row]:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
-            raise ValueError(f"plot.{caller}: failed must agree with the results, received one that contradicts {wrong} of the {result.calls} calls of one")
-    counts = {name: [np.append(0, np.cumsum(_hits(result))) for result in row] for name, row in rows.items()}
+            raise ValueError(
+                f"plot.{caller}: failed must agree with the results, received one that contradicts"
+                f" {wrong} of the {result.calls} calls of one"
+            )
+    counts = {
+        name: [np.append(0, np.cumsum(_hits(result))) for result in row]
+        for name, row in rows.items()
+    }
     every = [count for row in counts.values() for count in row]
     width, most = max(1, *(len(count) - 1 for count in every)), max(count[-1] for count in every)
     total = None if truth is None else int(truth.sum())
@@ -40,33 +50,62 @@ def failures_found(results, failed=None, ax=None):
         for i, (name, row) in enumerate(counts.items()):
             labels.append(_found(ax, name, row, i, len(counts) > 1, total))
         _bounds(ax, total, width, height)
-        ax.set(xlabel="calls of the system", ylabel="failures found", xlim=(0, width), ylim=(0, height))
+        ax.set(
+            xlabel="calls of the system", ylabel="failures found", xlim=(0, width), ylim=(0, height)
+        )
         for axis in (ax.xaxis, ax.yaxis):
             axis.get_major_locator().set_params(integer=True)
         labels.sort(key=lambda label: label[0])
         gap = (0.115 if any("\n" in text for _, text, _ in labels) else 0.065) * height
-        for (_, text, look), y in zip(labels, _apart([at for (at, _), _, _ in labels], gap, 0, height), strict=True):
+        for (_, text, look), y in zip(
+            labels, _apart([at for (at, _), _, _ in labels], gap, 0, height), strict=True
+        ):
             if "marker" in look:
-                ax.plot([1.025], [y], transform=ax.get_yaxis_transform(), clip_on=False, linestyle="", markersize=5, label="_key", **look)
-            ax.text(1.045, y, text, transform=ax.get_yaxis_transform(), color=look["color"], va="center", fontsize=9)
+                ax.plot(
+                    [1.025],
+                    [y],
+                    transform=ax.get_yaxis_transform(),
+                    clip_on=False,
+                    linestyle="",
+                    markersize=5,
+                    label="_key",
+                    **look,
+                )
+            ax.text(
+                1.045,
+                y,
+                text,
+                transform=ax.get_yaxis_transform(),
+                color=look["color"],
+                va="center",
+                fontsize=9,
+            )
     return ax
 
 
 def roc(result, failed, iterations=None, ax=None):
-    """ROC curves of the scores after several iterations, the darker and thicker the later, each with the area under it (figure 4.4 of the thesis).
+    """ROC curves of the scores after several iterations, the darker and thicker the later, each
+    with the area under it (figure 4.4 of the thesis).
 
-    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter 4. ``failed`` [n] bool: which of all n inputs fail, which
-    only an exhaustive study knows. ``iterations``: which ones, counted from 1 as ``print(result)`` does; default: up to four, evenly, the last one included.
-    Where all inputs fail or none there is no curve, and the area is "-". Returns the Axes.
+    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
+    4. ``failed`` [n] bool: which of all n inputs fail, which only an exhaustive study knows.
+    ``iterations``: which ones, counted from 1 as ``print(result)`` does; default: up to four,
+    evenly, the last one included. Where all inputs fail or none there is no curve, and the area is
+    "-". Returns the Axes.
 
-    ValueError for what is no `jast.weakness.Result`, one without iterations, iterations that were not made, and a ``failed`` of another shape or type.
+    ValueError for what is no `jast.weakness.Result`, one without iterations, iterations that were
+    not made, and a ``failed`` of another shape or type.
     """
     caller = "roc"
     made = len(checked_result(caller, result).history.scores)
     truth = _truth(caller, failed, len(result.scores))
     if not made:
         raise ValueError(f"plot.{caller}: result must have iterations, received none")
-    chosen = np.unique(np.linspace(1, made, min(4, made)).round().astype(int)) if iterations is None else np.atleast_1d(np.asarray(iterations, object))
+    chosen = (
+        np.unique(np.linspace(1, made, min(4, made)).round().astype(int))
+        if iterations is None
+        else np.atleast_1d(np.asarray(iterations, object))
+    )
     chosen = [style.iteration(caller, "iterations", k, made) for k in chosen]
     if not chosen:
         raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
@@ -74,19 +113,55 @@ def roc(result, failed, iterations=None, ax=None):
         from matplotlib.colors import LinearSegmentedColormap
 
         shades = LinearSegmentedColormap.from_list("", (LIGHT, style.BLUE, DARK))
-        ax.plot([0, 1], [0, 1], color=style.GREY, linewidth=1.2, linestyle=(0, (1, 1.5)), label="_chance", zorder=2)
-        look = dict(rotation=45, rotation_mode="anchor", transform_rotates_text=True, ha="center", va="top", fontsize=9)
+        ax.plot(
+            [0, 1],
+            [0, 1],
+            color=style.GREY,
+            linewidth=1.2,
+            linestyle=(0, (1, 1.5)),
+            label="_chance",
+            zorder=2,
+        )
+        look = dict(
+            rotation=45,
+            rotation_mode="anchor",
+            transform_rotates_text=True,
+            ha="center",
+            va="top",
+            fontsize=9,
+        )
         ax.text(0.22, 0.205, "chance", color=style.GREY, path_effects=style.halo(), **look)
         areas = []
         for k in chosen:
-            late = (k - min(chosen)) / (max(chosen) - min(chosen)) if max(chosen) > min(chosen) else 0.5
+            late = (
+                (k - min(chosen)) / (max(chosen) - min(chosen))
+                if max(chosen) > min(chosen)
+                else 0.5
+            )
             curve = measures.roc(result.history.scores[k - 1], truth)
             areas.append(curve.area)
             label = f"iteration {k}:  AUC {'-' if np.isnan(areas[-1]) else f'{areas[-1]:.3f}'}"
-            ax.plot(curve.false_positive, curve.true_positive, color=shades(late), linewidth=1.2 + 1.2 * late, label=label, zorder=3 + late)
+            ax.plot(
+                curve.false_positive,
+                curve.true_positive,
+                color=shades(late),
+                linewidth=1.2 + 1.2 * late,
+                label=label,
+                zorder=3 + late,
+            )
         if truth.all() or not truth.any():
-            ax.text(0.5, 0.55, "all inputs fail" if truth.all() else "no input fails", color=style.GREY, ha="center", path_effects=style.halo())
-        ax.set(xlabel="share of passing inputs flagged (false positives)", ylabel="share of failures flagged (true positives)")
+            ax.text(
+                0.5,
+                0.55,
+                "all inputs fail" if truth.all() else "no input fails",
+                color=style.GREY,
+                ha="center",
+                path_effects=style.halo(),
+            )
+        ax.set(
+            xlabel="share of passing inputs flagged (false positives)",
+            ylabel="share of failures flagged (true positives)",
+        )
         ax.set(xlim=(-0.01, 1.01), ylim=(-0.01, 1.01), aspect="equal")
         place = "upper left" if max(areas) < 0.5 else "lower right"  # beyond the diagonal
         ax.legend(loc=place, fontsize=9, frameon=True, framealpha=0.85, edgecolor="none")
@@ -96,17 +171,32 @@ def roc(result, failed, iterations=None, ax=None):
 def checked_result(caller, result):
     """``result``, or a ValueError where it is none."""
     if not isinstance(result, Result):
-        raise ValueError(f"plot.{caller}: result must be a jast.weakness.Result, received {type(result).__name__}")
+        raise ValueError(
+            f"plot.{caller}: result must be a jast.weakness.Result, received"
+            f" {type(result).__name__}"
+        )
     return result
 
 
 def _rows(caller, results):
-    """Name -> list of `Result`s, or a ValueError. A `Result` is a tuple, so a tuple is no list here."""
+    """Name -> list of `Result`s, or a ValueError. A `Result` is a tuple, so a tuple is no list
+    here.
+    """
     rows = results if isinstance(results, dict) else {"": results}
     rows = {name: row if isinstance(row, list) else [row] for name, row in rows.items()}
-    if not rows or not all(rows.values()) or not all(isinstance(result, Result) for row in rows.values() for result in row):
-        received = sorted({type(result).__name__ for row in rows.values() for result in row} - {"Result"}) or "none"
-        raise ValueError(f"plot.{caller}: results must be a jast.weakness.Result, a list of them or a dict of name -> either, received {received}")
+    if (
+        not rows
+        or not all(rows.values())
+        or not all(isinstance(result, Result) for row in rows.values() for result in row)
+    ):
+        received = (
+            sorted({type(result).__name__ for row in rows.values() for result in row} - {"Result"})
+            or "none"
+        )
+        raise ValueError(
+            f"plot.{caller}: results must be a jast.weakness.Result, a list of them or a dict of"
+            f" name -> either, received {received}"
+        )
     return rows
 
 
@@ -114,7 +204,10 @@ def _same_n(caller, rows):
     """The number of inputs, or a ValueError where the results differ in it."""
     sizes = sorted({len(result.scores) for row in rows.values() for result in row})
     if len(sizes) > 1:
-        raise ValueError(f"plot.{caller}: results must be of the same inputs, received results of {', '.join(map(str, sizes))} inputs")
+        raise ValueError(
+            f"plot.{caller}: results must be of the same inputs, received results of"
+            f" {', '.join(map(str, sizes))} inputs"
+        )
     return sizes[0]
 
 
@@ -122,7 +215,10 @@ def _truth(caller, failed, n):
     """``failed`` as an array, or a ValueError."""
     truth = np.asarray(failed)
     if truth.shape != (n,) or truth.dtype != bool:
-        raise ValueError(f"plot.{caller}: failed must be bool [{n}], received {truth.dtype} of shape {truth.shape}")
+        raise ValueError(
+            f"plot.{caller}: failed must be bool [{n}], received {truth.dtype} of shape"
+            f" {truth.shape}"
+        )
     return truth
 
 
@@ -132,14 +228,35 @@ def _hits(result):
 
 
 def _found(ax, name, row, i, marked, total):
-    """The curve of one result or the mean of several, and its label: ((height at its end, mean height), text, look)."""
-    look = dict(color=style.COLOURS[i % len(style.COLOURS)]) | (dict(marker=style.MARKERS[i % len(style.MARKERS)]) if marked else {})
+    """The curve of one result or the mean of several, and its label: ((height at its end, mean
+    height), text, look).
+    """
+    look = dict(color=style.COLOURS[i % len(style.COLOURS)]) | (
+        dict(marker=style.MARKERS[i % len(style.MARKERS)]) if marked else {}
+    )
     common = min(map(len, row))
     counts = np.stack([count[:common] for count in row])
     mean, last = counts.mean(0), counts[:, -1].mean()
-    ax.plot(np.arange(common), mean, label=name or "found", linewidth=2, markersize=5, markevery=(0.03 + 0.03 * i, 0.17) if marked else None, zorder=4, **look)
+    ax.plot(
+        np.arange(common),
+        mean,
+        label=name or "found",
+        linewidth=2,
+        markersize=5,
+        markevery=(0.03 + 0.03 * i, 0.17) if marked else None,
+        zorder=4,
+        **look,
+    )
     if len(row) > 1:
-        ax.fill_between(np.arange(common), counts.min(0), counts.max(0), color=look["color"], alpha=0.2, linewidth=0, zorder=3)
+        ax.fill_between(
+            np.arange(common),
+            counts.min(0),
+            counts.max(0),
+            color=look["color"],
+            alpha=0.2,
+            linewidth=0,
+            zorder=3,
+        )
     share = f" ({100 * last / total:.1f} %)" if total else ""
     number = f"{last:,.{1 if len(row) > 1 else 0}f}"
     text = f"{name}: {number}{share}" if name else f"{number} found{share}"
@@ -151,33 +268,92 @@ def _chance(ax, total, n, width):
     calls = np.unique(np.append(np.linspace(0, n, 400).round(), min(width, n))).astype(int)
     mean = calls * total / n
     half = 2 * np.sqrt(mean * (1 - total / n) * (n - calls) / max(n - 1, 1))
-    ax.fill_between(calls, np.maximum(mean - half, 0), np.minimum(mean + half, total), color=style.GREY, alpha=0.22, linewidth=0, zorder=1.5)
-    ax.plot(calls, mean, color=style.GREY, linewidth=1.4, linestyle=(0, (4, 2)), label="random choice", zorder=2)
+    ax.fill_between(
+        calls,
+        np.maximum(mean - half, 0),
+        np.minimum(mean + half, total),
+        color=style.GREY,
+        alpha=0.22,
+        linewidth=0,
+        zorder=1.5,
+    )
+    ax.plot(
+        calls,
+        mean,
+        color=style.GREY,
+        linewidth=1.4,
+        linestyle=(0, (4, 2)),
+        label="random choice",
+        zorder=2,
+    )
     return (width * total / n, -1.0), "random choice, ± 2 sd", dict(color="#6B6B6B")
 
 
 def _bounds(ax, total, width, height):
     """All failures, where they are known, and a perfect choice."""
     top = height if total is None else total
-    ax.plot([0, top], [0, top], color=style.INK, linewidth=1.2, linestyle=(0, (1, 1.5)), label="perfect choice", zorder=2.5)
+    ax.plot(
+        [0, top],
+        [0, top],
+        color=style.INK,
+        linewidth=1.2,
+        linestyle=(0, (1, 1.5)),
+        label="perfect choice",
+        zorder=2.5,
+    )
     small = dict(fontsize=9, color=style.INK, path_effects=style.halo(), zorder=5)
     if total is not None:
         ax.axhline(total, color=style.INK, linewidth=1.0, label="all failures", zorder=2)
         words = {0: "no input fails", 1: "the only failure"}.get(total, f"all {total:,} failures")
-        ax.annotate(words, (1, total), (0, 3), xycoords=ax.get_yaxis_transform(), textcoords="offset points", ha="right", va="bottom", **small)
+        ax.annotate(
+            words,
+            (1, total),
+            (0, 3),
+            xycoords=ax.get_yaxis_transform(),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            **small,
+        )
     if total == 0:
         return
     reach = min(top, width)
     if reach > 0.4 * width:  # beside the line, where nothing can be
-        ax.annotate("perfect choice", (0.62 * reach, 0.62 * reach), (-6, 2), textcoords="offset points", ha="right", va="bottom", **small)
+        ax.annotate(
+            "perfect choice",
+            (0.62 * reach, 0.62 * reach),
+            (-6, 2),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            **small,
+        )
     elif total is None:
-        ax.annotate("perfect choice", (reach, height), (6, -2), textcoords="offset points", ha="left", va="top", **small)
+        ax.annotate(
+            "perfect choice",
+            (reach, height),
+            (6, -2),
+            textcoords="offset points",
+            ha="left",
+            va="top",
+            **small,
+        )
     else:
-        ax.annotate("perfect choice", (reach, total), (0, 3), textcoords="offset points", ha="left", va="bottom", **small)
+        ax.annotate(
+            "perfect choice",
+            (reach, total),
+            (0, 3),
+            textcoords="offset points",
+            ha="left",
+            va="bottom",
+            **small,
+        )
 
 
 def _apart(heights, gap, low, high):
-    """Rising heights moved as little as it takes to be at least ``gap`` apart, in low ... high where they fit."""
+    """Rising heights moved as little as it takes to be at least ``gap`` apart, in low ... high
+    where they fit.
+    """
     blocks = []
     for i, y in enumerate(heights):
         blocks.append((y - i * gap, 1))
@@ -185,4 +361,6 @@ def _apart(heights, gap, low, high):
             (a, m), (b, k) = blocks[-2:]
             blocks[-2:] = [((a * m + b * k) / (m + k), m + k)]
     level = np.repeat([y for y, _ in blocks], [k for _, k in blocks])
-    return np.clip(level, low, max(high - (len(heights) - 1) * gap, low)) + gap * np.arange(len(heights))
+    return np.clip(level, low, max(high - (len(heights) - 1) * gap, low)) + gap * np.arange(
+        len(heights)
+    )

@@ -1,4 +1,6 @@
-"""Disturbances by their latent normal numbers: x = Q(Phi(z)), z ~ N(0, I) under the model, so that a policy is free of units and of p's family."""
+"""Disturbances by their latent normal numbers: x = Q(Phi(z)), z ~ N(0, I) under the model, so that
+a policy is free of units and of p's family.
+"""
 
 import math
 
@@ -29,20 +31,26 @@ def log_normal(z, mean=None, deviation=None):
 
 
 def sizes(sim):
-    """``(n, n0)``: how many numbers x and x0 are made of; n0 is 0 where the start is fixed, or not of floats with quantiles, and then drawn as it is.
+    """``(n, n0)``: how many numbers x and x0 are made of; n0 is 0 where the start is fixed, or not
+    of floats with quantiles, and then drawn as it is.
 
-    ValueError naming ``disturbance`` where x is not of floats, or has no quantile function with an inverse.
+    ValueError naming ``disturbance`` where x is not of floats, or has no quantile function with an
+    inverse.
     """
     like0, like = jax.eval_shape(_shapes, sim)
 
     def build(dist):
-        full = lambda v: jax.tree.map(lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist))
+        full = lambda v: jax.tree.map(
+            lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist)
+        )
         return tilted(dist, full(0), full(1)).log_prob(D.sample(dist, jax.random.key(0)))
 
     if not _floats(like):
         raise ValueError(f"sac: disturbance: expected floats, received {_kinds(like)}")
     try:
-        jax.eval_shape(lambda: build(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))))
+        jax.eval_shape(
+            lambda: build(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
+        )
     except ValueError as error:
         raise ValueError(f"sac: disturbance: {error}") from None
     if not random_start(sim) or not _floats(like0):
@@ -55,7 +63,9 @@ def sizes(sim):
 
 
 class Moved(D.Distribution):
-    """``dist`` with its latents z ~ N(mean, deviation^2), [n] each; the ``mode`` is the value at z = mean, the deterministic policy's."""
+    """``dist`` with its latents z ~ N(mean, deviation^2), [n] each; the ``mode`` is the value at z
+    = mean, the deterministic policy's.
+    """
 
     def __init__(self, dist, mean, deviation):
         super().__init__()
@@ -81,7 +91,9 @@ class Moved(D.Distribution):
 
 
 class Blended(D.Distribution):
-    """sum_k weights[k] (``dist`` with z ~ N(means[k], deviations[k]^2)); ``weights`` [K] of sum 1, ``means`` and ``deviations`` [K, n]."""
+    """sum_k weights[k] (``dist`` with z ~ N(means[k], deviations[k]^2)); ``weights`` [K] of sum 1,
+    ``means`` and ``deviations`` [K, n].
+    """
 
     def __init__(self, dist, weights, means, deviations):
         super().__init__()
@@ -94,7 +106,10 @@ class Blended(D.Distribution):
     def sample(self, *, seed, sample_shape=()):
         """One value; ``sample_shape`` must be ()."""
         if sample_shape != ():
-            raise ValueError(f"Blended: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys")
+            raise ValueError(
+                f"Blended: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
+                " keys"
+            )
         which, where = jax.random.split(seed)
         k = jax.random.categorical(which, jnp.log(self.weights))
         return Moved(self.model, self.means[k], self.deviations[k]).sample(seed=where)
@@ -103,7 +118,9 @@ class Blended(D.Distribution):
         return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
 
     def log_prob(self, value):
-        each = jax.vmap(lambda m, s: Moved(self.model, m, s).log_prob(value))(self.means, self.deviations)
+        each = jax.vmap(lambda m, s: Moved(self.model, m, s).log_prob(value))(
+            self.means, self.deviations
+        )
         return jax.nn.logsumexp(each + jnp.log(self.weights).astype(each.dtype))
 
     def mode(self):

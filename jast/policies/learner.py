@@ -1,7 +1,9 @@
-"""Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) in the latents of a disturbance, with the model itself as the measure of entropy.
+"""Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) in the latents of a disturbance, with
+the model itself as the measure of entropy.
 
-With temperature 1 the soft return is sum log p(z) / pi(z | s) + lambda (d(s) - d(s_T)). Its optimum is V(s) = log E_p[exp(lambda (d(s) - d(s_T)))], which
-is, less lambda d(s) and for a large lambda, the log of the probability of failure from s; the best pi is the disturbances given failure.
+With temperature 1 the soft return is sum log p(z) / pi(z | s) + lambda (d(s) - d(s_T)). Its optimum
+is V(s) = log E_p[exp(lambda (d(s) - d(s_T)))], which is, less lambda d(s) and for a large lambda,
+the log of the probability of failure from s; the best pi is the disturbances given failure.
 """
 
 import itertools
@@ -16,7 +18,19 @@ from jax.scipy.special import ndtr
 from jast.heads.networks import _network
 from jast.policies.latent import LOG_2PI, log_normal
 
-__all__ = ["Learner", "Net", "Rates", "act", "draw", "entropy_term", "learner", "networks", "see", "soft_value", "update"]
+__all__ = [
+    "Learner",
+    "Net",
+    "Rates",
+    "act",
+    "draw",
+    "entropy_term",
+    "learner",
+    "networks",
+    "see",
+    "soft_value",
+    "update",
+]
 
 
 EVEN = 0.2
@@ -42,7 +56,9 @@ class Net(NamedTuple):
     inputs: Any
     """`jast.heads.Moments` of the observation."""
     unit: Any
-    """float32: the distance that an episode comes nearer by, about; times lambda what the critics answer in."""
+    """float32: the distance that an episode comes nearer by, about; times lambda what the critics
+    answer in.
+    """
 
 
 class Learner(NamedTuple):
@@ -61,14 +77,21 @@ class Learner(NamedTuple):
 
 
 def networks(m, n, hidden, components):
-    """The networks' ``(init, apply)``, the actor's and the critic's, for ``m`` numbers seen, time and distance beside them, and ``n`` latents."""
-    return _network(hidden, (components, 2 * n + 1), "relu", True), _network(hidden, (), "relu", True)
+    """The networks' ``(init, apply)``, the actor's and the critic's, for ``m`` numbers seen, time
+    and distance beside them, and ``n`` latents.
+    """
+    return _network(hidden, (components, 2 * n + 1), "relu", True), _network(
+        hidden, (), "relu", True
+    )
 
 
 def learner(key, m, n, hidden, components, alpha):
     """A `Learner` that has learned nothing."""
     inits = [init for init, _ in networks(m, n, hidden, components)]
-    shapes = [jax.eval_shape(init, jax.random.key(0), jnp.zeros((size,), jnp.float32)) for init, size in zip(inits, (m + 2, m + 2 + n), strict=True)]
+    shapes = [
+        jax.eval_shape(init, jax.random.key(0), jnp.zeros((size,), jnp.float32))
+        for init, size in zip(inits, (m + 2, m + 2 + n), strict=True)
+    ]
     actor, one, other = _drawn(key, (shapes[0], shapes[1], shapes[1]))
     critic = jax.tree.map(lambda a, b: jnp.stack([a, b]), one, other)
     parts = actor, critic, jnp.log(alpha)
@@ -76,34 +99,53 @@ def learner(key, m, n, hidden, components, alpha):
 
 
 def _drawn(key, shapes):
-    """Networks' parameters, uniform in +-1/sqrt(fan-in) as `make_head` has them, in one draw: one for each array is much to compile."""
+    """Networks' parameters, uniform in +-1/sqrt(fan-in) as `make_head` has them, in one draw: one
+    for each array is much to compile.
+    """
     leaves, structure = jax.tree.flatten([params["params"] for params in shapes])
     fan_in = lambda layer: dict.fromkeys(layer, layer["kernel"].shape[0])
-    fans = jax.tree.leaves([{name: fan_in(layer) for name, layer in params["params"].items()} for params in shapes])
+    fans = jax.tree.leaves(
+        [{name: fan_in(layer) for name, layer in params["params"].items()} for params in shapes]
+    )
     ends = list(itertools.accumulate(math.prod(s.shape) for s in leaves))
     flat = jax.random.uniform(key, (ends[-1],), jnp.float32, -1, 1)
-    drawn = [flat[b - math.prod(s.shape) : b].reshape(s.shape) / math.sqrt(fan) for s, fan, b in zip(leaves, fans, ends, strict=True)]
+    drawn = [
+        flat[b - math.prod(s.shape) : b].reshape(s.shape) / math.sqrt(fan)
+        for s, fan, b in zip(leaves, fans, ends, strict=True)
+    ]
     return [{"params": params} for params in structure.unflatten(drawn)]
 
 
 def see(net, horizon, seen, t, potential):
-    """[m + 2]: the actor's inputs, the observation in its moments, the share of the horizon that is gone (the best policy depends on the time left), and the
-    miss distance as it shapes the reward: the value of a state has its kinks."""
+    """[m + 2]: the actor's inputs, the observation in its moments, the share of the horizon that is
+    gone (the best policy depends on the time left), and the miss distance as it shapes the reward:
+    the value of a state has its kinks.
+    """
     gone = jnp.asarray(t).astype(jnp.float32) / horizon
-    return jnp.concatenate([net.inputs.normalise(seen), jnp.stack([gone - 0.5, potential / net.unit])])
+    return jnp.concatenate(
+        [net.inputs.normalise(seen), jnp.stack([gone - 0.5, potential / net.unit])]
+    )
 
 
 def act(apply, actor, inputs):
-    """The policy: a mixture of the latents, its log weights [K], means and deviations [K, n]; a deviation is from e^-2 to e^2."""
+    """The policy: a mixture of the latents, its log weights [K], means and deviations [K, n]; a
+    deviation is from e^-2 to e^2.
+    """
     out = apply(actor, inputs)
     n = (out.shape[1] - 1) // 2
     # no component may die out: it would learn no more, and never come to see its own way
     weights = (1 - EVEN) * jax.nn.softmax(out[:, 0]) + EVEN / out.shape[0]
-    return jnp.log(weights), out[:, 1 : n + 1] + _apart(out.shape[0], n), jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2))
+    return (
+        jnp.log(weights),
+        out[:, 1 : n + 1] + _apart(out.shape[0], n),
+        jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2)),
+    )
 
 
 def _apart(k, n):
-    """[k, n]: where the components are before anything was learned, on opposite sides, so that each goes its own way."""
+    """[k, n]: where the components are before anything was learned, on opposite sides, so that each
+    goes its own way.
+    """
     side = np.random.default_rng(0).choice([-1.0, 1.0], size=(1, n))
     if k == 1:
         return jnp.zeros((1, n), jnp.float32)
@@ -118,19 +160,25 @@ def draw(mixture, noise):
 
 
 def entropy_term(z, log_w, mean, deviation):
-    """log pi(z | s) less the log density of N(0, I) at its mode: so measured, an episode that ends early neither gains nor loses."""
+    """log pi(z | s) less the log density of N(0, I) at its mode: so measured, an episode that ends
+    early neither gains nor loses.
+    """
     log_pi = jax.nn.logsumexp(log_w + jax.vmap(log_normal, (None, 0, 0))(z, mean, deviation))
     return log_pi + 0.5 * z.shape[0] * LOG_2PI
 
 
 def _values(apply, unit, critic, inputs, z):
-    """[2]: Q of both critics. The networks' part is what is to come beside log p, so far out, where they know nothing, -|z|^2 / 2 decides."""
+    """[2]: Q of both critics. The networks' part is what is to come beside log p, so far out, where
+    they know nothing, -|z|^2 / 2 decides.
+    """
     both = jnp.concatenate([inputs, z])
     return unit * jax.vmap(lambda p: apply(p, both))(critic) - 0.5 * jnp.sum(z**2)
 
 
 def _soft(applies, unit, actor, critic, inputs, noise):
-    """The least of two Q, and the entropy term, in the mean over the components at a draw of each."""
+    """The least of two Q, and the entropy term, in the mean over the components at a draw of
+    each.
+    """
     log_w, mean, deviation = act(applies[0], actor, inputs)
     w, z = jnp.exp(log_w), mean + deviation * noise[None]
     q = jax.vmap(lambda z: jnp.min(_values(applies[1], unit, critic, inputs, z)))(z)
@@ -139,24 +187,36 @@ def _soft(applies, unit, actor, critic, inputs, noise):
 
 
 def soft_value(applies, unit, learner, inputs, noise):
-    """V at ``inputs`` by the average actor and the target critics, over the draws ``noise`` [k, n] (Haarnoja eq. 3)."""
-    q, log_pi = jax.vmap(lambda e: _soft(applies, unit, learner.average, learner.target, inputs, e))(noise)
+    """V at ``inputs`` by the average actor and the target critics, over the draws ``noise`` [k, n]
+    (Haarnoja eq. 3).
+    """
+    q, log_pi = jax.vmap(
+        lambda e: _soft(applies, unit, learner.average, learner.target, inputs, e)
+    )(noise)
     return jnp.mean(q - jnp.exp(learner.log_alpha) * log_pi)
 
 
 def update(noise, learner, applies, net, rates, acting, scale, rows, horizon):
-    """One step of all networks on transitions, ``rows`` [batch], with ``noise`` [2, batch, n]: ``(Learner, critic loss)``; ``scale`` is lambda.
+    """One step of all networks on transitions, ``rows`` [batch], with ``noise`` [2, batch, n]:
+    ``(Learner, critic loss)``; ``scale`` is lambda.
 
     ``acting``: 1, or 0 while the critics learn alone.
     """
     unit, alpha = net.unit * scale, jnp.exp(learner.log_alpha)
     inputs = jax.vmap(lambda *row: see(net, horizon, *row))(rows.seen, rows.t, rows.potential)
-    following = jax.vmap(lambda *row: see(net, horizon, *row))(rows.next_seen, rows.t + 1, rows.potential - rows.approach)
+    following = jax.vmap(lambda *row: see(net, horizon, *row))(
+        rows.next_seen, rows.t + 1, rows.potential - rows.approach
+    )
     soft = jax.vmap(lambda *args: _soft(applies, unit, *args), (None, None, 0, 0))
 
     q, log_pi = soft(learner.actor, learner.target, following, noise[0])
-    # log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21; the target: Haarnoja eq. 5 with gamma 1
-    reward = -0.5 * jnp.sum(rows.z**2, axis=1) + scale * rows.approach + rates.bonus * rows.failure.astype(jnp.float32)
+    # log p relative to its mode, the shaping and the bonus: Lipkis and Agogino eq. 21; the target:
+    # Haarnoja eq. 5 with gamma 1
+    reward = (
+        -0.5 * jnp.sum(rows.z**2, axis=1)
+        + scale * rows.approach
+        + rates.bonus * rows.failure.astype(jnp.float32)
+    )
     goal = reward + jnp.where(rows.done, 0, q - alpha * log_pi)
 
     def critic_loss(critic):
@@ -169,14 +229,30 @@ def update(noise, learner, applies, net, rates, acting, scale, rows, horizon):
 
     loss, by_critic = jax.value_and_grad(critic_loss)(learner.critic)
     (_, log_pi), by_actor = jax.value_and_grad(actor_loss, has_aux=True)(learner.actor)
-    # Haarnoja eq. 18, in log alpha: the mean entropy of a latent less that of N(0, 1), of which log pi is -1/2, is held at what is wanted
+    # Haarnoja eq. 18, in log alpha: the mean entropy of a latent less that of N(0, 1), of which log
+    # pi is -1/2, is held at what is wanted
     by_alpha = -rates.adapt * (log_pi + rows.z.shape[1] * (rates.entropy + 0.5))
-    gradients, parts = (by_actor, by_critic, by_alpha), (learner.actor, learner.critic, learner.log_alpha)
+    gradients, parts = (
+        (by_actor, by_critic, by_alpha),
+        (learner.actor, learner.critic, learner.log_alpha),
+    )
     steps = acting * rates.learning_rate, rates.learning_rate, acting * rates.learning_rate
-    moved = [_descend(*each) for each in zip(gradients, learner.optimiser, parts, steps, strict=True)]
+    moved = [
+        _descend(*each) for each in zip(gradients, learner.optimiser, parts, steps, strict=True)
+    ]
     (actor, critic, log_alpha), optimiser = zip(*moved, strict=True)
     follow = lambda old, new: jax.tree.map(lambda a, b: a + rates.polyak * (b - a), old, new)
-    return Learner(actor, critic, follow(learner.target, critic), follow(learner.average, actor), log_alpha, optimiser), loss
+    return (
+        Learner(
+            actor,
+            critic,
+            follow(learner.target, critic),
+            follow(learner.average, actor),
+            log_alpha,
+            optimiser,
+        ),
+        loss,
+    )
 
 
 def _adam():

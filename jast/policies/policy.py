@@ -1,4 +1,6 @@
-"""What a learner of failures hands out: a `Policy` with its start, its parameters and the curve of its training."""
+"""What a learner of failures hands out: a `Policy` with its start, its parameters and the curve of
+its training.
+"""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -25,7 +27,9 @@ class History(NamedTuple):
     steps: Any
     """Steps of the simulator so far."""
     mean_return: Any
-    """Of the stretch's episodes: log p in the latents relative to the mode, -|z|^2 / 2, and lambda (d(s0) - d(s_T))."""
+    """Of the stretch's episodes: log p in the latents relative to the mode, -|z|^2 / 2, and lambda
+    (d(s0) - d(s_T)).
+    """
     failing_share: Any
     log_p: Any
     """Mean of -|z|^2 / 2 over its failing episodes; NaN where none failed."""
@@ -44,12 +48,16 @@ WHOLE = {"episodes": np.int64, "steps": np.int64, "invalid": np.int64}
 
 def history(rows):
     """The `History` of ``rows`` [n, fields], float64."""
-    return History(*(rows[:, i].astype(WHOLE.get(name, np.float64)) for i, name in enumerate(History._fields)))
+    return History(
+        *(rows[:, i].astype(WHOLE.get(name, np.float64)) for i, name in enumerate(History._fields))
+    )
 
 
 def row(rows, training, count):
     """``rows`` and that of a stretch more, by its `Count`."""
-    episodes, steps, invalid = (rows[-1, History._fields.index(name)] if len(rows) else 0 for name in WHOLE)
+    episodes, steps, invalid = (
+        rows[-1, History._fields.index(name)] if len(rows) else 0 for name in WHOLE
+    )
     share = lambda a, b: float(a) / float(b) if b else np.nan
     new = History(
         episodes=episodes + count.episodes,
@@ -83,10 +91,13 @@ class Learned(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FailurePolicy(Policy):
-    """A `Policy` that was taught to fail; a pytree of arrays, so it goes through `jax.jit` and `jax.vmap`. ``print`` shows how it learned.
+    """A `Policy` that was taught to fail; a pytree of arrays, so it goes through `jax.jit` and
+    `jax.vmap`. ``print`` shows how it learned.
 
-    ``disturbance(state, t)`` is a mixture in the latents of x, its ``mode`` the deterministic policy's value; ``start()`` is the start tilted by the critics.
-    Both have samples and densities, above 0 wherever the model's are, so `jast.rollout` plays it and importance sampling may draw from it.
+    ``disturbance(state, t)`` is a mixture in the latents of x, its ``mode`` the deterministic
+    policy's value; ``start()`` is the start tilted by the critics. Both have samples and densities,
+    above 0 wherever the model's are, so `jast.rollout` plays it and importance sampling may draw
+    from it.
     """
 
     learned: Learned = None
@@ -96,24 +107,49 @@ class FailurePolicy(Policy):
         if any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves(self.history)):
             return "FailurePolicy (traced)"
         h, last = self.history, len(self.history.episodes) - 1
-        formats = dict(episodes="9d", mean_return="10.4g", failing_share="8.1%", log_p="9.4g", alpha="7.3f", critic_loss="10.3g", scale="9.4g")
+        formats = dict(
+            episodes="9d",
+            mean_return="10.4g",
+            failing_share="8.1%",
+            log_p="9.4g",
+            alpha="7.3f",
+            critic_loss="10.3g",
+            scale="9.4g",
+        )
         names = ("episodes", "return", "failing", "log p", "alpha", "loss", "lambda")
-        table = [" ".join(f"{name:>{form.split('.')[0].rstrip('d')}}" for name, form in zip(names, formats.values(), strict=True))]
+        table = [
+            " ".join(
+                f"{name:>{form.split('.')[0].rstrip('d')}}"
+                for name, form in zip(names, formats.values(), strict=True)
+            )
+        ]
         for i in sorted({*range(0, last, max(1, last // 8)), last}):
-            table.append(" ".join(f"{getattr(h, name)[i].item():{form}}" for name, form in formats.items()))
+            table.append(
+                " ".join(f"{getattr(h, name)[i].item():{form}}" for name, form in formats.items())
+            )
         if h.invalid[-1]:
             table.append(f"{h.invalid[-1]} transitions were not finite and not learned from")
         if self.learned.tilt != ():
             text = lambda a: np.array2string(np.asarray(a), precision=2, suppress_small=True)
-            parts = (f"{w:.2f} N({text(m)}, {text(s)})" for w, m, s in zip(*self.learned.tilt, strict=True))
+            parts = (
+                f"{w:.2f} N({text(m)}, {text(s)})"
+                for w, m, s in zip(*self.learned.tilt, strict=True)
+            )
             table.append("start, mean and deviation of its latents: " + " + ".join(parts))
         return "\n".join(table)
 
 
 def assemble(sim, apply, dense, learned, history):
-    """The `FailurePolicy` of ``sim`` with what was ``learned``; ``apply``: the actor's function; ``dense``: whether it sees the distance."""
+    """The `FailurePolicy` of ``sim`` with what was ``learned``; ``apply``: the actor's function;
+    ``dense``: whether it sees the distance.
+    """
     start = sim.start if learned.tilt == () else Partial(_start, sim.start, learned.tilt)
-    return FailurePolicy(start, Partial(_disturbance, sim, apply, jnp.asarray(dense), learned.actor, learned.net), learned, history)
+    return FailurePolicy(
+        start,
+        Partial(_disturbance, sim, apply, jnp.asarray(dense), learned.actor, learned.net),
+        learned,
+        history,
+    )
 
 
 def _start(start, tilt):

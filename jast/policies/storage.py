@@ -1,4 +1,6 @@
-"""Learned policies in one file: parameters, moments, the start and the curve of the training; the simulator's functions are not in it."""
+"""Learned policies in one file: parameters, moments, the start and the curve of the training; the
+simulator's functions are not in it.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -19,50 +21,86 @@ FORMAT, VERSION, KIND = "jast policy", 1, "a file of a jast failure policy"
 
 
 def save(path, policy):
-    """Write a `FailurePolicy` to the one file ``path``, an npz that `numpy.load` opens without pickle; an older one stays whole until the new one is.
+    """Write a `FailurePolicy` to the one file ``path``, an npz that `numpy.load` opens without
+    pickle; an older one stays whole until the new one is.
 
     ValueError for a policy of another kind.
     """
     if not isinstance(policy, FailurePolicy):
-        raise ValueError(f"save: policy must be a jast.policies.FailurePolicy, received {type(policy).__name__}")
+        raise ValueError(
+            f"save: policy must be a jast.policies.FailurePolicy, received {type(policy).__name__}"
+        )
     learned = policy.learned
     layers = learned.actor["params"]
     widths = [int(layers[f"Dense_{i}"]["bias"].shape[0]) for i in range(len(layers))]
     sim, _, dense = policy.disturbance.args[:3]
     n, _ = sizes(sim)
     components = widths[-1] // (2 * n + 1)
-    header = dict(hidden=widths[:-1], components=components, horizon=sim.horizon, tilted=learned.tilt != (), dense=bool(dense))
+    header = dict(
+        hidden=widths[:-1],
+        components=components,
+        horizon=sim.horizon,
+        tilted=learned.tilt != (),
+        dense=bool(dense),
+    )
     write(path, FORMAT, VERSION, header, named(learned._asdict() | dict(history=policy.history)))
 
 
 def load(path, sim):
-    """Read a file of `save` for the simulator ``sim`` that the policy was taught on, or one like it: `FailurePolicy`, its arrays as saved to the bit.
+    """Read a file of `save` for the simulator ``sim`` that the policy was taught on, or one like
+    it: `FailurePolicy`, its arrays as saved to the bit.
 
-    ValueError says why a file is refused: no policy's, a version unknown here, damaged, or no fit to ``sim`` (horizon, numbers seen, sizes of x and x0).
+    ValueError says why a file is refused: no policy's, a version unknown here, damaged, or no fit
+    to ``sim`` (horizon, numbers seen, sizes of x and x0).
     """
     header, arrays = read(path, FORMAT, VERSION, KIND)
     contract(sim)
     if header["horizon"] != sim.horizon:
-        raise ValueError(f"load: {path} does not fit sim: its horizon is {header['horizon']}, expected {sim.horizon}")
+        raise ValueError(
+            f"load: {path} does not fit sim: its horizon is {header['horizon']}, expected"
+            f" {sim.horizon}"
+        )
     n, n0 = sizes(sim)
     if header["tilted"] != bool(n0):
-        raise ValueError(f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} start, expected {'one' if n0 else 'none'}")
-    m = jax.eval_shape(lambda x0: observed(sim, sim.init(x0)), jax.eval_shape(_shapes, sim)[0]).shape[0]
+        raise ValueError(
+            f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} start,"
+            f" expected {'one' if n0 else 'none'}"
+        )
+    m = jax.eval_shape(
+        lambda x0: observed(sim, sim.init(x0)), jax.eval_shape(_shapes, sim)[0]
+    ).shape[0]
     hidden, components = tuple(header["hidden"]), header["components"]
-    new = jax.eval_shape(lambda: learner(jax.random.key(0), m, n, hidden, components, jnp.float32(1)))
+    new = jax.eval_shape(
+        lambda: learner(jax.random.key(0), m, n, hidden, components, jnp.float32(1))
+    )
     number, vector = (jax.ShapeDtypeStruct(s, jnp.float32) for s in ((), (m,)))
     k = len(arrays["tilt.0"]) if n0 else 0
-    tilt = Tilt(*(jax.ShapeDtypeStruct(s, jnp.float32) for s in ((k,), (k, n0), (k, n0)))) if n0 else ()
-    like = Learned(new.average, new.target, Net(Moments(number, vector, vector), number), tilt, number, number)
+    tilt = (
+        Tilt(*(jax.ShapeDtypeStruct(s, jnp.float32) for s in ((k,), (k, n0), (k, n0))))
+        if n0
+        else ()
+    )
+    like = Learned(
+        new.average, new.target, Net(Moments(number, vector, vector), number), tilt, number, number
+    )
     learned = Learned(*(_part(path, name, arrays, part) for name, part in like._asdict().items()))
     (_, act), _ = networks(m, n, hidden, components)
-    return assemble(sim, act, header["dense"], learned, History(*(np.asarray(a) for a in arrays_of(arrays, "history"))))
+    return assemble(
+        sim,
+        act,
+        header["dense"],
+        learned,
+        History(*(np.asarray(a) for a in arrays_of(arrays, "history"))),
+    )
 
 
 def _part(path, name, arrays, like):
     leaves, structure = arrays_of(arrays, name), jax.tree.structure(like)
     if len(leaves) != structure.num_leaves:
-        raise ValueError(f"load: {path} does not fit sim: {name} has {len(leaves)} arrays, expected {structure.num_leaves}")
+        raise ValueError(
+            f"load: {path} does not fit sim: {name} has {len(leaves)} arrays, expected"
+            f" {structure.num_leaves}"
+        )
     for a, (at, s) in zip(leaves, jax.tree_util.tree_leaves_with_path(like), strict=True):
         check_array(path, "sim", f"{name}{jax.tree_util.keystr(at)}", a, s)
     return structure.unflatten(leaves)

@@ -1,4 +1,6 @@
-"""The training of a failure policy as one compiled program: steps of all lanes, and after each, once enough was seen, an update of the networks."""
+"""The training of a failure policy as one compiled program: steps of all lanes, and after each,
+once enough was seen, an update of the networks.
+"""
 
 import functools
 from typing import Any, NamedTuple
@@ -44,8 +46,10 @@ class Phase(NamedTuple):
     updates: Any
     """int32: of the networks, after each step of all lanes."""
     acts: Any
-    """int32: from this step on the policy acts and learns. Before, the latents are a drift of each episode's own, and noise, and the critics learn alone: else
-    their first guesses would drive all components of the policy the same way."""
+    """int32: from this step on the policy acts and learns. Before, the latents are a drift of each
+    episode's own, and noise, and the critics learn alone: else their first guesses would drive all
+    components of the policy the same way.
+    """
     total: Any
     """Steps of all stretches together, over which the learning rate falls."""
 
@@ -94,17 +98,31 @@ def first(key, sim, shape, alpha):
     for_lanes, for_networks = jax.random.split(key)
     z0 = jax.random.normal(for_lanes, (shape.lanes, shape.n0), jnp.float32)
     still = jnp.zeros((shape.lanes, shape.n), jnp.float32)
-    lanes = jax.vmap(functools.partial(L.begin, sim, shape.dense))(jax.random.split(jax.random.clone(for_lanes), shape.lanes), z0, still)
+    lanes = jax.vmap(functools.partial(L.begin, sim, shape.dense))(
+        jax.random.split(jax.random.clone(for_lanes), shape.lanes), z0, still
+    )
     net = Net(Moments(*(jnp.asarray(a) for a in Moments.empty(shape.m))), jnp.ones((), jnp.float32))
     new = learner(for_networks, shape.m, shape.n, shape.hidden, shape.components, alpha)
     zero, one, at = jnp.zeros((), jnp.float32), jnp.ones((), jnp.float32), jnp.zeros((), jnp.int32)
-    return Training(lanes, L.empty(shape.capacity, shape.m, shape.n), at, new, net, scale=one, widen=one, reach=zero, at=at)
+    return Training(
+        lanes,
+        L.empty(shape.capacity, shape.m, shape.n),
+        at,
+        new,
+        net,
+        scale=one,
+        widen=one,
+        reach=zero,
+        at=at,
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "applies"))
 def stretch(key, sim, shape, applies, rates, training, phase, steps):
     """``steps`` steps of all lanes: ``(Training, Count)``."""
-    nothing = Count(*(jnp.zeros((), jnp.float32 if name in _SUMS else jnp.int32) for name in Count._fields))
+    nothing = Count(
+        *(jnp.zeros((), jnp.float32 if name in _SUMS else jnp.int32) for name in Count._fields)
+    )
 
     def body(_, carry):
         training, count = carry
@@ -124,11 +142,19 @@ def _step(key, sim, shape, applies, rates, training, phase):
     noise, drift, z0 = _cut(for_noise, ((k, shape.n + 1), (k, shape.n), (k, shape.n0)))
 
     def choose(lane, e):
-        mixture = act(applies[0], training.learner.actor, see(net, sim.horizon, lane.seen, lane.t, lane.potential))
+        mixture = act(
+            applies[0],
+            training.learner.actor,
+            see(net, sim.horizon, lane.seen, lane.t, lane.potential),
+        )
         return jnp.where(acting, draw(mixture, e), lane.drift + e[:-1])
 
-    moved, new, valid, invalid = jax.vmap(lambda lane, e: L.step(sim, shape.dense, lane, choose(lane, e)))(lanes, noise)
-    again = jax.vmap(functools.partial(L.begin, sim, shape.dense))(jax.random.split(for_starts, k), training.widen * z0, training.reach * drift)
+    moved, new, valid, invalid = jax.vmap(
+        lambda lane, e: L.step(sim, shape.dense, lane, choose(lane, e))
+    )(lanes, noise)
+    again = jax.vmap(functools.partial(L.begin, sim, shape.dense))(
+        jax.random.split(for_starts, k), training.widen * z0, training.reach * drift
+    )
     buffer, stored = L.put(training.buffer, training.stored, new, valid)
     updates = jnp.where(stored > 0, phase.updates, 0)
     left = jnp.clip(1 - training.at.astype(jnp.float32) / phase.total, 0.05, 1)
@@ -137,26 +163,57 @@ def _step(key, sim, shape, applies, rates, training, phase):
     def learn(i, carry):
         for_noise, for_rows = jax.random.split(jax.random.fold_in(for_updates, i))
         # of the stored ones all alike; the remainder favours none by more than 2^-15
-        at = jax.random.bits(for_rows, (shape.batch,), jnp.uint32) % jnp.clip(stored, 1, shape.capacity).astype(jnp.uint32)
+        at = jax.random.bits(for_rows, (shape.batch,), jnp.uint32) % jnp.clip(
+            stored, 1, shape.capacity
+        ).astype(jnp.uint32)
         rows = jax.tree.map(lambda a: a[at.astype(jnp.int32)], buffer)
         noise = jax.random.normal(for_noise, (2, shape.batch, shape.n), jnp.float32)
-        new, loss = update(noise, carry[0], applies, net, slower, acting.astype(jnp.float32), training.scale, rows, sim.horizon)
+        new, loss = update(
+            noise,
+            carry[0],
+            applies,
+            net,
+            slower,
+            acting.astype(jnp.float32),
+            training.scale,
+            rows,
+            sim.horizon,
+        )
         return new, carry[1] + loss
 
-    new_learner, loss = lax.fori_loop(0, updates, learn, (training.learner, jnp.zeros((), jnp.float32)))
+    new_learner, loss = lax.fori_loop(
+        0, updates, learn, (training.learner, jnp.zeros((), jnp.float32))
+    )
     whole = moved.over & ~invalid
     number = lambda p: jnp.sum(p, dtype=jnp.int32)
     total = lambda p, a: jnp.sum(jnp.where(p, a, 0))
     count = Count(
-        number(moved.over), number(~lanes.over), number(invalid), number(whole), number(moved.failed), total(moved.failed, moved.log_p),
-        total(whole, moved.log_p), total(whole, moved.gain), total(whole, moved.nearest), total(whole, moved.nearest**2), loss, updates,
-    )  # fmt: skip
+        number(moved.over),
+        number(~lanes.over),
+        number(invalid),
+        number(whole),
+        number(moved.failed),
+        total(moved.failed, moved.log_p),
+        total(whole, moved.log_p),
+        total(whole, moved.gain),
+        total(whole, moved.nearest),
+        total(whole, moved.nearest**2),
+        loss,
+        updates,
+    )
     lanes = jax.vmap(_select)(moved.over, again, moved)
-    return training._replace(lanes=lanes, buffer=buffer, stored=stored, learner=new_learner, at=training.at + 1), count
+    return (
+        training._replace(
+            lanes=lanes, buffer=buffer, stored=stored, learner=new_learner, at=training.at + 1
+        ),
+        count,
+    )
 
 
 def _cut(key, shapes):
-    """Standard normal arrays of these shapes, in one draw: each call of a generator is much to compile."""
+    """Standard normal arrays of these shapes, in one draw: each call of a generator is much to
+    compile.
+    """
     ends, total = [], 0
     for shape in shapes:
         size = functools.reduce(lambda a, b: a * b, shape, 1)
@@ -175,7 +232,8 @@ def settle(training, horizon):
     average = lambda a: jnp.einsum("n,n...->...", stored, a) / n
     mean = average(rows.seen)
     deviation = jnp.sqrt(average((rows.seen - mean[None]) ** 2))
-    deviation = jnp.where(deviation > 1e-6 * jnp.abs(mean), deviation, 0)  # a constant, up to rounding
+    # a constant, up to rounding
+    deviation = jnp.where(deviation > 1e-6 * jnp.abs(mean), deviation, 0)
     unit = jnp.sqrt(average(rows.approach**2) * horizon)
     return training._replace(net=Net(Moments(n, mean, deviation), jnp.where(unit > 0, unit, 1)))
 
@@ -184,7 +242,8 @@ def settle(training, horizon):
 def tilt(key, sim, shape, applies, training, bonus):
     """The `Tilt` of the start that the critics ask for: p(x0) exp(V_true(s0)).
 
-    The shaped return of an episode is its true one and lambda (d(s0) - d(s_T)), so V_true(s0), with -lambda d(s_T) at the end, is V(s0) - lambda d(s0).
+    The shaped return of an episode is its true one and lambda (d(s0) - d(s_T)), so V_true(s0), with
+    -lambda d(s_T) at the end, is V(s0) - lambda d(s0).
     """
     for_draws, for_fit = jax.random.split(key)
     noise = jax.random.normal(for_draws, (VALUE_DRAWS, shape.n), jnp.float32)
@@ -193,6 +252,9 @@ def tilt(key, sim, shape, applies, training, bonus):
         lane = L.at(sim, shape.dense, x_of(sim.start(), z0))
         inputs = see(training.net, sim.horizon, lane.seen, lane.t, lane.potential)
         v = soft_value(applies, training.net.unit * training.scale, training.learner, inputs, noise)
-        return jnp.where(lane.over, jnp.where(lane.failed, bonus, 0), v) - training.scale * lane.potential
+        return (
+            jnp.where(lane.over, jnp.where(lane.failed, bonus, 0), v)
+            - training.scale * lane.potential
+        )
 
     return starts.fit(for_fit, log_value, shape.n0, wide=training.widen)

@@ -1,7 +1,10 @@
-"""The cross-entropy method over disturbance sequences: draw episodes, keep the elites, draw the next ones like them.
+"""The cross-entropy method over disturbance sequences: draw episodes, keep the elites, draw the
+next ones like them.
 
-The cross-entropy method for optimisation with smoothed updating (de Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy method), for
-proposals that are independent over time, each step with its own (`jast.cross_entropy.sequences`). Unlike there, elites are the best of all iterations.
+The cross-entropy method for optimisation with smoothed updating (de Boer, Kroese, Mannor and
+Rubinstein 2005, A tutorial on the cross-entropy method), for proposals that are independent over
+time, each step with its own (`jast.cross_entropy.sequences`). Unlike there, elites are the best of
+all iterations.
 """
 
 from functools import partial
@@ -55,33 +58,62 @@ class Pool(NamedTuple):
 
 
 def cem(
-    key, sim, *, samples=300, elites=30, iterations=30, reward=rewards.STANDARD, actions=None, smoothing=0.3, floor=0.05, fresh=0.1, trees=1, top=64,
-    record=False, progress=False, callback=None,
-):  # fmt: skip
-    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the ``elites`` best distinct ones so far; maximises ``reward``.
+    key,
+    sim,
+    *,
+    samples=300,
+    elites=30,
+    iterations=30,
+    reward=rewards.STANDARD,
+    actions=None,
+    smoothing=0.3,
+    floor=0.05,
+    fresh=0.1,
+    trees=1,
+    top=64,
+    record=False,
+    progress=False,
+    callback=None,
+):
+    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the
+    ``elites`` best distinct ones so far; maximises ``reward``.
 
-    Failures rank before other episodes, each by reward; one whose reward is not finite is never an elite. With ``actions.quantiles()`` and
-    ``uniform(low, high)`` x_t is the quantile, or the point of the box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the
-    share ``smoothing`` of the last fit is kept, and s_t >= ``floor``. With ``samples()``, for any disturbance (integers, seeds of unknown density), x_t is
-    that of a random elite, each step with another, or with probability ``fresh`` a draw from p(x | s). A random start is treated likewise, but never by the
-    box. Default ``actions``: quantiles where all disturbances have them, else samples.
+    Failures rank before other episodes, each by reward; one whose reward is not finite is never an
+    elite. With ``actions.quantiles()`` and ``uniform(low, high)`` x_t is the quantile, or the point
+    of the box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the
+    share ``smoothing`` of the last fit is kept, and s_t >= ``floor``. With ``samples()``, for any
+    disturbance (integers, seeds of unknown density), x_t is that of a random elite, each step with
+    another, or with probability ``fresh`` a draw from p(x | s). A random start is treated likewise,
+    but never by the box. Default ``actions``: quantiles where all disturbances have them, else
+    samples.
 
-    ``trees``: independent searches, side by side; tree k is the same whatever their number. Defaults are tuned on the ferry; 1000 samples, 100 elites and 10
-    iterations are the customary ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed. ``top``: distinct failures kept;
-    ``record=True`` keeps the numbers of every episode (``result.trials``).
-    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every iteration with the episodes of all trees; KeyboardInterrupt ends the search
-    with the result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks.
+    ``trees``: independent searches, side by side; tree k is the same whatever their number.
+    Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
+    ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed.
+    ``top``: distinct failures kept; ``record=True`` keeps the numbers of every episode
+    (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total)`` is called after
+    every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
+    result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and
+    `jax.vmap`, without archive, history and callbacks.
 
-    A reward whose log p outweighs the distance has its best non-failing episode far from any failure, and the elites gather there: weigh the distance
-    (`jast.rewards.shaped`) where no failure is found. Raises ValueError for a count below 1, more elites than samples, a setting outside its range, and where
-    the simulator's functions or the actions do not fit together.
+    A reward whose log p outweighs the distance has its best non-failing episode far from any
+    failure, and the elites gather there: weigh the distance (`jast.rewards.shaped`) where no
+    failure is found. Raises ValueError for a count below 1, more elites than samples, a setting
+    outside its range, and where the simulator's functions or the actions do not fit together.
     """
-    samples, elites, iterations, trees, top = E.whole("cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top)
+    samples, elites, iterations, trees, top = E.whole(
+        "cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top
+    )
     if elites > samples:
         raise ValueError(f"cem: elites must be at most samples, {samples}, received {elites}")
     if samples * iterations * trees >= 2**31:
-        raise ValueError(f"cem: samples x iterations x trees must be below 2^31, received {samples} x {iterations} x {trees}")
-    share = lambda name, value: _checks.real("cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1")
+        raise ValueError(
+            f"cem: samples x iterations x trees must be below 2^31, received {samples} x"
+            f" {iterations} x {trees}"
+        )
+    share = lambda name, value: _checks.real(
+        "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
+    )
     real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
     actions = _chosen(contract(sim, observed=False)) if actions is None else actions
     counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
@@ -106,16 +138,38 @@ def cem(
         return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
 
     ends = [samples * (i + 1) for i in range(iterations)]
-    (pool, _), log = E.drive(chunk, carry, ends, host=hosted(sim), trees=trees, progress=progress, callback=callback, name="cem")
+    (pool, _), log = E.drive(
+        chunk,
+        carry,
+        ends,
+        host=hosted(sim),
+        trees=trees,
+        progress=progress,
+        callback=callback,
+        name="cem",
+    )
     found, tree, number, count = jax.device_get(_archive(pool, top))
     n = int((found.reward > -jnp.inf).sum())
-    found = E.finish(sim, reward, log, _best(pool), jax.tree.map(lambda a: a[:n], found), tree[:n], number[:n], count[:n], settings, top)
+    found = E.finish(
+        sim,
+        reward,
+        log,
+        _best(pool),
+        jax.tree.map(lambda a: a[:n], found),
+        tree[:n],
+        number[:n],
+        count[:n],
+        settings,
+        top,
+    )
     return found._replace(incidents=since(before, incidents(sim)))
 
 
 @partial(jax.jit, static_argnums=5)
 def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
-    """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and x), `E.Tally`, best reward [trees], `Trials`)."""
+    """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and
+    x), `E.Tally`, best reward [trees], `Trials`).
+    """
     pool, proposals = carry
     (trees,), samples = keys.shape, plan.samples
     number = begin + jnp.arange(samples, dtype=jnp.int32)
@@ -124,26 +178,61 @@ def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
 
     flat = lambda a: a.reshape(trees * samples, *a.shape[2:])
     apart = lambda a: a.reshape(trees, samples, *a.shape[1:])
-    draws = (P.drawer(kind, a, f) for kind, a, f in zip(plan.kinds, (choices.quantiles(), actions), (actions.draw_start, actions.draw), strict=True))
+    draws = (
+        P.drawer(kind, a, f)
+        for kind, a, f in zip(
+            plan.kinds,
+            (choices.quantiles(), actions),
+            (actions.draw_start, actions.draw),
+            strict=True,
+        )
+    )
     live = jnp.ones((trees * samples,), bool)
-    played = E.play(sim, reward, flat(keys), *draws, live, jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows), record=True)
+    played = E.play(
+        sim,
+        reward,
+        flat(keys),
+        *draws,
+        live,
+        jax.tree.map(lambda a: jnp.moveaxis(flat(a), 1, 0), rows),
+        record=True,
+    )
     tree = jnp.repeat(jnp.arange(trees, dtype=jnp.int32), samples)
-    counted = E.tally(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)  # trees run side by side
+    # trees run side by side
+    counted = E.tally(played, live, jnp.tile(number, trees) * trees + tree, tree, trees)
 
-    latent = tuple(row if kind == "latent" else () for kind, row in zip(plan.kinds, rows, strict=True))
+    latent = tuple(
+        row if kind == "latent" else () for kind, row in zip(plan.kinds, rows, strict=True)
+    )
     number = jnp.broadcast_to(number, (trees, samples))
-    new = Pool(jax.tree.map(apart, played.episode), latent, apart(played.tag), number, jnp.ones_like(number))
+    new = Pool(
+        jax.tree.map(apart, played.episode),
+        latent,
+        apart(played.tag),
+        number,
+        jnp.ones_like(number),
+    )
     pool = jax.vmap(_merge)(pool, new)
     proposals = jax.vmap(lambda g, p: _fit(g, p, real, plan))(proposals, pool)
-    return (pool, proposals), counted, pool.episode.reward[:, 0], jax.tree.map(apart, E.trials(played))
+    return (
+        (pool, proposals),
+        counted,
+        pool.episode.reward[:, 0],
+        jax.tree.map(apart, E.trials(played)),
+    )
 
 
 def _propose(keys, sim, real, plan, pool, proposals):
-    """Of one tree: the rows [samples, 1, ...] that x0 is made of (``()``: one start), and [samples, horizon, ...] those of x."""
+    """Of one tree: the rows [samples, 1, ...] that x0 is made of (``()``: one start), and [samples,
+    horizon, ...] those of x.
+    """
     elite = jax.tree.map(lambda a: a[: plan.elites], pool.episode)
     start = random_start(sim)
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
-    parents = (jax.tree.map(lambda a: a[:, None], elite.x0), known), (elite.disturbances, jnp.where(known > 0, elite.length, -1))
+    parents = (
+        (jax.tree.map(lambda a: a[:, None], elite.x0), known),
+        (elite.disturbances, jnp.where(known > 0, elite.length, -1)),
+    )
 
     def rows(part):
         if plan.kinds[part] == "latent":
@@ -155,34 +244,53 @@ def _propose(keys, sim, real, plan, pool, proposals):
 
 def _fit(proposals, pool, real, plan):
     """The proposals of one tree, fitted to the elites at the steps that they reached."""
-    z, reward, length = jax.tree.map(lambda a: a[: plan.elites], (pool.latent, pool.episode.reward, pool.episode.length))
+    z, reward, length = jax.tree.map(
+        lambda a: a[: plan.elites], (pool.latent, pool.episode.reward, pool.episode.length)
+    )
     known = reward[:, None] > -jnp.inf
     horizon = jax.tree.leaves(pool.episode.disturbances)[0].shape[1]
     counts = known, known & (jnp.arange(horizon, dtype=jnp.int32)[None] < length[:, None])
-    return tuple(sequences.fit(g, v, n, real.smoothing, real.floor) if g != () else () for g, v, n in zip(proposals, z, counts, strict=True))
+    return tuple(
+        sequences.fit(g, v, n, real.smoothing, real.floor) if g != () else ()
+        for g, v, n in zip(proposals, z, counts, strict=True)
+    )
 
 
 def _merge(pool, new):
     """The best of both; an episode of reward -inf stands first only where there is no other."""
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), pool, new)
     (k,), (n,) = pool.tag.shape, both.tag.shape
-    places, counts = E.distinct(both.episode.failure, both.episode.reward, both.tag, both.number, both.count, k)
+    places, counts = E.distinct(
+        both.episode.failure, both.episode.reward, both.tag, both.number, both.count, k
+    )
     there = places < n
     taken = _take(both, jnp.where(there | (jnp.arange(k) > 0), places, k))
-    return taken._replace(episode=taken.episode._replace(reward=jnp.where(there, taken.episode.reward, -jnp.inf)), count=counts)
+    return taken._replace(
+        episode=taken.episode._replace(reward=jnp.where(there, taken.episode.reward, -jnp.inf)),
+        count=counts,
+    )
 
 
 def _nothing(sim, plan, trees, k):
     """An empty `Pool` and the first proposals, of every tree."""
     likes = jax.eval_shape(_shapes, sim)
-    latent = [kind == "latent" and bool(jax.tree.leaves(like)) for kind, like in zip(plan.kinds, likes, strict=True)]
-    proposals = tuple(sequences.standard(like, steps) if use else () for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True))
+    latent = [
+        kind == "latent" and bool(jax.tree.leaves(like))
+        for kind, like in zip(plan.kinds, likes, strict=True)
+    ]
+    proposals = tuple(
+        sequences.standard(like, steps) if use else ()
+        for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True)
+    )
     zero = lambda dtype: jnp.zeros((k,), dtype)
     x0 = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), likes[0])
     x = jax.tree.map(lambda s: jnp.zeros((k, sim.horizon, *s.shape), s.dtype), likes[1])
     real = zero(accumulator(sim))
     episode = Episode(x0, x, real, real, zero(bool), zero(jnp.int32), real - jnp.inf)
-    z = tuple(jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else () for g in proposals)
+    z = tuple(
+        jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
+        for g in proposals
+    )
     one = Pool(episode, z, zero(jnp.uint32), zero(jnp.int32), zero(jnp.int32)), proposals
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (trees, *a.shape)), one)
 
@@ -197,13 +305,20 @@ def _best(pool):
 
 @partial(jax.jit, static_argnums=1)
 def _archive(pool, top):
-    """The ``top`` best distinct failures of all trees: (episodes, tree, number, count), reward -inf where there are fewer."""
+    """The ``top`` best distinct failures of all trees: (episodes, tree, number, count), reward -inf
+    where there are fewer.
+    """
     trees, k = pool.tag.shape
     flat = jax.tree.map(lambda a: a.reshape(trees * k, *a.shape[2:]), pool._replace(latent=()))
     value = jnp.where(flat.episode.failure, flat.episode.reward, -jnp.inf)
     places, counts = E.distinct(flat.episode.failure, value, flat.tag, flat.number, flat.count, top)
     episode, number = _take((flat.episode, flat.number), places)
-    return episode._replace(reward=jnp.where(places < trees * k, episode.reward, -jnp.inf)), places // k, number, counts
+    return (
+        episode._replace(reward=jnp.where(places < trees * k, episode.reward, -jnp.inf)),
+        places // k,
+        number,
+        counts,
+    )
 
 
 def _take(tree, places):
@@ -216,7 +331,10 @@ def _chosen(sim):
 
     def look():
         start = sim.start()
-        found.append(D.has_quantile(start) and D.has_quantile(sim.disturbance(sim.init(D.sample(start, jax.random.key(0))))))
+        found.append(
+            D.has_quantile(start)
+            and D.has_quantile(sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))
+        )
 
     jax.eval_shape(look)
     return choices.quantiles() if found[0] else choices.samples()

@@ -8,13 +8,25 @@ import jax.numpy as jnp
 from jast.episode import random_start
 from jast.heads.heads import flat, observed
 from jast.search.records import unpack
-from jast.search.tree import FRESH, LINK, PAGE, RETURNS, ROW, VISITS, choose_child, node_keys, node_shapes
+from jast.search.tree import (
+    FRESH,
+    LINK,
+    PAGE,
+    RETURNS,
+    ROW,
+    VISITS,
+    choose_child,
+    node_keys,
+    node_shapes,
+)
 
 __all__ = ["Edges", "edges_of"]
 
 
 class Edges(NamedTuple):
-    """The edges (s, a) of B trees of S simulations; the one of row i was first taken by simulation i."""
+    """The edges (s, a) of B trees of S simulations; the one of row i was first taken by simulation
+    i.
+    """
 
     seen: Any
     """[S, B, n] what networks see of s."""
@@ -31,7 +43,9 @@ class Edges(NamedTuple):
 
 
 def edges_of(problem, axes, tree, children):
-    """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a node."""
+    """The `Edges` of trees that keep states at every node; ``children``: the greatest number of a
+    node.
+    """
     lanes = tree.key.shape[0]
     lane = jnp.arange(lanes, dtype=jnp.int32)[None]
     like = node_shapes(tree, "node")
@@ -39,7 +53,9 @@ def edges_of(problem, axes, tree, children):
     parent, slot = node.parent[1:], node.slot[1:]
     row = parent * lanes + lane
     for hop in range(1, -(-children // PAGE)):
-        row = jnp.where(slot >= hop * PAGE, tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane, row)
+        row = jnp.where(
+            slot >= hop * PAGE, tree.edges[row * ROW + LINK].astype(jnp.int32) * lanes + lane, row
+        )
     at = row * ROW + slot % PAGE
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
@@ -52,11 +68,15 @@ def edges_of(problem, axes, tree, children):
 
         def edge(parent, slot):
             state = jax.tree.map(lambda a: a[parent], states)
-            return observed(problem.sim, state), flat(choose_child(problem, node_keys(keys[None], parent[None])[0], slot, state)[1])
+            return observed(problem.sim, state), flat(
+                choose_child(problem, node_keys(keys[None], parent[None])[0], slot, state)[1]
+            )
 
         return jax.vmap(edge)(parent, slot)
 
-    seen, x = jax.vmap(one, in_axes=(axes, 0, 1, 1, 1), out_axes=1)(problem, tree.key, node.state, parent, slot)
+    seen, x = jax.vmap(one, in_axes=(axes, 0, 1, 1, 1), out_axes=1)(
+        problem, tree.key, node.state, parent, slot
+    )
     if random_start(problem.sim):  # the first level chooses x0
         valid = valid & (parent > 0)
     return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)

@@ -1,7 +1,9 @@
-"""What searches over independent episodes share: lanes in lockstep, counting, the best distinct episodes, the loop on the host and its result.
+"""What searches over independent episodes share: lanes in lockstep, counting, the best distinct
+episodes, the loop on the host and its result.
 
-Episode n of tree k draws the disturbance of level t with the key folded from (tree key k, n, t); the start, where it is random, is level 0. So an episode
-is known by its number, whatever the chunks it was simulated in.
+Episode n of tree k draws the disturbance of level t with the key folded from (tree key k, n, t);
+the start, where it is random, is level 0. So an episode is known by its number, whatever the chunks
+it was simulated in.
 """
 
 from typing import Any, NamedTuple
@@ -19,16 +21,34 @@ from jast.search.records import pack
 from jast.search.result import History, SearchResult, Trials
 from jast.search.threads import apart
 
-__all__ = ["Played", "Tally", "add", "distinct", "drive", "finish", "finish_traced", "nothing", "play", "prepare", "tally", "trials", "whole"]
+__all__ = [
+    "Played",
+    "Tally",
+    "add",
+    "distinct",
+    "drive",
+    "finish",
+    "finish_traced",
+    "nothing",
+    "play",
+    "prepare",
+    "tally",
+    "trials",
+    "whole",
+]
 
 
 class Played(NamedTuple):
     """Simulated episodes, one a lane."""
 
     episode: Episode
-    """Leading axis [lanes]; ``disturbances`` [lanes, horizon, ...], or None where they were not recorded."""
+    """Leading axis [lanes]; ``disturbances`` [lanes, horizon, ...], or None where they were not
+    recorded.
+    """
     invalid: Any
-    """[lanes] bool: the reward is not finite, as the simulator, a density or the reward was not; no failure then, reward -inf."""
+    """[lanes] bool: the reward is not finite, as the simulator, a density or the reward was not; no
+    failure then, reward -inf.
+    """
     tag: Any
     """[lanes] uint32: a hash of x0 and the disturbances, to tell repetitions."""
 
@@ -41,7 +61,9 @@ class Tally(NamedTuple):
     failures: Any
     invalid: Any
     first: Any
-    """How many episodes of the search were simulated up to and including its first failing one; ``NEVER`` where none of these failed."""
+    """How many episodes of the search were simulated up to and including its first failing one;
+    ``NEVER`` where none of these failed.
+    """
     failing: Any
     """[trees] bool: whether the tree found a failure."""
 
@@ -52,14 +74,19 @@ NEVER = np.int32(2**31 - 1)
 def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, judge=True):
     """Simulate one episode a lane, all lanes a step at a time: `Played`.
 
-    ``keys`` [lanes]: of the episodes. ``draw_start(key, row, dist)`` and ``draw(key, row, dist)`` make x0 and x with the key of their level; ``rows``: a pair
-    of pytrees, [1, lanes, ...] for x0 and [horizon, lanes, ...] for x, that the draws depend on. Lanes that are not ``live`` [lanes] bool come back as
-    episodes of length 0 and mean nothing. Ended lanes step on, and only what is summed up is masked (and the state, where it is yet to be judged). Without
-    ``judge`` an episodic system is not evaluated: for the disturbances of episodes whose outcome is known.
+    ``keys`` [lanes]: of the episodes. ``draw_start(key, row, dist)`` and ``draw(key, row, dist)``
+    make x0 and x with the key of their level; ``rows``: a pair of pytrees, [1, lanes, ...] for x0
+    and [horizon, lanes, ...] for x, that the draws depend on. Lanes that are not ``live`` [lanes]
+    bool come back as episodes of length 0 and mean nothing. Ended lanes step on, and only what is
+    summed up is masked (and the state, where it is yet to be judged). Without ``judge`` an episodic
+    system is not evaluated: for the disturbances of episodes whose outcome is known.
     """
     start = int(random_start(sim))
     rows = ((), ()) if rows is None else rows
-    at = lambda level, rows, t: (jax.vmap(jax.random.fold_in, (0, None))(keys, level), jax.tree.map(lambda a: a[t], rows))
+    at = lambda level, rows, t: (
+        jax.vmap(jax.random.fold_in, (0, None))(keys, level),
+        jax.tree.map(lambda a: a[t], rows),
+    )
 
     def first(key, row):
         x0 = draw_start(key, row, sim.start()) if start else ()
@@ -81,28 +108,52 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
         t, length, tag, xs, before = carry
         on = ~before.done
         x, after, folded = move(*at(t + start, rows[1], t), before, tag, t + 1 >= sim.horizon)
-        masked = jax.tree.map(lambda a, b: jnp.where(on, a, b), after._replace(state=()), before._replace(state=()))
-        kept = masked._replace(state=jax.tree.map(lambda a, b: jax.vmap(jnp.where)(on, a, b), after.state, before.state) if sim.episodic else after.state)
+        masked = jax.tree.map(
+            lambda a, b: jnp.where(on, a, b), after._replace(state=()), before._replace(state=())
+        )
+        kept = masked._replace(
+            state=(
+                jax.tree.map(lambda a, b: jax.vmap(jnp.where)(on, a, b), after.state, before.state)
+                if sim.episodic
+                else after.state
+            )
+        )
         if record:
-            xs = jax.tree.map(lambda a, b: a.at[t].set(jax.vmap(jnp.where)(on, b, jnp.zeros_like(b))), xs, x)
+            xs = jax.tree.map(
+                lambda a, b: a.at[t].set(jax.vmap(jnp.where)(on, b, jnp.zeros_like(b))), xs, x
+            )
         return t + 1, length + on.astype(jnp.int32), jnp.where(on, folded, tag), xs, kept
 
-    carry = jnp.int32(0), jnp.zeros(live.shape, jnp.int32), tag, xs, progress._replace(done=progress.done | ~live)
+    carry = (
+        jnp.int32(0),
+        jnp.zeros(live.shape, jnp.int32),
+        tag,
+        xs,
+        progress._replace(done=progress.done | ~live),
+    )
     _, length, tag, xs, end = lax.while_loop(lambda c: jnp.any(~c[4].done), step, carry)
     if judge:
         end = jax.vmap(lambda e, on: conclude(sim, reward, e, on))(end, live)
     finite = jnp.isfinite(end.reward)
     xs = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), xs)
     value = jnp.where(finite, end.reward, -jnp.inf)
-    return Played(Episode(x0, xs, end.log_prob, end.distance, end.failure & finite, length, value), ~finite, tag)
+    return Played(
+        Episode(x0, xs, end.log_prob, end.distance, end.failure & finite, length, value),
+        ~finite,
+        tag,
+    )
 
 
 def tally(played, live, order, tree=None, trees=1):
-    """The `Tally` of the ``live`` lanes of ``played``; ``order`` [lanes]: each one's place in the search, from 0; ``tree`` [lanes] of ``trees``, default 0."""
+    """The `Tally` of the ``live`` lanes of ``played``; ``order`` [lanes]: each one's place in the
+    search, from 0; ``tree`` [lanes] of ``trees``, default 0.
+    """
     e = played.episode
     count = lambda p: jnp.sum(p & live, dtype=jnp.int32)
     failing = e.failure & live
-    of_tree = jnp.any(failing)[None] if tree is None else jnp.zeros((trees,), bool).at[tree].max(failing)
+    of_tree = (
+        jnp.any(failing)[None] if tree is None else jnp.zeros((trees,), bool).at[tree].max(failing)
+    )
     steps = jnp.sum(jnp.where(live, e.length, 0), dtype=jnp.int32)
     first = jnp.min(jnp.where(failing, order + 1, NEVER))
     return Tally(count(live), steps, count(e.failure), count(played.invalid), first, of_tree)
@@ -116,7 +167,11 @@ def trials(played):
 
 def add(a, b):
     """Two tallies as one."""
-    return Tally(*(x + y for x, y in zip(a[:4], b[:4], strict=True)), jnp.minimum(a.first, b.first), a.failing | b.failing)
+    return Tally(
+        *(x + y for x, y in zip(a[:4], b[:4], strict=True)),
+        jnp.minimum(a.first, b.first),
+        a.failing | b.failing,
+    )
 
 
 def nothing(trees=1):
@@ -126,14 +181,18 @@ def nothing(trees=1):
 
 
 def distinct(failure, reward, tag, number, count, k):
-    """The k best distinct of n episodes: (their places [k], n where there are no more; their counts [k]).
+    """The k best distinct of n episodes: (their places [k], n where there are no more; their counts
+    [k]).
 
-    Failures before the others, then by falling reward; those of a reward that is not finite never. Equal reward and tag is a repetition, of which the least
-    ``number`` stands for all, with their ``count`` added.
+    Failures before the others, then by falling reward; those of a reward that is not finite never.
+    Equal reward and tag is a repetition, of which the least ``number`` stands for all, with their
+    ``count`` added.
     """
     (n,) = reward.shape
     group = jnp.where(jnp.isfinite(reward), jnp.where(failure, 0, 1), 2)
-    group, value, tag, _, place, count = lax.sort((group, -reward, tag, number, jnp.arange(n, dtype=jnp.int32), count), num_keys=4)
+    group, value, tag, _, place, count = lax.sort(
+        (group, -reward, tag, number, jnp.arange(n, dtype=jnp.int32), count), num_keys=4
+    )
     differs = [a[1:] != a[:-1] for a in (group, value, tag)]
     new = jnp.concatenate([jnp.ones((1,), bool), differs[0] | differs[1] | differs[2]])
     to = jnp.where(group < 2, jnp.cumsum(new, dtype=jnp.int32) - 1, k)
@@ -148,15 +207,25 @@ def is_traced(*trees):
 
 
 def whole(function, **values):
-    """The values as Python ints; ValueError naming the setting unless each is a whole number from 1 to 2^31 - 1."""
+    """The values as Python ints; ValueError naming the setting unless each is a whole number from 1
+    to 2^31 - 1.
+    """
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value < 2**31:
-            raise ValueError(f"{function}: {name} must be a whole number from 1 to 2^31 - 1, received {value!r}")
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | np.integer)
+            or not 1 <= value < 2**31
+        ):
+            raise ValueError(
+                f"{function}: {name} must be a whole number from 1 to 2^31 - 1, received {value!r}"
+            )
     return [int(v) for v in values.values()]
 
 
 def prepare(function, key, sim, reward, actions, **settings):
-    """``(reward, settings)`` as the search takes them, once `contract` holds: the reward as a pytree, the settings with names and seed (None if traced)."""
+    """``(reward, settings)`` as the search takes them, once `contract` holds: the reward as a
+    pytree, the settings with names and seed (None if traced).
+    """
     contract(sim, actions, observed=False)
     reward = rewards.as_pytree(reward)
     if is_traced(key, sim, reward, actions, settings):
@@ -164,8 +233,16 @@ def prepare(function, key, sim, reward, actions, **settings):
     seed = key if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else jax.random.key_data(key)
     func = getattr(reward, "func", reward)
     name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
-    settings = jax.tree.map(lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist(), settings)
-    return reward, dict(method=function, **settings, seed=np.asarray(seed).tolist(), reward=name, actions=ACTIONS.get(type(actions), type(actions).__name__))
+    settings = jax.tree.map(
+        lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist(), settings
+    )
+    return reward, dict(
+        method=function,
+        **settings,
+        seed=np.asarray(seed).tolist(),
+        reward=name,
+        actions=ACTIONS.get(type(actions), type(actions).__name__),
+    )
 
 
 class Log(NamedTuple):
@@ -178,11 +255,13 @@ class Log(NamedTuple):
 
 
 def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=None, name="search"):
-    """``(carry, Log)`` after ``carry, tally, best, trials = chunk(carry, begin, end)`` for each stretch up to the next of ``ends`` (episodes of each tree).
+    """``(carry, Log)`` after ``carry, tally, best, trials = chunk(carry, begin, end)`` for each
+    stretch up to the next of ``ends`` (episodes of each tree).
 
-    ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None. ``host``: the system runs on the host.
-    ``callback(done, total)`` after each chunk: the episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised again
-    where there is none.
+    ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None.
+    ``host``: the system runs on the host. ``callback(done, total)`` after each chunk: the episodes
+    of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised
+    again where there is none.
     """
     whole, bar = ends[-1] * trees, None
     if progress:
@@ -196,11 +275,15 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
             run = lambda: jax.block_until_ready(chunk(carry, done, end))  # noqa: B023
             carry, counted, best, record = apart(run) if host else run()
             counted, best, record = jax.device_get((counted, best, record))
-            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)  # Python's ints do not overflow
+            # Python's ints do not overflow
+            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
             if total is not None:
                 sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
-                counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
-            kept = carry, end, counted, [*moments, (end, best, counted.failures, record)]  # at once: an interruption finds all of a chunk or nothing
+                counted = Tally(
+                    *sums, min(total.first, counted.first), total.failing | counted.failing
+                )
+            # at once: an interruption finds all of a chunk or nothing
+            kept = carry, end, counted, [*moments, (end, best, counted.failures, record)]
             if bar is not None:
                 bar.update(end * trees - bar.n)
                 bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}", refresh=False)
@@ -222,14 +305,22 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
 def finish(sim, reward, log, best, candidates, tree, simulation, counts, settings, top):
     """The `SearchResult` on the host.
 
-    ``best``: the best episode that was simulated; ``candidates``: episodes [m] that failed, with the tree and number at which each was first found and how
-    often. All are replayed, and what is said of them is what the replay says.
+    ``best``: the best episode that was simulated; ``candidates``: episodes [m] that failed, with
+    the tree and number at which each was first found and how often. All are replayed, and what is
+    said of them is what the replay says.
     """
     candidates = jax.device_get(candidates)
-    candidates = candidates._replace(failure=np.ones(len(simulation), bool))  # so that one that no longer fails is counted as dropped
+    # so that one that no longer fails is counted as dropped
+    candidates = candidates._replace(failure=np.ones(len(simulation), bool))
     found = archive.collect(sim, reward, candidates, tree, simulation, log.tally.failures, top)
-    times = {(int(k), int(i)): int(n) for k, i, n in zip(tree, simulation, counts, strict=True)}  # repetitions are no candidates, but were counted
-    found = found._replace(counts=np.array([times[int(k), int(i)] for k, i in zip(found.tree, found.simulation, strict=True)], np.int32))
+    # repetitions are no candidates, but were counted
+    times = {(int(k), int(i)): int(n) for k, i, n in zip(tree, simulation, counts, strict=True)}
+    found = found._replace(
+        counts=np.array(
+            [times[int(k), int(i)] for k, i in zip(found.tree, found.simulation, strict=True)],
+            np.int32,
+        )
+    )
     best = jax.device_get(replay(sim, found.best if found.size else best, reward=reward))
     n = log.tally
     return SearchResult(
@@ -266,7 +357,9 @@ def finish_traced(sim, reward, n, best, best_reward):
 
 
 def _fold(tag, x):
-    """The hash with the bits of one more disturbance: a multiply and a shift a word, as it is paid at every step."""
+    """The hash with the bits of one more disturbance: a multiply and a shift a word, as it is paid
+    at every step.
+    """
     for word in pack(x) if jax.tree.leaves(x) else ():
         tag = (tag ^ word) * jnp.uint32(0x85EBCA6B)
         tag = tag ^ (tag >> 15)

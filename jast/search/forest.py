@@ -1,4 +1,6 @@
-"""Monte Carlo forest search with action pruning: MCFS-AP of Lytskjold and Mengshoel, Algorithm 1."""
+"""Monte Carlo forest search with action pruning: MCFS-AP of Lytskjold and Mengshoel, Algorithm
+1.
+"""
 
 from jast import actions as A
 from jast import rewards
@@ -12,53 +14,113 @@ MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
     "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
-    "episodic": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None, follow=True, urgent=True),
+    "episodic": (
+        PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None, follow=True, urgent=True)
+    ),
 }
 
 
 def forest(
-    key, sim, *, trees=200, prunes=18, simulations=500, heads=None, reward=rewards.STANDARD, actions=SAMPLES, exploration=10.0, mode="default", widening=None,
-    spread=None, focus=None, follow=None, feed=None, urgent=None, head_settings=None, memoize="auto", top=64, record=False, threads=None, lanes=None,
-    available=None, progress=False, callback=None,
-):  # fmt: skip
-    """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each: `SearchResult`. The reward is maximised.
+    key,
+    sim,
+    *,
+    trees=200,
+    prunes=18,
+    simulations=500,
+    heads=None,
+    reward=rewards.STANDARD,
+    actions=SAMPLES,
+    exploration=10.0,
+    mode="default",
+    widening=None,
+    spread=None,
+    focus=None,
+    follow=None,
+    feed=None,
+    urgent=None,
+    head_settings=None,
+    memoize="auto",
+    top=64,
+    record=False,
+    threads=None,
+    lanes=None,
+    available=None,
+    progress=False,
+    callback=None,
+):
+    """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each:
+    `SearchResult`. The reward is maximised.
 
-    A simulation walks down from the root by eq. 3, Q(s, a) + ``exploration`` sqrt(ln N(s) / (1 + N(s, a))), where a node has at most k N^alpha + 1
-    children, ``widening`` = (k, alpha), alpha in [0, 1]; takes a child never visited, rolls out at random to the episode's end, and backs its reward up as a
-    mean. After ``simulations`` of them the most visited child becomes the root and keeps its subtree; a tree ends early when its root is an episode's end.
+    A simulation walks down from the root by eq. 3, Q(s, a) + ``exploration`` sqrt(ln N(s) / (1 +
+    N(s, a))), where a node has at most k N^alpha + 1 children, ``widening`` = (k, alpha), alpha in
+    [0, 1]; takes a child never visited, rolls out at random to the episode's end, and backs its
+    reward up as a mean. After ``simulations`` of them the most visited child becomes the root and
+    keeps its subtree; a tree ends early when its root is an episode's end.
 
-    ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``:
-    the children of a node cover the action space evenly; ``focus``: every second child, and in half of the trees every second rollout step, is drawn closer to
-    the mode of the disturbance by this factor: 0.2 for a uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches into the
-    tails, for failures too rare for the model's own draws; where failures lie at the edge of a tight box, 1 finds more. Each may be given on its own.
-    ``actions`` and ``reward``: `jast.actions`, `jast.rewards`.
+    ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn
+    independently. ``mode="default"`` is what works: (2, 0.5); ``spread``: the children of a node
+    cover the action space evenly; ``focus``: every second child, and in half of the trees every
+    second rollout step, is drawn closer to the mode of the disturbance by this factor: 0.2 for a
+    uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches into
+    the tails, for failures too rare for the model's own draws; where failures lie at the edge of a
+    tight box, 1 finds more. Each may be given on its own. ``actions`` and ``reward``:
+    `jast.actions`, `jast.rewards`.
 
-    ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none": the same trees, for memory against simulator steps; "auto"
-    takes "node" where it fits. ``top``: failures kept in the archive; ``record=True`` keeps the numbers of every episode as well (``result.trials``).
+    ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none":
+    the same trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``:
+    failures kept in the archive; ``record=True`` keeps the numbers of every episode as well
+    (``result.trials``).
 
-    ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of systems that are judged at their end only: ``urgent`` and
-    ``follow``. ``urgent``: a child that was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of its tree, the next
-    simulations grow its path into the tree, an action each, so that every step of it can be varied; not with a value head. ``exploration`` is in the units of
-    the reward: there a hundredth of what a failure earns. ``mode="thesis"`` is Moss's: ``widening`` (10, 0.3), ``urgent``, and ``feed``: with half of its steps
-    to go, a rollout takes the action that the tree's best episode took there (Algorithm 9).
+    ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of
+    systems that are judged at their end only: ``urgent`` and ``follow``. ``urgent``: a child that
+    was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of
+    its tree, the next simulations grow its path into the tree, an action each, so that every step
+    of it can be varied; not with a value head. ``exploration`` is in the units of the reward: there
+    a hundredth of what a failure earns. ``mode="thesis"`` is Moss's: ``widening`` (10, 0.3),
+    ``urgent``, and ``feed``: with half of its steps to go, a rollout takes the action that the
+    tree's best episode took there (Algorithm 9).
 
-    Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither changes a result. ``available``: bytes that the trees in
-    flight may take (default: what is free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the simulations of all trees.
-    A KeyboardInterrupt ends the search with an honest result of what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
+    Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither
+    changes a result. ``available``: bytes that the trees in flight may take (default: what is
+    free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the
+    simulations of all trees. A KeyboardInterrupt ends the search with an honest result of what was
+    done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
 
-    ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw, "value": a v(s, a) that joins eq. 3, "both"; or
-    `jast.heads.Heads` of your own or of an earlier result (``result.heads``), also of another start of the same system. The trees then grow in rounds, and
-    between two rounds the heads learn from the statistics of the roots and, the policy, from the best episodes; no untrained head guides the first round. With
-    ``mode="paper"`` they are the published ones, a tree a round. ``head_settings``: `jast.heads.settings`, if not the mode's; ``settings(train=False)`` uses
-    heads as they are, which is what `jax.jit` and `jax.vmap` do. ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
+    ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw,
+    "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier
+    result (``result.heads``), also of another start of the same system. The trees then grow in
+    rounds, and between two rounds the heads learn from the statistics of the roots and, the policy,
+    from the best episodes; no untrained head guides the first round. With ``mode="paper"`` they are
+    the published ones, a tree a round. ``head_settings``: `jast.heads.settings`, if not the mode's;
+    ``settings(train=False)`` uses heads as they are, which is what `jax.jit` and `jax.vmap` do.
+    ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
 
-    Raises ValueError for counts below 1, a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not finite at the start, and
-    trees that do not fit into memory, with the numbers.
+    Raises ValueError for counts below 1, a simulator that breaks its contract, heads that do not
+    fit it, an ``observe`` that is not finite at the start, and trees that do not fit into memory,
+    with the numbers.
     """
-    given = dict(widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent)
+    given = dict(
+        widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent
+    )
     return grow_trees(
-        "forest", key, sim, settled("forest", MODES, mode, actions, **given), trees=trees, prunes=prunes, simulations=simulations,
-        heads=heads, head_settings=head_settings,
-        reward=reward, actions=actions, exploration=exploration, memoize=memoize, top=top, record=record, threads=threads, lanes=lanes, available=available,
-        progress=progress, callback=callback,
-    )  # fmt: skip
+        "forest",
+        key,
+        sim,
+        settled("forest", MODES, mode, actions, **given),
+        trees=trees,
+        prunes=prunes,
+        simulations=simulations,
+        heads=heads,
+        head_settings=head_settings,
+        reward=reward,
+        actions=actions,
+        exploration=exploration,
+        memoize=memoize,
+        top=top,
+        record=record,
+        threads=threads,
+        lanes=lanes,
+        available=available,
+        progress=progress,
+        callback=callback,
+    )

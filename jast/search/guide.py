@@ -1,4 +1,6 @@
-"""How a search uses its heads: rollout steps drawn from the policy head's histogram, and the value term of eq. 3."""
+"""How a search uses its heads: rollout steps drawn from the policy head's histogram, and the value
+term of eq. 3.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +14,8 @@ from jast.heads.heads import flat, histogram, in_bins, observed, unflat, value
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
 
-_SHARE, _HEAD = jnp.uint32(1 << 31), jnp.uint32(1)  # addresses apart from those of levels, and of what is drawn without heads
+# addresses apart from those of levels, and of what is drawn without heads
+_SHARE, _HEAD = jnp.uint32(1 << 31), jnp.uint32(1)
 
 
 @jax.tree_util.register_dataclass
@@ -37,22 +40,41 @@ class Guide:
 
 
 def guide(heads, settings):
-    """The `Guide` by ``heads`` (of `jast.heads`) and their settings; one without influence where they were never trained and may not guide so."""
+    """The `Guide` by ``heads`` (of `jast.heads`) and their settings; one without influence where
+    they were never trained and may not guide so.
+    """
     levels = jnp.where(settings.from_start, 2**30, jnp.asarray(heads.levels, jnp.int32))
     on = levels > 0
     number = lambda value, neutral: jnp.where(on, jnp.float32(value), jnp.float32(neutral))
-    weights = dict(power=jnp.float32(settings.power), q_weight=number(settings.q_weight, 1), v_weight=number(settings.v_weight, 0))
-    return jax.tree.map(jnp.asarray, Guide(heads, share=jnp.float32(settings.share), levels=levels, eager=settings.candidates == "all", **weights))
+    weights = dict(
+        power=jnp.float32(settings.power),
+        q_weight=number(settings.q_weight, 1),
+        v_weight=number(settings.v_weight, 0),
+    )
+    return jax.tree.map(
+        jnp.asarray,
+        Guide(
+            heads,
+            share=jnp.float32(settings.share),
+            levels=levels,
+            eager=settings.candidates == "all",
+            **weights,
+        ),
+    )
 
 
 def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
-    """A rollout's disturbance by the policy head; ``otherwise`` at levels that it has learned nothing of, and in the simulations that are not its share."""
+    """A rollout's disturbance by the policy head; ``otherwise`` at levels that it has learned
+    nothing of, and in the simulations that are not its share.
+    """
     logits = guide.power * histogram(guide.heads, observed(sim, state))
     own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
     key = jax.random.fold_in(key, _HEAD)
     u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
     x = actions.at(unflat(in_bins(logits, u), D.event_like(dist)), dist)
-    return jax.tree.map(lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise)
+    return jax.tree.map(
+        lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise
+    )
 
 
 def child_value(guide, sim, state, x):

@@ -1,4 +1,6 @@
-"""What a tree does with the best episode that it has seen: grow that episode's path, or feed its action to later rollouts."""
+"""What a tree does with the best episode that it has seen: grow that episode's path, or feed its
+action to later rollouts.
+"""
 
 from typing import Any, NamedTuple
 
@@ -12,14 +14,18 @@ __all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onwa
 
 
 class Lead(NamedTuple):
-    """The best episode of each of B trees; with ``follow``, the best failure. Without it ``on`` to ``path`` are ``()``, without ``feed`` ``fed`` is."""
+    """The best episode of each of B trees; with ``follow``, the best failure. Without it ``on`` to
+    ``path`` are ``()``, without ``feed`` ``fed`` is.
+    """
 
     value: jax.Array
     """[B] float: its reward; -inf before there is one."""
     source: jax.Array
     """[B] int32: 1 + its simulation."""
     on: Any
-    """[B] bool: the next simulation goes straight to ``node`` and takes there what the best episode took."""
+    """[B] bool: the next simulation goes straight to ``node`` and takes there what the best episode
+    took.
+    """
     node: Any
     """[B] int32: the last node on the path of that episode."""
     depth: Any
@@ -31,7 +37,9 @@ class Lead(NamedTuple):
     path: Any
     """[H, B] int32: edges to it, as places in the tree's edges."""
     fed: Any
-    """[S + 1, B, words] uint32: what the rollout of each simulation is fed: whether there is anything, and the packed disturbance."""
+    """[S + 1, B, words] uint32: what the rollout of each simulation is fed: whether there is
+    anything, and the packed disturbance.
+    """
 
 
 def lead_of(problem, lanes, levels, simulations, dtype):
@@ -41,8 +49,16 @@ def lead_of(problem, lanes, levels, simulations, dtype):
         return ()
     count, low = jnp.zeros((lanes,), jnp.int32), jnp.full((lanes,), -jnp.inf, dtype)
     rows = lambda n: jnp.zeros((n, lanes), jnp.int32)
-    path = (count > 0, count, count, jnp.zeros_like(low), rows(levels + 1), rows(levels)) if follow else ((),) * 6
-    fed = jnp.zeros((simulations + 1, lanes, 1 + width(_like(problem.sim))), jnp.uint32) if feed else ()
+    path = (
+        (count > 0, count, count, jnp.zeros_like(low), rows(levels + 1), rows(levels))
+        if follow
+        else ((),) * 6
+    )
+    fed = (
+        jnp.zeros((simulations + 1, lanes, 1 + width(_like(problem.sim))), jnp.uint32)
+        if feed
+        else ()
+    )
     return Lead(low, count, *path, fed)
 
 
@@ -52,12 +68,16 @@ def follows(tree):
 
 
 def feed_level(sim, start):
-    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9); ``start``: levels before the first step."""
+    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9); ``start``: levels
+    before the first step.
+    """
     return sim.horizon - sim.horizon // 2 + start
 
 
 def fed_of(tree, simulation, lane):
-    """What the rollouts of these simulations were fed, [..., words]; ``()`` where nothing ever is."""
+    """What the rollouts of these simulations were fed, [..., words]; ``()`` where nothing ever
+    is.
+    """
     fed = tree.lead.fed if isinstance(tree.lead, Lead) else ()
     return fed if isinstance(fed, tuple) else fed[simulation, lane]
 
@@ -69,10 +89,13 @@ def fed_or(sim, words, here, x):
 
 
 def onward(tree, walk, fresh, child, value, failed, i, middle):
-    """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B, words]: what their rollouts took at `feed_level`."""
+    """The `Lead` after simulation ``i``, whose episodes earned ``value`` [B]; ``middle`` [B,
+    words]: what their rollouts took at `feed_level`.
+    """
     lead = tree.lead
     better = fresh & jnp.isfinite(value) & (value > lead.value)
-    if follows(tree):  # of failures only: following every better miss costs more finds than it brings
+    # of failures only: following every better miss costs more finds than it brings
+    if follows(tree):
         better &= failed
     pick = lambda pred, new, old: jnp.where(pred, new, old)
     if follows(tree):
@@ -87,9 +110,13 @@ def onward(tree, walk, fresh, child, value, failed, i, middle):
             path=pick(moves[None], walk.path, lead.path),
         )
     if not isinstance(lead.fed, tuple):
-        row = pick((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])  # thesis Algorithm 9: a* after this rollout
+        # thesis Algorithm 9: a* after this rollout
+        row = pick((better & (middle[:, 0] > 0))[:, None], middle, lead.fed[i])
         lead = lead._replace(fed=jax.lax.dynamic_update_slice_in_dim(lead.fed, row[None], i + 1, 0))
-    return lead._replace(value=pick(better, value, lead.value), source=pick(better, jnp.zeros_like(lead.source) + i + 1, lead.source))
+    return lead._replace(
+        value=pick(better, value, lead.value),
+        source=pick(better, jnp.zeros_like(lead.source) + i + 1, lead.source),
+    )
 
 
 def packed(there, x):

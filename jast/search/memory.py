@@ -8,14 +8,20 @@ __all__ = ["available", "readable"]
 
 
 def available():
-    """Bytes that are free now: of the default accelerator, or of the machine where that is a CPU; None where the system does not tell."""
+    """Bytes that are free now: of the default accelerator, or of the machine where that is a CPU;
+    None where the system does not tell.
+    """
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+        return (
+            stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+        )
     try:
         with open("/proc/meminfo") as f:
-            return next(int(line.split()[1]) * 1024 for line in f if line.startswith("MemAvailable"))
+            return next(
+                int(line.split()[1]) * 1024 for line in f if line.startswith("MemAvailable")
+            )
     except (OSError, StopIteration):
         pass
     try:

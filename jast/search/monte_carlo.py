@@ -1,4 +1,6 @@
-"""Random search: independent episodes and nothing learned from any. The baseline of every other search."""
+"""Random search: independent episodes and nothing learned from any. The baseline of every other
+search.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +19,9 @@ from jast.search import episodes as E
 __all__ = ["monte_carlo"]
 
 LANES, HOSTED = 4096, 64
-"""Episodes in lockstep; of a system on the host, where a chunk takes long, and only between chunks can a search be watched and interrupted."""
+"""Episodes in lockstep; of a system on the host, where a chunk takes long, and only between chunks
+can a search be watched and interrupted.
+"""
 MOMENTS = 200
 """Of the history, about: a moment is at least a block of ``LANES`` episodes."""
 
@@ -38,17 +42,32 @@ class Found(NamedTuple):
 SAMPLES = choices.samples()
 
 
-def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=SAMPLES, top=64, record=False, progress=False, callback=None):
-    """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree. Maximises ``reward``.
+def monte_carlo(
+    key,
+    sim,
+    *,
+    episodes=100_000,
+    reward=rewards.STANDARD,
+    actions=SAMPLES,
+    top=64,
+    record=False,
+    progress=False,
+    callback=None,
+):
+    """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the
+    best: `SearchResult` of one tree. Maximises ``reward``.
 
-    With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up to chance. A random start is drawn likewise (from its own
-    distribution where actions are a box). The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``: distinct failures
-    kept, static like ``episodes``. ``record=True`` keeps the numbers of every episode (``result.trials``); without it memory does not grow with ``episodes``.
-    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which there are about 200 (a black box has one each 64
-    episodes); KeyboardInterrupt ends the search with the result of the whole chunks, and ``settings["interrupted"]``.
+    With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up
+    to chance. A random start is drawn likewise (from its own distribution where actions are a box).
+    The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``:
+    distinct failures kept, static like ``episodes``. ``record=True`` keeps the numbers of every
+    episode (``result.trials``); without it memory does not grow with ``episodes``.
+    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which
+    there are about 200 (a black box has one each 64 episodes); KeyboardInterrupt ends the search
+    with the result of the whole chunks, and ``settings["interrupted"]``.
 
-    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError for a count below 1 and where the simulator's functions or
-    the actions do not fit together.
+    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError
+    for a count below 1 and where the simulator's functions or the actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
     reward, settings = E.prepare("monte_carlo", key, sim, reward, actions, episodes=episodes)
@@ -56,7 +75,10 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
     key = tree_keys(key, 1)[0]
     if settings is None:
         if episodes * sim.horizon >= 2**31:
-            raise ValueError(f"monte_carlo: episodes times the horizon must be below 2^31 inside a transformation, received {episodes} x {sim.horizon}")
+            raise ValueError(
+                "monte_carlo: episodes times the horizon must be below 2^31 inside a"
+                f" transformation, received {episodes} x {sim.horizon}"
+            )
         found, counted = _chunk(key, sim, reward, actions, _nothing(sim, 1), 0, episodes, lanes)
         best = jax.tree.map(lambda a: a[0], _rebuild(key, sim, reward, actions, found.number[None]))
         return E.finish_traced(sim, reward, counted, best, found.reward[None])
@@ -66,26 +88,63 @@ def monte_carlo(key, sim, *, episodes=100_000, reward=rewards.STANDARD, actions=
     def chunk(found, begin, end):
         if record:
             found, counted, rows = _block(key, sim, reward, actions, found, begin, end, lanes)
-            return found, counted, found.reward[None], jax.tree.map(lambda a: a[: end - begin, None], E.trials(rows))
+            return (
+                found,
+                counted,
+                found.reward[None],
+                jax.tree.map(lambda a: a[: end - begin, None], E.trials(rows)),
+            )
         found, counted = _chunk(key, sim, reward, actions, found, begin, end, lanes)
         return found, counted, found.reward[None], None
 
     most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
     blocks = 1 if record or hosted(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
     ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
-    found, log = E.drive(chunk, _nothing(sim, top), ends, host=hosted(sim), progress=progress, callback=callback, name="monte_carlo")
-    rebuilt = _rebuild(key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number]))
+    found, log = E.drive(
+        chunk,
+        _nothing(sim, top),
+        ends,
+        host=hosted(sim),
+        progress=progress,
+        callback=callback,
+        name="monte_carlo",
+    )
+    rebuilt = _rebuild(
+        key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number])
+    )
     found, rebuilt = jax.device_get((found, rebuilt))
     n = int((found.top_reward > -jnp.inf).sum())
-    best, candidates = jax.tree.map(lambda a: a[0], rebuilt), jax.tree.map(lambda a: a[1 : n + 1], rebuilt)
-    found = E.finish(sim, reward, log, best, candidates, [0] * n, found.top_number[:n], found.top_count[:n], settings, top)
+    best, candidates = (
+        jax.tree.map(lambda a: a[0], rebuilt),
+        jax.tree.map(lambda a: a[1 : n + 1], rebuilt),
+    )
+    found = E.finish(
+        sim,
+        reward,
+        log,
+        best,
+        candidates,
+        [0] * n,
+        found.top_number[:n],
+        found.top_count[:n],
+        settings,
+        top,
+    )
     return found._replace(incidents=since(before, incidents(sim)))
 
 
 def _nothing(sim, top):
     zero, lowest = jnp.zeros((), jnp.int32), jnp.asarray(-jnp.inf, accumulator(sim))
     none = jnp.zeros((top,), jnp.int32)
-    return Found(jnp.zeros((), bool), lowest, zero, jnp.full((top,), lowest), none, none.astype(jnp.uint32), none)
+    return Found(
+        jnp.zeros((), bool),
+        lowest,
+        zero,
+        jnp.full((top,), lowest),
+        none,
+        none.astype(jnp.uint32),
+        none,
+    )
 
 
 @partial(jax.jit, static_argnames="lanes")
@@ -99,13 +158,17 @@ def _chunk(key, sim, reward, actions, found, begin, end, lanes):
 
     begin, end = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
     # compared by what is left, as the end may be the last int32
-    _, found, counted = lax.while_loop(lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, found, E.nothing()))
+    _, found, counted = lax.while_loop(
+        lambda c: (c[0] < end) & (c[0] >= begin), block, (begin, found, E.nothing())
+    )
     return found, counted
 
 
 @partial(jax.jit, static_argnames="lanes")
 def _block(key, sim, reward, actions, found, begin, end, lanes):
-    """Those of episodes ``begin`` .. ``end - 1`` that fit in the lanes: (`Found`, `Tally`, `Played`)."""
+    """Those of episodes ``begin`` .. ``end - 1`` that fit in the lanes: (`Found`, `Tally`,
+    `Played`).
+    """
     number = begin + jnp.arange(lanes, dtype=jnp.int32)
     live = (number < end) & (number >= begin)
     played = _play(key, sim, reward, actions, number, live)
@@ -114,14 +177,18 @@ def _block(key, sim, reward, actions, found, begin, end, lanes):
 
 def _play(key, sim, reward, actions, number, live, **how):
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-    draw_start, draw = (lambda key, row, dist, f=f: f(key, dist) for f in (actions.draw_start, actions.draw))
+    draw_start, draw = (
+        lambda key, row, dist, f=f: f(key, dist) for f in (actions.draw_start, actions.draw)
+    )
     return E.play(sim, reward, keys, draw_start, draw, live, **how)
 
 
 @jax.jit
 def _rebuild(key, sim, reward, actions, number):
     """The episodes of these numbers [m], with their disturbances."""
-    return _play(key, sim, reward, actions, number, jnp.ones(number.shape, bool), record=True, judge=False).episode
+    return _play(
+        key, sim, reward, actions, number, jnp.ones(number.shape, bool), record=True, judge=False
+    ).episode
 
 
 def _keep(found, played, number, live):
@@ -130,18 +197,41 @@ def _keep(found, played, number, live):
     failing = live & e.failure
     any_failure = jnp.any(failing)
     i = jnp.argmax(jnp.where(failing | ~any_failure, value, -jnp.inf))
-    better = (any_failure & ~found.failure) | ((any_failure == found.failure) & (value[i] > found.reward))
+    better = (any_failure & ~found.failure) | (
+        (any_failure == found.failure) & (value[i] > found.reward)
+    )
     pick = lambda a, b: jnp.where(better, a, b)
-    found = found._replace(failure=found.failure | any_failure, reward=pick(value[i], found.reward), number=pick(number[i], found.number))
+    found = found._replace(
+        failure=found.failure | any_failure,
+        reward=pick(value[i], found.reward),
+        number=pick(number[i], found.number),
+    )
 
     def merge(found):
         values = jnp.concatenate([found.top_reward, jnp.where(failing, value, -jnp.inf)])
-        numbers, tags = jnp.concatenate([found.top_number, number]), jnp.concatenate([found.top_tag, played.tag])
+        numbers, tags = (
+            jnp.concatenate([found.top_number, number]),
+            jnp.concatenate([found.top_tag, played.tag]),
+        )
         counts = jnp.concatenate([found.top_count, jnp.ones_like(number)])
         (k,) = found.top_reward.shape
         places, counts = E.distinct(jnp.ones(values.shape, bool), values, tags, numbers, counts, k)
-        taken = [a.at[places].get(mode="fill", fill_value=fill) for a, fill in ((values, -jnp.inf), (numbers, 0), (tags, 0))]
-        return found._replace(**dict(zip(("top_reward", "top_number", "top_tag", "top_count"), (*taken, counts), strict=True)))
+        taken = [
+            a.at[places].get(mode="fill", fill_value=fill)
+            for a, fill in ((values, -jnp.inf), (numbers, 0), (tags, 0))
+        ]
+        return found._replace(
+            **dict(
+                zip(
+                    ("top_reward", "top_number", "top_tag", "top_count"),
+                    (*taken, counts),
+                    strict=True,
+                )
+            )
+        )
 
-    # rarely anything enters, and sorting is dear; a repetition of the least kept one is to be counted, too
-    return lax.cond(jnp.any(failing & (value >= found.top_reward[-1])), merge, lambda found: found, found)
+    # rarely anything enters, and sorting is dear; a repetition of the least kept one is to be
+    # counted, too
+    return lax.cond(
+        jnp.any(failing & (value >= found.top_reward[-1])), merge, lambda found: found, found
+    )

@@ -1,4 +1,6 @@
-"""How `jast.search.cem` makes the disturbances of an episode: of latent normal numbers (`jast.cross_entropy.sequences`), or copied from good episodes."""
+"""How `jast.search.cem` makes the disturbances of an episode: of latent normal numbers
+(`jast.cross_entropy.sequences`), or copied from good episodes.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +12,14 @@ from jast.cross_entropy.sequences import place
 
 __all__ = ["copies", "drawer", "kinds"]
 
-_CHOICE = np.uint32(1 << 31)  # addresses of an episode's choice of parents, apart from those of its levels
+# addresses of an episode's choice of parents, apart from those of its levels
+_CHOICE = np.uint32(1 << 31)
 
 
 def kinds(sim, actions):
-    """How x0 and x are proposed: "latent" where they have a quantile function or a box, else "copy"."""
+    """How x0 and x are proposed: "latent" where they have a quantile function or a box, else
+    "copy".
+    """
     if isinstance(actions, choices.Quantiles):
         return "latent", "latent"
     if isinstance(actions, choices.UniformBox):  # a start is not of the box
@@ -25,8 +30,9 @@ def kinds(sim, actions):
 def copies(key, values, lengths, fresh, part):
     """The disturbances [T, ...] that one episode may copy, and whether it does [T].
 
-    ``values`` [n, T, ...]: those of n parents, of which ``lengths`` [n] rows count, -1: no parent. Each step has a parent of its own, drawn uniformly, and
-    with probability ``fresh`` none. The key is that of the episode; ``part`` tells x0 (0) from the steps (1).
+    ``values`` [n, T, ...]: those of n parents, of which ``lengths`` [n] rows count, -1: no parent.
+    Each step has a parent of its own, drawn uniformly, and with probability ``fresh`` none. The key
+    is that of the episode; ``part`` tells x0 (0) from the steps (1).
     """
     steps = jax.tree.leaves(values)[0].shape[1]
     t = jnp.arange(steps, dtype=jnp.int32)
@@ -38,7 +44,9 @@ def copies(key, values, lengths, fresh, part):
 
 
 def drawer(kind, actions, anew):
-    """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copies`; ``anew(key, distribution)`` draws where there is nothing to copy."""
+    """``(key, row, distribution) -> disturbance``, the row being z, or a pair of `copies`;
+    ``anew(key, distribution)`` draws where there is nothing to copy.
+    """
 
     def latent(key, z, dist):
         return place(actions, dist, z)

@@ -1,4 +1,6 @@
-"""Action pruning (MCFS-AP A1): the robust child becomes the root, its subtree stays, and the old root's statistics are kept for training."""
+"""Action pruning (MCFS-AP A1): the robust child becomes the root, its subtree stays, and the old
+root's statistics are kept for training.
+"""
 
 from typing import Any, NamedTuple
 
@@ -24,7 +26,9 @@ class Roots(NamedTuple):
     actions: Any
     """[B, K, ...] the disturbances x of the children."""
     starts: Any
-    """[B, K, ...] the x0 of the children, which are the choices at depth 0 of a random start; ``()`` for a system with one start."""
+    """[B, K, ...] the x0 of the children, which are the choices at depth 0 of a random start;
+    ``()`` for a system with one start.
+    """
     visits: jax.Array
     """[B, K] int32: 0 where there is no such child."""
     q: jax.Array
@@ -34,9 +38,11 @@ class Roots(NamedTuple):
 
 
 def prune(problem, axes, tree, children, memoize="node"):
-    """Make the most visited child of each root the root (ties: the first made): the tree and the old roots' `Roots`.
+    """Make the most visited child of each root the root (ties: the first made): the tree and the
+    old roots' `Roots`.
 
-    ``children``: the greatest number of children a node can have, static. A tree whose new root is an episode's end is at its end.
+    ``children``: the greatest number of children a node can have, static. A tree whose new root is
+    an episode's end is at its end.
     """
     root, level = tree.root, tree.depth
     searching = tree.alive & ~tree.ended
@@ -49,11 +55,17 @@ def prune(problem, axes, tree, children, memoize="node"):
     source, fed = (), ()
     if follows(tree):
         like = node_shapes(tree, memoize)
-        known = jax.vmap(jax.vmap(lambda w: unpack(w, like).source))(tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]])
+        known = jax.vmap(jax.vmap(lambda w: unpack(w, like).source))(
+            tree.nodes[jnp.abs(child).astype(jnp.int32), lane[:, None]]
+        )
         source = jnp.where(visits > 0, known, 0)
         fed = fed_of(tree, jnp.maximum(source - 1, 0), lane[:, None])
-    draw = lambda p, key, root, level, state, *of: jax.vmap(lambda slot, *of: choose(p, key, root, slot, level, state, *of))(slots, *of)
-    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(problem, tree.key, root, level, state, source, fed)
+    draw = lambda p, key, root, level, state, *of: jax.vmap(
+        lambda slot, *of: choose(p, key, root, slot, level, state, *of)
+    )(slots, *of)
+    starts, actions = jax.vmap(draw, in_axes=(axes, 0, 0, 0, 0, 0, 0))(
+        problem, tree.key, root, level, state, source, fed
+    )
     roots = Roots(state, level, actions, starts, visits.astype(jnp.int32), q, searching)
 
     slot = jnp.argmax(visits, axis=1).astype(jnp.int32)
@@ -73,25 +85,35 @@ def prune(problem, axes, tree, children, memoize="node"):
     )
     if follows(tree):  # what is known of another branch says nothing of this one
         lead, keep = tree.lead, _pick(tree.lead.trail.T, level + 1) == new
-        tree = tree._replace(lead=lead._replace(on=lead.on & keep, value=jnp.where(keep, lead.value, -jnp.inf)))
+        tree = tree._replace(
+            lead=lead._replace(on=lead.on & keep, value=jnp.where(keep, lead.value, -jnp.inf))
+        )
     if memoize == "root":
         of = jax.tree.map(lambda a: jax.vmap(lambda row, j: row[j])(a, slot), (source, fed))
-        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(problem, tree.key, root, slot, level, state, *of)
+        after = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
+            problem, tree.key, root, slot, level, state, *of
+        )
         tree = tree._replace(base=select_lanes(move, after, state))
     return tree, roots
 
 
 def _settle(tree):
-    """The visits and returns of this turn, added to the edges above the root: the backup of Algorithm 1 goes to the first root."""
+    """The visits and returns of this turn, added to the edges above the root: the backup of
+    Algorithm 1 goes to the first root.
+    """
     place = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
     at = jnp.where(place < tree.depth[None], tree.path, tree.edges.size)
     places = jnp.stack([at + VISITS, at + RETURNS]).reshape(-1)
     values = jnp.broadcast_to(tree.turn[:, None], (2, *at.shape)).reshape(-1)
-    return tree._replace(edges=tree.edges.at[places].add(values, mode="drop"), turn=jnp.zeros_like(tree.turn))
+    return tree._replace(
+        edges=tree.edges.at[places].add(values, mode="drop"), turn=jnp.zeros_like(tree.turn)
+    )
 
 
 def _children(tree, children):
-    """Of each root's children: their pages' rows [B, pages], and [B, children] visits, returns, ids and rewards; 0 where there is none."""
+    """Of each root's children: their pages' rows [B, pages], and [B, children] visits, returns, ids
+    and rewards; 0 where there is none.
+    """
     (lanes,) = tree.key.shape
     lane = jnp.arange(lanes, dtype=jnp.int32)
     edges = tree.edges.reshape(-1, ROW)
@@ -104,7 +126,10 @@ def _children(tree, children):
 
     start = (tree.root * lanes + lane, jnp.ones((lanes,), bool))
     _, (rows, records) = lax.scan(page, start, None, length=-(-children // PAGE))
-    columns = (records[:, :, c : c + PAGE].swapaxes(0, 1).reshape(lanes, -1)[:, :children] for c in (VISITS, RETURNS, CHILD, REWARD))
+    columns = (
+        records[:, :, c : c + PAGE].swapaxes(0, 1).reshape(lanes, -1)[:, :children]
+        for c in (VISITS, RETURNS, CHILD, REWARD)
+    )
     return rows.T, *columns
 
 
@@ -113,7 +138,11 @@ def _root_state(problem, axes, tree, memoize):
         (lanes,) = tree.key.shape
         like = node_shapes(tree, memoize)
         return jax.vmap(lambda w: unpack(w, like).state)(tree.nodes[tree.root, jnp.arange(lanes)])
-    return tree.base if memoize == "root" else replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
+    return (
+        tree.base
+        if memoize == "root"
+        else replay_to(problem, axes, tree, tree.trail, tree.depth, memoize)[0]
+    )
 
 
 def _pick(array, index):

@@ -1,4 +1,6 @@
-"""Episodes of a tree search, rebuilt from the number of their simulation: choices are addressed, so none has to be stored."""
+"""Episodes of a tree search, rebuilt from the number of their simulation: choices are addressed, so
+none has to be stored.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +9,23 @@ from jax import lax
 from jast.episode import Episode, blank
 from jast.search.lead import fed_of
 from jast.search.records import unpack
-from jast.search.tree import FAILURE, FRESH, choose, choose_rollout, levels, node_shapes, of_lanes, take
+from jast.search.tree import (
+    FAILURE,
+    FRESH,
+    choose,
+    choose_rollout,
+    levels,
+    node_shapes,
+    of_lanes,
+    take,
+)
 
 __all__ = ["rebuild"]
 
 
 def rebuild(problem, axes, tree, lane, i, memoize="node"):
-    """The episode of simulation ``i`` [n] of tree ``lane`` [n]: an `Episode` [n, ...] with the search's own reward, without states and true log p.
+    """The episode of simulation ``i`` [n] of tree ``lane`` [n]: an `Episode` [n, ...] with the
+    search's own reward, without states and true log p.
 
     To be passed through `jast.replay`, which gives it its exact numbers.
     """
@@ -32,24 +44,41 @@ def _one(problem, axes, tree, lane, i, memoize):
         return record.parent, (node, record.parent, record.slot, record.source)
 
     _, (nodes, parents, slots, sources) = lax.scan(up, leaf, None, length=height)
-    depth = jnp.sum(nodes > 0, dtype=jnp.int32)  # choices made in the tree; those of the rollout follow
+    # choices made in the tree; those of the rollout follow
+    depth = jnp.sum(nodes > 0, dtype=jnp.int32)
     rolling = jax.random.fold_in(key, i)
     begin = jax.tree.map(lambda a: a[lane], tree.origin)
 
     def down(at, level):
         up_there = jnp.clip(depth - 1 - level, 0, height - 1)
         source = jax.tree.map(lambda a: a[up_there], sources)
-        of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if problem.choice.follow else ()
+        of = (
+            (source, fed_of(tree, jnp.maximum(source - 1, 0), lane))
+            if problem.choice.follow
+            else ()
+        )
         chosen = choose(problem, key, parents[up_there], slots[up_there], level, at.state, *of)
         rolled = choose_rollout(problem, rolling, key, level, at.state, fed_of(tree, i, lane))
         x0, x = action = jax.tree.map(lambda a, b: jnp.where(level < depth, a, b), chosen, rolled)
         after = take(problem, level, at, action)
         kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at, after)
-        return kept, (x0, jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x), ~at.done)
+        return kept, (
+            x0,
+            jax.tree.map(lambda a: jnp.where(at.done, jnp.zeros((), a.dtype), a), x),
+            ~at.done,
+        )
 
     start = blank(sim, begin)._replace(done=tree.ended[lane])
     end, (x0s, xs, lived) = lax.scan(down, start, jnp.arange(height, dtype=jnp.int32))
     first = height - sim.horizon
     x0 = jax.tree.map(lambda a: a[0], x0s)
     steps = jnp.sum(lived[first:], dtype=jnp.int32)
-    return Episode(x0, jax.tree.map(lambda a: a[first:], xs), end.log_prob, end.distance, (outcome & FAILURE) > 0, steps, tree.log[i, lane])
+    return Episode(
+        x0,
+        jax.tree.map(lambda a: a[first:], xs),
+        end.log_prob,
+        end.distance,
+        (outcome & FAILURE) > 0,
+        steps,
+        tree.log[i, lane],
+    )

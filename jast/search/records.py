@@ -1,6 +1,8 @@
-"""Pytrees as rows of 32-bit words, so that a tree keeps all it knows of a node in one place in memory.
+"""Pytrees as rows of 32-bit words, so that a tree keeps all it knows of a node in one place in
+memory.
 
-Reading a node is then one access instead of one a leaf: most of the time of a search on a cheap simulator goes into waiting for memory.
+Reading a node is then one access instead of one a leaf: most of the time of a search on a cheap
+simulator goes into waiting for memory.
 """
 
 import math
@@ -23,8 +25,12 @@ def width(like):
 
 
 def pack(tree):
-    """The leaves of one pytree (no batch axis) as uint32 [width]; exact for every dtype up to 64 bits."""
-    return jnp.concatenate([jnp.zeros((0,), jnp.uint32), *(_words(jnp.ravel(a)) for a in jax.tree.leaves(tree))])
+    """The leaves of one pytree (no batch axis) as uint32 [width]; exact for every dtype up to 64
+    bits.
+    """
+    return jnp.concatenate(
+        [jnp.zeros((0,), jnp.uint32), *(_words(jnp.ravel(a)) for a in jax.tree.leaves(tree))]
+    )
 
 
 def unpack(words, like):
@@ -44,7 +50,9 @@ def _words(a):
     if jnp.issubdtype(a.dtype, jnp.complexfloating):
         return _words(jnp.stack([a.real, a.imag], axis=-1).reshape(-1))
     if a.dtype.itemsize < 4:
-        return lax.bitcast_convert_type(a, {1: jnp.uint8, 2: jnp.uint16}[a.dtype.itemsize]).astype(jnp.uint32)
+        return lax.bitcast_convert_type(a, {1: jnp.uint8, 2: jnp.uint16}[a.dtype.itemsize]).astype(
+            jnp.uint32
+        )
     return lax.bitcast_convert_type(a, jnp.uint32).reshape(-1)
 
 
@@ -55,5 +63,7 @@ def _value(words, dtype):
         parts = _value(words, jnp.finfo(dtype).dtype).reshape(-1, 2)
         return lax.complex(parts[:, 0], parts[:, 1])
     if dtype.itemsize < 4:
-        return lax.bitcast_convert_type(words.astype({1: jnp.uint8, 2: jnp.uint16}[dtype.itemsize]), dtype)
+        return lax.bitcast_convert_type(
+            words.astype({1: jnp.uint8, 2: jnp.uint16}[dtype.itemsize]), dtype
+        )
     return lax.bitcast_convert_type(words.reshape(-1, 2) if dtype.itemsize == 8 else words, dtype)

@@ -1,4 +1,6 @@
-"""What every search returns, how its episodes are counted and ranked, and its archive of failures."""
+"""What every search returns, how its episodes are counted and ranked, and its archive of
+failures.
+"""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +24,9 @@ class History(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they were simulated."""
+    """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they
+    were simulated.
+    """
 
     reward: Any
     """float; -inf where the episode was invalid."""
@@ -33,16 +37,24 @@ class Trials(NamedTuple):
     failure: Any
     """bool."""
     ran: Any
-    """bool: it was simulated; a search tree that comes to an episode's end again has its outcome already."""
+    """bool: it was simulated; a search tree that comes to an episode's end again has its outcome
+    already.
+    """
 
 
 class SearchResult(NamedTuple):
-    """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap` all are traced arrays and ``failures`` is None."""
+    """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap`
+    all are traced arrays and ``failures`` is None.
+    """
 
     best: Episode
-    """The best episode: the failure of the highest reward, or the episode of the highest reward where none failed; with its states."""
+    """The best episode: the failure of the highest reward, or the episode of the highest reward
+    where none failed; with its states.
+    """
     best_reward_per_tree: Any
-    """[trees] float: reward of each tree's best episode, likewise; -inf where the simulator returned no finite number."""
+    """[trees] float: reward of each tree's best episode, likewise; -inf where the simulator
+    returned no finite number.
+    """
     failures: Failures | None
     """The archive: the best distinct failures, replayed (`jast.failures`)."""
     episodes: Any
@@ -50,14 +62,20 @@ class SearchResult(NamedTuple):
     simulator_steps: Any
     """int: calls of ``step``; an episode that starts from a kept state costs only its new steps."""
     first_failure: Any
-    """int: how many episodes were simulated up to and including the first that failed, or None (-1 when traced)."""
+    """int: how many episodes were simulated up to and including the first that failed, or None (-1
+    when traced).
+    """
     failing_share: Any
-    """float: share of the simulated episodes that failed. The share of the trees is ``failing_trees``."""
+    """float: share of the simulated episodes that failed. The share of the trees is
+    ``failing_trees``.
+    """
     failing: Any
     """[trees] bool: whether the tree found a failure."""
     history: History | None
     invalid: Any
-    """int: episodes in which the simulator, a density or the reward gave NaN or infinity; they count as no failure, with reward -inf."""
+    """int: episodes in which the simulator, a density or the reward gave NaN or infinity; they
+    count as no failure, with reward -inf.
+    """
     settings: dict | None
     """What was asked for: method, counts, seed."""
     roots: Any = None
@@ -67,7 +85,9 @@ class SearchResult(NamedTuple):
     trials: Trials | None = None
     """Every episode, where the search was asked to ``record``."""
     incidents: tuple = ()
-    """What went wrong on the host of a black box: `jast.incidents.Incident`, with counts and an example of each."""
+    """What went wrong on the host of a black box: `jast.incidents.Incident`, with counts and an
+    example of each.
+    """
     lessons: tuple = ()
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
 
@@ -82,13 +102,17 @@ class SearchResult(NamedTuple):
 
 def table(results):
     """A readable table of several searches, a dict name -> `SearchResult`."""
-    lines = [f"{'method':14} {'episodes':>10} {'steps':>12} {'failing':>9} {'trees':>7} {'first':>9} {'best reward':>12} {'mean best':>10}"]
+    lines = [
+        f"{'method':14} {'episodes':>10} {'steps':>12} {'failing':>9} {'trees':>7} {'first':>9}"
+        f" {'best reward':>12} {'mean best':>10}"
+    ]
     for name, r in results.items():
         first = "-" if r.first_failure is None else str(r.first_failure)
         best = np.asarray(r.best_reward_per_tree)
         lines.append(
-            f"{name:14} {r.episodes:10d} {r.simulator_steps:12d} {100 * r.failing_share:8.3f}% {100 * r.failing_trees:6.1f}% {first:>9} "
-            f"{float(r.best.reward):12.4f} {best[np.isfinite(best)].mean() if np.isfinite(best).any() else -np.inf:10.4f}"
+            f"{name:14} {r.episodes:10d} {r.simulator_steps:12d} {100 * r.failing_share:8.3f}%"
+            f" {100 * r.failing_trees:6.1f}% {first:>9} {float(r.best.reward):12.4f}"
+            f" {best[np.isfinite(best)].mean() if np.isfinite(best).any() else -np.inf:10.4f}"
         )
     return "\n".join(lines)
 
@@ -96,17 +120,32 @@ def table(results):
 def _words(result):
     if bool(result.best.failure):
         e = result.best
-        text = f"likeliest failure: reward {float(e.reward):.4f}, log p {float(e.log_prob):.4f}, distance {float(e.distance):.4f}, {int(e.length)} steps"
+        text = (
+            f"likeliest failure: reward {float(e.reward):.4f}, log p {float(e.log_prob):.4f},"
+            f" distance {float(e.distance):.4f}, {int(e.length)} steps"
+        )
     else:
-        text = f"no failure was found; the nearest episode came to distance {float(result.best.distance):.4f}"
+        text = (
+            "no failure was found; the nearest episode came to distance"
+            f" {float(result.best.distance):.4f}"
+        )
     if result.invalid:
-        text += f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward returned NaN or infinity"
+        text += (
+            f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward"
+            " returned NaN or infinity"
+        )
     text += "".join(f"\n  {incident}" for incident in result.incidents)
     for n, lesson in enumerate(result.lessons):
         for name, of in lesson.items():
             if of.rejected:
-                text += f"\nround {n + 1}: training of the {name} head was rejected, its loss was {of.loss}; the parameters from before were kept"
+                text += (
+                    f"\nround {n + 1}: training of the {name} head was rejected, its loss was"
+                    f" {of.loss}; the parameters from before were kept"
+                )
     if dropped := sum(of.dropped for lesson in result.lessons for of in lesson.values()):
-        text += f"\n{dropped} samples for the heads were left out: observe, a disturbance or a reward was not finite"
+        text += (
+            f"\n{dropped} samples for the heads were left out: observe, a disturbance or a reward"
+            " was not finite"
+        )
     note = (result.settings or {}).get("interrupted")
     return text + (f"\ninterrupted: {note}" if note else "")

@@ -1,4 +1,6 @@
-"""Running a tree search: trees in groups over threads, in chunks that can be watched and interrupted; or all in one traced program."""
+"""Running a tree search: trees in groups over threads, in chunks that can be watched and
+interrupted; or all in one traced program.
+"""
 
 import concurrent.futures
 import functools
@@ -50,7 +52,9 @@ class Harvest(NamedTuple):
     steps: Any
     """[B] simulator steps."""
     roots: Any
-    """`Roots` with a leading axis [prunes], zeros from where all trees of the group are at their end."""
+    """`Roots` with a leading axis [prunes], zeros from where all trees of the group are at their
+    end.
+    """
     found: Episode
     """[n] the best failing episodes, or the best ones of trees without failure."""
     tree: Any
@@ -95,16 +99,20 @@ def _shared(problem):
 def bytes_per_tree(problem, plan):
     """Bytes that one tree takes while it grows, from the shapes of its arrays."""
     simulations = plan.prunes * plan.simulations
-    build = lambda p, keys: make(p, _shared(p), keys, simulations, plan.memoize, plan.pages, plan.record)
+    build = lambda p, keys: make(
+        p, _shared(p), keys, simulations, plan.memoize, plan.pages, plan.record
+    )
     tree = jax.eval_shape(build, problem, tree_keys(jax.random.key(0), 2))
     return sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree)) // 2
 
 
 def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk, first=0):
-    """Grow one tree a key, ``lanes`` at a time in each of ``threads`` threads: a list of `Harvest` in the order of the keys, and whether it was interrupted.
+    """Grow one tree a key, ``lanes`` at a time in each of ``threads`` threads: a list of `Harvest`
+    in the order of the keys, and whether it was interrupted.
 
-    ``first``: the number of the first tree. ``on_chunk(simulations)`` is called from the main thread when so many more simulations are done; a
-    KeyboardInterrupt there, or from the keyboard, ends all trees at their next chunk.
+    ``first``: the number of the first tree. ``on_chunk(simulations)`` is called from the main
+    thread when so many more simulations are done; a KeyboardInterrupt there, or from the keyboard,
+    ends all trees at their next chunk.
     """
     trees = keys.shape[0]
     groups = [np.arange(start, min(start + lanes, trees)) for start in range(0, trees, lanes)]
@@ -121,7 +129,16 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
             return None
         with surroundings():
             try:
-                return _one_group(problem, keys[np.resize(group, lanes)], group + first, plan, chunk, candidates, report, stop)
+                return _one_group(
+                    problem,
+                    keys[np.resize(group, lanes)],
+                    group + first,
+                    plan,
+                    chunk,
+                    candidates,
+                    report,
+                    stop,
+                )
             except BaseException:
                 stop.set()  # the other groups need not finish either
                 raise
@@ -132,7 +149,9 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
         waiting = set(futures)
         while waiting:
             try:
-                _, waiting = concurrent.futures.wait(waiting, timeout=0.05, return_when=concurrent.futures.FIRST_EXCEPTION)
+                _, waiting = concurrent.futures.wait(
+                    waiting, timeout=0.05, return_when=concurrent.futures.FIRST_EXCEPTION
+                )
                 if done[0] > told:
                     told, news = done[0], done[0] - told
                     on_chunk(news)
@@ -146,12 +165,16 @@ def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk
 
 
 def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
-    tree = _make(problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record)
+    tree = _make(
+        problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record
+    )
     turns = []
     for turn in range(plan.prunes):
         first, end = turn * plan.simulations, (turn + 1) * plan.simulations
         for at in range(first, end, chunk):
-            tree = jax.block_until_ready(_grow(problem, tree, at, min(at + chunk, end), plan.memoize))
+            tree = jax.block_until_ready(
+                _grow(problem, tree, at, min(at + chunk, end), plan.memoize)
+            )
             report((min(at + chunk, end) - at) * len(group))
             if stop.is_set():
                 break
@@ -159,15 +182,42 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
         turns.append(jax.device_get(jax.tree.map(lambda a: a[: len(group)], roots)))
         if stop.is_set() or not bool(jnp.any(tree.alive)):
             break
-    log, outcome, steps = (np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps))
+    log, outcome, steps = (
+        np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps)
+    )
     lane, i = _candidates(log, outcome, candidates)
     wanted = candidates + len(group)
-    found = _rebuild(problem, tree, np.resize(lane, wanted).astype(np.int32), np.resize(i, wanted).astype(np.int32), plan.memoize)
+    found = _rebuild(
+        problem,
+        tree,
+        np.resize(lane, wanted).astype(np.int32),
+        np.resize(i, wanted).astype(np.int32),
+        plan.memoize,
+    )
     found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
-    roots = jax.tree.map(lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]), *turns)
-    edges = jax.device_get(jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))) if plan.edges else ()
+    roots = jax.tree.map(
+        lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]),
+        *turns,
+    )
+    edges = (
+        jax.device_get(
+            jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))
+        )
+        if plan.edges
+        else ()
+    )
     trials = np.asarray(tree.trials)[..., : len(group)] if plan.record else ()
-    return Harvest(log, outcome, steps, roots, found, group[lane].astype(np.int32), i.astype(np.int32), edges, trials)
+    return Harvest(
+        log,
+        outcome,
+        steps,
+        roots,
+        found,
+        group[lane].astype(np.int32),
+        i.astype(np.int32),
+        edges,
+        trials,
+    )
 
 
 def _candidates(log, outcome, most):
@@ -195,7 +245,9 @@ class Traced(NamedTuple):
 
 
 def grow_traced(problem, keys, plan):
-    """The whole search as one traced program, for `jax.jit` and `jax.vmap`: `Traced`. Under `jax.vmap` the batch becomes more trees, not more programs."""
+    """The whole search as one traced program, for `jax.jit` and `jax.vmap`: `Traced`. Under
+    `jax.vmap` the batch becomes more trees, not more programs.
+    """
     leaves, treedef = jax.tree.flatten(problem)
     return _batchable(treedef, plan, (None,) * len(leaves))(keys, leaves)
 
@@ -214,12 +266,22 @@ def _batchable(treedef, plan, axes):
 
         def spread(leaf, is_batched, axis):
             if not is_batched:
-                return (leaf, None) if axis is None else (jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)), 0)
-            leaf = leaf if axis == 0 else jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
+                return (
+                    (leaf, None)
+                    if axis is None
+                    else (jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)), 0)
+                )
+            leaf = (
+                leaf
+                if axis == 0
+                else jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
+            )
             return leaf.reshape(size * lanes, *leaf.shape[2:]), 0
 
         pairs = [spread(*each) for each in zip(leaves, leaf_batched, axes, strict=True)]
-        out = _batchable(treedef, plan, tuple(axis for _, axis in pairs))(keys.reshape(-1), [leaf for leaf, _ in pairs])
+        out = _batchable(treedef, plan, tuple(axis for _, axis in pairs))(
+            keys.reshape(-1), [leaf for leaf, _ in pairs]
+        )
         out = jax.tree.map(lambda a: a.reshape(size, lanes, *a.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
@@ -230,17 +292,25 @@ def _traced(problem, axes, keys, plan):
     tree = make(problem, axes, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages)
 
     def turn(n, tree):
-        tree = simulate.grow(problem, axes, tree, n * plan.simulations, (n + 1) * plan.simulations, plan.memoize)
+        tree = simulate.grow(
+            problem, axes, tree, n * plan.simulations, (n + 1) * plan.simulations, plan.memoize
+        )
         return prune(problem, axes, tree, plan.children, plan.memoize)[0]
 
     tree = lax.fori_loop(0, plan.prunes, turn, tree)
     has = lambda bit: (tree.outcome & bit) > 0
     failing = has(FRESH) & has(FAILURE)
-    value = jnp.where(has(FRESH) & jnp.where(jnp.any(failing, axis=0), failing, True), tree.log, -jnp.inf)
+    value = jnp.where(
+        has(FRESH) & jnp.where(jnp.any(failing, axis=0), failing, True), tree.log, -jnp.inf
+    )
     best = jnp.argmax(value, axis=0).astype(jnp.int32)
     lane = jnp.arange(keys.shape[0], dtype=jnp.int32)
     found = rebuild(problem, axes, tree, lane, best, plan.memoize)
     count = lambda bit: jnp.sum(has(bit), axis=0, dtype=jnp.int32)
-    first = jnp.where(jnp.any(has(FAILURE), axis=0), jnp.argmax(has(FAILURE), axis=0), tree.log.shape[0]).astype(jnp.int32)
-    exact = jax.vmap(lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0))(problem, found)
+    first = jnp.where(
+        jnp.any(has(FAILURE), axis=0), jnp.argmax(has(FAILURE), axis=0), tree.log.shape[0]
+    ).astype(jnp.int32)
+    exact = jax.vmap(
+        lambda p, e: play_back(p.sim, p.reward, e.x0, e.disturbances, e.length), in_axes=(axes, 0)
+    )(problem, found)
     return Traced(exact, count(FAILURE), count(RAN), tree.steps, count(INVALID), first)

@@ -34,9 +34,13 @@ __all__ = ["child_state", "grow", "replay_to", "select_lanes"]
 
 
 def grow(problem, axes, tree, begin_at, end_at, memoize="node"):
-    """Run simulations ``begin_at`` .. ``end_at - 1`` in every tree (traced: one program for any number); none where all trees are at their end."""
+    """Run simulations ``begin_at`` .. ``end_at - 1`` in every tree (traced: one program for any
+    number); none where all trees are at their end.
+    """
     end_at = jnp.where(jnp.any(tree.alive), end_at, begin_at)
-    return lax.fori_loop(begin_at, end_at, lambda i, tree: _simulation(problem, axes, tree, i, memoize), tree)
+    return lax.fori_loop(
+        begin_at, end_at, lambda i, tree: _simulation(problem, axes, tree, i, memoize), tree
+    )
 
 
 def _simulation(problem, axes, tree, i, memoize):
@@ -51,57 +55,113 @@ def _simulation(problem, axes, tree, i, memoize):
     thin = lambda progress: progress if recorded else progress._replace(log_prob=zero)
 
     def expand():
-        """The new child of each tree; and the node it is a child of, or the episode's end that selection ran into."""
+        """The new child of each tree; and the node it is a child of, or the episode's end that
+        selection ran into.
+        """
         at = jnp.where(fresh, walk.node, -walk.best.child)
-        desk = lax.dynamic_update_slice_in_dim(tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0)
+        desk = lax.dynamic_update_slice_in_dim(
+            tree.desk, tree.nodes[at, lane][None], jnp.minimum(i, 0), 0
+        )
         like = node_shapes(tree, memoize)
         node = jax.vmap(lambda w: unpack(w, like))(desk[0])
-        state, replayed = (node.state, jnp.zeros_like(at)) if memoize == "node" else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
+        state, replayed = (
+            (node.state, jnp.zeros_like(at))
+            if memoize == "node"
+            else replay_to(problem, axes, tree, walk.trail, walk.depth, memoize)
+        )
         so_far = node.log_prob if recorded else zero
-        before = Progress(state, so_far, walk.reward, node.distance, nothing, nothing, nothing, zero if episodic else ())
+        before = Progress(
+            state,
+            so_far,
+            walk.reward,
+            node.distance,
+            nothing,
+            nothing,
+            nothing,
+            zero if episodic else (),
+        )
         of = (source, fed_of(tree, jnp.maximum(source - 1, 0), lane)) if follows(tree) else ((), ())
-        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of)
+        child = jax.vmap(_child, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))(
+            problem, tree.key, walk.node, walk.best.slot, walk.depth, before, *of
+        )
         known = node.reward, node.failure, node.invalid, (node.distance, so_far) if recorded else ()
         return desk, thin(child), replayed, known, fed_of(tree, jnp.zeros_like(lane) + i, lane)
 
-    # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA copies the tree
-    nobody = lambda: (tree.desk, *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:]))
-    desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = lax.cond(jnp.any(tree.alive), expand, nobody)
+    # in a conditional, so that all reads of the tree are over before the first write: otherwise XLA
+    # copies the tree
+    nobody = lambda: (
+        tree.desk,
+        *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(expand)[1:]),
+    )
+    desk, child, replayed, (known_reward, known_failure, known_invalid, known_trial), fed = (
+        lax.cond(jnp.any(tree.alive), expand, nobody)
+    )
 
-    # roll out; lanes that have ended step on, and only what is summed up is masked (and the state, where it is yet to be judged)
+    # roll out; lanes that have ended step on, and only what is summed up is masked (and the state,
+    # where it is yet to be judged)
     key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(tree.key, i)
     middle = feed_level(problem.sim, int(random_start(problem.sim)))
 
     def roll(carry):
         level, steps, at, taken = carry
         live = ~at.done
-        after, x = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0, 0))(problem, key, tree.key, level, at, fed)
-        kept = jax.tree.map(lambda a, b: jnp.where(live, b, a), at._replace(state=()), after._replace(state=()))
+        after, x = jax.vmap(_rolled, in_axes=(axes, 0, 0, 0, 0, 0))(
+            problem, key, tree.key, level, at, fed
+        )
+        kept = jax.tree.map(
+            lambda a, b: jnp.where(live, b, a), at._replace(state=()), after._replace(state=())
+        )
         if problem.choice.feed:
             here = live & (level == middle)
             taken = jnp.where(here[:, None], jax.vmap(packed)(here, x), taken)
         state = select_lanes(live, after.state, at.state) if episodic else after.state
         return level + 1, steps + _one(live), thin(kept._replace(state=state)), taken
 
-    steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))  # a random start is a level, but no step
-    carry = walk.depth + 1, steps, child._replace(done=child.done | ~fresh), jnp.zeros_like(fed) if problem.choice.feed else ()
+    # a random start is a level, but no step
+    steps = _one(fresh & (walk.depth >= levels(problem.sim) - problem.sim.horizon))
+    carry = (
+        walk.depth + 1,
+        steps,
+        child._replace(done=child.done | ~fresh),
+        jnp.zeros_like(fed) if problem.choice.feed else (),
+    )
     _, steps, end, taken = lax.while_loop(lambda c: jnp.any(~c[2].done), roll, carry)
     if episodic:
-        end = jax.vmap(lambda p, e, live: conclude(p.sim, p.reward, e, live), in_axes=(axes, 0, 0))(problem, end, fresh)
-        child = jax.tree.map(lambda a, b: jnp.where(child.done, b, a), child._replace(state=()), end._replace(state=()))._replace(state=child.state)
+        end = jax.vmap(lambda p, e, live: conclude(p.sim, p.reward, e, live), in_axes=(axes, 0, 0))(
+            problem, end, fresh
+        )
+        child = jax.tree.map(
+            lambda a, b: jnp.where(child.done, b, a),
+            child._replace(state=()),
+            end._replace(state=()),
+        )._replace(state=child.state)
 
     value = jnp.where(fresh, end.reward, known_reward)
     finite = jnp.isfinite(value)
     worst = jnp.where(finite & tree.alive, jnp.minimum(tree.worst, value), tree.worst)
     backed = jnp.where(finite, value, jnp.where(jnp.isfinite(worst), worst, 0))
     first = tree.ended & tree.alive
-    failed, invalid = jnp.where(fresh, end.failure, known_failure), jnp.where(fresh, end.invalid, known_invalid)
-    bits = _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
+    failed, invalid = (
+        jnp.where(fresh, end.failure, known_failure),
+        jnp.where(fresh, end.invalid, known_invalid),
+    )
+    bits = (
+        _bit(fresh | first, FRESH) | _bit(failed, FAILURE) | _bit(invalid, INVALID) | jnp.uint8(RAN)
+    )
     bits = jnp.where(tree.alive, bits, 0).astype(jnp.uint8)
     state = child.state if memoize == "node" else ()
     numbers = child.reward, child.distance, child.failure, child.invalid
-    kept = Node(walk.node, walk.best.slot, *numbers, state, source, child.log_prob if recorded else ())
-    trial = tuple(jnp.where(fresh, a, b) for a, b in zip((end.distance, end.log_prob), known_trial, strict=True)) if recorded else ()
+    kept = Node(
+        walk.node, walk.best.slot, *numbers, state, source, child.log_prob if recorded else ()
+    )
+    trial = (
+        tuple(
+            jnp.where(fresh, a, b)
+            for a, b in zip((end.distance, end.log_prob), known_trial, strict=True)
+        )
+        if recorded
+        else ()
+    )
     tree = tree._replace(
         edges=_back_up(tree, walk, fresh, child, backed, i + 1, link=not problem.values),
         nodes=lax.dynamic_update_slice_in_dim(tree.nodes, jax.vmap(pack)(kept)[None], i + 1, 0),
@@ -114,24 +174,49 @@ def _simulation(problem, axes, tree, i, memoize):
         log=lax.dynamic_update_slice_in_dim(tree.log, value[None], i, 0),
         outcome=lax.dynamic_update_slice_in_dim(tree.outcome, bits[None], i, 0),
         alive=tree.alive & ~tree.ended,
-        lead=onward(tree, walk, fresh, child, value, failed, i, taken) if isinstance(tree.lead, Lead) else (),
-        trials=lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0) if recorded else (),
+        lead=(
+            onward(tree, walk, fresh, child, value, failed, i, taken)
+            if isinstance(tree.lead, Lead)
+            else ()
+        ),
+        trials=(
+            lax.dynamic_update_slice_in_dim(tree.trials, jnp.stack(trial)[None], i, 0)
+            if recorded
+            else ()
+        ),
     )
     if not problem.values:
         return tree
-    return foresee(problem, axes, tree, walk, fresh, lambda lane, level, live: replay_to(problem, axes, tree, walk.trail, level, memoize, lane, live), memoize)
+    return foresee(
+        problem,
+        axes,
+        tree,
+        walk,
+        fresh,
+        lambda lane, level, live: replay_to(
+            problem, axes, tree, walk.trail, level, memoize, lane, live
+        ),
+        memoize,
+    )
 
 
 def _back_up(tree, walk, fresh, child, value, new, link):
-    """The edges with one more visit and return along each path, and the new children in their slots: one scatter, since what is new was 0."""
+    """The edges with one more visit and return along each path, and the new children in their
+    slots: one scatter, since what is new was 0.
+    """
     nowhere = tree.edges.size
     level = jnp.arange(tree.path.shape[0], dtype=jnp.int32)[:, None]
     last = walk.depth + _one(tree.alive & ~tree.ended)
-    at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(-1)
+    at = jnp.where((level >= tree.depth[None]) & (level < last[None]), walk.path, nowhere).reshape(
+        -1
+    )
     ids = jnp.where(child.done, -new, new).astype(tree.edges.dtype)
     slot = jnp.where(fresh, walk.best.edge, nowhere)
     returns = jnp.broadcast_to(value[None], walk.path.shape).reshape(-1)
-    places, values = [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD], [jnp.ones_like(returns), returns, ids, child.reward]
+    places, values = (
+        [at + VISITS, at + RETURNS, slot + CHILD, slot + REWARD],
+        [jnp.ones_like(returns), returns, ids, child.reward],
+    )
     if link:  # where the page is full now, another goes on
         places.append(jnp.where(fresh & _fills(walk), walk.best.edge // ROW * ROW + LINK, nowhere))
         values.append(tree.pages.astype(tree.edges.dtype))
@@ -144,24 +229,38 @@ def _fills(walk):
 
 
 def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
-    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept, and the simulator steps that it took to get there.
+    """The simulator's state at the node ``trail[depth]`` of each tree, from the state that is kept,
+    and the simulator steps that it took to get there.
 
     Or of the trees ``lane`` [m], ``depth`` [m], where ``live`` [m].
     """
     like = node_shapes(tree, memoize)
-    key, base, first = tree.key, tree.base, tree.depth if memoize == "root" else jnp.zeros_like(tree.depth)
+    key, base, first = (
+        tree.key,
+        tree.base,
+        tree.depth if memoize == "root" else jnp.zeros_like(tree.depth),
+    )
     running = tree.alive & ~tree.ended if live is None else live
     if lane is None:
         lane = jnp.arange(key.shape[0], dtype=jnp.int32)
     else:
-        problem, key, base, first = of_lanes(problem, axes, lane), key[lane], jax.tree.map(lambda a: a[lane], base), first[lane]
+        problem, key, base, first = (
+            of_lanes(problem, axes, lane),
+            key[lane],
+            jax.tree.map(lambda a: a[lane], base),
+            first[lane],
+        )
     move = jax.vmap(child_state, in_axes=(axes, 0, 0, 0, 0, 0, 0, 0))
 
     def body(carry):
         level, state = carry
         node = jax.vmap(lambda w: unpack(w, like))(tree.nodes[trail[level + 1, lane], lane])
         live = running & (level < depth)
-        of = (node.source, fed_of(tree, jnp.maximum(node.source - 1, 0), lane)) if follows(tree) else ((), ())
+        of = (
+            (node.source, fed_of(tree, jnp.maximum(node.source - 1, 0), lane))
+            if follows(tree)
+            else ((), ())
+        )
         after = move(problem, key, node.parent, node.slot, level, state, *of)
         return level + _one(live), select_lanes(live, after, state)
 
@@ -171,7 +270,12 @@ def replay_to(problem, axes, tree, trail, depth, memoize, lane=None, live=None):
 
 
 def _child(problem, tree_key, parent, slot, level, before, source, fed):
-    return take(problem, level, before, choose(problem, tree_key, parent, slot, level, before.state, source, fed))
+    return take(
+        problem,
+        level,
+        before,
+        choose(problem, tree_key, parent, slot, level, before.state, source, fed),
+    )
 
 
 def _rolled(problem, key, tree_key, level, before, fed):
@@ -181,7 +285,9 @@ def _rolled(problem, key, tree_key, level, before, fed):
 
 def child_state(problem, tree_key, parent, slot, level, state, source=(), fed=()):
     """One lane: the simulator's state at a node's child."""
-    return _child(problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed).state
+    return _child(
+        problem, tree_key, parent, slot, level, blank(problem.sim, state), source, fed
+    ).state
 
 
 def select_lanes(pred, a, b):

@@ -1,4 +1,6 @@
-"""Running a part of a search in a thread of its own, with the settings of JAX of the one that it is started from."""
+"""Running a part of a search in a thread of its own, with the settings of JAX of the one that it is
+started from.
+"""
 
 import concurrent.futures
 import contextlib
@@ -9,7 +11,9 @@ __all__ = ["apart", "handed_on"]
 
 
 def handed_on():
-    """A context manager's maker: in another thread it sets what ``with`` statements have set in this one, which JAX keeps for each thread apart."""
+    """A context manager's maker: in another thread it sets what ``with`` statements have set in
+    this one, which JAX keeps for each thread apart.
+    """
     config = jax.config
     settings = (
         (jax.enable_x64, config.jax_enable_x64),
@@ -31,7 +35,9 @@ def handed_on():
 
 
 def apart(function, *args):
-    """``function(*args)`` in another thread. A KeyboardInterrupt meets this one, which waits for it: not a callback in the middle of a program of XLA's."""
+    """``function(*args)`` in another thread. A KeyboardInterrupt meets this one, which waits for
+    it: not a callback in the middle of a program of XLA's.
+    """
     surroundings = handed_on()
 
     def run():

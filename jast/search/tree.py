@@ -1,15 +1,20 @@
 """A batch of search trees as arrays.
 
-All trees advance in lockstep: simulation i runs in every tree at once. Arrays never leave their place: every write is a row, or a scatter whose index is
-out of range where there is nothing to write, and no tree array is an operand of a select.
+All trees advance in lockstep: simulation i runs in every tree at once. Arrays never leave their
+place: every write is a row, or a scatter whose index is out of range where there is nothing to
+write, and no tree array is an operand of a select.
 
- - Node ids: node ``i + 1`` is made by simulation i, in every tree; 0 is the first root. So making a node is one contiguous row write.
- - Edges: a node's children sit in pages of ``PAGE`` slots, each slot with the child's visits, the sum of its returns and its id. The first page of a node has
-   the node's id; when a page fills up, the next free one is linked behind it, so a node may have any number of children. What a selection reads of every page,
-   visits and returns, stands together: two cache lines in float32.
- - A slot that was never visited needs no storage: the number of children is a function of the node's visits alone (`widths`), and the action of a slot is drawn
-   from its address (tree, node, slot). Unvisited slots score alike, so they are visited in order.
- - With a value head they do not: then v(s, a) of every child stands in ``Tree.values``, and pages are linked when a child appears, not when it is visited.
+ - Node ids: node ``i + 1`` is made by simulation i, in every tree; 0 is the first root. So making a
+   node is one contiguous row write.
+ - Edges: a node's children sit in pages of ``PAGE`` slots, each slot with the child's visits, the
+   sum of its returns and its id. The first page of a node has the node's id; when a page fills up,
+   the next free one is linked behind it, so a node may have any number of children. What a
+   selection reads of every page, visits and returns, stands together: two cache lines in float32.
+ - A slot that was never visited needs no storage: the number of children is a function of the
+   node's visits alone (`widths`), and the action of a slot is drawn from its address (tree, node,
+   slot). Unvisited slots score alike, so they are visited in order.
+ - With a value head they do not: then v(s, a) of every child stands in ``Tree.values``, and pages
+   are linked when a child appears, not when it is visited.
  - Returns are those of whole episodes; Q(s, a) subtracts the reward up to s.
 """
 
@@ -27,13 +32,29 @@ from jast.search.records import pack
 from jast.simulator import never
 
 __all__ = [
-    "Node", "Problem", "Settings", "Tree", "choose", "choose_child", "choose_rollout", "levels", "make", "most_lanes", "node_keys", "node_shapes", "of_lanes",
-    "pages_of", "take", "widths",
-]  # fmt: skip
+    "Node",
+    "Problem",
+    "Settings",
+    "Tree",
+    "choose",
+    "choose_child",
+    "choose_rollout",
+    "levels",
+    "make",
+    "most_lanes",
+    "node_keys",
+    "node_shapes",
+    "of_lanes",
+    "pages_of",
+    "take",
+    "widths",
+]
 
 PAGE = 15
-VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))  # columns of a page's row in Tree.edges
-LINK = VISITS + PAGE  # a page's last entry is no child: there stands the page that continues this one, or 0
+# columns of a page's row in Tree.edges
+VISITS, RETURNS, CHILD, REWARD = (column * (PAGE + 1) for column in range(4))
+# a page's last entry is no child: there stands the page that continues this one, or 0
+LINK = VISITS + PAGE
 ROW = 4 * (PAGE + 1)
 
 FAILURE, FRESH, INVALID, RAN = 1, 2, 4, 8  # bits of Tree.outcome
@@ -72,15 +93,21 @@ class Tree(NamedTuple):
     key: jax.Array
     """[B] counter keys."""
     edges: jax.Array
-    """[pages * B * ROW] float: a row a page, ``page * B + lane``. Of each child: visits N(s, a), sum of returns, node id (negative: an episode's end, 0: not
-    visited yet), reward from the start up to it."""
+    """[pages * B * ROW] float: a row a page, ``page * B + lane``. Of each child: visits N(s, a),
+    sum of returns, node id (negative: an episode's end, 0: not visited yet), reward from the start
+    up to it.
+    """
     nodes: jax.Array
     """[S + 1, B, words] uint32: a packed `Node` each."""
     desk: jax.Array
-    """[2, B, words] uint32: where the node of a simulation is laid out to be read. XLA would cut a gather from a large array over threads, which for so few
-    numbers costs more than it saves, unless the gather ends in an update in place."""
+    """[2, B, words] uint32: where the node of a simulation is laid out to be read. XLA would cut a
+    gather from a large array over threads, which for so few numbers costs more than it saves,
+    unless the gather ends in an update in place.
+    """
     values: Any
-    """[pages * B * (PAGE + 1)] float: v(s, a) of each child, rows as in ``edges``; ``()`` without a value head."""
+    """[pages * B * (PAGE + 1)] float: v(s, a) of each child, rows as in ``edges``; ``()`` without a
+    value head.
+    """
     pages: jax.Array
     """[B] int32: pages in use."""
     root: jax.Array
@@ -96,15 +123,20 @@ class Tree(NamedTuple):
     path: jax.Array
     """[H, B] int32: edges from the first root to the current one, as places in ``edges``."""
     turn: jax.Array
-    """[2, B] float: visits and returns since the last root, which the edges of ``path`` have not seen yet."""
+    """[2, B] float: visits and returns since the last root, which the edges of ``path`` have not
+    seen yet.
+    """
     alive: jax.Array
     """[B] bool: false once the root is an episode's end."""
     ended: jax.Array
-    """[B] bool: the first root is one: the system ends at its start, and one simulation says all."""
+    """[B] bool: the first root is one: the system ends at its start, and one simulation says all.
+    """
     origin: Any
     """[B, ...] the first root's state."""
     base: Any
-    """[B, ...] the state from which replays start: the first root's or, with memoization at roots, the current one's."""
+    """[B, ...] the state from which replays start: the first root's or, with memoization at roots,
+    the current one's.
+    """
     worst: jax.Array
     """[B] float: least finite return so far, backed up in place of one that is not finite."""
     steps: jax.Array
@@ -116,7 +148,9 @@ class Tree(NamedTuple):
     lead: Any
     """`Lead`, the best episode of each tree, or ``()`` where the search makes no use of it."""
     trials: Any
-    """[S, 2, B] float: miss distance and true log p of the episode of each simulation; ``()`` where they are not recorded."""
+    """[S, 2, B] float: miss distance and true log p of the episode of each simulation; ``()`` where
+    they are not recorded.
+    """
 
 
 class Node(NamedTuple):
@@ -133,23 +167,29 @@ class Node(NamedTuple):
     state: Any
     """The simulator's state, or ``()`` where states are not kept at nodes."""
     source: Any = ()
-    """int32: 1 + the simulation whose rollout took the action that led here, 0: it is the slot's own; ``()`` without `Choice.follow`."""
+    """int32: 1 + the simulation whose rollout took the action that led here, 0: it is the slot's
+    own; ``()`` without `Choice.follow`.
+    """
     log_prob: Any = ()
     """From the start up to here; ``()`` where trials are not recorded."""
 
 
 def widths(simulations, k, alpha):
-    """[simulations + 2] int32: the number of children of a node that was visited n times before, n = 0, 1, ...
+    """[simulations + 2] int32: the number of children of a node that was visited n times before, n
+    = 0, 1, ...
 
-    Progressive widening adds at most one child a visit, while #children <= k n^alpha (MCFS-AP Algorithm 1; Moss's Algorithm 10 tests before it adds), which
-    for alpha <= 1 comes to min(n, floor(k n^alpha) + 1). Made on the host in float64 unless ``k`` or ``alpha`` are traced.
+    Progressive widening adds at most one child a visit, while #children <= k n^alpha (MCFS-AP
+    Algorithm 1; Moss's Algorithm 10 tests before it adds), which for alpha <= 1 comes to min(n,
+    floor(k n^alpha) + 1). Made on the host in float64 unless ``k`` or ``alpha`` are traced.
     """
     if isinstance(k, jax.core.Tracer) or isinstance(alpha, jax.core.Tracer):
         n = jnp.arange(simulations + 2, dtype=jnp.int32)
         bound = jnp.floor(k * n.astype(jnp.float32) ** alpha * (1 + 4e-7)).astype(jnp.int32) + 1
         return jnp.minimum(n, bound)
     n = np.arange(simulations + 2)
-    return jnp.asarray(np.minimum(n, np.floor(float(k) * n ** float(alpha) * (1 + 1e-14)) + 1), jnp.int32)
+    return jnp.asarray(
+        np.minimum(n, np.floor(float(k) * n ** float(alpha) * (1 + 1e-14)) + 1), jnp.int32
+    )
 
 
 def levels(sim):
@@ -158,11 +198,17 @@ def levels(sim):
 
 
 def _pages(simulations, levels=0, table=None):
-    """One for each node, and one more whenever one is full; ``levels`` and ``table`` bound how many, where children need a place before they are visited."""
+    """One for each node, and one more whenever one is full; ``levels`` and ``table`` bound how
+    many, where children need a place before they are visited.
+    """
     more = simulations // PAGE
     if levels:  # at each level, the visits of all nodes are at most the simulations
         n = np.arange(1, simulations + 2)
-        children = n if isinstance(table, jax.core.Tracer) else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
+        children = (
+            n
+            if isinstance(table, jax.core.Tracer)
+            else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
+        )
         more = int(simulations * levels * np.max((-(-children // PAGE) - 1) / n)) + levels
     return simulations + 1 + more + 1
 
@@ -170,7 +216,11 @@ def _pages(simulations, levels=0, table=None):
 def pages_of(problem, simulations):
     """Pages of a tree of so many simulations."""
     many = problem.values and problem.guide.eager  # children stand on pages before they are visited
-    return _pages(simulations, levels(problem.sim), problem.settings.widths) if many else _pages(simulations)
+    return (
+        _pages(simulations, levels(problem.sim), problem.settings.widths)
+        if many
+        else _pages(simulations)
+    )
 
 
 def most_lanes(pages):
@@ -179,22 +229,33 @@ def most_lanes(pages):
 
 
 def make(problem, axes, keys, simulations, memoize="node", pages=None, record=False):
-    """Trees of one root each, with room for ``simulations`` in so many ``pages`` (default: `pages_of`).
+    """Trees of one root each, with room for ``simulations`` in so many ``pages`` (default:
+    `pages_of`).
 
-    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None). ``record``: `Tree.trials` are wanted.
+    ``axes`` says which parts of ``problem`` differ between trees (0) or not (None). ``record``:
+    `Tree.trials` are wanted.
     """
     (lanes,) = keys.shape
     pages = pages_of(problem, simulations) if pages is None else pages
     if lanes > most_lanes(pages):
-        raise ValueError(f"search: at most {most_lanes(pages)} trees of {simulations} simulations fit into one program's 32-bit places, received {lanes}")
+        raise ValueError(
+            f"search: at most {most_lanes(pages)} trees of {simulations} simulations fit into one"
+            f" program's 32-bit places, received {lanes}"
+        )
 
     def origin(problem, key):
         if random_start(problem.sim):
-            x0 = problem.choice.actions.draw_start(key, problem.sim.start())  # any state will do: the first level chooses x0
+            # any state will do: the first level chooses x0
+            x0 = problem.choice.actions.draw_start(key, problem.sim.start())
             return blank(problem.sim, begin(problem.sim, problem.reward, x0).state)
         first = begin(problem.sim, problem.reward, ())
-        # an episodic system may be at its end from the start, but a user's evaluation is not called in vain
-        return first if problem.sim.is_terminal.func is never else conclude(problem.sim, problem.reward, first, first.done)
+        # an episodic system may be at its end from the start, but a user's evaluation is not called
+        # in vain
+        return (
+            first
+            if problem.sim.is_terminal.func is never
+            else conclude(problem.sim, problem.reward, first, first.done)
+        )
 
     first = jax.vmap(origin, in_axes=(axes, 0))(problem, keys)
     dtype = first.reward.dtype
@@ -202,7 +263,15 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None, record=Fa
     lead = lead_of(problem, lanes, levels(problem.sim), simulations, dtype)
     kept = first.state if memoize == "node" else ()
     node = Node(
-        count, count, first.reward, first.distance, first.failure, first.invalid, kept, count if problem.choice.follow else (), first.log_prob if record else ()
+        count,
+        count,
+        first.reward,
+        first.distance,
+        first.failure,
+        first.invalid,
+        kept,
+        count if problem.choice.follow else (),
+        first.log_prob if record else (),
     )
     words = jax.vmap(pack)(node)
     return Tree(
@@ -236,56 +305,95 @@ def node_shapes(tree, memoize):
     """The `shapes` of one tree's `Node`."""
     dtype = tree.edges.dtype
     number, real = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), dtype)
-    state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree.origin) if memoize == "node" else ()
+    state = (
+        jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree.origin)
+        if memoize == "node"
+        else ()
+    )
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
     recorded = not isinstance(tree.trials, tuple)
-    return Node(number, number, real, real, flag, flag, state, number if follows(tree) else (), real if recorded else ())
+    return Node(
+        number,
+        number,
+        real,
+        real,
+        flag,
+        flag,
+        state,
+        number if follows(tree) else (),
+        real if recorded else (),
+    )
 
 
 def choose_child(problem, node_key, slot, state):
-    """One lane: (x0, x), the action of a node's child, for a first level that chooses x0 and for any other; x0 is ``()`` for a system with one start."""
+    """One lane: (x0, x), the action of a node's child, for a first level that chooses x0 and for
+    any other; x0 is ``()`` for a system with one start.
+    """
     sim, choice = problem.sim, problem.choice
     x0 = choice.child(node_key, slot, sim.start(), start=True) if random_start(sim) else ()
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
 
 def choose(problem, tree_key, parent, slot, level, state, source=(), fed=()):
-    """One lane: (x0, x), the action of the child in this slot of the node ``parent``, or the one of the rollout of simulation ``source`` - 1, fed ``fed``."""
+    """One lane: (x0, x), the action of the child in this slot of the node ``parent``, or the one of
+    the rollout of simulation ``source`` - 1, fed ``fed``.
+    """
     own = choose_child(problem, node_keys(tree_key[None], parent[None])[0], slot, state)
     if not problem.choice.follow:
         return own
-    taken = choose_rollout(problem, jax.random.fold_in(tree_key, source - 1), tree_key, level, state, fed)
+    taken = choose_rollout(
+        problem, jax.random.fold_in(tree_key, source - 1), tree_key, level, state, fed
+    )
     return jax.tree.map(lambda a, b: jnp.where(source > 0, a, b), taken, own)
 
 
 def choose_rollout(problem, key, tree_key, level, state, fed=()):
-    """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree, and what it is fed."""
+    """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree, and
+    what it is fed.
+    """
     sim, choice = problem.sim, problem.choice
     simulation, key = key, jax.random.fold_in(key, level)
     x0 = choice.roll(key, tree_key, sim.start(), start=True) if random_start(sim) else ()
     dist = sim.disturbance(state)
     x = choice.roll(key, tree_key, dist)
     if problem.guide != () and problem.guide.heads.policy is not None:
-        x = lax.cond(problem.guide.levels > 0, lambda: rolled(problem.guide, sim, choice.actions, simulation, key, level, state, dist, x), lambda: x)
+        x = lax.cond(
+            problem.guide.levels > 0,
+            lambda: rolled(
+                problem.guide, sim, choice.actions, simulation, key, level, state, dist, x
+            ),
+            lambda: x,
+        )
     if problem.choice.feed:
         x = fed_or(sim, fed, level == feed_level(sim, int(random_start(sim))), x)
     return x0, x
 
 
 def take(problem, level, before, action, rolling=False):
-    """One lane: the `Progress` that the action leads to; ``rolling``: it is not the start that is chosen."""
+    """One lane: the `Progress` that the action leads to; ``rolling``: it is not the start that is
+    chosen.
+    """
     sim, reward = problem.sim, problem.reward
     x0, x = action
     start = int(random_start(sim))
     after = advance(sim, reward, before, x, level + 1 - start >= sim.horizon)
     if start and not rolling:
-        after = jax.tree.map(lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after)
+        after = jax.tree.map(
+            lambda a, b: jnp.where(level == 0, a, b), begin(sim, reward, x0), after
+        )
     return after
 
 
 def of_lanes(problem, axes, lane):
-    """``problem`` with those of its leaves that differ between trees taken of these trees, [...]; ``axes`` as in `make`."""
-    return jax.tree.map(lambda axis, leaf: leaf if axis is None else leaf[lane], axes, problem, is_leaf=lambda x: x is None)
+    """``problem`` with those of its leaves that differ between trees taken of these trees, [...];
+    ``axes`` as in `make`.
+    """
+    return jax.tree.map(
+        lambda axis, leaf: leaf if axis is None else leaf[lane],
+        axes,
+        problem,
+        is_leaf=lambda x: x is None,
+    )
 
 
 def node_keys(keys, node):

@@ -12,6 +12,19 @@ from jast.simulators.ruin import ruin, ruin_probability
 from jast.simulators.walk import walk1d
 
 __all__ = [
-    "autoregression", "bluesky", "bluesky_flight", "colav", "ferry", "fms", "fms_misses", "fms_path", "landing", "landing_probability", "limit_state",
-    "pendulum", "ruin", "ruin_probability", "walk1d",
-]  # fmt: skip
+    "autoregression",
+    "bluesky",
+    "bluesky_flight",
+    "colav",
+    "ferry",
+    "fms",
+    "fms_misses",
+    "fms_path",
+    "landing",
+    "landing_probability",
+    "limit_state",
+    "pendulum",
+    "ruin",
+    "ruin_probability",
+    "walk1d",
+]

@@ -8,7 +8,9 @@ __all__ = ["positive"]
 
 
 def positive(function, **values):
-    """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless positive and finite (not looked at while traced)."""
+    """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless
+    positive and finite (not looked at while traced).
+    """
     for name, value in values.items():
         if not (value.shape == () if isinstance(value, jax.core.Tracer) else _is_positive(value)):
             raise ValueError(f"{function}: {name} must be a positive number, received {value!r}")
@@ -23,4 +25,8 @@ def _is_positive(value):
         a = np.asarray(value)
     except ValueError:  # rows of different lengths
         return False
-    return a.shape == () and (jnp.issubdtype(a.dtype, jnp.floating) or jnp.issubdtype(a.dtype, jnp.integer)) and bool(0 < a < np.inf)
+    return (
+        a.shape == ()
+        and (jnp.issubdtype(a.dtype, jnp.floating) or jnp.issubdtype(a.dtype, jnp.integer))
+        and bool(0 < a < np.inf)
+    )

@@ -1,7 +1,9 @@
-"""Autoregression: a stationary Gaussian process of memory one, the Ornstein-Uhlenbeck process at equal times, must stay below a threshold.
+"""Autoregression: a stationary Gaussian process of memory one, the Ornstein-Uhlenbeck process at
+equal times, must stay below a threshold.
 
-s' = a s + sqrt(1 - a^2) x, x ~ N(0, 1), s0 = 0; failure where s >= threshold at any step.
-Known truth (a = exp(-.1), threshold 5, 100 steps; Nystrom quadrature of the first-passage mass, two grids agree to 1e-9): P = 1.7438880336e-5.
+s' = a s + sqrt(1 - a^2) x, x ~ N(0, 1), s0 = 0; failure where s >= threshold at any step. Known
+truth (a = exp(-.1), threshold 5, 100 steps; Nystrom quadrature of the first-passage mass, two grids
+agree to 1e-9): P = 1.7438880336e-5.
 """
 
 import jax.numpy as jnp
@@ -15,13 +17,21 @@ __all__ = ["autoregression"]
 
 
 def autoregression(rate=0.1, threshold=5.0, horizon=100):
-    """The process from 0, a `Simulator` with a scalar state of variance below 1 and a standard normal x (scalar).
+    """The process from 0, a `Simulator` with a scalar state of variance below 1 and a standard
+    normal x (scalar).
 
-    ``rate``: of forgetting, a step keeps a = exp(-rate) of the state; ``threshold``: in stationary standard deviations; both traced. ``horizon`` (steps) is
-    static. Miss distance: max(threshold - s, 0). ValueError for a parameter that is not positive or a horizon below 1.
+    ``rate``: of forgetting, a step keeps a = exp(-rate) of the state; ``threshold``: in stationary
+    standard deviations; both traced. ``horizon`` (steps) is static. Miss distance: max(threshold -
+    s, 0). ValueError for a parameter that is not positive or a horizon below 1.
     """
     rate, threshold = positive("autoregression", rate=rate, threshold=threshold)
-    return Simulator(Partial(_init, rate), Partial(_step, rate), _disturbance, Partial(_evaluate, threshold), horizon)
+    return Simulator(
+        Partial(_init, rate),
+        Partial(_step, rate),
+        _disturbance,
+        Partial(_evaluate, threshold),
+        horizon,
+    )
 
 
 def _init(rate, x0):

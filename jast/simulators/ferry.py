@@ -1,9 +1,12 @@
-"""S0: a vessel that steers at random meets a ferry that reacts to nothing (Lytskjold and Mengshoel, MCFS-AP).
+"""S0: a vessel that steers at random meets a ferry that reacts to nothing (Lytskjold and Mengshoel,
+MCFS-AP).
 
-Plane of about 100 x 100, x right, y up, no units. Known truth (uniform random seeds, float64): mean closest approach 23.95, no collision in 2,000,000
-episodes, best reward of 9000 about -16. A seed held constant never hits (the best, 0.8363, comes to 10.0075). Undisturbed (0.5 throughout): no failure,
-closest approach 24.2074. Best known failure: reward 29.649, seeds 0.97138 x4, 0.9566, 0.87626, 0.77608, 0.68724, then 0.63524 held; collision at step 20.
-The published best is 29.092. Rewards are those of ``standard(event_bonus=30., density="mode")`` with actions ``uniform(0., 1.)``.
+Plane of about 100 x 100, x right, y up, no units. Known truth (uniform random seeds, float64): mean
+closest approach 23.95, no collision in 2,000,000 episodes, best reward of 9000 about -16. A seed
+held constant never hits (the best, 0.8363, comes to 10.0075). Undisturbed (0.5 throughout): no
+failure, closest approach 24.2074. Best known failure: reward 29.649, seeds 0.97138 x4, 0.9566,
+0.87626, 0.77608, 0.68724, then 0.63524 held; collision at step 20. The published best is 29.092.
+Rewards are those of ``standard(event_bonus=30., density="mode")`` with actions ``uniform(0., 1.)``.
 """
 
 from typing import NamedTuple
@@ -22,7 +25,9 @@ COLLISION = 5.0
 
 
 class FerryState(NamedTuple):
-    """Positions of both vessels, the adversary's heading (radians, from +y towards +x), its last seed and whether one was drawn yet."""
+    """Positions of both vessels, the adversary's heading (radians, from +y towards +x), its last
+    seed and whether one was drawn yet.
+    """
 
     ferry_x: jax.Array
     ferry_y: jax.Array
@@ -34,11 +39,14 @@ class FerryState(NamedTuple):
 
 
 def ferry(adversary=(16.0, 0.0)):
-    """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts ((17, 0) is the easier S0b).
+    """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts
+    ((17, 0) is the easier S0b).
 
-    A step turns the adversary by (10 a - 5) pi / 100 radians, a in [0, 1] its seed (0.5: straight on), then moves both vessels by 5. The first seed is
-    uniform, each next one tent-shaped around the last: mode-normalised log p is ln(1 - |a_t - a_{t-1}|). Failure: centres closer than 5 at a step's end.
-    Ends after 21 steps, when the ferry has left the plane (x > 100). ValueError unless ``adversary`` is two numbers.
+    A step turns the adversary by (10 a - 5) pi / 100 radians, a in [0, 1] its seed (0.5: straight
+    on), then moves both vessels by 5. The first seed is uniform, each next one tent-shaped around
+    the last: mode-normalised log p is ln(1 - |a_t - a_{t-1}|). Failure: centres closer than 5 at a
+    step's end. Ends after 21 steps, when the ferry has left the plane (x > 100). ValueError unless
+    ``adversary`` is two numbers.
     """
     try:
         start = jnp.asarray(adversary)
@@ -50,18 +58,34 @@ def ferry(adversary=(16.0, 0.0)):
     if not jnp.issubdtype(adversary.dtype, jnp.floating):
         adversary = adversary.astype(jnp.zeros(()).dtype)
     return Simulator(
-        init=Partial(_init, adversary), step=_step, disturbance=_disturbance, evaluate=_evaluate, horizon=21, is_terminal=_is_terminal, observe=_observe
+        init=Partial(_init, adversary),
+        step=_step,
+        disturbance=_disturbance,
+        evaluate=_evaluate,
+        horizon=21,
+        is_terminal=_is_terminal,
+        observe=_observe,
     )
 
 
 def _init(adversary, x0):
     zero = jnp.zeros((), adversary.dtype)
-    return FerryState(zero, zero + 50, adversary[0], adversary[1], zero, zero + 0.5, jnp.zeros((), bool))
+    return FerryState(
+        zero, zero + 50, adversary[0], adversary[1], zero, zero + 0.5, jnp.zeros((), bool)
+    )
 
 
 def _step(s, a):
     heading = s.heading + (10 * a - 5) * jnp.asarray(jnp.pi / 100, a.dtype)
-    return FerryState(s.ferry_x + SPEED, s.ferry_y, s.x + SPEED * jnp.sin(heading), s.y + SPEED * jnp.cos(heading), heading, a, jnp.ones((), bool))
+    return FerryState(
+        s.ferry_x + SPEED,
+        s.ferry_y,
+        s.x + SPEED * jnp.sin(heading),
+        s.y + SPEED * jnp.cos(heading),
+        heading,
+        a,
+        jnp.ones((), bool),
+    )
 
 
 def _disturbance(s):
@@ -80,4 +104,12 @@ def _is_terminal(s):
 
 def _observe(s):
     """The five numbers of the paper's networks."""
-    return jnp.stack([s.ferry_x / 100, s.x / 100, s.y / 100, jnp.sin(s.heading) / 2 + 0.5, jnp.cos(s.heading) / 2 + 0.5])
+    return jnp.stack(
+        [
+            s.ferry_x / 100,
+            s.x / 100,
+            s.y / 100,
+            jnp.sin(s.heading) / 2 + 0.5,
+            jnp.cos(s.heading) / 2 + 0.5,
+        ]
+    )

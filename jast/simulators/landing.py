@@ -1,8 +1,11 @@
-"""Landing: an aircraft drifts sideways on its way down and must touch down within the runway (Lipkis and Agogino, NASA).
+"""Landing: an aircraft drifts sideways on its way down and must touch down within the runway
+(Lipkis and Agogino, NASA).
 
-x1(0) = 0, x2(0) = s0 ~ N(0, sigma_i^2); ten steps of x1 += 1, x2 += x_t, x_t ~ N(0, sigma_t^2) (a = 10, v = 1); failure where abs(x2) > b at the end only.
-Known truth: P = 2 Phi(-b / sqrt(sigma_i^2 + 10 sigma_t^2)) = 4.0236721906842e-13 at b = 1, sigma_i = .1, sigma_t = .03 (published estimate 3.253e-13
-+- 1.378e-13), with two equal modes: s0 = sigma_i^2 b / var = .5263, x_t = sigma_t^2 b / var = .04737 and their mirror image, var = .019.
+x1(0) = 0, x2(0) = s0 ~ N(0, sigma_i^2); ten steps of x1 += 1, x2 += x_t, x_t ~ N(0, sigma_t^2) (a =
+10, v = 1); failure where abs(x2) > b at the end only. Known truth: P = 2 Phi(-b / sqrt(sigma_i^2 +
+10 sigma_t^2)) = 4.0236721906842e-13 at b = 1, sigma_i = .1, sigma_t = .03 (published estimate
+3.253e-13 +- 1.378e-13), with two equal modes: s0 = sigma_i^2 b / var = .5263, x_t = sigma_t^2 b /
+var = .04737 and their mirror image, var = .019.
 """
 
 from typing import NamedTuple
@@ -29,20 +32,29 @@ class LandingState(NamedTuple):
 
 
 def landing(b=1.0, sigma_i=0.1, sigma_t=0.03):
-    """The landing, a `Simulator` of ten steps, episodic, with the initial offset as x0 (scalar) and the drift of a step as x (scalar).
+    """The landing, a `Simulator` of ten steps, episodic, with the initial offset as x0 (scalar) and
+    the drift of a step as x (scalar).
 
-    ``b``: half width of the runway, ``sigma_i`` and ``sigma_t``: standard deviations of the initial offset and of a step's drift; all traced. Miss distance:
-    max(b - abs(x2), 0) at the end. ValueError for a parameter that is not positive.
+    ``b``: half width of the runway, ``sigma_i`` and ``sigma_t``: standard deviations of the initial
+    offset and of a step's drift; all traced. Miss distance: max(b - abs(x2), 0) at the end.
+    ValueError for a parameter that is not positive.
     """
     b, sigma_i, sigma_t = positive("landing", b=b, sigma_i=sigma_i, sigma_t=sigma_t)
     return Simulator(
-        init=_init, step=_step, disturbance=Partial(_disturbance, sigma_t), evaluate=Partial(_evaluate, b), horizon=STEPS, start=Partial(_start, sigma_i),
+        init=_init,
+        step=_step,
+        disturbance=Partial(_disturbance, sigma_t),
+        evaluate=Partial(_evaluate, b),
+        horizon=STEPS,
+        start=Partial(_start, sigma_i),
         episodic=True,
-    )  # fmt: skip
+    )
 
 
 def landing_probability(b=1.0, sigma_i=0.1, sigma_t=0.03):
-    """The failure probability of `landing` in closed form: 2 Phi(-b / sqrt(sigma_i^2 + 10 sigma_t^2))."""
+    """The failure probability of `landing` in closed form: 2 Phi(-b / sqrt(sigma_i^2 + 10
+    sigma_t^2)).
+    """
     b, sigma_i, sigma_t = (jnp.asarray(v) for v in (b, sigma_i, sigma_t))
     return 2 * ndtr(-b / jnp.sqrt(sigma_i**2 + STEPS * sigma_t**2))
 

@@ -1,7 +1,9 @@
-"""Limit states: the static problems of structural reliability, P(g(x) <= 0) for x ~ N(0, I_d), as simulators of one step.
+"""Limit states: the static problems of structural reliability, P(g(x) <= 0) for x ~ N(0, I_d), as
+simulators of one step.
 
-Known truths: hyperplane g = 5 - x.e, abs(e) = 1, any d: Phi(-5) = 2.8665157188e-7; four branches (p = 7, k = 3, d = 2), g = min of
-k + .1 (x1 - x2)^2 -+ (x1 + x2) / sqrt 2 and +-(x1 - x2) + p / sqrt 2: 2.2227950662e-3; g = max(3.5 - x1, 3.5 - x2): Phi(-3.5)^2 = 5.4116288413e-8.
+Known truths: hyperplane g = 5 - x.e, abs(e) = 1, any d: Phi(-5) = 2.8665157188e-7; four branches (p
+= 7, k = 3, d = 2), g = min of k + .1 (x1 - x2)^2 -+ (x1 + x2) / sqrt 2 and +-(x1 - x2) + p / sqrt
+2: 2.2227950662e-3; g = max(3.5 - x1, 3.5 - x2): Phi(-3.5)^2 = 5.4116288413e-8.
 """
 
 import jax
@@ -15,13 +17,18 @@ __all__ = ["limit_state"]
 
 
 def limit_state(g, dimension):
-    """One step, x ~ N(0, I_dimension) [dimension]; failure where g(x) <= 0, miss distance max(g(x), 0): a `Simulator`, episodic.
+    """One step, x ~ N(0, I_dimension) [dimension]; failure where g(x) <= 0, miss distance max(g(x),
+    0): a `Simulator`, episodic.
 
-    ``g``: [dimension] -> float scalar; a plain function is static by identity, what a `jax.tree_util.Partial` binds is traced. Observed are the first 64
-    coordinates. Raises ValueError for a dimension below 1 and a ``g`` that is no function or does not return a float scalar.
+    ``g``: [dimension] -> float scalar; a plain function is static by identity, what a
+    `jax.tree_util.Partial` binds is traced. Observed are the first 64 coordinates. Raises
+    ValueError for a dimension below 1 and a ``g`` that is no function or does not return a float
+    scalar.
     """
     if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
-        raise ValueError(f"limit_state: dimension must be an int of at least 1, received {dimension!r}")
+        raise ValueError(
+            f"limit_state: dimension must be an int of at least 1, received {dimension!r}"
+        )
     if not callable(g):
         raise ValueError(f"limit_state: g must be a function, received {g!r}")
     g = g if isinstance(g, Partial) else Partial(g)
@@ -32,11 +39,19 @@ def limit_state(g, dimension):
     except AttributeError:
         received = repr(value)
     except Exception as e:
-        raise ValueError(f"limit_state: g raised {type(e).__name__} on a vector of {dimension} numbers: {e}") from e
+        raise ValueError(
+            f"limit_state: g raised {type(e).__name__} on a vector of {dimension} numbers: {e}"
+        ) from e
     if received not in (f"{d}[]" for d in ("float16", "bfloat16", "float32", "float64")):
         raise ValueError(f"limit_state: g must return a float scalar, received {received}")
     return Simulator(
-        init=Partial(_init, origin), step=_step, disturbance=_disturbance, evaluate=Partial(_evaluate, g), horizon=1, observe=_observe, episodic=True
+        init=Partial(_init, origin),
+        step=_step,
+        disturbance=_disturbance,
+        evaluate=Partial(_evaluate, g),
+        horizon=1,
+        observe=_observe,
+        episodic=True,
     )
 
 

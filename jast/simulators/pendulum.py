@@ -1,8 +1,11 @@
-"""Pendulum: a torque-limited controller holds an inverted pendulum upright and sees its state through noise (Algorithms for Validation).
+"""Pendulum: a torque-limited controller holds an inverted pendulum upright and sees its state
+through noise (Algorithms for Validation).
 
-theta0 ~ N(0, (pi/32)^2), omega0 ~ N(0, .5^2); each of 40 steps of .05 s: o = s + x, x ~ N(0, .1^2 I); a = clip(-15 o1 - 8 o2, -2, 2);
-omega += (15 sin theta + 3 a) .05; theta += .05 omega; omega is clipped to +-8 (m = l = 1, g = 10). Failure where abs(theta) >= pi/4 at any of the 41 states.
-Known truth: P = 8.169e-3 +- .009e-3 (Monte Carlo, 1e8 episodes, one standard error). Undisturbed: no failure.
+theta0 ~ N(0, (pi/32)^2), omega0 ~ N(0, .5^2); each of 40 steps of .05 s: o = s + x, x ~ N(0, .1^2
+I); a = clip(-15 o1 - 8 o2, -2, 2); omega += (15 sin theta + 3 a) .05; theta += .05 omega; omega is
+clipped to +-8 (m = l = 1, g = 10). Failure where abs(theta) >= pi/4 at any of the 41 states. Known
+truth: P = 8.169e-3 +- .009e-3 (Monte Carlo, 1e8 episodes, one standard error). Undisturbed: no
+failure.
 """
 
 from typing import NamedTuple
@@ -31,14 +34,20 @@ class PendulumState(NamedTuple):
 
 
 def pendulum(noise=0.1, sigma_theta=jnp.pi / 32, sigma_omega=0.5, limit=jnp.pi / 4):
-    """The pendulum, a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the error of the observation as x [2].
+    """The pendulum, a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the error of the
+    observation as x [2].
 
-    ``noise``: standard deviation of both errors, ``sigma_theta`` and ``sigma_omega``: of the start, ``limit``: the angle (radians) of a failure; all traced.
-    Miss distance: max(limit - abs(theta), 0). ValueError for a parameter that is not positive.
+    ``noise``: standard deviation of both errors, ``sigma_theta`` and ``sigma_omega``: of the start,
+    ``limit``: the angle (radians) of a failure; all traced. Miss distance: max(limit - abs(theta),
+    0). ValueError for a parameter that is not positive.
     """
-    noise, sigma_theta, sigma_omega, limit = positive("pendulum", noise=noise, sigma_theta=sigma_theta, sigma_omega=sigma_omega, limit=limit)
+    noise, sigma_theta, sigma_omega, limit = positive(
+        "pendulum", noise=noise, sigma_theta=sigma_theta, sigma_omega=sigma_omega, limit=limit
+    )
     start = Partial(_start, jnp.stack([sigma_theta, sigma_omega]))
-    return Simulator(_init, _step, Partial(_disturbance, noise), Partial(_evaluate, limit), STEPS, start=start)
+    return Simulator(
+        _init, _step, Partial(_disturbance, noise), Partial(_evaluate, limit), STEPS, start=start
+    )
 
 
 def _start(sigma):

@@ -1,8 +1,10 @@
-"""Gambler's ruin: a gambler at bad odds wins a fortune before he is ruined (the textbook's rare event with discrete disturbances).
+"""Gambler's ruin: a gambler at bad odds wins a fortune before he is ruined (the textbook's rare
+event with discrete disturbances).
 
-A step wins 1 with probability ``up``, else loses 1; failure at ``goal``, ruin at 0 ends an episode. Known truth (up = .4, start 1, goal 30), without a horizon:
-P = (r^start - 1) / (r^goal - 1) = 2.6075611241e-6, r = (1 - up) / up; within the 371 steps of the default: 2.6049921451e-6, less by 9.9e-4 of it (powers of
-the transition matrix).
+A step wins 1 with probability ``up``, else loses 1; failure at ``goal``, ruin at 0 ends an episode.
+Known truth (up = .4, start 1, goal 30), without a horizon: P = (r^start - 1) / (r^goal - 1) =
+2.6075611241e-6, r = (1 - up) / up; within the 371 steps of the default: 2.6049921451e-6, less by
+9.9e-4 of it (powers of the transition matrix).
 """
 
 import jax
@@ -18,34 +20,56 @@ __all__ = ["ruin", "ruin_probability"]
 
 
 def ruin(up=0.4, start=1, goal=30, horizon=371):
-    """The gambler, a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0 (lost), int32.
+    """The gambler, a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0
+    (lost), int32.
 
-    ``up`` (0 < up < 1) is traced, and so are the whole numbers ``start`` and ``goal`` (0 < start < goal); ``horizon`` (steps) is static. Miss distance:
-    max(goal - fortune, 0). ValueError for parameters outside of these ranges.
+    ``up`` (0 < up < 1) is traced, and so are the whole numbers ``start`` and ``goal`` (0 < start <
+    goal); ``horizon`` (steps) is static. Miss distance: max(goal - fortune, 0). ValueError for
+    parameters outside of these ranges.
     """
     up = _probability("ruin", up)
-    start, goal = (v if _traced(v) else whole("ruin", name, v) for name, v in (("start", start), ("goal", goal)))
+    start, goal = (
+        v if _traced(v) else whole("ruin", name, v)
+        for name, v in (("start", start), ("goal", goal))
+    )
     if not _traced(start) and not _traced(goal) and goal <= start:
         raise ValueError(f"ruin: goal must be above start = {start}, received {goal}")
     start, goal = jnp.asarray(start, jnp.int32), jnp.asarray(goal, jnp.int32)
-    return Simulator(Partial(_init, start), _step, Partial(_disturbance, up), Partial(_evaluate, goal, up), horizon, is_terminal=_is_terminal)
+    return Simulator(
+        Partial(_init, start),
+        _step,
+        Partial(_disturbance, up),
+        Partial(_evaluate, goal, up),
+        horizon,
+        is_terminal=_is_terminal,
+    )
 
 
 def ruin_probability(up=0.4, start=1, goal=30, horizon=None):
-    """The failure probability of `ruin`, scalar: in closed form without a horizon, else exactly, step by step. ``start``, ``goal``, ``horizon``: ints."""
+    """The failure probability of `ruin`, scalar: in closed form without a horizon, else exactly,
+    step by step. ``start``, ``goal``, ``horizon``: ints.
+    """
     up = _probability("ruin_probability", up)
     if horizon is None:
         log_r = jnp.log1p(-up) - jnp.log(up)
         fair = log_r == 0
         log_r = jnp.where(fair, 1, log_r)
-        # (r^i - 1) / (r^n - 1) with the greater power taken out where r > 1, so that nothing overflows
-        ratio = jnp.expm1(-jnp.abs(log_r) * start) / jnp.expm1(-jnp.abs(log_r) * goal) * jnp.exp(jnp.maximum(log_r, 0) * (start - goal))
+        # (r^i - 1) / (r^n - 1) with the greater power taken out where r > 1, so that nothing
+        # overflows
+        ratio = (
+            jnp.expm1(-jnp.abs(log_r) * start)
+            / jnp.expm1(-jnp.abs(log_r) * goal)
+            * jnp.exp(jnp.maximum(log_r, 0) * (start - goal))
+        )
         return jnp.where(fair, jnp.asarray(start / goal, up.dtype), ratio)
 
     def step(_, carry):
         mass, won = carry  # mass at the fortunes 1 to goal - 1
         end = jnp.zeros((1,), up.dtype)
-        return jnp.concatenate([end, up * mass[:-1]]) + jnp.concatenate([(1 - up) * mass[1:], end]), won + up * mass[-1]
+        return (
+            jnp.concatenate([end, up * mass[:-1]]) + jnp.concatenate([(1 - up) * mass[1:], end]),
+            won + up * mass[-1],
+        )
 
     mass = jnp.zeros((goal - 1,), up.dtype).at[start - 1].set(1)
     return lax.fori_loop(0, horizon, step, (mass, jnp.zeros((), up.dtype)))[1]
@@ -69,7 +93,8 @@ def _step(s, x):
 
 
 def _disturbance(up, s):
-    return Categorical(probs=jnp.stack([1 - up, up]), dtype=jnp.int32)  # a Bernoulli mixes dtypes in its density
+    # a Bernoulli mixes dtypes in its density
+    return Categorical(probs=jnp.stack([1 - up, up]), dtype=jnp.int32)
 
 
 def _evaluate(goal, up, s):

@@ -1,8 +1,9 @@
 """walk1D, the field's first example: a random walk that fails on leaving a band.
 
-Known truth (sigma = 1, threshold = 10, failure at any step; quadrature, two grids agree to 1e-9): "two-sided", T = 30 (POMDPStressTesting.jl):
-P = .1087363323; "one-sided", T = 10 (AdaStress.jl): P = 9.578759495e-4. Likeliest failure by raw log density, two-sided: 7 equal steps of 10/7,
-log p = -13.5754; by density over that of the mode: 30 steps of 1/3, -1.6667.
+Known truth (sigma = 1, threshold = 10, failure at any step; quadrature, two grids agree to 1e-9):
+"two-sided", T = 30 (POMDPStressTesting.jl): P = .1087363323; "one-sided", T = 10 (AdaStress.jl): P
+= 9.578759495e-4. Likeliest failure by raw log density, two-sided: 7 equal steps of 10/7, log p =
+-13.5754; by density over that of the mode: 30 steps of 1/3, -1.6667.
 """
 
 import jax.numpy as jnp
@@ -20,15 +21,22 @@ HORIZON = {"two-sided": 30, "one-sided": 10}
 def walk1d(form="two-sided", sigma=1.0, threshold=10.0, horizon=None):
     """s += x, x ~ N(0, sigma^2), from s = 0: a `Simulator` with a scalar state.
 
-    ``form="two-sided"`` fails where abs(s) >= threshold within 30 steps, miss distance max(threshold - abs(s), 0); ``"one-sided"`` where s >= threshold
-    within 10 steps, max(threshold - s, 0). ``sigma`` (of a step) and ``threshold`` are traced, ``horizon`` (steps, default by the form) is static.
-    ValueError for another form, or a parameter that is not positive.
+    ``form="two-sided"`` fails where abs(s) >= threshold within 30 steps, miss distance
+    max(threshold - abs(s), 0); ``"one-sided"`` where s >= threshold within 10 steps, max(threshold
+    - s, 0). ``sigma`` (of a step) and ``threshold`` are traced, ``horizon`` (steps, default by the
+    form) is static. ValueError for another form, or a parameter that is not positive.
     """
     if form not in HORIZON:
         raise ValueError(f'walk1d: form must be "two-sided" or "one-sided", received {form!r}')
     sigma, threshold = positive("walk1d", sigma=sigma, threshold=threshold)
     evaluate = Partial(_two_sided if form == "two-sided" else _one_sided, threshold)
-    return Simulator(Partial(_init, sigma), _step, Partial(_disturbance, sigma), evaluate, HORIZON[form] if horizon is None else horizon)
+    return Simulator(
+        Partial(_init, sigma),
+        _step,
+        Partial(_disturbance, sigma),
+        evaluate,
+        HORIZON[form] if horizon is None else horizon,
+    )
 
 
 def _init(sigma, x0):

@@ -1,4 +1,6 @@
-"""Adversarial weakness recognition (Moss's thesis, chapter 4): which inputs of a labelled data set a classifier gets wrong, found with few calls of it."""
+"""Adversarial weakness recognition (Moss's thesis, chapter 4): which inputs of a labelled data set
+a classifier gets wrong, found with few calls of it.
+"""
 
 from jast.weakness.contract import Seen, Selector, Step
 from jast.weakness.data import Data, digits, from_idx, idx
@@ -10,6 +12,26 @@ from jast.weakness.storage import load, save
 from jast.weakness.validate import validate
 
 __all__ = [
-    "Data", "History", "Judgement", "Result", "Roc", "Seen", "Selector", "State", "Step", "auc", "default", "digits", "from_idx", "idx", "influence", "judge",
-    "load", "random", "roc", "save", "thesis", "validate",
-]  # fmt: skip
+    "Data",
+    "History",
+    "Judgement",
+    "Result",
+    "Roc",
+    "Seen",
+    "Selector",
+    "State",
+    "Step",
+    "auc",
+    "default",
+    "digits",
+    "from_idx",
+    "idx",
+    "influence",
+    "judge",
+    "load",
+    "random",
+    "roc",
+    "save",
+    "thesis",
+    "validate",
+]

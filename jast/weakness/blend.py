@@ -10,7 +10,9 @@ def sigmoid(x):
 
 
 def logistic(rows, failed, mean, precision):
-    """[p]: the most probable coefficients for ``rows`` [m, p] and ``failed`` [m] bool under independent normal priors, by Newton's method with halved steps."""
+    """[p]: the most probable coefficients for ``rows`` [m, p] and ``failed`` [m] bool under
+    independent normal priors, by Newton's method with halved steps.
+    """
     target = failed.astype(float)
 
     def cost(b):

@@ -1,4 +1,6 @@
-"""A committee of small classifiers, each trained without a part of the inputs: what those left out think of every input, in one program."""
+"""A committee of small classifiers, each trained without a part of the inputs: what those left out
+think of every input, in one program.
+"""
 
 from typing import Any, NamedTuple
 
@@ -26,8 +28,9 @@ class Committee(NamedTuple):
 
 
 def folds(rng, n, parts=5, repeats=4):
-    """[parts * repeats, n] bool: the inputs that each member may learn from; every one leaves out its own part, so that each input is left out ``repeats``
-    times."""
+    """[parts * repeats, n] bool: the inputs that each member may learn from; every one leaves out
+    its own part, so that each input is left out ``repeats`` times.
+    """
     rows = []
     for _ in range(repeats):
         part = rng.permutation(n) % parts
@@ -36,25 +39,36 @@ def folds(rng, n, parts=5, repeats=4):
 
 
 def fit(rng, x, targets, weights, classes, passes):
-    """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n] by Adam.
+    """Train a `Committee` on ``x`` [n, d] float32 with ``targets`` [n] int and ``weights`` [M, n]
+    by Adam.
 
-    All members see the same minibatches, so that their first layers are one matrix product. ``passes``: over the inputs, as long as these are
-    300 to 1500 steps.
+    All members see the same minibatches, so that their first layers are one matrix product.
+    ``passes``: over the inputs, as long as these are 300 to 1500 steps.
     """
     members, (n, d) = len(weights), x.shape
-    batch = min(BATCH, max(n // 8, min(n, 16)))  # few inputs: small batches, so that they are not passed over too often
+    # few inputs: small batches, so that they are not passed over too often
+    batch = min(BATCH, max(n // 8, min(n, 16)))
     steps = max(STEPS[0], min(passes * n // batch, STEPS[1]))
-    order = np.concatenate([rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(-(-steps // (n // batch)))])[:steps].astype(np.int32)
+    order = np.concatenate(
+        [
+            rng.permutation(n)[: n // batch * batch].reshape(-1, batch)
+            for _ in range(-(-steps // (n // batch)))
+        ]
+    )[:steps].astype(np.int32)
     normal = lambda *shape: rng.standard_normal(shape, np.float32)
     start = Committee(
-        normal(d, members, HIDDEN) * np.float32(np.sqrt(2 / d)), np.zeros((members, HIDDEN), np.float32),
-        normal(members, HIDDEN, classes) * np.float32(np.sqrt(1 / HIDDEN)), np.zeros((members, classes), np.float32),
-    )  # fmt: skip
+        normal(d, members, HIDDEN) * np.float32(np.sqrt(2 / d)),
+        np.zeros((members, HIDDEN), np.float32),
+        normal(members, HIDDEN, classes) * np.float32(np.sqrt(1 / HIDDEN)),
+        np.zeros((members, classes), np.float32),
+    )
     return _fit(start, x, targets.astype(np.int32), weights.astype(np.float32), order)
 
 
 def held_out(committee, x, labels, learn):
-    """[n]: the mean probability that members who have not learned from an input (``learn`` [M, n] bool) give to its label."""
+    """[n]: the mean probability that members who have not learned from an input (``learn`` [M, n]
+    bool) give to its label.
+    """
     each = np.exp(np.asarray(_label_log_probs(committee, x, labels.astype(np.int32))))
     out = ~np.asarray(learn).T
     return np.sum(each * out, axis=1) / out.sum(1)
@@ -68,7 +82,8 @@ def _label_log_probs(committee, x, labels):
         with jax.numpy_rank_promotion("allow"):
             return jax.nn.log_softmax(logits(committee, row[0]))[:, row[1]]
 
-    return jax.lax.map(one, (x, labels), batch_size=ROWS)  # in blocks: all logits of many classes would not fit
+    # in blocks: all logits of many classes would not fit
+    return jax.lax.map(one, (x, labels), batch_size=ROWS)
 
 
 def logits(committee, x):
@@ -79,12 +94,16 @@ def logits(committee, x):
 
 @jax.jit
 def gradient(committee, x, labels):
-    """[m, d]: the gradient at each row of ``x`` of the log odds that its label is not what the committee says."""
+    """[m, d]: the gradient at each row of ``x`` of the log odds that its label is not what the
+    committee says.
+    """
 
     def odds(x, label):
         each = jax.nn.log_softmax(logits(committee, x))
         # sums over the members are their mean, but for a constant that both have
-        return jax.nn.logsumexp(jnp.where(jnp.arange(each.shape[1], dtype=label.dtype) == label, -jnp.inf, each)) - jax.nn.logsumexp(each[:, label])
+        return jax.nn.logsumexp(
+            jnp.where(jnp.arange(each.shape[1], dtype=label.dtype) == label, -jnp.inf, each)
+        ) - jax.nn.logsumexp(each[:, label])
 
     with jax.numpy_rank_promotion("allow"):
         return jax.vmap(jax.grad(odds))(x, labels)
@@ -94,7 +113,8 @@ def gradient(committee, x, labels):
 def _fit(start, x, targets, weights, order):
     import optax
 
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # optax asks for it
+    # optax asks for it
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         steps, batch = order.shape
         adam = optax.adam(lambda i: RATE * (1 - i / steps))
 

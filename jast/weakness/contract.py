@@ -1,4 +1,6 @@
-"""What stands between the validation loop and a way of choosing inputs: what it is given, and what it answers."""
+"""What stands between the validation loop and a way of choosing inputs: what it is given, and what
+it answers.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -35,7 +37,9 @@ class Step(NamedTuple):
     scores: Any
     """[n] in [0, 1]: how suspect each input is"""
     candidates: Any
-    """[k] int: the inputs that it ran because it held them for failures; their share of failures is the iteration's precision"""
+    """[k] int: the inputs that it ran because it held them for failures; their share of failures is
+    the iteration's precision
+    """
     expected: float
     """Failures that it expects among the inputs not yet run"""
 
@@ -49,5 +53,7 @@ class Selector(NamedTuple):
     start: Callable
     """``start(key, data) -> memory``, before any call"""
     step: Callable
-    """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do. ``ask(indices)`` runs the system on those of ``indices`` that
-    were not run yet, as far as the budget goes, and returns the new `Seen`."""
+    """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do.
+    ``ask(indices)`` runs the system on those of ``indices`` that were not run yet, as far as the
+    budget goes, and returns the new `Seen`.
+    """

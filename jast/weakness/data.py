@@ -1,4 +1,6 @@
-"""Labelled data sets: arrays, checked once for everything that works on them, and where they come from."""
+"""Labelled data sets: arrays, checked once for everything that works on them, and where they come
+from.
+"""
 
 import gzip
 import hashlib
@@ -13,7 +15,8 @@ from jast._checks import whole
 
 __all__ = ["Data", "arrays", "digits", "fingerprint", "from_idx", "idx", "within"]
 
-TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}  # of IDX files, which are big-endian
+# of IDX files, which are big-endian
+TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}
 
 
 LARGEST, MOST = 1e30, 65_536  # number among the inputs; classes
@@ -34,33 +37,61 @@ class Data(NamedTuple):
 
     @property
     def image(self):
-        """Whether the inputs are images or other grids, whose numbers have one unit; else they are rows of a table, whose columns each have their own."""
+        """Whether the inputs are images or other grids, whose numbers have one unit; else they are
+        rows of a table, whose columns each have their own.
+        """
         return self.inputs.ndim > 2
 
 
 def arrays(function, inputs, labels, classes=None):
-    """A `Data` of ``inputs`` [n, ...] and ``labels`` [n]. ``classes``: how many there are; default: the largest label and 1.
+    """A `Data` of ``inputs`` [n, ...] and ``labels`` [n]. ``classes``: how many there are; default:
+    the largest label and 1.
 
-    ValueError, in the name of ``function``, for arrays of other shapes or lengths, numbers that are not finite, labels that are not whole or out of range.
+    ValueError, in the name of ``function``, for arrays of other shapes or lengths, numbers that are
+    not finite, labels that are not whole or out of range.
     """
     inputs, labels = np.asarray(inputs), np.asarray(labels)
     if inputs.ndim < 2 or inputs.dtype.kind not in "fiub" or inputs.size == 0:
-        raise ValueError(f"{function}: inputs must be numbers [n, ...], n inputs of one shape, received {inputs.dtype} of shape {inputs.shape}")
+        raise ValueError(
+            f"{function}: inputs must be numbers [n, ...], n inputs of one shape, received"
+            f" {inputs.dtype} of shape {inputs.shape}"
+        )
     if inputs.dtype.kind == "f":
         bad = np.flatnonzero(~np.isfinite(inputs).reshape(len(inputs), -1).all(1))
         if len(bad):
-            raise ValueError(f"{function}: inputs must be finite; {len(bad)} of {len(inputs)} hold NaN or infinity, the first is number {bad[0]}")
+            raise ValueError(
+                f"{function}: inputs must be finite; {len(bad)} of {len(inputs)} hold NaN or"
+                f" infinity, the first is number {bad[0]}"
+            )
     if max(abs(float(inputs.max())), abs(float(inputs.min()))) > LARGEST:
-        raise ValueError(f"{function}: inputs must lie within {LARGEST:g} of 0, received {inputs.min()} to {inputs.max()}")
+        raise ValueError(
+            f"{function}: inputs must lie within {LARGEST:g} of 0, received {inputs.min()} to"
+            f" {inputs.max()}"
+        )
     if labels.shape != (len(inputs),) or labels.dtype.kind not in "iub":
-        hint = "" if labels.dtype.kind in "iub" else "; np.unique(labels, return_inverse=True)[1] makes such numbers"
-        raise ValueError(f"{function}: labels must be whole numbers [{len(inputs)}], one for each input, received {labels.dtype} of shape {labels.shape}{hint}")
-    classes = max(int(labels.max()) + 1, 2) if classes is None else whole(function, "classes", classes, 2)
+        hint = (
+            ""
+            if labels.dtype.kind in "iub"
+            else "; np.unique(labels, return_inverse=True)[1] makes such numbers"
+        )
+        raise ValueError(
+            f"{function}: labels must be whole numbers [{len(inputs)}], one for each input,"
+            f" received {labels.dtype} of shape {labels.shape}{hint}"
+        )
+    classes = (
+        max(int(labels.max()) + 1, 2) if classes is None else whole(function, "classes", classes, 2)
+    )
     if classes > MOST:
-        raise ValueError(f"{function}: there may be {MOST} classes, received {classes}; np.unique(labels, return_inverse=True)[1] leaves no gaps")
+        raise ValueError(
+            f"{function}: there may be {MOST} classes, received {classes}; np.unique(labels,"
+            " return_inverse=True)[1] leaves no gaps"
+        )
     bad = np.flatnonzero((labels < 0) | (labels >= classes))
     if len(bad):
-        raise ValueError(f"{function}: labels must lie in 0 ... {classes - 1}; {len(bad)} do not, the first is number {bad[0]}: {labels[bad[0]]}")
+        raise ValueError(
+            f"{function}: labels must lie in 0 ... {classes - 1}; {len(bad)} do not, the first is"
+            f" number {bad[0]}: {labels[bad[0]]}"
+        )
     return Data(inputs, labels.astype(np.int32), classes)
 
 
@@ -78,46 +109,72 @@ def fingerprint(data):
 
 
 def idx(path):
-    """The array of one IDX file, the format of MNIST, EMNIST and Fashion-MNIST, compressed with gzip or not; in the machine's byte order.
+    """The array of one IDX file, the format of MNIST, EMNIST and Fashion-MNIST, compressed with
+    gzip or not; in the machine's byte order.
 
-    Y. LeCun, C. Cortes, C. Burges, "The MNIST database of handwritten digits": two zero bytes, a code of the type, the number of dimensions, each dimension as
-    a big-endian 32-bit number, then the numbers row by row. ValueError for a file that is damaged or none of these.
+    Y. LeCun, C. Cortes, C. Burges, "The MNIST database of handwritten digits": two zero bytes, a
+    code of the type, the number of dimensions, each dimension as a big-endian 32-bit number, then
+    the numbers row by row. ValueError for a file that is damaged or none of these.
     """
     raw = _content(path)
     if len(raw) < 4 or raw[:2] != b"\0\0":
-        raise ValueError(f"idx: {path} must be an IDX file, starting with two zero bytes, a type and a number of dimensions; it starts with {raw[:4]!r}")
+        raise ValueError(
+            f"idx: {path} must be an IDX file, starting with two zero bytes, a type and a number of"
+            f" dimensions; it starts with {raw[:4]!r}"
+        )
     if raw[2] not in TYPES:
-        raise ValueError(f"idx: {path} must have a type of {', '.join(f'0x{t:02X}' for t in TYPES)}, received 0x{raw[2]:02X}")
+        raise ValueError(
+            f"idx: {path} must have a type of {', '.join(f'0x{t:02X}' for t in TYPES)}, received"
+            f" 0x{raw[2]:02X}"
+        )
     start = 4 + 4 * raw[3]
     if len(raw) < start:
-        raise ValueError(f"idx: {path} is cut off in its header: {raw[3]} dimensions take {start} bytes, received {len(raw)}")
+        raise ValueError(
+            f"idx: {path} is cut off in its header: {raw[3]} dimensions take {start} bytes,"
+            f" received {len(raw)}"
+        )
     kind = np.dtype(f">{TYPES[raw[2]]}")
     shape = tuple(int.from_bytes(raw[at : at + 4], "big") for at in range(4, start, 4))
     size = math.prod(shape) * kind.itemsize
     if len(raw) != start + size:
         state = "cut off" if len(raw) < start + size else "too long"
-        raise ValueError(f"idx: {path} is {state}: {kind} of shape {shape} is {size} bytes after the header, received {len(raw) - start}")
+        raise ValueError(
+            f"idx: {path} is {state}: {kind} of shape {shape} is {size} bytes after the header,"
+            f" received {len(raw) - start}"
+        )
     return np.frombuffer(raw, kind, offset=start).reshape(shape).astype(kind.newbyteorder("="))
 
 
 def from_idx(folder, name="t10k"):
-    """``(inputs [n, height, width] float32 in [0, 1], labels [n] int32)`` of a folder of IDX files: MNIST's, by default its test images.
+    """``(inputs [n, height, width] float32 in [0, 1], labels [n] int32)`` of a folder of IDX files:
+    MNIST's, by default its test images.
 
-    The files are ``<name>-images-idx3-ubyte`` and ``<name>-labels-idx1-ubyte``, or with a dot before ``idx``, and ``.gz`` after it or not. FileNotFoundError
-    where there are none; ValueError where they are damaged, or hold something else than n images and n labels of unsigned bytes.
+    The files are ``<name>-images-idx3-ubyte`` and ``<name>-labels-idx1-ubyte``, or with a dot
+    before ``idx``, and ``.gz`` after it or not. FileNotFoundError where there are none; ValueError
+    where they are damaged, or hold something else than n images and n labels of unsigned bytes.
     """
-    images, labels = (_named(folder, f"{name}-{part}", f"idx{dims}-ubyte", dims) for part, dims in (("images", 3), ("labels", 1)))
+    images, labels = (
+        _named(folder, f"{name}-{part}", f"idx{dims}-ubyte", dims)
+        for part, dims in (("images", 3), ("labels", 1))
+    )
     if len(images) != len(labels):
-        raise ValueError(f"from_idx: {name} in {folder} must have a label for each image, received {len(images)} images and {len(labels)} labels")
+        raise ValueError(
+            f"from_idx: {name} in {folder} must have a label for each image, received {len(images)}"
+            f" images and {len(labels)} labels"
+        )
     return images.astype(np.float32) / np.float32(255), labels.astype(np.int32)
 
 
 def digits():
-    """``(inputs [1797, 8, 8] float32 in [0, 1], labels [1797] int32)``: the handwritten digits that come with scikit-learn, of E. Alpaydin and C. Kaynak."""
+    """``(inputs [1797, 8, 8] float32 in [0, 1], labels [1797] int32)``: the handwritten digits that
+    come with scikit-learn, of E. Alpaydin and C. Kaynak.
+    """
     try:
         from sklearn.datasets import load_digits
     except ImportError as error:
-        raise ImportError("digits: the images come with scikit-learn: pip install 'jast[digits]'") from error
+        raise ImportError(
+            "digits: the images come with scikit-learn: pip install 'jast[digits]'"
+        ) from error
     bunch = load_digits()
     return (bunch.images / 16).astype(np.float32), bunch.target.astype(np.int32)
 
@@ -129,15 +186,24 @@ def _content(path):
     try:
         return gzip.decompress(raw)
     except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"idx: {path} must be a whole gzip file, received one that is damaged: {error}") from error
+        raise ValueError(
+            f"idx: {path} must be a whole gzip file, received one that is damaged: {error}"
+        ) from error
 
 
 def _named(folder, stem, ending, dims):
-    paths = [Path(folder) / f"{stem}{joint}{ending}{packed}" for joint in "-." for packed in ("", ".gz")]
+    paths = [
+        Path(folder) / f"{stem}{joint}{ending}{packed}" for joint in "-." for packed in ("", ".gz")
+    ]
     found = next((path for path in paths if path.is_file()), None)
     if found is None:
-        raise FileNotFoundError(f"from_idx: none of {', '.join(path.name for path in paths)} is in {folder}")
+        raise FileNotFoundError(
+            f"from_idx: none of {', '.join(path.name for path in paths)} is in {folder}"
+        )
     array = idx(found)
     if array.dtype != np.uint8 or array.ndim != dims:
-        raise ValueError(f"from_idx: {found} must hold unsigned bytes in {dims} dimensions, received {array.dtype} of shape {array.shape}")
+        raise ValueError(
+            f"from_idx: {found} must hold unsigned bytes in {dims} dimensions, received"
+            f" {array.dtype} of shape {array.shape}"
+        )
     return array

@@ -1,4 +1,6 @@
-"""The default selector: how hard each input is, learned from the labels before any call, and how the system differs, learned from its answers."""
+"""The default selector: how hard each input is, learned from the labels before any call, and how
+the system differs, learned from its answers.
+"""
 
 import numpy as np
 
@@ -12,30 +14,41 @@ from jast.weakness.views import components, difficulty_of_neighbours, reduce, vi
 
 __all__ = ["default"]
 
-PASSES = {True: 8, False: 50}  # over images, whose many pixels are soon learned by heart, and over tables
+# over images, whose many pixels are soon learned by heart, and over tables
+PASSES = {True: 8, False: 50}
 CLOSE = 64  # principal components in which distances are measured
 STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
-SURE, ENOUGH = 2, 20  # failures that the scores' sum over easy inputs is worth, where at least so many random calls correct it
-# log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision of the prior of b
+# failures that the scores' sum over easy inputs is worth, where at least so many random calls
+# correct it
+SURE, ENOUGH = 2, 20
+# log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision
+# of the prior of b
 PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
 
 
 def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
-    """The `Selector` that `validate` uses unless told otherwise. It needs no knowledge of the system, and works on images and tables.
+    """The `Selector` that `validate` uses unless told otherwise. It needs no knowledge of the
+    system, and works on images and tables.
 
-    Before any call, a committee of small networks is cross-validated on the inputs and their labels: an input that those who have not seen it get wrong is
-    a hard one for most classifiers. After each batch a second committee imitates the system: it learns the system's answers where they are known (each with
-    the weight of ten) and the labels elsewhere, and again each input is judged by members that have not seen it. A logistic regression on the inputs that were
-    run blends these opinions and that of an input's nearest neighbours; a Gaussian process over inputs with the same label adds what they all miss, such as a
-    region of easy inputs that the system gets wrong.
+    Before any call, a committee of small networks is cross-validated on the inputs and their
+    labels: an input that those who have not seen it get wrong is a hard one for most classifiers.
+    After each batch a second committee imitates the system: it learns the system's answers where
+    they are known (each with the weight of ten) and the labels elsewhere, and again each input is
+    judged by members that have not seen it. A logistic regression on the inputs that were run
+    blends these opinions and that of an input's nearest neighbours; a Gaussian process over inputs
+    with the same label adds what they all miss, such as a region of easy inputs that the system
+    gets wrong.
 
-    A batch is the inputs with the highest probability of failure, but for a share that is drawn at random from the others: ``exploration`` over the least
-    probability in the batch, at most a fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls of the first batch
-    (default: half a per cent of the inputs, at least 10), then ``growth`` times the calls so far, at least ``first``. ``repeats``: how often each input is left
-    out; each repetition is five networks for each of two views. The scores are probabilities of failure. ``expected`` is their sum over what was not run,
-    corrected by how the random calls turned out once there are twenty: a rough guide, in the runs measured between a seventh and six times the truth, as
-    suspicious inputs teach little about easy ones; random choice expects without bias. In a state, ``memory["difficulty"]`` is the committee's word before
-    any call, as log odds.
+    A batch is the inputs with the highest probability of failure, but for a share that is drawn at
+    random from the others: ``exploration`` over the least probability in the batch, at most a
+    fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls
+    of the first batch (default: half a per cent of the inputs, at least 10), then ``growth`` times
+    the calls so far, at least ``first``. ``repeats``: how often each input is left out; each
+    repetition is five networks for each of two views. The scores are probabilities of failure.
+    ``expected`` is their sum over what was not run, corrected by how the random calls turned out
+    once there are twenty: a rough guide, in the runs measured between a seventh and six times the
+    truth, as suspicious inputs teach little about easy ones; random choice expects without bias. In
+    a state, ``memory["difficulty"]`` is the committee's word before any call, as log odds.
     """
     first = first if first is None else whole("default", "first", first)
     repeats = whole("default", "repeats", repeats)
@@ -49,26 +62,52 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
         seen_as = views(data, reduced)
         close = reduced[:, :CLOSE] if reduced.shape[1] else components(rng, seen_as.centred, CLOSE)
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
-        difficulty = sum(_odds(rng, view, data.labels, learn, learn, data) for view in seen_as) / len(seen_as)
+        difficulty = sum(
+            _odds(rng, view, data.labels, learn, learn, data) for view in seen_as
+        ) / len(seen_as)
         neighbours = difficulty_of_neighbours(rng, close, data.labels, data.classes)
         drawn, blends = np.zeros(data.size, bool), np.tile(PRIOR, (data.size, 1))
-        return dict(reduced=reduced, close=close, learn=learn, difficulty=difficulty, neighbours=neighbours, suspicion=difficulty, drawn=drawn, blends=blends)
+        return dict(
+            reduced=reduced,
+            close=close,
+            learn=learn,
+            difficulty=difficulty,
+            neighbours=neighbours,
+            suspicion=difficulty,
+            drawn=drawn,
+            blends=blends,
+        )
 
     def step(key, data, memory, seen, ask):
         rng = generator(key)
         least = max(10, data.size // 200) if first is None else first
-        chosen, likely = _batch(rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration)
+        chosen, likely = _batch(
+            rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration
+        )
         seen = ask(chosen)
         tried = seen.tried
-        answers, weights = np.where(tried, seen.predicted, data.labels), memory["learn"] * np.where(tried, STRENGTH, 1)
-        imitations = [_odds(rng, view, answers, weights, memory["learn"], data) for view in views(data, memory["reduced"])]
-        rows = np.stack([memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1)
+        answers, weights = (
+            np.where(tried, seen.predicted, data.labels),
+            memory["learn"] * np.where(tried, STRENGTH, 1),
+        )
+        imitations = [
+            _odds(rng, view, answers, weights, memory["learn"], data)
+            for view in views(data, memory["reduced"])
+        ]
+        rows = np.stack(
+            [memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1
+        )
         blend = logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
         # an input that was run is judged by the blend from before its outcome was known
         blends = np.where(tried[:, None], memory["blends"], blend)
         odds = np.sum(rows * blends, axis=1)
-        suspicion = np.where(tried, odds, odds + residual(rng, memory["close"], data.labels, rows @ blend, seen))
-        scores, drawn = sigmoid(suspicion), memory["drawn"] | tried & np.isin(np.arange(data.size), np.setdiff1d(chosen, likely))
+        suspicion = np.where(
+            tried, odds, odds + residual(rng, memory["close"], data.labels, rows @ blend, seen)
+        )
+        scores, drawn = (
+            sigmoid(suspicion),
+            memory["drawn"] | tried & np.isin(np.arange(data.size), np.setdiff1d(chosen, likely)),
+        )
         memory = memory | dict(suspicion=suspicion, drawn=drawn, blends=blends)
         return Step(memory, scores, likely, _expected(scores, seen, drawn))
 
@@ -76,26 +115,35 @@ def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
 
 
 def _expected(scores, seen, drawn):
-    """Failures among what was not run: the sum of the scores, times how many more failures than their scores say were among those ``drawn`` [n] at random."""
+    """Failures among what was not run: the sum of the scores, times how many more failures than
+    their scores say were among those ``drawn`` [n] at random.
+    """
     left = scores[~seen.tried]
-    alike = drawn & (scores <= left.max(initial=0))  # those that would not have been run by now for their scores
-    more = (SURE + seen.failed[alike].sum()) / (SURE + scores[alike].sum())  # a gamma prior of mean 1, worth SURE failures
+    # those that would not have been run by now for their scores
+    alike = drawn & (scores <= left.max(initial=0))
+    # a gamma prior of mean 1, worth SURE failures
+    more = (SURE + seen.failed[alike].sum()) / (SURE + scores[alike].sum())
     return float(left.sum() * (more if alike.sum() >= ENOUGH else 1))
 
 
 def _odds(rng, x, answers, weights, learn, data):
     """[n] log odds against each input's label, by the members that have not learned from it."""
     trained = committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])
-    right = np.clip(committee.held_out(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6)
+    right = np.clip(
+        committee.held_out(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6
+    )
     return np.log1p(-right) - np.log(right)
 
 
 def _batch(rng, suspicion, seen, size, exploration):
-    """(inputs to run, those of them that are held for failures): the most suspect, and some of the others at random."""
+    """(inputs to run, those of them that are held for failures): the most suspect, and some of the
+    others at random.
+    """
     free = np.flatnonzero(~seen.tried)
     size = min(size, len(free))
     ranked = free[np.argsort(-suspicion[free], kind="stable")]
     share = min(exploration / max(sigmoid(suspicion[ranked[size - 1]]), 1e-6), 0.2)
-    random = rng.binomial(size, share) if len(seen.order) else 0  # the first batch tells how the prior was
+    # the first batch tells how the prior was
+    random = rng.binomial(size, share) if len(seen.order) else 0
     likely = ranked[: size - random]
     return np.concatenate([likely, rng.permutation(ranked[size - random :])[:random]]), likely

@@ -1,4 +1,6 @@
-"""Which numbers of an input make it fail: contributions to the log odds of failure, by networks that imitate the system."""
+"""Which numbers of an input make it fail: contributions to the log odds of failure, by networks
+that imitate the system.
+"""
 
 import numpy as np
 
@@ -15,11 +17,14 @@ MEMBERS, EFFORT = 5, 4
 
 
 def influence(key, result, inputs, labels, *, at=None, classes=None):
-    """[k, ...]: what each number of k inputs contributes to the log odds that the system gets them wrong, in the shape of the inputs; above 0: to failure.
+    """[k, ...]: what each number of k inputs contributes to the log odds that the system gets them
+    wrong, in the shape of the inputs; above 0: to failure.
 
-    The gradient of these log odds times the input's difference from the mean input, by five networks that have learned the system's answers where ``result``
-    has them, and the labels elsewhere, whatever selector found them. A first-order picture of an imitation, not of the system itself. ``inputs``, ``labels``,
-    ``classes``: those of `validate`. ``at``: which inputs; default: the failures found. The key is consumed.
+    The gradient of these log odds times the input's difference from the mean input, by five
+    networks that have learned the system's answers where ``result`` has them, and the labels
+    elsewhere, whatever selector found them. A first-order picture of an imitation, not of the
+    system itself. ``inputs``, ``labels``, ``classes``: those of `validate`. ``at``: which inputs;
+    default: the failures found. The key is consumed.
 
     ValueError for other inputs or labels than the result's, and indices out of range.
     """
@@ -32,12 +37,21 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
         raise ValueError("influence: inputs and labels are not those of the result")
     at = np.asarray(result.failures if at is None else at)
     if at.ndim != 1 or not within(at, data.size):
-        raise ValueError(f"influence: at must be indices [k] in 0 ... {data.size - 1}, received {at!r}")
+        raise ValueError(
+            f"influence: at must be indices [k] in 0 ... {data.size - 1}, received {at!r}"
+        )
     at = at.astype(int)
     tried = result.predicted >= 0
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
     rng = generator(key)
     x = centred(scaled(data), data.image)
-    imitation = committee.fit(rng, x, np.where(tried, result.predicted, data.labels), weights, data.classes, EFFORT * PASSES[data.image])
+    imitation = committee.fit(
+        rng,
+        x,
+        np.where(tried, result.predicted, data.labels),
+        weights,
+        data.classes,
+        EFFORT * PASSES[data.image],
+    )
     slope = np.asarray(committee.gradient(imitation, x[at], data.labels[at]))
     return (slope * (x[at] - x.mean(0))).reshape(-1, *data.inputs.shape[1:])

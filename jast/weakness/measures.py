@@ -1,4 +1,6 @@
-"""How well scores tell failures from the rest: ROC curves, the area under them, precision and recall."""
+"""How well scores tell failures from the rest: ROC curves, the area under them, precision and
+recall.
+"""
 
 from typing import Any, NamedTuple
 
@@ -40,53 +42,88 @@ class Judgement(NamedTuple):
 
 
 def roc(scores, failed):
-    """The `Roc` of ``scores`` [n] (high: suspect) against ``failed`` [n] bool; equal scores are one point. NaN shares where all fail or none.
+    """The `Roc` of ``scores`` [n] (high: suspect) against ``failed`` [n] bool; equal scores are one
+    point. NaN shares where all fail or none.
 
     ValueError for arrays of other lengths, and scores that are NaN.
     """
     scores, failed = _pair("roc", scores, failed)
     order = np.argsort(-scores, kind="stable")
-    last = np.flatnonzero(np.append(np.diff(scores[order]) != 0, True)) if len(scores) else np.zeros(0, int)
+    last = (
+        np.flatnonzero(np.append(np.diff(scores[order]) != 0, True))
+        if len(scores)
+        else np.zeros(0, int)
+    )
     hits, count = np.cumsum(failed[order])[last], last + 1
-    share = lambda part, whole: np.append(0.0, part / whole if whole else np.full(len(part), np.nan))
-    return Roc(share(count - hits, np.sum(~failed)), share(hits, np.sum(failed)), np.append(np.inf, scores[order][last]))
+    share = lambda part, whole: np.append(
+        0.0, part / whole if whole else np.full(len(part), np.nan)
+    )
+    return Roc(
+        share(count - hits, np.sum(~failed)),
+        share(hits, np.sum(failed)),
+        np.append(np.inf, scores[order][last]),
+    )
 
 
 def auc(scores, failed):
-    """Area under the ROC curve: the chance that a failure has the higher score of a random pair, equal ones count half. NaN where all inputs fail or none."""
+    """Area under the ROC curve: the chance that a failure has the higher score of a random pair,
+    equal ones count half. NaN where all inputs fail or none.
+    """
     return roc(scores, failed).area
 
 
 def judge(result, failed, *, threshold=0.5, top=None):
-    """The `Judgement` of a result's iterations by the truth on all inputs: ``failed`` [n] bool, which only a study knows that has run the system on all.
+    """The `Judgement` of a result's iterations by the truth on all inputs: ``failed`` [n] bool,
+    which only a study knows that has run the system on all.
 
-    Candidates are the inputs with a score of at least ``threshold``, or, with ``top``, the so many with the highest. The scores of inputs that were run are
-    those of models that have not seen their outcomes (the thesis's adversary has: as published).
+    Candidates are the inputs with a score of at least ``threshold``, or, with ``top``, the so many
+    with the highest. The scores of inputs that were run are those of models that have not seen
+    their outcomes (the thesis's adversary has: as published).
     """
     if not isinstance(result, Result):
         raise ValueError(f"judge: result must be a Result, received {type(result).__name__}")
-    threshold = number("judge", "threshold", threshold, lambda v: not np.isnan(v), "to compare scores with")
+    threshold = number(
+        "judge", "threshold", threshold, lambda v: not np.isnan(v), "to compare scores with"
+    )
     every = np.asarray(result.history.scores)
     failed = np.asarray(failed)
     if failed.shape != every.shape[1:] or failed.dtype != bool:
-        raise ValueError(f"judge: failed must be bool [{every.shape[1]}], received {failed.dtype} of shape {failed.shape}")
+        raise ValueError(
+            f"judge: failed must be bool [{every.shape[1]}], received {failed.dtype} of shape"
+            f" {failed.shape}"
+        )
     n = len(failed)
     if not failed[result.failures].all():
-        raise ValueError("judge: failed must agree with the result, whose failures are not all among them")
+        raise ValueError(
+            "judge: failed must agree with the result, whose failures are not all among them"
+        )
     if top is not None and whole("judge", "top", top) > n:
         raise ValueError(f"judge: top must be at most {n}, the inputs there are, received {top!r}")
     rows = []
     for scores in every:
-        chosen = scores >= threshold if top is None else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
+        chosen = (
+            scores >= threshold
+            if top is None
+            else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
+        )
         hits, k, all_ = int(np.sum(failed & chosen)), int(np.sum(chosen)), int(np.sum(failed))
-        rows.append((auc(scores, failed), hits / k if k else np.nan, hits / all_ if all_ else np.nan, k))
-    return Judgement(*(np.asarray(column) for column in zip(*rows, strict=True))) if rows else Judgement(*(np.zeros(0) for _ in range(4)))
+        rows.append(
+            (auc(scores, failed), hits / k if k else np.nan, hits / all_ if all_ else np.nan, k)
+        )
+    return (
+        Judgement(*(np.asarray(column) for column in zip(*rows, strict=True)))
+        if rows
+        else Judgement(*(np.zeros(0) for _ in range(4)))
+    )
 
 
 def _pair(function, scores, failed):
     scores, failed = np.asarray(scores, float), np.asarray(failed)
     if scores.ndim != 1 or scores.shape != failed.shape or failed.dtype != bool:
-        raise ValueError(f"{function}: scores and failed must be [n], failed bool, received {scores.shape} and {failed.dtype} of shape {failed.shape}")
+        raise ValueError(
+            f"{function}: scores and failed must be [n], failed bool, received {scores.shape} and"
+            f" {failed.dtype} of shape {failed.shape}"
+        )
     if np.isnan(scores).any():
         raise ValueError(f"{function}: scores must not be NaN, {int(np.isnan(scores).sum())} are")
     return scores, failed

@@ -1,4 +1,5 @@
-"""The two networks of adversarial weakness recognition and their training: an autoencoder of the inputs, an adversary that tells failures by their codes.
+"""The two networks of adversarial weakness recognition and their training: an autoencoder of the
+inputs, an adversary that tells failures by their codes.
 
 R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford 2021, chapter 4.
 """
@@ -12,31 +13,47 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-__all__ = ["Network", "adversary", "autoencoder", "fit_adversary", "fit_autoencoder", "logits", "sizes"]
+__all__ = [
+    "Network",
+    "adversary",
+    "autoencoder",
+    "fit_adversary",
+    "fit_autoencoder",
+    "logits",
+    "sizes",
+]
 
 ADVERSARY = (128, 64)
 LEAK = 0.01  # of the autoencoder's leaky ReLU; Flux's default, which the published code takes
 
 
 class Network(NamedTuple):
-    """Pure functions of one Flax module, the same object whenever one of the same sizes is asked for: programs that hold it are not compiled again."""
+    """Pure functions of one Flax module, the same object whenever one of the same sizes is asked
+    for: programs that hold it are not compiled again.
+    """
 
     init: Any
     """``init(key) -> params``: weights uniform as Glorot's, biases zero, float32"""
     apply: Any
-    """``apply(params, x [..., inputs])``: of the autoencoder the reconstruction [..., inputs], of the adversary the logits [...]"""
+    """``apply(params, x [..., inputs])``: of the autoencoder the reconstruction [..., inputs], of
+    the adversary the logits [...]
+    """
     encode: Any
     """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; None of the adversary"""
 
 
 def sizes(inputs):
-    """The autoencoder's layers for so many numbers: half of them, at most 392, and a quarter, at most 64. The thesis's (392, 64) for its 784 pixels."""
+    """The autoencoder's layers for so many numbers: half of them, at most 392, and a quarter, at
+    most 64. The thesis's (392, 64) for its 784 pixels.
+    """
     return max(1, min(392, inputs // 2)), max(1, min(64, inputs // 4))
 
 
 @functools.cache
 def autoencoder(inputs, hidden):
-    """The `Network` of chapter 4, "Dataset Autoencoder": dense layers of ``hidden`` widths, the same backwards, leaky ReLU after every one, also the last."""
+    """The `Network` of chapter 4, "Dataset Autoencoder": dense layers of ``hidden`` widths, the
+    same backwards, leaky ReLU after every one, also the last.
+    """
     module = _modules()[0](inputs, hidden)
     encode = Partial(lambda params, x: module.apply(params, x, method="encode"))
     return Network(_init(module, inputs), Partial(module.apply), encode)
@@ -44,17 +61,21 @@ def autoencoder(inputs, hidden):
 
 @functools.cache
 def adversary(inputs):
-    """The `Network` of chapter 4, "Adversarial Failure Classifier": inputs-128-64-1, ReLU between; its logits, whose sigmoid is the score."""
+    """The `Network` of chapter 4, "Adversarial Failure Classifier": inputs-128-64-1, ReLU between;
+    its logits, whose sigmoid is the score.
+    """
     module = _modules()[1](ADVERSARY)
     return Network(_init(module, inputs), Partial(module.apply), None)
 
 
 def _init(module, inputs):
-    return jax.jit(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)))  # one program, not one a layer
+    # one program, not one a layer
+    return jax.jit(lambda key: module.init(key, jnp.zeros(inputs, jnp.float32)))
 
 
 def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
-    """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled each epoch: (codes [n, hidden[-1]], losses [epochs]).
+    """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled
+    each epoch: (codes [n, hidden[-1]], losses [epochs]).
 
     Minibatches of ``batch``, at most n; the last of an epoch may be smaller.
     """
@@ -62,16 +83,42 @@ def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
     first, then = jax.random.split(key)
     n = len(rows)
     number = np.arange(n, dtype=np.int32)
-    params, losses = _fit(then, network.init(first), rows, rows, number, n, epochs, rate, network.apply, _squared, min(batch, n))
+    params, losses = _fit(
+        then,
+        network.init(first),
+        rows,
+        rows,
+        number,
+        n,
+        epochs,
+        rate,
+        network.apply,
+        _squared,
+        min(batch, n),
+    )
     return _codes(network.encode, params, rows), losses
 
 
 def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=1, rate=3e-5):
-    """Train an adversary further on the first ``size`` of ``number`` [room] int32, rows of ``codes`` [m, d] that may repeat: (params, losses [epochs]).
+    """Train an adversary further on the first ``size`` of ``number`` [room] int32, rows of
+    ``codes`` [m, d] that may repeat: (params, losses [epochs]).
 
-    ``failed`` [m] float32: the targets, of the binary cross-entropy. ``size`` is a number, not a shape: other sizes in the same room compile nothing.
+    ``failed`` [m] float32: the targets, of the binary cross-entropy. ``size`` is a number, not a
+    shape: other sizes in the same room compile nothing.
     """
-    return _fit(key, params, codes, failed, number, size, epochs, rate, adversary(codes.shape[1]).apply, _entropy, batch)
+    return _fit(
+        key,
+        params,
+        codes,
+        failed,
+        number,
+        size,
+        epochs,
+        rate,
+        adversary(codes.shape[1]).apply,
+        _entropy,
+        batch,
+    )
 
 
 @jax.jit
@@ -95,7 +142,9 @@ def _entropy(logit, target):
 
 @functools.partial(jax.jit, static_argnames=("epochs", "loss", "batch"))
 def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, batch):
-    """``epochs`` passes in minibatches over the first ``size`` of the rows' ``number``, by Adam that starts anew: (params, mean loss of each epoch)."""
+    """``epochs`` passes in minibatches over the first ``size`` of the rows' ``number``, by Adam
+    that starts anew: (params, mean loss of each epoch).
+    """
     import optax  # here: it takes a while
 
     optimiser = optax.adam(rate)
@@ -110,18 +159,28 @@ def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, ba
         params, state, total = carry
         now = i * batch + jnp.arange(batch, dtype=jnp.int32)
         weight = (now < size).astype(jnp.float32)  # the last batch may be smaller
-        value, gradient = jax.value_and_grad(mean_loss)(params, order[jnp.minimum(now, size - 1)], weight)
+        value, gradient = jax.value_and_grad(mean_loss)(
+            params, order[jnp.minimum(now, size - 1)], weight
+        )
         with jax.numpy_dtype_promotion("standard"):  # optax asks for it
             update, state = optimiser.update(gradient, state)
             params = optax.apply_updates(params, update)
         return params, state, total + value * jnp.sum(weight)
 
     def epoch(carry, key):
-        order = number[jnp.argsort(jnp.where(place < size, jax.random.uniform(key, place.shape, jnp.float32), 2.0))]
-        params, state, total = lax.fori_loop(0, steps, functools.partial(step, order=order), (*carry, jnp.zeros((), jnp.float32)))
+        order = number[
+            jnp.argsort(
+                jnp.where(place < size, jax.random.uniform(key, place.shape, jnp.float32), 2.0)
+            )
+        ]
+        params, state, total = lax.fori_loop(
+            0, steps, functools.partial(step, order=order), (*carry, jnp.zeros((), jnp.float32))
+        )
         return (params, state), total / size.astype(jnp.float32)
 
-    (params, _), losses = lax.scan(epoch, (params, optimiser.init(params)), jax.random.split(key, epochs))
+    (params, _), losses = lax.scan(
+        epoch, (params, optimiser.init(params)), jax.random.split(key, epochs)
+    )
     return params, losses
 
 
@@ -129,7 +188,9 @@ def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, ba
 def _modules():
     import flax.linen as nn  # here: it takes a while
 
-    dense = functools.partial(nn.Dense, kernel_init=nn.initializers.glorot_uniform(), param_dtype=jnp.float32)
+    dense = functools.partial(
+        nn.Dense, kernel_init=nn.initializers.glorot_uniform(), param_dtype=jnp.float32
+    )
 
     class Autoencoder(nn.Module):
         inputs: int

@@ -1,4 +1,5 @@
-"""What opinions miss: a Gaussian process over inputs of one label, on top of the log odds that they give, by Laplace's approximation.
+"""What opinions miss: a Gaussian process over inputs of one label, on top of the log odds that they
+give, by Laplace's approximation.
 
 Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), algorithms 3.1 and 3.2.
 """
@@ -16,20 +17,34 @@ MARGIN = 1.0  # of log evidence, by which it must be better than nothing
 
 
 def residual(rng, close, labels, odds, seen):
-    """[n]: what to add to ``odds`` [n], the log odds of failure, by what was seen near each input with its label; 0 where there is no evidence for it.
+    """[n]: what to add to ``odds`` [n], the log odds of failure, by what was seen near each input
+    with its label; 0 where there is no evidence for it.
 
-    ``close`` [n, c]: coordinates. One amplitude and one length, in units of the usual distance to a neighbour, for all labels: those of greatest evidence.
+    ``close`` [n, c]: coordinates. One amplitude and one length, in units of the usual distance to a
+    neighbour, for all labels: those of greatest evidence.
     """
     out, groups = np.zeros(len(labels)), []
     for label in np.unique(labels):
         every = np.flatnonzero(labels == label)
         known = every[seen.tried[every]]
         if len(known) > 1:
-            groups.append((every, np.sort(rng.choice(known, MOST, replace=False)) if len(known) > MOST else known))
+            groups.append(
+                (
+                    every,
+                    np.sort(rng.choice(known, MOST, replace=False)) if len(known) > MOST else known,
+                )
+            )
     if not groups:
         return out
     unit = np.median([_spacing(rng, close[every]) for every, _ in groups])
-    data = [(squared_distances(close[known], close[known]), seen.failed[known].astype(float), odds[known]) for _, known in groups]
+    data = [
+        (
+            squared_distances(close[known], close[known]),
+            seen.failed[known].astype(float),
+            odds[known],
+        )
+        for _, known in groups
+    ]
     best, choice = sum(np.sum(t * m - np.logaddexp(0, m)) for _, t, m in data) + MARGIN, None
     for variance in VARIANCES:
         for length in LENGTHS:
@@ -39,7 +54,9 @@ def residual(rng, close, labels, odds, seen):
                 best, choice = total, (variance, length, [slope for _, slope in fits])
     if choice is not None:
         for (every, known), slope in zip(groups, choice[2], strict=True):
-            out[every] = _kernel(squared_distances(close[every], close[known]), unit, *choice[:2]) @ slope
+            out[every] = (
+                _kernel(squared_distances(close[every], close[known]), unit, *choice[:2]) @ slope
+            )
     return out
 
 
@@ -55,17 +72,23 @@ def _kernel(d2, unit, variance, length):
 
 
 def _laplace(kernel, target, mean):
-    """(log evidence, slope [m]) of failures ``target`` [m] with log odds mean + f, f ~ N(0, kernel): the mode of f at other points is their kernel @ slope."""
+    """(log evidence, slope [m]) of failures ``target`` [m] with log odds mean + f, f ~ N(0,
+    kernel): the mode of f at other points is their kernel @ slope.
+    """
     m = len(target)
     f, a = np.zeros(m), np.zeros(m)
-    log_posterior = lambda f, a: -0.5 * a @ f + np.sum(target * (mean + f) - np.logaddexp(0, mean + f))
+    log_posterior = lambda f, a: (
+        -0.5 * a @ f + np.sum(target * (mean + f) - np.logaddexp(0, mean + f))
+    )
     now = log_posterior(f, a)
     for _ in range(50):
         p = sigmoid(mean + f)
         w = np.maximum(p * (1 - p), 1e-10)
         root = np.sqrt(w)
         b = w * f + target - p
-        aim = b - root * np.linalg.solve(np.eye(m) + root[:, None] * kernel * root, root * (kernel @ b))
+        aim = b - root * np.linalg.solve(
+            np.eye(m) + root[:, None] * kernel * root, root * (kernel @ b)
+        )
         step = 1.0
         while True:
             new_a = a + step * (aim - a)

@@ -15,13 +15,19 @@ class History(NamedTuple):
     found: Any
     """[R] int: failures found by then"""
     precision: Any
-    """[R]: share of failures among the iteration's candidates, all of which were run; NaN where there were none"""
+    """[R]: share of failures among the iteration's candidates, all of which were run; NaN where
+    there were none
+    """
     recall: Any
     """[R]: failures found, as a share of these and ``expected``: as rough as that is"""
     auc: Any
-    """[R]: area under the ROC curve of the iteration's scores on the inputs run so far, which were chosen (`judge`: on all); NaN where all failed or none"""
+    """[R]: area under the ROC curve of the iteration's scores on the inputs run so far, which were
+    chosen (`judge`: on all); NaN where all failed or none
+    """
     expected: Any
-    """[R]: how many failures the selector expects among the inputs not yet run: rough, unless all inputs were run at random"""
+    """[R]: how many failures the selector expects among the inputs not yet run: rough, unless all
+    inputs were run at random
+    """
     scores: Any
     """[R, n] float32: the scores after each iteration"""
 
@@ -60,7 +66,9 @@ class Result(NamedTuple):
     predicted: Any
     """[n] int32: the system's answers, -1 where it was not run"""
     scores: Any
-    """[n] float32: how suspect each input is now, in [0, 1]; default selector: the probability that it fails, without its own outcome"""
+    """[n] float32: how suspect each input is now, in [0, 1]; default selector: the probability that
+    it fails, without its own outcome
+    """
     ranked: Any
     """[n - calls] int: the inputs not yet run, the most suspect first"""
     expected: float
@@ -74,10 +82,19 @@ class Result(NamedTuple):
     def __str__(self):
         h, n = self.history, len(self.scores)
         rows = zip(h.calls, h.found, h.precision, h.recall, h.auc, h.expected, strict=True)
-        table = "\n".join(f"{i:9d} {c:7d} {f:8d} {_share(p):>10} {_share(r):>9} {_share(a):>7} {e:9.0f}" for i, (c, f, p, r, a, e) in enumerate(rows, 1))
-        left = "" if np.isnan(self.expected) else f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
+        table = "\n".join(
+            f"{i:9d} {c:7d} {f:8d} {_share(p):>10} {_share(r):>9} {_share(a):>7} {e:9.0f}"
+            for i, (c, f, p, r, a, e) in enumerate(rows, 1)
+        )
+        left = (
+            ""
+            if np.isnan(self.expected)
+            else f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
+        )
         head = f"{len(self.failures)} failures in {self.calls} calls ({n} inputs){left}"
-        names = "iteration   calls failures  precision   ~recall AUC run ~expected\n" if table else ""
+        names = (
+            "iteration   calls failures  precision   ~recall AUC run ~expected\n" if table else ""
+        )
         return "\n".join([head, names + table, *(f"stopped: {i}" for i in self.incidents)]).strip()
 
 

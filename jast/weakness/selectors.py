@@ -12,7 +12,9 @@ __all__ = ["NAMES", "default", "random", "thesis"]
 
 
 def random(*, batch=None):
-    """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least 10): the baseline, whose failure rate is unbiased."""
+    """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least
+    10): the baseline, whose failure rate is unbiased.
+    """
     batch = batch if batch is None else whole("random", "batch", batch)
 
     def step(key, data, memory, seen, ask):

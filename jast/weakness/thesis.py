@@ -1,4 +1,6 @@
-"""The adversary on encodings: R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford 2021, chapter 4."""
+"""The adversary on encodings: R. J. Moss, "Algorithms for Efficient Validation of Black-Box
+Systems", Stanford 2021, chapter 4.
+"""
 
 import functools
 
@@ -16,37 +18,76 @@ __all__ = ["thesis"]
 ADVERSARY = "adversary/"
 
 
-def thesis(*, iterations=10, sample=500, threshold=0.5, copies=10, epochs=20, rate=3e-5, hidden=None, encoder_epochs=20, encoder_rate=1e-3, batch=None):
-    """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes of the inputs, without their labels.
+def thesis(
+    *,
+    iterations=10,
+    sample=500,
+    threshold=0.5,
+    copies=10,
+    epochs=20,
+    rate=3e-5,
+    hidden=None,
+    encoder_epochs=20,
+    encoder_rate=1e-3,
+    batch=None,
+):
+    """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes
+    of the inputs, without their labels.
 
-    The autoencoder (``hidden`` widths; default: `networks.sizes`, the published 392 and 64 for 784 pixels) is trained on all inputs before any call, for
-    ``encoder_epochs`` by Adam at ``encoder_rate``, in minibatches of ``batch`` (default: a tenth of the inputs, at most 1000; the text's 1000 for its 10,000).
-    Each of the ``iterations`` draws ``sample`` inputs without replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam
-    at ``rate``, row by row, shuffled each epoch, each failure there and ``copies`` more times; its weights go on to the next iteration, Adam starts anew. Those
-    of the second half with a score of at least ``threshold`` are the candidates, and are run. What was run before is not run again; it is learned from again
-    only if drawn again.
+    The autoencoder (``hidden`` widths; default: `networks.sizes`, the published 392 and 64 for 784
+    pixels) is trained on all inputs before any call, for ``encoder_epochs`` by Adam at
+    ``encoder_rate``, in minibatches of ``batch`` (default: a tenth of the inputs, at most 1000; the
+    text's 1000 for its 10,000). Each of the ``iterations`` draws ``sample`` inputs without
+    replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam
+    at ``rate``, row by row, shuffled each epoch, each failure there and ``copies`` more times; its
+    weights go on to the next iteration, Adam starts anew. Those of the second half with a score of
+    at least ``threshold`` are the candidates, and are run. What was run before is not run again; it
+    is learned from again only if drawn again.
 
-    Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's output, on inputs it was trained on too, as published.
-    ``expected``: the failure rate of the random halves, of what was run there first, for every input not yet run.
+    Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's
+    output, on inputs it was trained on too, as published. ``expected``: the failure rate of the
+    random halves, of what was run there first, for every input not yet run.
     """
     whole_ = functools.partial(whole, "thesis")
     iterations, sample, epochs, encoder_epochs = (
-        whole_(name, value) for name, value in dict(iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs).items()
+        whole_(name, value)
+        for name, value in dict(
+            iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs
+        ).items()
     )
     batch = None if batch is None else whole_("batch", batch)
     copies = whole_("copies", copies, 0)
     threshold = number("thesis", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
     rate = number("thesis", "rate", rate, lambda v: 0 < v < np.inf, "above 0")
-    encoder_rate = number("thesis", "encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
-    hidden = None if hidden is None else tuple(whole_("hidden", width) for width in np.atleast_1d(hidden).tolist())
+    encoder_rate = number(
+        "thesis", "encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0"
+    )
+    hidden = (
+        None
+        if hidden is None
+        else tuple(whole_("hidden", width) for width in np.atleast_1d(hidden).tolist())
+    )
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
     settings = dict(
-        iterations=iterations, sample=sample, threshold=threshold, copies=copies, epochs=epochs, rate=rate, hidden=hidden and list(hidden),
-        encoder_epochs=encoder_epochs, encoder_rate=encoder_rate, batch=batch,
-    )  # fmt: skip
+        iterations=iterations,
+        sample=sample,
+        threshold=threshold,
+        copies=copies,
+        epochs=epochs,
+        rate=rate,
+        hidden=hidden and list(hidden),
+        encoder_epochs=encoder_epochs,
+        encoder_rate=encoder_rate,
+        batch=batch,
+    )
     start = functools.partial(_start, hidden, encoder_epochs, encoder_rate, batch)
-    return Selector("thesis", settings, start, functools.partial(_step, iterations, sample, threshold, copies, epochs, rate))
+    return Selector(
+        "thesis",
+        settings,
+        start,
+        functools.partial(_step, iterations, sample, threshold, copies, epochs, rate),
+    )
 
 
 def _start(hidden, epochs, rate, batch, key, data):
@@ -54,7 +95,9 @@ def _start(hidden, epochs, rate, batch, key, data):
     rows = scaled(data)
     hidden = hidden or networks.sizes(rows.shape[1])
     batch = batch or max(1, min(1000, data.size // 10))
-    codes, losses = networks.fit_autoencoder(first, rows, hidden, epochs=epochs, batch=batch, rate=rate)
+    codes, losses = networks.fit_autoencoder(
+        first, rows, hidden, epochs=epochs, batch=batch, rate=rate
+    )
     params = networks.adversary(codes.shape[1]).init(then)
     counts = {name: np.zeros((), np.int64) for name in ("iteration", "drawn", "failed")}
     return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(params)}
@@ -75,29 +118,65 @@ def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory
 
     candidates = rest[scores[rest] >= threshold]
     now = ask(candidates)
-    counts = dict(iteration=memory["iteration"] + 1, drawn=memory["drawn"] + new.sum(), failed=memory["failed"] + now.failed[lesson[new]].sum())
+    counts = dict(
+        iteration=memory["iteration"] + 1,
+        drawn=memory["drawn"] + new.sum(),
+        failed=memory["failed"] + now.failed[lesson[new]].sum(),
+    )
     expected = counts["failed"] / max(counts["drawn"], 1) * np.sum(~now.tried)
-    return Step({**memory, **_flat(params), **{name: np.asarray(count, np.int64) for name, count in counts.items()}}, scores, candidates, float(expected))
+    return Step(
+        {
+            **memory,
+            **_flat(params),
+            **{name: np.asarray(count, np.int64) for name, count in counts.items()},
+        },
+        scores,
+        candidates,
+        float(expected),
+    )
 
 
 def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
-    """The adversary after training on those of ``lesson`` that were answered: a budget may end in the midst of it."""
+    """The adversary after training on those of ``lesson`` that were answered: a budget may end in
+    the midst of it.
+    """
     answered, failed = seen.tried[lesson], seen.failed[lesson]
-    rows = np.repeat(np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered)
+    rows = np.repeat(
+        np.arange(len(lesson), dtype=np.int32), np.where(failed, 1 + copies, 1) * answered
+    )
     if len(rows) == 0:
         return params
-    room = np.zeros(len(lesson) * (1 + copies), np.int32)  # of one size, whatever failed: one program for all iterations
+    # of one size, whatever failed: one program for all iterations
+    room = np.zeros(len(lesson) * (1 + copies), np.int32)
     room[: len(rows)] = rows
-    return networks.fit_adversary(key, params, codes[lesson], failed.astype(np.float32), room, len(rows), epochs=epochs, rate=rate)[0]
+    return networks.fit_adversary(
+        key,
+        params,
+        codes[lesson],
+        failed.astype(np.float32),
+        room,
+        len(rows),
+        epochs=epochs,
+        rate=rate,
+    )[0]
 
 
 def _flat(params):
     from flax.traverse_util import flatten_dict
 
-    return {ADVERSARY + name: np.asarray(array) for name, array in flatten_dict(params, sep="/").items()}
+    return {
+        ADVERSARY + name: np.asarray(array) for name, array in flatten_dict(params, sep="/").items()
+    }
 
 
 def _nested(memory):
     from flax.traverse_util import unflatten_dict
 
-    return unflatten_dict({name.removeprefix(ADVERSARY): array for name, array in memory.items() if name.startswith(ADVERSARY)}, sep="/")
+    return unflatten_dict(
+        {
+            name.removeprefix(ADVERSARY): array
+            for name, array in memory.items()
+            if name.startswith(ADVERSARY)
+        },
+        sep="/",
+    )

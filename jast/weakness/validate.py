@@ -26,43 +26,75 @@ class _Stop(Exception):
     """The system did not answer."""
 
 
-def validate(key, predict, inputs, labels, *, budget=None, selector="default", classes=None, state=None, checkpoint=None, progress=False, callback=None):
-    """Find the inputs of a labelled data set that a classifier gets wrong, with at most ``budget`` calls of it: a `Result`.
+def validate(
+    key,
+    predict,
+    inputs,
+    labels,
+    *,
+    budget=None,
+    selector="default",
+    classes=None,
+    state=None,
+    checkpoint=None,
+    progress=False,
+    callback=None,
+):
+    """Find the inputs of a labelled data set that a classifier gets wrong, with at most ``budget``
+    calls of it: a `Result`.
 
-    ``predict(inputs [m, ...]) -> labels [m]``: the system under test, any Python callable. It is called with up to 1024 inputs at once, in the dtype of
-    ``inputs``, and never twice on one input. ``inputs`` [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns]. ``labels`` [n]: the
-    true classes, whole numbers in 0 ... ``classes`` - 1 (default: the largest and 1), as the predictions must be. ``budget``: calls, those of ``state``
-    included; default: all n. The iteration in which it is spent is cut short.
+    ``predict(inputs [m, ...]) -> labels [m]``: the system under test, any Python callable. It is
+    called with up to 1024 inputs at once, in the dtype of ``inputs``, and never twice on one input.
+    ``inputs`` [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns].
+    ``labels`` [n]: the true classes, whole numbers in 0 ... ``classes`` - 1 (default: the largest
+    and 1), as the predictions must be. ``budget``: calls, those of ``state`` included; default: all
+    n. The iteration in which it is spent is cut short.
 
-    ``selector``: "default" learns from the labels how hard each input is, and from each answer where the system differs (`default`); "thesis" is the adversary
-    on encodings of Moss's thesis, chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
+    ``selector``: "default" learns from the labels how hard each input is, and from each answer
+    where the system differs (`default`); "thesis" is the adversary on encodings of Moss's thesis,
+    chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
 
-    ``state``: of an earlier result of the same data and selector, to go on from there: after an interruption as if there had been none, after a budget that
-    was spent with new batches. ``checkpoint``: a file to which the state is written after every call of ``predict``, and from which an existing one goes on.
-    ``progress=True`` shows a bar of calls; ``callback(iteration, result)`` is called after each iteration. The key is consumed; a ``state`` goes on with
-    its own.
+    ``state``: of an earlier result of the same data and selector, to go on from there: after an
+    interruption as if there had been none, after a budget that was spent with new batches.
+    ``checkpoint``: a file to which the state is written after every call of ``predict``, and from
+    which an existing one goes on. ``progress=True`` shows a bar of calls; ``callback(iteration,
+    result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
 
-    Where ``predict`` raises, or answers with something else than m labels in range, or at a KeyboardInterrupt, the search ends, with a RuntimeWarning, and
-    the result so far says so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked again by a run that goes on. So
-    it does where anything else raises after the first answer: ``callback``, the checkpoint's disk, a selector. ValueError for an answer that is none at the
-    very first call; for inputs that are not finite, labels out of range, a state or checkpoint of other data or of another selector.
+    Where ``predict`` raises, or answers with something else than m labels in range, or at a
+    KeyboardInterrupt, the search ends, with a RuntimeWarning, and the result so far says so in
+    ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked
+    again by a run that goes on. So it does where anything else raises after the first answer:
+    ``callback``, the checkpoint's disk, a selector. ValueError for an answer that is none at the
+    very first call; for inputs that are not finite, labels out of range, a state or checkpoint of
+    other data or of another selector.
     """
     data = arrays("validate", inputs, labels, classes)
     chosen = _selector(selector)
     n = data.size
     if not callable(predict):
-        raise ValueError(f"validate: predict must be callable: inputs [m, ...] -> labels [m], received {predict!r}")
+        raise ValueError(
+            "validate: predict must be callable: inputs [m, ...] -> labels [m], received"
+            f" {predict!r}"
+        )
     budget = n if budget is None else min(whole("validate", "budget", budget), n)
     if callback is not None and not callable(callback):
-        raise ValueError(f"validate: callback must be callable, (iteration, result), received {callback!r}")
+        raise ValueError(
+            f"validate: callback must be callable, (iteration, result), received {callback!r}"
+        )
     if checkpoint is not None and not os.path.isdir(os.path.dirname(os.path.abspath(checkpoint))):
-        raise ValueError(f"validate: checkpoint must be a file in a folder that exists, received {checkpoint}")
+        raise ValueError(
+            f"validate: checkpoint must be a file in a folder that exists, received {checkpoint}"
+        )
     if checkpoint is not None and os.path.exists(checkpoint):
         if state is not None:
-            raise ValueError(f"validate: give state or an existing checkpoint, not both; {checkpoint} exists")
+            raise ValueError(
+                f"validate: give state or an existing checkpoint, not both; {checkpoint} exists"
+            )
         state = load(checkpoint)
     state = _begin(key, data, chosen) if state is None else _fits(state, data, chosen)
-    return _run(state, chosen, data, predict, max(budget, len(state.order)), checkpoint, progress, callback)
+    return _run(
+        state, chosen, data, predict, max(budget, len(state.order)), checkpoint, progress, callback
+    )
 
 
 def _selector(selector):
@@ -72,7 +104,10 @@ def _selector(selector):
         return selector
     if not isinstance(selector, str) or selector not in selectors.NAMES:
         hint = f": call it, {selector.__name__}()" if selector in selectors.NAMES.values() else ""
-        raise ValueError(f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received {selector!r}{hint}")
+        raise ValueError(
+            f"validate: selector must be one of {sorted(selectors.NAMES)} or a Selector, received"
+            f" {selector!r}{hint}"
+        )
     return selectors.NAMES[selector]()
 
 
@@ -82,12 +117,26 @@ def _described(selector):
 
 def _begin(key, data, selector):
     n = data.size
-    history = History(*(np.zeros(0, int) for _ in range(2)), *(np.zeros(0) for _ in range(4)), np.zeros((0, n), np.float32))
+    history = History(
+        *(np.zeros(0, int) for _ in range(2)),
+        *(np.zeros(0) for _ in range(4)),
+        np.zeros((0, n), np.float32),
+    )
     numbers = np.asarray(jax.random.key_data(key))
     if numbers.shape != (2,):  # of another generator
         numbers = generator(key).integers(0, 2**32, 2, np.uint32)
     memory = selector.start(_key(numbers, 0), data)
-    return State(_described(selector), fingerprint(data), numbers, memory, np.zeros(0, int), np.full(n, -1, np.int32), 0, history, False)
+    return State(
+        _described(selector),
+        fingerprint(data),
+        numbers,
+        memory,
+        np.zeros(0, int),
+        np.full(n, -1, np.int32),
+        0,
+        history,
+        False,
+    )
 
 
 def _key(numbers, iteration):
@@ -97,23 +146,39 @@ def _key(numbers, iteration):
 def _fits(state, data, selector):
     if not isinstance(state, State):
         hint = ": give result.state" if isinstance(state, Result) else ""
-        raise ValueError(f"validate: state must be the state of a Result, received {type(state).__name__}{hint}")
+        raise ValueError(
+            f"validate: state must be the state of a Result, received {type(state).__name__}{hint}"
+        )
     if state.data != fingerprint(data):
         raise ValueError("validate: state is of other inputs or labels")
     if state.selector != _described(selector):
-        raise ValueError(f"validate: state is of the selector {state.selector}, received {_described(selector)}: give the same again")
+        raise ValueError(
+            f"validate: state is of the selector {state.selector}, received {_described(selector)}:"
+            " give the same again"
+        )
     return state
 
 
 def _run(state, selector, data, predict, budget, checkpoint, progress, callback):
     answers, answered = state.predicted.copy(), list(state.order)  # all that the system has said
-    seen = _seen(state.order[: state.complete], answers, data.labels)  # what whole iterations have seen of it
+    # what whole iterations have seen of it
+    seen = _seen(state.order[: state.complete], answers, data.labels)
     memory, history, finished, incidents = state.memory, state.history, state.finished, []
     bar = _bar(progress, budget, len(answered))
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)
-        return State(state.selector, state.data, state.key, memory, order, predicted, len(seen.order), history, finished)
+        return State(
+            state.selector,
+            state.data,
+            state.key,
+            memory,
+            order,
+            predicted,
+            len(seen.order),
+            history,
+            finished,
+        )
 
     current = seen
 
@@ -121,8 +186,13 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
         nonlocal current
         indices = np.asarray(indices)
         if indices.size and indices.ndim != 1 or not within(indices, data.size):
-            raise ValueError(f"validate: the selector {selector.name} must ask for indices [m] in 0 ... {data.size - 1}, received {indices!r}")
-        new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][: budget - len(current.order)]
+            raise ValueError(
+                f"validate: the selector {selector.name} must ask for indices [m] in 0 ..."
+                f" {data.size - 1}, received {indices!r}"
+            )
+        new = [i for i in dict.fromkeys(indices.tolist()) if current.predicted[i] < 0][
+            : budget - len(current.order)
+        ]
         fresh = [i for i in new if answers[i] < 0][: budget - len(answered)]
         for at in range(0, len(fresh), CHUNK):
             batch = np.asarray(fresh[at : at + CHUNK])
@@ -131,7 +201,9 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             bar.update(len(batch))
             if checkpoint is not None:
                 save(checkpoint, kept())
-        current = _seen(current.order.tolist() + [i for i in new if answers[i] >= 0], answers, data.labels)
+        current = _seen(
+            current.order.tolist() + [i for i in new if answers[i] >= 0], answers, data.labels
+        )
         return current
 
     idle = 0
@@ -145,7 +217,10 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             idle = 0 if len(current.order) > len(seen.order) else idle + 1
             row = _row(history, step, current)
             # those that an interrupted iteration had asked for, and this one has not, come last
-            order = current.order.tolist() + np.asarray(answered, int)[~current.tried[answered]].tolist()
+            order = (
+                current.order.tolist()
+                + np.asarray(answered, int)[~current.tried[answered]].tolist()
+            )
             seen, memory, history, answered = current, step.memory, row, order
             if callback is not None:
                 callback(len(history.calls), _result(kept(), data, ()))
@@ -162,7 +237,9 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
         if not answered:
             raise
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        incidents.append(f"{type(error).__name__}: {error} ({os.path.basename(frame.filename)}:{frame.lineno})")
+        incidents.append(
+            f"{type(error).__name__}: {error} ({os.path.basename(frame.filename)}:{frame.lineno})"
+        )
     except KeyboardInterrupt:
         if not answered:
             raise
@@ -170,13 +247,20 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     finally:
         bar.close()
     if incidents:
-        warnings.warn(f"validate: ended after {len(answered)} of {budget} calls: {incidents[0]}", RuntimeWarning, stacklevel=3)
+        warnings.warn(
+            f"validate: ended after {len(answered)} of {budget} calls: {incidents[0]}",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     return _result(kept(), data, tuple(incidents))
 
 
 def _answers(predict, data, batch):
     """[m] int32: what the system says about the inputs numbered ``batch``."""
-    where = f"the batch of {len(batch)} inputs [{', '.join(map(str, batch[:4]))}{', ...' if len(batch) > 4 else ''}]"
+    where = (
+        f"the batch of {len(batch)} inputs"
+        f" [{', '.join(map(str, batch[:4]))}{', ...' if len(batch) > 4 else ''}]"
+    )
     try:
         given = predict(data.inputs[batch])
     except Exception as error:
@@ -184,14 +268,27 @@ def _answers(predict, data, batch):
     try:
         said = np.asarray(given)
     except Exception as error:
-        raise _Stop(f"predict must return labels [{len(batch)}], received {type(given).__name__}, on {where}") from error
+        raise _Stop(
+            f"predict must return labels [{len(batch)}], received {type(given).__name__}, on"
+            f" {where}"
+        ) from error
     if said.shape != batch.shape or said.dtype.kind not in "iub":
-        hint = "; give the argmax of scores" if said.dtype.kind == "f" and said.ndim > 1 else "; give them as integers" if said.dtype.kind == "f" else ""
-        raise _Stop(f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape {said.shape}{hint}, on {where}")
+        hint = (
+            "; give the argmax of scores"
+            if said.dtype.kind == "f" and said.ndim > 1
+            else "; give them as integers"
+            if said.dtype.kind == "f"
+            else ""
+        )
+        raise _Stop(
+            f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape"
+            f" {said.shape}{hint}, on {where}"
+        )
     out = np.flatnonzero((said < 0) | (said >= data.classes))
     if len(out):
         raise _Stop(
-            f"predict must return labels in 0 ... {data.classes - 1} (classes={data.classes}), received {said[out[0]]} for input {batch[out[0]]}, on {where}"
+            f"predict must return labels in 0 ... {data.classes - 1} (classes={data.classes}),"
+            f" received {said[out[0]]} for input {batch[out[0]]}, on {where}"
         )
     return said.astype(np.int32)
 
@@ -207,16 +304,33 @@ def _row(history, step, seen):
     failed, tried = seen.failed, seen.tried
     scores = np.asarray(step.scores, np.float32)
     if scores.shape != tried.shape or not np.all((scores >= 0) & (scores <= 1)):
-        bad = "" if scores.shape != tried.shape else f", {np.sum(~((scores >= 0) & (scores <= 1)))} elsewhere"
-        raise ValueError(f"validate: the selector's scores must be [{len(tried)}] in [0, 1], received shape {scores.shape}{bad}")
+        bad = (
+            ""
+            if scores.shape != tried.shape
+            else f", {np.sum(~((scores >= 0) & (scores <= 1)))} elsewhere"
+        )
+        raise ValueError(
+            f"validate: the selector's scores must be [{len(tried)}] in [0, 1], received shape"
+            f" {scores.shape}{bad}"
+        )
     ran = np.asarray(step.candidates, int)
     ran = ran[tried[ran]]
     found, total = int(failed.sum()), failed.sum() + step.expected
     new = (
-        len(seen.order), found, failed[ran].mean() if len(ran) else np.nan, found / total if total > 0 else np.nan, auc(scores[tried], failed[tried]),
-        step.expected, scores,
-    )  # fmt: skip
-    return History(*(np.concatenate([old, np.asarray(one, old.dtype)[None]]) for old, one in zip(history, new, strict=True)))
+        len(seen.order),
+        found,
+        failed[ran].mean() if len(ran) else np.nan,
+        found / total if total > 0 else np.nan,
+        auc(scores[tried], failed[tried]),
+        step.expected,
+        scores,
+    )
+    return History(
+        *(
+            np.concatenate([old, np.asarray(one, old.dtype)[None]])
+            for old, one in zip(history, new, strict=True)
+        )
+    )
 
 
 def _result(state, data, incidents):
@@ -226,8 +340,21 @@ def _result(state, data, incidents):
     ranked = left[np.argsort(-scores[left], kind="stable")]
     failures = state.order[seen.failed[state.order]]
     # of the last iteration, unless more has been answered since
-    expected = float(h.expected[-1]) if len(h.expected) and state.complete == len(state.order) else np.nan
-    return Result(failures, len(state.order), state.order, state.predicted, scores, ranked, expected, h, incidents, state)
+    expected = (
+        float(h.expected[-1]) if len(h.expected) and state.complete == len(state.order) else np.nan
+    )
+    return Result(
+        failures,
+        len(state.order),
+        state.order,
+        state.predicted,
+        scores,
+        ranked,
+        expected,
+        h,
+        incidents,
+        state,
+    )
 
 
 def _bar(progress, budget, at):

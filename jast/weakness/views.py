@@ -4,9 +4,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Views", "centred", "components", "difficulty_of_neighbours", "reduce", "scaled", "squared_distances", "views"]
+__all__ = [
+    "Views",
+    "centred",
+    "components",
+    "difficulty_of_neighbours",
+    "reduce",
+    "scaled",
+    "squared_distances",
+    "views",
+]
 
-WIDE, KEPT = 2048, 512  # inputs of more numbers than WIDE are seen by their first KEPT principal components
+# inputs of more numbers than WIDE are seen by their first KEPT principal components
+WIDE, KEPT = 2048, 512
 NEIGHBOURS, REFERENCE, ROWS = 15, 20_000, 1024
 
 
@@ -14,8 +24,9 @@ class Views(NamedTuple):
     """Of n inputs, float32."""
 
     scaled: Any
-    """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks within each column, from -0.7 to 0.7; components
-    of wide inputs: by their largest"""
+    """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks
+    within each column, from -0.7 to 0.7; components of wide inputs: by their largest
+    """
     centred: Any
     """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
 
@@ -23,23 +34,34 @@ class Views(NamedTuple):
 def views(data, reduced):
     """The `Views` of a `Data`; of its components ``reduced``, of `reduce`, where it has any."""
     if reduced.shape[1]:
-        return Views(reduced / np.float32(max(np.abs(reduced).max(), 1e-6)), reduced * np.float32(0.4 / max(reduced.std(), 1e-6)))
+        return Views(
+            reduced / np.float32(max(np.abs(reduced).max(), 1e-6)),
+            reduced * np.float32(0.4 / max(reduced.std(), 1e-6)),
+        )
     x = scaled(data)
     return Views(x if data.image else _ranks(data.inputs), centred(x, data.image))
 
 
 def reduce(rng, data):
-    """[n, 512]: the first principal components of inputs of more than 2048 numbers; [n, 0] of others."""
+    """[n, 512]: the first principal components of inputs of more than 2048 numbers; [n, 0] of
+    others.
+    """
     if data.inputs[0].size <= WIDE:
         return np.zeros((data.size, 0), np.float32)
     return components(rng, centred(scaled(data), data.image), KEPT)
 
 
 def scaled(data):
-    """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all images, or of each column of a table, where what lies
-    further out than a column's first and last hundredth, by more than these are apart, is brought in."""
-    wide = data.inputs.dtype.itemsize > 4 or not data.image  # small differences may lie on a large mean
-    x, over = data.inputs.reshape(data.size, -1).astype(np.float64 if wide else np.float32), None if data.image else 0
+    """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all
+    images, or of each column of a table, where what lies further out than a column's first and last
+    hundredth, by more than these are apart, is brought in.
+    """
+    # small differences may lie on a large mean
+    wide = data.inputs.dtype.itemsize > 4 or not data.image
+    x, over = (
+        data.inputs.reshape(data.size, -1).astype(np.float64 if wide else np.float32),
+        None if data.image else 0,
+    )
     if not data.image:  # a few values far out must not press the others together
         low, high = np.quantile(x, (0.01, 0.99), axis=0)
         x = np.where(high > low, np.clip(x, low - (high - low), high + (high - low)), x)
@@ -57,16 +79,22 @@ def _ranks(x):
 
 
 def centred(x, image):
-    """Rows ``x`` [n, d] with mean 0 and a deviation of 0.4: of all numbers of an image together, or of each column of a table."""
+    """Rows ``x`` [n, d] with mean 0 and a deviation of 0.4: of all numbers of an image together, or
+    of each column of a table.
+    """
     x = x - x.mean(0)
     deviation = np.sqrt(np.mean(x**2, axis=None if image else 0))
-    # a column that is the same for nearly all inputs must not stand above the others where it is not
-    return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(np.float32) * np.float32(0.4)
+    # a column that is the same for nearly all inputs must not stand above the others where it is
+    # not
+    return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(
+        np.float32
+    ) * np.float32(0.4)
 
 
 def components(rng, x, k):
-    """[n, k]: the first k principal components; of wide inputs, those of a random subspace that two power iterations turn towards them (Halko, Martinsson and
-    Tropp, 2011)."""
+    """[n, k]: the first k principal components; of wide inputs, those of a random subspace that two
+    power iterations turn towards them (Halko, Martinsson and Tropp, 2011).
+    """
     k = min(k, x.shape[1])
     if x.shape[1] > WIDE:
         basis = np.linalg.qr(rng.standard_normal((x.shape[1], k + 10), np.float32))[0]
@@ -78,7 +106,9 @@ def components(rng, x, k):
 
 
 def difficulty_of_neighbours(rng, close, labels, classes):
-    """[n]: the log odds against each input's label by its 15 nearest others, weighted by their inverse squared distances."""
+    """[n]: the log odds against each input's label by its 15 nearest others, weighted by their
+    inverse squared distances.
+    """
     n = len(close)
     reference = np.arange(n) if n <= REFERENCE else np.sort(rng.choice(n, REFERENCE, replace=False))
     k = min(NEIGHBOURS, len(reference) - 1)
@@ -91,7 +121,9 @@ def difficulty_of_neighbours(rng, close, labels, classes):
         d2[rows[:, None] == reference] = np.inf  # not itself
         near = np.argpartition(d2, k - 1, axis=1)[:, :k]
         weight = 1 / (np.take_along_axis(d2, near, 1) + 1e-3)
-        right[rows] = np.sum(weight * (labels[reference[near]] == labels[rows][:, None]), axis=1) / np.sum(weight, axis=1)
+        right[rows] = np.sum(
+            weight * (labels[reference[near]] == labels[rows][:, None]), axis=1
+        ) / np.sum(weight, axis=1)
     right = (right * k + 1 / classes) / (k + 1)  # one more, that knows nothing
     return np.log1p(-right) - np.log(right)
 

@@ -1,9 +1,12 @@
-"""The ferry's collision avoidance: safety zones around the tracked obstacle, and the speed along the path that keeps out of them.
+"""The ferry's collision avoidance: safety zones around the tracked obstacle, and the speed along
+the path that keeps out of them.
 
-Path-velocity decomposition: the path is fixed, the planner chooses a speed. It predicts the obstacle at the tracker's velocity, and for each candidate speed
-adds up what the zones that the ferry would enter cost. The zones, the weights of the two penalty regions and of slowness, and the rule for keeping a speed are
-those published for S1 (Lytskjold and Mengshoel); the weight of the region of collision, the prediction, the sum of it all, and planning
-every 3 s (published: 5 s) are ours.
+Path-velocity decomposition: the path is fixed, the planner chooses a speed. It predicts the
+obstacle at the tracker's velocity, and for each candidate speed adds up what the zones that the
+ferry would enter cost. The zones, the weights of the two penalty regions and of slowness, and the
+rule for keeping a speed are those published for S1 (Lytskjold and Mengshoel); the weight of the
+region of collision, the prediction, the sum of it all, and planning every 3 s (published: 5 s) are
+ours.
 """
 
 from typing import NamedTuple
@@ -11,7 +14,18 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["DESIRED", "FIRST", "SPEEDS", "STILL", "ZONES", "Zone", "costs", "inside", "plan", "speed_of"]
+__all__ = [
+    "DESIRED",
+    "FIRST",
+    "SPEEDS",
+    "STILL",
+    "ZONES",
+    "Zone",
+    "costs",
+    "inside",
+    "plan",
+    "speed_of",
+]
 
 
 class Zone(NamedTuple):
@@ -32,7 +46,8 @@ ZONES = (
 )
 DESIRED = 0.75  # m/s
 STILL = 0.05  # m/s: published threshold of low velocity
-SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])  # candidates, m/s: published range
+# candidates, m/s: published range
+SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])
 FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
 STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end: ours (published horizon: up to 600)
 SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
@@ -41,20 +56,29 @@ KEEP_LEAST = 20.0  # ... and this much less
 
 
 def inside(zone, ahead, right):
-    """Whether a point ``ahead`` and to the ``right`` of an obstacle (m) is in its zone: a quarter of an ellipse in each quadrant."""
+    """Whether a point ``ahead`` and to the ``right`` of an obstacle (m) is in its zone: a quarter
+    of an ellipse in each quadrant.
+    """
     x = ahead / jnp.where(ahead > 0, zone.forward, zone.aft)
     y = right / jnp.where(right > 0, zone.starboard, zone.port)
     return x**2 + y**2 < 1
 
 
 def costs(along, obstacle):
-    """[candidates] cost of each of `SPEEDS` for a ferry at ``along`` on the path and an obstacle with this `tracker.Track`."""
+    """[candidates] cost of each of `SPEEDS` for a ferry at ``along`` on the path and an obstacle
+    with this `tracker.Track`.
+    """
     dtype = along.dtype
-    speeds, times = jnp.asarray(SPEEDS, dtype)[:, None], jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :]
+    speeds, times = (
+        jnp.asarray(SPEEDS, dtype)[:, None],
+        jnp.arange(STEP, AHEAD + STEP, STEP, dtype=dtype)[None, :],
+    )
     n, e, v_n, v_e = obstacle
     speed = jnp.sqrt(v_n**2 + v_e**2)
     still = speed < STILL  # a course of its own an obstacle at rest has not
-    north, east = (jnp.where(still, rest, v / jnp.where(still, 1, speed)) for v, rest in ((v_n, 1), (v_e, 0)))
+    north, east = (
+        jnp.where(still, rest, v / jnp.where(still, 1, speed)) for v, rest in ((v_n, 1), (v_e, 0))
+    )
     d_n, d_e = along + speeds * times - n - v_n * times, -e - v_e * times
     ahead, right = d_n * north + d_e * east, d_e * north - d_n * east
     rate = jnp.zeros_like(ahead)
@@ -68,7 +92,11 @@ def plan(along, current, obstacle):
     """int32: which of `SPEEDS` to take now; ``current``: the one in force."""
     cost = costs(along, obstacle)
     now, least = _pick(cost, current), jnp.min(cost)
-    return jnp.where((least < KEEP * now) & (least < now - KEEP_LEAST), jnp.argmin(cost).astype(jnp.int32), current)
+    return jnp.where(
+        (least < KEEP * now) & (least < now - KEEP_LEAST),
+        jnp.argmin(cost).astype(jnp.int32),
+        current,
+    )
 
 
 def speed_of(choice, dtype):

@@ -1,4 +1,6 @@
-"""Encounters of the ferry and an adversary, as data: where each starts and what the adversary is told to do."""
+"""Encounters of the ferry and an adversary, as data: where each starts and what the adversary is
+told to do.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,12 +10,17 @@ __all__ = ["SCENARIOS", "Scenario"]
 
 
 class Scenario(NamedTuple):
-    """An encounter; arrays or numbers, all traced but the number of rows of ``route``, which is the horizon."""
+    """An encounter; arrays or numbers, all traced but the number of rows of ``route``, which is the
+    horizon.
+    """
 
     adversary: Any
-    """Its start: north (m), east (m), heading (radians, from north towards east); it moves ahead at the speed of the first row of the route."""
+    """Its start: north (m), east (m), heading (radians, from north towards east); it moves ahead at
+    the speed of the first row of the route.
+    """
     route: Any
-    """[steps, 3]: the surge, sway (m/s) and yaw rate (rad/s) that it is told at each search step."""
+    """[steps, 3]: the surge, sway (m/s) and yaw rate (rad/s) that it is told at each search step.
+    """
     ferry: Any = (10.0, 0.0, 0.0)
     """The ferry's start, at rest; its path goes from (0, 0) to (100, 0)."""
 
@@ -32,4 +39,6 @@ SCENARIOS = {
     "overtaking": Scenario((0.0, 45.0, 0.0), _route(27, (0, 25, -0.0225))),
     "sharp turn": Scenario((20.0, 45.0, 0.0), _route(25, (5, 5, -0.10472))),
 }
-"""Starts and routes are those published for S1 (delay3, delay2, delay4 with the gradual left turn, over_turn with the sharp left turn)."""
+"""Starts and routes are those published for S1 (delay3, delay2, delay4 with the gradual left turn,
+over_turn with the sharp left turn).
+"""

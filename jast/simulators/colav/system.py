@@ -16,7 +16,15 @@ from jast.simulators._parameter import positive
 from jast.simulators.colav import planner, tracker
 from jast.simulators.colav.scenarios import SCENARIOS, Scenario
 from jast.simulators.colav.tracker import BUFFER, PERIOD, Track
-from jast.simulators.colav.vessels import Adversary, Control, Pose, Velocity, adversary_substep, ferry_substep, world_velocity
+from jast.simulators.colav.vessels import (
+    Adversary,
+    Control,
+    Pose,
+    Velocity,
+    adversary_substep,
+    ferry_substep,
+    world_velocity,
+)
 
 __all__ = ["COLLISION", "ColavState", "colav"]
 
@@ -51,7 +59,9 @@ class ColavState(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Model:
-    """What the simulator's functions know: the encounter, and the scales of the disturbances (traced); which of them there are, and the substeps (static)."""
+    """What the simulator's functions know: the encounter, and the scales of the disturbances
+    (traced); which of them there are, and the substeps (static).
+    """
 
     scenario: Scenario
     longest: Any
@@ -64,33 +74,47 @@ class Model:
 
 
 def colav(
-    scenario="sharp turn", disturbances="delay", *, substeps=30, longest_delay=BUFFER, delay_change=0.2, delay_easing=0.8, steering_change=0.5,
+    scenario="sharp turn",
+    disturbances="delay",
+    *,
+    substeps=30,
+    longest_delay=BUFFER,
+    delay_change=0.2,
+    delay_easing=0.8,
+    steering_change=0.5,
     noise=(0.3, 0.1),
-):  # fmt: skip
-    """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s, with states of 90 numbers.
+):
+    """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s,
+    with states of 90 numbers.
 
-    ``scenario``: "head-on", "crossing", "overtaking", "sharp turn", or a `Scenario` of your own (``from
-    jast.simulators.colav import Scenario``). ``disturbances``, one or several of:
+    ``scenario``: "head-on", "crossing", "overtaking", "sharp turn", or a `Scenario` of your own
+    (``from jast.simulators.colav import Scenario``). ``disturbances``, one or several of:
 
-    - "delay": the ferry's sensors show the adversary as it was a x ``longest_delay`` seconds ago (at most 40, and nothing before the start), a in [0, 1] drawn
-      each step: tent-shaped around ``delay_easing`` times the last a, of half width ``delay_change``. Undisturbed: 0.
-    - "steering": the adversary turns at a - 0.5 rad/s on top of its route; a in [0, 1], tent-shaped around the last, of half width ``steering_change``.
-      Undisturbed: 0.5.
-    - "noise": errors of the sensed position (two, in m) and velocity (two, in m/s), normal of standard deviations ``noise``, one draw a step. Undisturbed: 0.
+    - "delay": the ferry's sensors show the adversary as it was a x ``longest_delay`` seconds ago
+      (at most 40, and nothing before the start), a in [0, 1] drawn each step: tent-shaped around
+      ``delay_easing`` times the last a, of half width ``delay_change``. Undisturbed: 0.
+    - "steering": the adversary turns at a - 0.5 rad/s on top of its route; a in [0, 1], tent-shaped
+      around the last, of half width ``steering_change``. Undisturbed: 0.5.
+    - "noise": errors of the sensed position (two, in m) and velocity (two, in m/s), normal of
+      standard deviations ``noise``, one draw a step. Undisturbed: 0.
 
-    With one kind x is its array (scalar, scalar, [4]), with several a dict of them by name. The published step rewards of delay and steering are
-    ln(1 - |a - a'|) up to a factor, with -0.5 a for a delay (for which the easing stands here); the published steering stands in place of a route, the
-    published noise is within 0.5 and costs its mean absolute value. The past is kept at the ends of steps and read in between (`tracker`), not as a buffer
-    of samples.
+    With one kind x is its array (scalar, scalar, [4]), with several a dict of them by name. The
+    published step rewards of delay and steering are ln(1 - |a - a'|) up to a factor, with -0.5 a
+    for a delay (for which the easing stands here); the published steering stands in place of a
+    route, the published noise is within 0.5 and costs its mean absolute value. The past is kept at
+    the ends of steps and read in between (`tracker`), not as a buffer of samples.
 
-    In a step the planner looks at the track and commands a speed (`planner`); then, ``substeps`` times (static), the adversary moves, the tracker takes in
-    what the sensors show, and the ferry follows its path (`vessels`). Miss distance: least distance between the centres at substeps; failure below 1 m. Ends
-    when the ferry is at the dock (99 m). Distances are in metres; the dtype is JAX's default float. At the default 30 substeps the ferry's path is right to
-    10 cm; one substep of 3 s is unstable but for small motions and serves measurements of time. The planner's choice is among speeds, so the miss distance
-    has no useful gradient in delays and noise.
+    In a step the planner looks at the track and commands a speed (`planner`); then, ``substeps``
+    times (static), the adversary moves, the tracker takes in what the sensors show, and the ferry
+    follows its path (`vessels`). Miss distance: least distance between the centres at substeps;
+    failure below 1 m. Ends when the ferry is at the dock (99 m). Distances are in metres; the dtype
+    is JAX's default float. At the default 30 substeps the ferry's path is right to 10 cm; one
+    substep of 3 s is unstable but for small motions and serves measurements of time. The planner's
+    choice is among speeds, so the miss distance has no useful gradient in delays and noise.
 
-    Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has other shapes, a delay beyond the buffer, substeps below 1,
-    scales that are not positive and finite, and an easing above 1.
+    Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has
+    other shapes, a delay beyond the buffer, substeps below 1, scales that are not positive and
+    finite, and an easing above 1.
     """
     kinds = _kinds(disturbances)
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
@@ -98,28 +122,47 @@ def colav(
     try:
         noise_of_position, noise_of_velocity = noise
     except (TypeError, ValueError):
-        raise ValueError(f"colav: noise must be a pair, of position (m) and velocity (m/s), received {noise!r}") from None
+        raise ValueError(
+            f"colav: noise must be a pair, of position (m) and velocity (m/s), received {noise!r}"
+        ) from None
     scales = positive(
-        "colav", longest_delay=longest_delay, delay_change=delay_change, delay_easing=delay_easing, steering_change=steering_change,
-        noise_of_position=noise_of_position, noise_of_velocity=noise_of_velocity,
-    )  # fmt: skip
-    for name, value, most, why in (("longest_delay", longest_delay, BUFFER, " s, the past that is kept"), ("delay_easing", delay_easing, 1, "")):
+        "colav",
+        longest_delay=longest_delay,
+        delay_change=delay_change,
+        delay_easing=delay_easing,
+        steering_change=steering_change,
+        noise_of_position=noise_of_position,
+        noise_of_velocity=noise_of_velocity,
+    )
+    for name, value, most, why in (
+        ("longest_delay", longest_delay, BUFFER, " s, the past that is kept"),
+        ("delay_easing", delay_easing, 1, ""),
+    ):
         if not isinstance(value, jax.core.Tracer) and float(value) > most:
             raise ValueError(f"colav: {name} must be at most {most:g}{why}, received {value!r}")
     dtype = jnp.zeros(()).dtype
     *scales, place, speed = (a.astype(dtype) for a in scales)
-    model = Model(_settled(scenario, dtype), *scales, jnp.stack([place, place, speed, speed]), kinds, substeps)
+    model = Model(
+        _settled(scenario, dtype), *scales, jnp.stack([place, place, speed, speed]), kinds, substeps
+    )
     return Simulator(
-        init=Partial(_init, model), step=Partial(_step, model), disturbance=Partial(_disturbance, model), evaluate=_evaluate,
-        horizon=model.scenario.route.shape[0], is_terminal=_is_terminal, observe=_observe,
-    )  # fmt: skip
+        init=Partial(_init, model),
+        step=Partial(_step, model),
+        disturbance=Partial(_disturbance, model),
+        evaluate=_evaluate,
+        horizon=model.scenario.route.shape[0],
+        is_terminal=_is_terminal,
+        observe=_observe,
+    )
 
 
 def _kinds(disturbances):
     """The kinds of disturbance as a tuple; ValueError for what is none."""
     kinds = tuple(disturbances) if isinstance(disturbances, tuple | list) else (disturbances,)
     if not kinds or not all(kind in KINDS for kind in kinds) or len(set(kinds)) != len(kinds):
-        raise ValueError(f"colav: disturbances must be one or several of {KINDS}, received {disturbances!r}")
+        raise ValueError(
+            f"colav: disturbances must be one or several of {KINDS}, received {disturbances!r}"
+        )
     return kinds
 
 
@@ -127,20 +170,34 @@ def _settled(scenario, dtype):
     """The scenario as arrays, or a ValueError that says what is wrong with it."""
     if isinstance(scenario, str):
         if scenario not in SCENARIOS:
-            raise ValueError(f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received {scenario!r}")
+            raise ValueError(
+                f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received"
+                f" {scenario!r}"
+            )
         scenario = SCENARIOS[scenario]
     if not isinstance(scenario, Scenario):
-        raise ValueError(f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received {type(scenario).__name__}")
-    shapes = dict(adversary="three numbers (north, east, heading)", route="[steps, 3] (surge, sway, yaw rate)", ferry="three numbers (north, east, heading)")
+        raise ValueError(
+            f"colav: scenario must be one of {list(SCENARIOS)} or a Scenario, received"
+            f" {type(scenario).__name__}"
+        )
+    shapes = dict(
+        adversary="three numbers (north, east, heading)",
+        route="[steps, 3] (surge, sway, yaw rate)",
+        ferry="three numbers (north, east, heading)",
+    )
     arrays = {}
     for name, expected in shapes.items():
         value = getattr(scenario, name)
         try:
             a = jnp.asarray(value, dtype)
         except (TypeError, ValueError):
-            raise ValueError(f"colav: {name} of the scenario must be {expected}, received {value!r}") from None
+            raise ValueError(
+                f"colav: {name} of the scenario must be {expected}, received {value!r}"
+            ) from None
         if a.ndim != 1 + (name == "route") or a.shape[-1] != 3 or a.shape[0] < 1:
-            raise ValueError(f"colav: {name} of the scenario must be {expected}, received shape {a.shape}")
+            raise ValueError(
+                f"colav: {name} of the scenario must be {expected}, received shape {a.shape}"
+            )
         if not isinstance(a, jax.core.Tracer) and not np.isfinite(a).all():
             raise ValueError(f"colav: {name} of the scenario must be finite, received {value!r}")
         arrays[name] = a
@@ -150,12 +207,24 @@ def _settled(scenario, dtype):
 def _init(model, x0):
     start = model.scenario
     zero = jnp.zeros((), start.route.dtype)
-    pose, adversary = Pose(*start.ferry), Adversary(Pose(*start.adversary), Velocity(start.route[0, 0], start.route[0, 1], zero))
+    pose, adversary = (
+        Pose(*start.ferry),
+        Adversary(Pose(*start.adversary), Velocity(start.route[0, 0], start.route[0, 1], zero)),
+    )
     now = _seen(adversary)
     return ColavState(
-        pose=pose, velocity=Velocity(zero, zero, zero), control=Control(pose.n, zero, zero, zero, zero), choice=jnp.int32(planner.FIRST), track=now,
-        adversary=adversary, past=tracker.begin(now), step=jnp.int32(0), delay=zero, steering=zero + 0.5, near=jnp.sqrt(_apart(pose, adversary.pose)),
-    )  # fmt: skip
+        pose=pose,
+        velocity=Velocity(zero, zero, zero),
+        control=Control(pose.n, zero, zero, zero, zero),
+        choice=jnp.int32(planner.FIRST),
+        track=now,
+        adversary=adversary,
+        past=tracker.begin(now),
+        step=jnp.int32(0),
+        delay=zero,
+        steering=zero + 0.5,
+        near=jnp.sqrt(_apart(pose, adversary.pose)),
+    )
 
 
 def _disturbance(model, s):
@@ -166,14 +235,21 @@ def _disturbance(model, s):
             return D.tent(s.steering, model.swing)
         return D.MultivariateNormalDiag(jnp.zeros(4, s.delay.dtype), model.noise)
 
-    return of(model.kinds[0]) if len(model.kinds) == 1 else D.Joint({kind: of(kind) for kind in model.kinds})
+    return (
+        of(model.kinds[0])
+        if len(model.kinds) == 1
+        else D.Joint({kind: of(kind) for kind in model.kinds})
+    )
 
 
 def _step(model, s, x):
     x = {model.kinds[0]: x} if len(model.kinds) == 1 else x
     dtype, n = s.near.dtype, model.substeps
     zero = jnp.zeros((), dtype)
-    delay, steering = jnp.clip(x.get("delay", zero), 0, 1), jnp.clip(x.get("steering", s.steering), 0, 1)
+    delay, steering = (
+        jnp.clip(x.get("delay", zero), 0, 1),
+        jnp.clip(x.get("steering", s.steering), 0, 1),
+    )
     noise = Track(*x.get("noise", jnp.zeros(4, dtype)))
     dt = PERIOD / n
 
@@ -184,7 +260,8 @@ def _step(model, s, x):
         adversary = adversary_substep(adversary, told, dt)
         return adversary, adversary.pose
 
-    adversary, poses = lax.scan(sail, s.adversary, None, length=n)  # it minds nobody, so it may go first
+    # it minds nobody, so it may go first
+    adversary, poses = lax.scan(sail, s.adversary, None, length=n)
     past = tracker.push(s.past, _seen(adversary))
     read = tracker.reader(past, s.step, delay * (jnp.minimum(model.longest, BUFFER) / PERIOD))
     choice = planner.plan(s.control.along, s.choice, s.track)
@@ -201,7 +278,19 @@ def _step(model, s, x):
     start = (s.pose, s.velocity, s.control, s.track, zero + math.inf)
     since = jnp.arange(1, n + 1, dtype=dtype) / n
     (pose, velocity, control, track, near), _ = lax.scan(drive, start, (since, poses))
-    return ColavState(pose, velocity, control, choice, track, adversary, past, s.step + 1, delay, steering, jnp.sqrt(near))
+    return ColavState(
+        pose,
+        velocity,
+        control,
+        choice,
+        track,
+        adversary,
+        past,
+        s.step + 1,
+        delay,
+        steering,
+        jnp.sqrt(near),
+    )
 
 
 def _evaluate(s):
@@ -213,15 +302,33 @@ def _is_terminal(s):
 
 
 def _observe(s):
-    """Twelve numbers: both vessels, the track's error, and the last disturbances; positions in units of 100 m."""
+    """Twelve numbers: both vessels, the track's error, and the last disturbances; positions in
+    units of 100 m.
+    """
     p, a = s.pose, s.adversary.pose
     error = ((s.track.n - a.n) / 100, (s.track.e - a.e) / 100)
-    return jnp.stack([p.n / 100, p.e / 100, p.psi, s.velocity.u, a.n / 100, a.e / 100, jnp.sin(a.psi), jnp.cos(a.psi), *error, s.delay, s.steering])
+    return jnp.stack(
+        [
+            p.n / 100,
+            p.e / 100,
+            p.psi,
+            s.velocity.u,
+            a.n / 100,
+            a.e / 100,
+            jnp.sin(a.psi),
+            jnp.cos(a.psi),
+            *error,
+            s.delay,
+            s.steering,
+        ]
+    )
 
 
 def _seen(adversary):
     """The adversary's true `Track`."""
-    return Track(adversary.pose.n, adversary.pose.e, *world_velocity(adversary.pose, adversary.velocity))
+    return Track(
+        adversary.pose.n, adversary.pose.e, *world_velocity(adversary.pose, adversary.velocity)
+    )
 
 
 def _apart(a, b):

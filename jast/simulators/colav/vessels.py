@@ -1,11 +1,15 @@
-"""The two vessels: a ferry of three degrees of freedom under path-following control, and an adversary with first-order velocities.
+"""The two vessels: a ferry of three degrees of freedom under path-following control, and an
+adversary with first-order velocities.
 
-Frame: N (north, along the ferry's path) and E (east), metres; heading psi, radians, from north towards east; body velocities u (surge), v (sway), r (yaw
-rate). Everything is a scalar, one vessel: XLA then makes one kernel of a substep for all vessels of a batch.
+Frame: N (north, along the ferry's path) and E (east), metres; heading psi, radians, from north
+towards east; body velocities u (surge), v (sway), r (yaw rate). Everything is a scalar, one vessel:
+XLA then makes one kernel of a substep for all vessels of a batch.
 
-The ferry is milliAmpere, the small brother of the mA2: masses (added mass included) and damping of Pedersen, Optimization Based System Identification for the
-milliAmpere Ferry (NTNU 2019), without the identified couplings, some of which would create energy (the damping matrix is indefinite at v = 1 m/s). Gains are
-those published for the mA2 in the S1 study of Lytskjold and Mengshoel; they fit these masses (0.29 rad/s, damping ratio 0.5 in surge).
+The ferry is milliAmpere, the small brother of the mA2: masses (added mass included) and damping of
+Pedersen, Optimization Based System Identification for the milliAmpere Ferry (NTNU 2019), without
+the identified couplings, some of which would create energy (the damping matrix is indefinite at v =
+1 m/s). Gains are those published for the mA2 in the S1 study of Lytskjold and Mengshoel; they fit
+these masses (0.29 rad/s, damping ratio 0.5 in surge).
 """
 
 from typing import NamedTuple
@@ -13,13 +17,28 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Adversary", "Control", "Pose", "Velocity", "adversary_substep", "energy", "ferry_substep", "world_velocity"]
+__all__ = [
+    "Adversary",
+    "Control",
+    "Pose",
+    "Velocity",
+    "adversary_substep",
+    "energy",
+    "ferry_substep",
+    "world_velocity",
+]
 
 MASS = (2389.657, 2533.911, 5068.910)  # kg, kg, kg m^2
-LINEAR, QUADRATIC, CUBIC = (27.632, 52.948, 122.861), (110.064, 116.487, 874.428), (13.965, 24.313, 0.0)  # damping X, Y, N
+LINEAR, QUADRATIC, CUBIC = (
+    (27.632, 52.948, 122.861),
+    (110.064, 116.487, 874.428),
+    (13.965, 24.313, 0.0),
+)  # damping X, Y, N
 KP, KI, KD = (200.0, 200.0, 800.0), (10.0, 10.0, 15.0), (700.0, 700.0, 1600.0)
 THRUST = (1000.0, 1000.0, 2000.0)  # greatest force (N) and moment (N m), each way: ours
-REACH = 5.0  # greatest position error that the controller sees, m: ours (the published planner allows 5 along the path, 3 across)
+# greatest position error that the controller sees, m: ours (the published planner allows 5 along
+# the path, 3 across)
+REACH = 5.0
 LAGS = (3.0, 5.0, 3.0)  # time constants of the adversary's surge, sway and yaw rate, s: published
 ACCELERATION = 0.15  # greatest change of the reference speed, m/s^2: ours
 WINDUP = 20.0  # greatest integral of an error (m s, rad s): ours
@@ -77,46 +96,80 @@ def energy(velocity):
 
 
 def forces(control, pose, velocity):
-    """Thrust of the controller: PID on position and heading in the body's axes, cut to what the thrusters can."""
+    """Thrust of the controller: PID on position and heading in the body's axes, cut to what the
+    thrusters can.
+    """
     c, s = jnp.cos(pose.psi), jnp.sin(pose.psi)
     error_n, error_e, error_psi = _errors(control.along, pose)
     body = lambda n, e: (c * n + s * e, c * e - s * n)
     (p_u, p_v), (i_u, i_v) = body(error_n, error_e), body(control.sum_n, control.sum_e)
     want_u, want_v = body(control.speed, jnp.zeros_like(control.speed))
-    errors = zip((p_u, p_v, error_psi), (i_u, i_v, control.sum_psi), (want_u - velocity.u, want_v - velocity.v, -velocity.r), strict=True)
-    wanted = (kp * p + ki * i + kd * d for kp, ki, kd, (p, i, d) in zip(KP, KI, KD, errors, strict=True))
+    errors = zip(
+        (p_u, p_v, error_psi),
+        (i_u, i_v, control.sum_psi),
+        (want_u - velocity.u, want_v - velocity.v, -velocity.r),
+        strict=True,
+    )
+    wanted = (
+        kp * p + ki * i + kd * d for kp, ki, kd, (p, i, d) in zip(KP, KI, KD, errors, strict=True)
+    )
     return Velocity(*(jnp.clip(f, -most, most) for f, most in zip(wanted, THRUST, strict=True)))
 
 
 def ferry_substep(pose, velocity, control, command, dt):
     """Pose, velocity and control ``dt`` seconds on, with the planner's speed ``command`` (m/s).
 
-    M nu' + C(nu) nu + D(nu) nu = tau; damping implicit, the pose with the new velocity: first order, stable up to a step of 1.5 s.
+    M nu' + C(nu) nu + D(nu) nu = tau; damping implicit, the pose with the new velocity: first
+    order, stable up to a step of 1.5 s.
     """
     thrust = forces(control, pose, velocity)
     u, v, r = velocity
-    (m_u, m_v, _) = MASS
+    m_u, m_v, _ = MASS
     turning = (m_v * v * r, -m_u * u * r, (m_u - m_v) * u * v)  # -C(nu) nu: does no work
-    drag = (a + b * jnp.abs(x) + k * x**2 for a, b, k, x in zip(LINEAR, QUADRATIC, CUBIC, velocity, strict=True))
-    velocity = Velocity(*((m * x + dt * (f + g)) / (m + dt * d) for m, x, f, g, d in zip(MASS, velocity, thrust, turning, drag, strict=True)))
+    drag = (
+        a + b * jnp.abs(x) + k * x**2
+        for a, b, k, x in zip(LINEAR, QUADRATIC, CUBIC, velocity, strict=True)
+    )
+    velocity = Velocity(
+        *(
+            (m * x + dt * (f + g)) / (m + dt * d)
+            for m, x, f, g, d in zip(MASS, velocity, thrust, turning, drag, strict=True)
+        )
+    )
     rate = pose_rate(pose, velocity)
     pose = Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True)))
     speed = control.speed + jnp.clip(command - control.speed, -ACCELERATION * dt, ACCELERATION * dt)
-    along = jnp.clip(control.along + dt * speed, pose.n - REACH, pose.n + REACH)  # the reference waits for the ferry
-    sums = zip((control.sum_n, control.sum_e, control.sum_psi), _errors(control.along, pose), strict=True)
-    return pose, velocity, Control(along, speed, *(jnp.clip(x + dt * error, -WINDUP, WINDUP) for x, error in sums))
+    # the reference waits for the ferry
+    along = jnp.clip(control.along + dt * speed, pose.n - REACH, pose.n + REACH)
+    sums = zip(
+        (control.sum_n, control.sum_e, control.sum_psi), _errors(control.along, pose), strict=True
+    )
+    return (
+        pose,
+        velocity,
+        Control(along, speed, *(jnp.clip(x + dt * error, -WINDUP, WINDUP) for x, error in sums)),
+    )
 
 
 def adversary_substep(adversary, command, dt):
-    """The adversary ``dt`` seconds on; its velocities approach ``command`` exponentially (exact), the pose follows by the midpoint (second order)."""
+    """The adversary ``dt`` seconds on; its velocities approach ``command`` exponentially (exact),
+    the pose follows by the midpoint (second order).
+    """
     pose, velocity = adversary
-    after = Velocity(*(to + (x - to) * jnp.exp(-dt / lag) for x, to, lag in zip(velocity, command, LAGS, strict=True)))
+    after = Velocity(
+        *(
+            to + (x - to) * jnp.exp(-dt / lag)
+            for x, to, lag in zip(velocity, command, LAGS, strict=True)
+        )
+    )
     mean = Velocity(*((a + b) / 2 for a, b in zip(velocity, after, strict=True)))
     rate = pose_rate(pose._replace(psi=pose.psi + dt / 2 * mean.r), mean)
     return Adversary(Pose(*(x + dt * dx for x, dx in zip(pose, rate, strict=True))), after)
 
 
 def _errors(along, pose):
-    """What is missing to the reference: north and east (m, as far as the controller sees), heading (radians, the short way round)."""
+    """What is missing to the reference: north and east (m, as far as the controller sees), heading
+    (radians, the short way round).
+    """
     turn = pose.psi - 2 * jnp.pi * jnp.round(pose.psi / (2 * jnp.pi))
     return Pose(jnp.clip(along - pose.n, -REACH, REACH), jnp.clip(-pose.e, -REACH, REACH), -turn)

@@ -1,7 +1,10 @@
-"""What may be wrong with a lateral path: the four failure events of the thesis (Moss, eq. 3.3 and 3.4, A.1 to A.3), with its formulas corrected.
+"""What may be wrong with a lateral path: the four failure events of the thesis (Moss, eq. 3.3 and
+3.4, A.1 to A.3), with its formulas corrected.
 
-A miss distance d <= 0 is a failure. What was corrected: eq. 3.3 as printed is at least 2 pi for every turn to the right, here the extent of an arc is taken
-modulo 2 pi; A.1 and A.3 compare azimuths at two points, between which the meridians converge by more than the thresholds, here both are taken at one.
+A miss distance d <= 0 is a failure. What was corrected: eq. 3.3 as printed is at least 2 pi for
+every turn to the right, here the extent of an arc is taken modulo 2 pi; A.1 and A.3 compare
+azimuths at two points, between which the meridians converge by more than the thresholds, here both
+are taken at one.
 """
 
 from typing import NamedTuple
@@ -52,8 +55,12 @@ def _arc_length(earth, path):
 
 
 def _straights(earth, path):
-    """Of the straights to the starts of the turns: whether each is one (longer than 1 mm), and its courses at both ends [T]."""
-    length, first, last = inverse(earth, jnp.concatenate([path.waypoints[:1], path.end[:-1]]), path.start)
+    """Of the straights to the starts of the turns: whether each is one (longer than 1 mm), and its
+    courses at both ends [T].
+    """
+    length, first, last = inverse(
+        earth, jnp.concatenate([path.waypoints[:1], path.end[:-1]]), path.start
+    )
     return path.straight[:-1] & (length > LEAST), first, last
 
 
@@ -77,4 +84,9 @@ def _course(earth, path):
     return COURSE - jnp.max(jnp.where(there[1:], change, 0), initial=0)
 
 
-EVENTS = {"arc length": _arc_length, "kink": _kink, "disconnection": _disconnection, "course": _course}
+EVENTS = {
+    "arc length": _arc_length,
+    "kink": _kink,
+    "disconnection": _disconnection,
+    "course": _course,
+}

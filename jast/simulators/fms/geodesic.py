@@ -1,9 +1,12 @@
 """Geodesics on an ellipsoid of revolution, direct and inverse, on arrays of any shape; float64.
 
-The two integrals of a geodesic on the auxiliary sphere (Karney 2013, Algorithms for geodesics, eq. 7 and 8), distance and longitude, are taken by Gauss and
-Legendre's rule over the leg itself instead of being expanded in a series, as Vincenty's is: no constants of a series, and short legs lose no digits. Against
-Karney's library on WGS84, legs of .001 to 3000 nmi either way: points and distances to 1e-8 m, azimuths to 1e-8 m sideways (at 37 m: to 1e-10 radians).
-Not for points that are nearly antipodal: there `inverse` gives finite numbers, but not the shortest path. A flattening of 0 is a sphere.
+The two integrals of a geodesic on the auxiliary sphere (Karney 2013, Algorithms for geodesics, eq.
+7 and 8), distance and longitude, are taken by Gauss and Legendre's rule over the leg itself instead
+of being expanded in a series, as Vincenty's is: no constants of a series, and short legs lose no
+digits. Against Karney's library on WGS84, legs of .001 to 3000 nmi either way: points and distances
+to 1e-8 m, azimuths to 1e-8 m sideways (at 37 m: to 1e-10 radians). Not for points that are nearly
+antipodal: there `inverse` gives finite numbers, but not the shortest path. A flattening of 0 is a
+sphere.
 """
 
 from typing import NamedTuple
@@ -17,7 +20,8 @@ __all__ = ["EARTHS", "Earth", "direct", "inverse", "wrap"]
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2  # on [0, 1]; six: below 1e-8 m on 3000 nmi
-INVERSE = 5  # iterations, each of which makes the error as many times smaller as the flattening is below 1
+# iterations, each of which makes the error as many times smaller as the flattening is below 1
+INVERSE = 5
 DIRECT = 3  # of Newton's method
 
 
@@ -33,10 +37,12 @@ EARTHS = {"wgs84": (6378137.0, 1 / 298.257223563), "sphere": (6371008.8, 0.0)}
 
 @jax.jit
 def direct(earth, point, course, distance):
-    """Where a geodesic leads from ``point`` [..., 2] (latitude, longitude; degrees): (point [..., 2], course there [...]).
+    """Where a geodesic leads from ``point`` [..., 2] (latitude, longitude; degrees): (point [...,
+    2], course there [...]).
 
-    ``course`` [...]: azimuth at the start, radians from north to the east; ``distance`` [...]: metres, a negative one goes backwards (the course at the end
-    still looks forwards). Longitudes are in [-180, 180].
+    ``course`` [...]: azimuth at the start, radians from north to the east; ``distance`` [...]:
+    metres, a negative one goes backwards (the course at the end still looks forwards). Longitudes
+    are in [-180, 180].
     """
     f = earth.flattening
     b = earth.radius * (1 - f)
@@ -62,9 +68,11 @@ def direct(earth, point, course, distance):
 
 @jax.jit
 def inverse(earth, start, end):
-    """The geodesic between two points [..., 2] (latitude, longitude; degrees): (distance in metres, course at the start, course at the end), [...] each.
+    """The geodesic between two points [..., 2] (latitude, longitude; degrees): (distance in metres,
+    course at the start, course at the end), [...] each.
 
-    Courses are azimuths in radians from north to the east, both looking forwards; of coincident points finite and without meaning, distance 0.
+    Courses are azimuths in radians from north to the east, both looking forwards; of coincident
+    points finite and without meaning, distance 0.
     """
     f = earth.flattening
     sin_1, cos_1 = _reduced(f, start[..., 0])
@@ -73,14 +81,26 @@ def inverse(earth, start, end):
     difference = jnp.radians(_turn(end[..., 1] - start[..., 1]))
 
     def sphere(omega):
-        """Of a difference of longitudes on the auxiliary sphere: the arc, its start, the sine of the azimuth at the equator, k^2, and both courses."""
+        """Of a difference of longitudes on the auxiliary sphere: the arc, its start, the sine of
+        the azimuth at the equator, k^2, and both courses.
+        """
         sin_o, bend = jnp.sin(omega), 2 * jnp.sin(omega / 2) ** 2
         east, north = cos_2 * sin_o, rise + sin_1 * cos_2 * bend
         sin_s = jnp.hypot(east, north)
         cos_s = sin_1 * sin_2 + cos_1 * cos_2 * (1 - bend)
         equator = cos_1 * east / jnp.maximum(sin_s, 1e-300)
-        first, last = jnp.arctan2(east, north), jnp.arctan2(cos_1 * sin_o, rise - sin_2 * cos_1 * bend)
-        return jnp.arctan2(sin_s, cos_s), jnp.arctan2(sin_1 * sin_s, north * cos_1), equator, _k2(f, equator), first, last
+        first, last = (
+            jnp.arctan2(east, north),
+            jnp.arctan2(cos_1 * sin_o, rise - sin_2 * cos_1 * bend),
+        )
+        return (
+            jnp.arctan2(sin_s, cos_s),
+            jnp.arctan2(sin_1 * sin_s, north * cos_1),
+            equator,
+            _k2(f, equator),
+            first,
+            last,
+        )
 
     def body(_, omega):
         sigma, sigma_1, equator, k2, *_ = sphere(omega)
@@ -118,7 +138,9 @@ def _stretch(k2, sine):
 
 def _mean(integrand, k2, sigma_1, sigma):
     """Mean of ``integrand(sqrt(1 + k^2 sin^2))`` over the arc ``sigma`` from ``sigma_1``."""
-    nodes, weights = (jnp.asarray(a, sigma.dtype).reshape(-1, *(1,) * sigma.ndim) for a in (NODES, WEIGHTS))
+    nodes, weights = (
+        jnp.asarray(a, sigma.dtype).reshape(-1, *(1,) * sigma.ndim) for a in (NODES, WEIGHTS)
+    )
     at = sigma_1[None] + nodes * sigma[None]
     return jnp.sum(weights * integrand(_stretch(k2[None], jnp.sin(at))), 0)
 

@@ -1,9 +1,12 @@
-"""The lateral path through a list of waypoints: fly-by turns, fitted to the legs, as packets of a straight and an arc; with the injected defect.
+"""The lateral path through a list of waypoints: fly-by turns, fitted to the legs, as packets of a
+straight and an arc; with the injected defect.
 
-A turn at a waypoint leaves the leg by its lead distance before the waypoint and is on the next leg by as much behind it. Where two turns do not fit on a
-leg, both are made smaller. The defect: a leg shorter than `Build.eps` is not fitted (as if to avoid a division by its length), its turns keep their nominal
-radii and overlap, and the arc of the second is made to start where the first ended, which is not where it was built to start: it is then longer or shorter
-than stated, and where that point lies past its own end it leads nearly all the way round (a fifth of the failures).
+A turn at a waypoint leaves the leg by its lead distance before the waypoint and is on the next leg
+by as much behind it. Where two turns do not fit on a leg, both are made smaller. The defect: a leg
+shorter than `Build.eps` is not fitted (as if to avoid a division by its length), its turns keep
+their nominal radii and overlap, and the arc of the second is made to start where the first ended,
+which is not where it was built to start: it is then longer or shorter than stated, and where that
+point lies past its own end it leads nearly all the way round (a fifth of the failures).
 """
 
 from typing import Any, NamedTuple
@@ -30,20 +33,26 @@ class Build(NamedTuple):
     eps: Any
     """Legs shorter than that (m) skip the fit; 0: none does, the correct builder."""
     every: Any
-    """bool: the guard acts on every such leg, not only where the turns at its ends have opposite senses."""
+    """bool: the guard acts on every such leg, not only where the turns at its ends have opposite
+    senses.
+    """
     bank: Any
     """Bank angle (radians)."""
     tas: Any
     """True air speed (m/s)."""
     snap: Any
-    """bool: an arc that would start before the last one ended is made to start at that end, which keeps the path connected."""
+    """bool: an arc that would start before the last one ended is made to start at that end, which
+    keeps the path connected.
+    """
     earth: Earth
 
 
 class Path(NamedTuple):
-    """The lateral path through T waypoints between two airports. Points are (latitude, longitude) in degrees, lengths in m, courses and angles in radians.
+    """The lateral path through T waypoints between two airports. Points are (latitude, longitude)
+    in degrees, lengths in m, courses and angles in radians.
 
-    Packet i is a straight to ``start[i]`` (where ``straight[i]``), then the arc to ``end[i]`` (where ``arc[i]``); last comes a straight to the destination.
+    Packet i is a straight to ``start[i]`` (where ``straight[i]``), then the arc to ``end[i]``
+    (where ``arc[i]``); last comes a straight to the destination.
     """
 
     waypoints: jax.Array
@@ -51,7 +60,8 @@ class Path(NamedTuple):
     legs: jax.Array
     """[T + 1] lengths."""
     skipped: jax.Array
-    """[T + 1] bool: legs on which the guard skipped the fit of turns that did not fit: the defect."""
+    """[T + 1] bool: legs on which the guard skipped the fit of turns that did not fit: the defect.
+    """
     turn: jax.Array
     """[T]: change of course at a waypoint, to the right positive, in [-pi, pi]."""
     start: jax.Array
@@ -73,7 +83,8 @@ class Path(NamedTuple):
 
 
 def lateral(build, waypoints, winds, count):
-    """The `Path` through the first ``count`` of the ``waypoints`` [T + 2, 2] behind the first; the last is the destination, and what lies between is left out.
+    """The `Path` through the first ``count`` of the ``waypoints`` [T + 2, 2] behind the first; the
+    last is the destination, and what lies between is left out.
 
     ``winds`` [T, 2]: direction blown towards (degrees) and speed (knots) at each waypoint.
     """
@@ -84,11 +95,14 @@ def lateral(build, waypoints, winds, count):
     out = leaving[1:]
     turn = jnp.where(place[1:-1] <= count, wrap(out - arriving[:-1]), 0)
 
-    speed = jnp.maximum(build.tas + KNOT * winds[:, 1] * jnp.cos(jnp.radians(winds[:, 0]) - out), SLOWEST)
+    speed = jnp.maximum(
+        build.tas + KNOT * winds[:, 1] * jnp.cos(jnp.radians(winds[:, 0]) - out), SLOWEST
+    )
     tan = jnp.tan(jnp.abs(turn) / 2)
     radius = jnp.minimum(speed**2 / (GRAVITY * jnp.tan(build.bank)), LEAD / jnp.maximum(tan, 1e-9))
     end = jnp.zeros((1,), tan.dtype)
-    both = lambda a: (lambda p: p[:-1] + p[1:])(jnp.concatenate([end, a, end]))  # of the turns at both ends of a leg
+    # of the turns at both ends of a leg
+    both = lambda a: (lambda p: p[:-1] + p[1:])(jnp.concatenate([end, a, end]))
     sense = jnp.concatenate([end, jnp.sign(turn), end])
     needs = SHARE * legs < both(radius * tan)
     short = (legs < build.eps) & (build.every | (sense[:-1] * sense[1:] < 0))
@@ -98,10 +112,27 @@ def lateral(build, waypoints, winds, count):
     overlap = both(lead) > legs
 
     at = jnp.stack([waypoints[1:-1]] * 2)
-    points, courses = direct(build.earth, at, jnp.stack([arriving[:-1], out]), jnp.stack([-lead, lead]))
+    points, courses = direct(
+        build.earth, at, jnp.stack([arriving[:-1], out]), jnp.stack([-lead, lead])
+    )
     (start, finish), (course_in, course_out) = points, courses
     side = jnp.where(turn < 0, -1, 1).astype(turn.dtype)
     centre, _ = direct(build.earth, start, course_in + side * jnp.pi / 2, radius)
-    start = jnp.where((build.snap & overlap[:-1])[:, None], jnp.concatenate([waypoints[:1], finish[:-1]]), start)
+    start = jnp.where(
+        (build.snap & overlap[:-1])[:, None], jnp.concatenate([waypoints[:1], finish[:-1]]), start
+    )
     beta = jnp.abs(turn) * radius
-    return Path(waypoints, legs, needs & short, turn, start, finish, course_out, centre, side * radius, beta, ~overlap, beta > LEAST)
+    return Path(
+        waypoints,
+        legs,
+        needs & short,
+        turn,
+        start,
+        finish,
+        course_out,
+        centre,
+        side * radius,
+        beta,
+        ~overlap,
+        beta > LEAST,
+    )

@@ -1,4 +1,6 @@
-"""The trajectory predictor and the routes that disturb it, as one `Simulator`; its paths and miss distances for users and pictures."""
+"""The trajectory predictor and the routes that disturb it, as one `Simulator`; its paths and miss
+distances for users and pictures.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -20,7 +22,9 @@ __all__ = ["MEANS", "SIGMAS", "FmsState", "fms", "fms_misses", "fms_path"]
 
 MEANS = (180.0, 50.0, -88.5, 66.8)
 SIGMAS = (45.0, 30.0, 39.5, 24.4)
-"""Of x: true course (degrees), distance (nmi), wind direction (degrees), wind speed (kt). Standard deviations, although the source calls them covariances."""
+"""Of x: true course (degrees), distance (nmi), wind direction (degrees), wind speed (kt). Standard
+deviations, although the source calls them covariances.
+"""
 
 
 class FmsState(NamedTuple):
@@ -37,7 +41,9 @@ class FmsState(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Model:
-    """What the simulator's functions know: the predictor's settings (traced), how many waypoints and which event (static)."""
+    """What the simulator's functions know: the predictor's settings (traced), how many waypoints
+    and which event (static).
+    """
 
     build: Any
     waypoints: int = field(metadata=dict(static=True))
@@ -45,62 +51,111 @@ class Model:
 
 
 def fms(
-    eps=0.03, bank=23.3, tas=450.0, waypoints=12, guard="s-turns", event="arc length", fixed=False, *, earth="wgs84", snap=True, database=False
-):  # fmt: skip
-    """The predictor on routes from KSFO to KLAX, an episodic `Simulator` of ``waypoints`` steps: x places the next waypoint, the path is judged at the end.
+    eps=0.03,
+    bank=23.3,
+    tas=450.0,
+    waypoints=12,
+    guard="s-turns",
+    event="arc length",
+    fixed=False,
+    *,
+    earth="wgs84",
+    snap=True,
+    database=False,
+):
+    """The predictor on routes from KSFO to KLAX, an episodic `Simulator` of ``waypoints`` steps: x
+    places the next waypoint, the path is judged at the end.
 
-    x [4], four normals (`MEANS`, `SIGMAS`): true course (degrees) and distance (nmi) from the last waypoint, negative ones backwards; wind direction (degrees,
-    blown towards) and speed (kt). With ``database=True`` the next waypoint is one of 26 named beacons more than 5 nmi away, all as likely as each other:
-    x = {"fix": int, "wind": [2]}, a baseline on which nothing fails.
+    x [4], four normals (`MEANS`, `SIGMAS`): true course (degrees) and distance (nmi) from the last
+    waypoint, negative ones backwards; wind direction (degrees, blown towards) and speed (kt). With
+    ``database=True`` the next waypoint is one of 26 named beacons more than 5 nmi away, all as
+    likely as each other: x = {"fix": int, "wind": [2]}, a baseline on which nothing fails.
 
-    ``eps`` (nmi): on legs shorter than that the defect acts, where the turns at both ends have opposite senses (``guard="s-turns"``) or always ("all");
-    ``fixed=True``: never, a negative control on which a search must find nothing. ``bank`` (degrees) and ``tas`` (true air speed, kt) set the radii of turns.
-    ``snap=False`` leaves overlapping turns disconnected. ``earth``: "wgs84" or "sphere". ``event``: which miss distance counts, a failure where it is not
-    positive: "arc length", "kink" (radians), "disconnection" (ft) or "course" (radians); `fms_misses` gives all four. Only the first sees the defect, with
-    ``snap=False`` only "disconnection". ``waypoints``, ``event`` and ``database`` are static, the rest is traced.
+    ``eps`` (nmi): on legs shorter than that the defect acts, where the turns at both ends have
+    opposite senses (``guard="s-turns"``) or always ("all"); ``fixed=True``: never, a negative
+    control on which a search must find nothing. ``bank`` (degrees) and ``tas`` (true air speed, kt)
+    set the radii of turns. ``snap=False`` leaves overlapping turns disconnected. ``earth``: "wgs84"
+    or "sphere". ``event``: which miss distance counts, a failure where it is not positive: "arc
+    length", "kink" (radians), "disconnection" (ft) or "course" (radians); `fms_misses` gives all
+    four. Only the first sees the defect, with ``snap=False`` only "disconnection". ``waypoints``,
+    ``event`` and ``database`` are static, the rest is traced.
 
-    Needs float64: ValueError unless made and used inside ``with jax.enable_x64(True):`` or with JAX_ENABLE_X64=1; and for settings out of range.
+    Needs float64: ValueError unless made and used inside ``with jax.enable_x64(True):`` or with
+    JAX_ENABLE_X64=1; and for settings out of range.
     """
     _double()
     waypoints = whole("fms", "waypoints", waypoints)
-    for name, value, known in (("guard", guard, ("s-turns", "all")), ("event", event, (*events.EVENTS,)), ("earth", earth, (*EARTHS,))):
+    for name, value, known in (
+        ("guard", guard, ("s-turns", "all")),
+        ("event", event, (*events.EVENTS,)),
+        ("earth", earth, (*EARTHS,)),
+    ):
         if value not in known:
-            raise ValueError(f"fms: {name} must be one of {', '.join(map(repr, known))}, received {value!r}")
+            raise ValueError(
+                f"fms: {name} must be one of {', '.join(map(repr, known))}, received {value!r}"
+            )
     for name, value in (("fixed", fixed), ("snap", snap), ("database", database)):
         if not isinstance(value, bool):
             raise ValueError(f"fms: {name} must be True or False, received {value!r}")
     eps = real("fms", "eps", eps, lambda v: 0 <= v < jnp.inf, "of nmi, at least 0")
     bank = real("fms", "bank", bank, lambda v: 0 < v < 90, "of degrees between 0 and 90")
     tas = real("fms", "tas", tas, lambda v: 0 < v < jnp.inf, "of knots, positive")
-    eps, bank, tas = (jnp.asarray(v, jnp.float64) for v in (eps * (0.0 if fixed else NMI), jnp.radians(bank), tas * KNOT))
-    build = Build(eps, jnp.asarray(guard == "all"), bank, tas, jnp.asarray(snap), Earth(*(jnp.asarray(v, jnp.float64) for v in EARTHS[earth])))
+    eps, bank, tas = (
+        jnp.asarray(v, jnp.float64)
+        for v in (eps * (0.0 if fixed else NMI), jnp.radians(bank), tas * KNOT)
+    )
+    build = Build(
+        eps,
+        jnp.asarray(guard == "all"),
+        bank,
+        tas,
+        jnp.asarray(snap),
+        Earth(*(jnp.asarray(v, jnp.float64) for v in EARTHS[earth])),
+    )
     model = Model(build, waypoints, event)
-    step, disturbance = (_step_database, _disturbance_database) if database else (_step, _disturbance)
+    step, disturbance = (
+        (_step_database, _disturbance_database) if database else (_step, _disturbance)
+    )
     return Simulator(
-        Partial(_init, model), Partial(step, model), Partial(disturbance, model), Partial(_evaluate, model), waypoints, observe=_observe, episodic=True
-    )  # fmt: skip
+        Partial(_init, model),
+        Partial(step, model),
+        Partial(disturbance, model),
+        Partial(_evaluate, model),
+        waypoints,
+        observe=_observe,
+        episodic=True,
+    )
 
 
 def fms_path(sim, episode):
-    """The lateral path of an `Episode` (or of an `FmsState`) of ``sim``: `jast.simulators.fms.Path`. ValueError for those of another system."""
+    """The lateral path of an `Episode` (or of an `FmsState`) of ``sim``:
+    `jast.simulators.fms.Path`. ValueError for those of another system.
+    """
     return _path(*_route("fms_path", sim, episode))
 
 
 def fms_misses(sim, episode):
-    """The miss distances of all four events, of an `Episode` (or of an `FmsState`) of ``sim``: `jast.simulators.fms.Misses`. ValueError as for `fms_path`."""
+    """The miss distances of all four events, of an `Episode` (or of an `FmsState`) of ``sim``:
+    `jast.simulators.fms.Misses`. ValueError as for `fms_path`.
+    """
     return _misses(*_route("fms_misses", sim, episode))
 
 
 def _route(caller, sim, episode):
     model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
     if not isinstance(model, Model):
-        raise ValueError(f"{caller}: sim must be a jast.simulators.fms(), received {type(sim).__name__}")
+        raise ValueError(
+            f"{caller}: sim must be a jast.simulators.fms(), received {type(sim).__name__}"
+        )
     state = episode
     if isinstance(episode, Episode):
         states = replay(sim, episode).states if episode.states is None else episode.states
         state = jax.tree.map(lambda a: jnp.asarray(a)[episode.length], states)
     if not isinstance(state, FmsState) or jnp.shape(state.waypoints) != (model.waypoints, 2):
-        raise ValueError(f"{caller}: episode must be one Episode or FmsState of {model.waypoints} waypoints, received {type(state).__name__}")
+        raise ValueError(
+            f"{caller}: episode must be one Episode or FmsState of {model.waypoints} waypoints,"
+            f" received {type(state).__name__}"
+        )
     _double()
     return model, state
 
@@ -150,11 +205,15 @@ def _disturbance_database(model, s):
     apart = jnp.asarray(APART)  # rows: the beacons, KSFO, KLAX
     here = jnp.append(jnp.all(POSITIONS == _last(s)[None], axis=1), s.t == 0)
     may = jnp.any(apart[:-1] & here[:, None], axis=0) & (apart[-1] | (s.t < model.waypoints - 1))
-    return D.Joint({"fix": D.Categorical(logits=jnp.where(may, 0.0, -jnp.inf)), "wind": _normals(slice(2, 4))})
+    return D.Joint(
+        {"fix": D.Categorical(logits=jnp.where(may, 0.0, -jnp.inf)), "wind": _normals(slice(2, 4))}
+    )
 
 
 def _normals(which):
-    return D.Independent(D.Normal(jnp.asarray(MEANS[which], jnp.float64), jnp.asarray(SIGMAS[which], jnp.float64)), 1)
+    return D.Independent(
+        D.Normal(jnp.asarray(MEANS[which], jnp.float64), jnp.asarray(SIGMAS[which], jnp.float64)), 1
+    )
 
 
 def _last(s, back=0):
@@ -164,13 +223,21 @@ def _last(s, back=0):
 
 
 def _observe(s):
-    """The share of the waypoints that are placed; the way to KLAX and the last leg, north and east (100 nmi, as on a plane); the last wind."""
+    """The share of the waypoints that are placed; the way to KLAX and the last leg, north and east
+    (100 nmi, as on a plane); the last wind.
+    """
     here, goal = _last(s), _point(KLAX)
     east = jnp.stack([jnp.ones(()), jnp.cos(jnp.radians(goal[0]))])
     ways = jnp.concatenate([goal - here, here - _last(s, 1)]) * 0.6 * jnp.concatenate([east, east])
     wind = s.winds[jnp.maximum(s.t - 1, 0)]
     course = jnp.radians(wind[0])
-    return jnp.concatenate([jnp.stack([s.t.astype(jnp.float64) / len(s.waypoints)]), ways, jnp.stack([wind[1] / 100, jnp.sin(course), jnp.cos(course)])])
+    return jnp.concatenate(
+        [
+            jnp.stack([s.t.astype(jnp.float64) / len(s.waypoints)]),
+            ways,
+            jnp.stack([wind[1] / 100, jnp.sin(course), jnp.cos(course)]),
+        ]
+    )
 
 
 def _point(degrees):
@@ -179,4 +246,7 @@ def _point(degrees):
 
 def _double():
     if not jax.config.jax_enable_x64:
-        raise ValueError("fms: float64 is needed, make and use it inside `with jax.enable_x64(True):`, received jax_enable_x64=False")
+        raise ValueError(
+            "fms: float64 is needed, make and use it inside `with jax.enable_x64(True):`, received"
+            " jax_enable_x64=False"
+        )
