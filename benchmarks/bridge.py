@@ -74,7 +74,7 @@ def proposals(name, seeds):
     make, truth = SYSTEMS[name]
     sim, rows = make(), []
     for seed in range(seeds):
-        proposal = ce.failure_proposal(jax.random.key(seed), sim, iterations=20)
+        proposal = jast.estimate.failure_proposal(jax.random.key(seed), sim, iterations=20)
         r = importance(jax.random.key(1000 + seed), sim, proposal.policy, FRESH)
         rows.append((r.mean / truth, r.relative_error, bool(proposal.reached)))
     ratio, error, reached = map(list, zip(*rows, strict=True))

@@ -19,7 +19,7 @@ import jast
 from benchmarks.engine import alone, cpu, problem, whole
 from benchmarks.ferry import timed
 from jast.counter import tree_keys
-from jast.estimate.intervals import clopper_pearson
+from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")

@@ -27,11 +27,11 @@ from benchmarks import reference
 from jast.counter import tree_keys
 from jast.episode import Progress, begin
 from jast.rewards import as_pytree
-from jast.search import run
-from jast.search.choice import Choice
 from jast.search.forest import MODES
-from jast.search.tree import Problem, Settings, choose_rollout, take, widths
-from jast.search.trees import settled
+from jast.search.tree import run
+from jast.search.tree.choice import Choice
+from jast.search.tree.grow import settled
+from jast.search.tree.layout import Problem, Settings, choose_rollout, take, widths
 from jast.simulator import Simulator
 
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import jast
-from jast.estimate.intervals import clopper_pearson
+from jast.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")

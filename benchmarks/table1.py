@@ -17,8 +17,8 @@ import jast
 from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
 from jast.counter import tree_keys
-from jast.estimate.intervals import clopper_pearson
-from jast.search.trees import LANES
+from jast.intervals import clopper_pearson
+from jast.search.tree.grow import LANES
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}

@@ -17,9 +17,9 @@ from jast import (
     simulators,
     weakness,
 )
-from jast.check import check
+from jast.contract import check
+from jast.crude import nominal
 from jast.episode import Episode, replay, rollout
-from jast.nominal import nominal
 from jast.policy import Policy
 from jast.simulator import Simulator
 

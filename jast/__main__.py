@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from jast import actions, failures, nominal, plot, rewards, simulators
-from jast.check import check
-from jast.estimate.intervals import clopper_pearson
+from jast.contract import check
+from jast.intervals import clopper_pearson
 from jast.search.cem import cem
 from jast.search.forest import forest
 from jast.search.mcts import mcts

@@ -12,8 +12,8 @@ from jax.tree_util import Partial
 import jast
 from jast import actions
 from jast import distributions as D
-from jast.check import contract
-from jast.estimate.intervals import clopper_pearson
+from jast.contract import contract
+from jast.intervals import clopper_pearson
 from jast.simulators import ferry, landing, limit_state, walk1d
 
 

@@ -10,8 +10,9 @@ from test_tree import FERRY, grown
 
 import jast
 from jast.distributions import Independent, Normal
-from jast.search import forest, mcts, run
-from jast.search import tree as T
+from jast.search import forest, mcts
+from jast.search.tree import layout as T
+from jast.search.tree import run
 
 
 class Host:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from jast.estimate import pareto_k
 from jast.estimate.diagnostics import reasons
 from jast.estimate.estimate import estimate, of_counts
-from jast.estimate.importance import Traces
+from jast.estimate.importance_sampling import Traces
 from jast.estimate.sums import add, nothing
 
 

@@ -22,11 +22,11 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate import latent as L
+from jast.estimate import limit_state as L
 from jast.estimate.adaptive import LEAST
 from jast.estimate.batches import numbers
 from jast.estimate.design_points import design_points, distinct
-from jast.estimate.fit import Gaussians, as_latent, fit, shrunk, together, unit
+from jast.estimate.gaussians import Gaussians, as_latent, fit, shrunk, together, unit
 from jast.estimate.populations import cool, explore
 from jast.simulators import landing
 

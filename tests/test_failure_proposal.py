@@ -12,8 +12,8 @@ from systems import ring, walk
 
 import jast
 from jast import distributions as D
-from jast.cross_entropy import failure_proposal
 from jast.cross_entropy.tilted import Tilted, tilted
+from jast.estimate import failure_proposal
 
 SEEDS = 3
 SMALL = dict(samples=400, iterations=6)

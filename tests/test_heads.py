@@ -24,9 +24,11 @@ from jast.heads.heads import flat, in_bins, moments, unflat
 from jast.heads.rounds import best_trees, enrol
 from jast.heads.samples import Samples, _rows, _steps, of_edges, of_episodes, of_roots
 from jast.heads.training import _fit, learn, learner
-from jast.search import forest, run, trees
-from jast.search.edges import Edges
-from jast.search.prune import Roots
+from jast.search import forest
+from jast.search.tree import grow as trees
+from jast.search.tree import run
+from jast.search.tree.edges import Edges
+from jast.search.tree.prune import Roots
 
 # --- networks
 # ----------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 import jast
 from jast.heads import Head, Heads, Moments, make_head, networks, storage
 from jast.heads.heads import histogram, value
-from jast.search import run
+from jast.search.tree import run
 
 WALK = jast.simulators.walk1d(threshold=4.0)  # one number observed, a disturbance of one
 SIZE = dict(trees=4, prunes=2, simulations=30)

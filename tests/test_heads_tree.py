@@ -32,10 +32,11 @@ from test_tree import (
 import jast
 from jast.counter import tree_keys
 from jast.heads import Heads, Moments, settings
-from jast.search import forest, run
-from jast.search import tree as T
-from jast.search.guide import guide
-from jast.search.records import unpack
+from jast.search import forest
+from jast.search.tree import layout as T
+from jast.search.tree import run
+from jast.search.tree.guide import guide
+from jast.search.tree.packing import unpack
 
 # --- heads that are known
 # ----------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from jast.estimate import (
     trace_proposal,
 )
 from jast.estimate.blend import blend
-from jast.estimate.importance import LANES, chunks, even, played
+from jast.estimate.importance_sampling import LANES, chunks, even, played
 from jast.policy import Policy, recorded
 from jast.simulators import landing, landing_probability, walk1d
 

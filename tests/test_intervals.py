@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jast.estimate import chernoff, clopper_pearson, jeffreys
-from jast.estimate.intervals import log_normal
+from jast.intervals import log_normal
 
 beta = scipy.stats.beta
 CASES = [

@@ -13,7 +13,7 @@ from systems import S0, ring, two_densities, walk
 import jast
 from jast import actions, rewards
 from jast.distributions import Categorical, seeds
-from jast.search import episodes as E
+from jast.search import lockstep as E
 from jast.search.monte_carlo import monte_carlo
 
 # the package has the function by that name

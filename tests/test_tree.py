@@ -17,10 +17,12 @@ from systems import S0, ring
 
 import jast
 from jast.counter import tree_keys
-from jast.search import forest, records, run
-from jast.search import tree as T
-from jast.search.choice import Choice
-from jast.search.records import pack, unpack
+from jast.search import forest
+from jast.search.tree import layout as T
+from jast.search.tree import packing as records
+from jast.search.tree import run
+from jast.search.tree.choice import Choice
+from jast.search.tree.packing import pack, unpack
 
 FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
 PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())

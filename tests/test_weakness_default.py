@@ -15,7 +15,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.neighbors import NearestNeighbors
 
 from jast import weakness
-from jast.weakness import blend, committee, residual, validate, views
+from jast.weakness import committee, residual, validate, views
+from jast.weakness import logistic as blend
 from jast.weakness.contract import Seen
 from jast.weakness.data import Data
 

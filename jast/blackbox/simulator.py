@@ -16,7 +16,7 @@ from jast.blackbox.callback import ask
 from jast.blackbox.host import Calls, Host
 from jast.blackbox.pool import Pool, packed
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
-from jast.check import OBSERVED
+from jast.contract import OBSERVED
 from jast.incidents import sources
 from jast.simulator import Simulator, fixed
 

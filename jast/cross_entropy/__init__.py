@@ -2,8 +2,8 @@
 surrogates and mixtures.
 """
 
+from jast._doors import door
 from jast.cross_entropy import schedules
-from jast.cross_entropy.failure_proposal import FailureProposal, failure_proposal
 from jast.cross_entropy.gaussian import Gaussian, normal
 from jast.cross_entropy.methods import (
     Search,
@@ -22,7 +22,6 @@ from jast.cross_entropy.stress import Stress, over
 
 __all__ = [
     "CEResult",
-    "FailureProposal",
     "Gaussian",
     "History",
     "Mixture",
@@ -35,7 +34,6 @@ __all__ = [
     "ce_method",
     "ce_mixture",
     "ce_surrogate",
-    "failure_proposal",
     "finish",
     "normal",
     "over",
@@ -46,3 +44,6 @@ __all__ = [
     "start",
     "tell",
 ]
+
+_MOVED = ("FailureProposal", "failure_proposal")
+__getattr__ = door(__name__, renamed={name: f"jast.estimate:{name}" for name in _MOVED})

@@ -2,7 +2,7 @@
 and a proposal moves each step's z.
 
 Shared by the search `jast.search.cem`, the objective of `jast.cross_entropy.over` and
-`jast.cross_entropy.failure_proposal`.
+`jast.estimate.failure_proposal`.
 """
 
 from typing import Any, NamedTuple

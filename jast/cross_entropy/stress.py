@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from jast import actions as choices
 from jast import distributions as D
 from jast import failures as archive
-from jast.check import contract
+from jast.contract import contract
 from jast.cross_entropy.gaussian import normal
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, random_start, rollout

@@ -10,13 +10,15 @@ from jast.estimate.adaptive import (
 )
 from jast.estimate.diagnostics import pareto_k
 from jast.estimate.estimate import Estimate
-from jast.estimate.failures import FailureSamples, failure_samples
-from jast.estimate.importance import Traces, importance, log_weights
-from jast.estimate.intervals import chernoff, clopper_pearson, jeffreys
+from jast.estimate.failure_samples import FailureSamples, failure_samples
+from jast.estimate.importance_sampling import Traces, importance, log_weights
+from jast.estimate.multilevel import FailureProposal, failure_proposal
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
+from jast.intervals import chernoff, clopper_pearson, jeffreys
 
 __all__ = [
     "Estimate",
+    "FailureProposal",
     "FailureSamples",
     "Proposal",
     "Traces",
@@ -24,6 +26,7 @@ __all__ = [
     "chernoff",
     "clopper_pearson",
     "failure_probability",
+    "failure_proposal",
     "failure_samples",
     "importance",
     "jeffreys",

@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import whole
-from jast.check import contract
-from jast.cross_entropy.failure_proposal import failure_proposal
-from jast.estimate import latent
+from jast.contract import contract
+from jast.estimate import limit_state as latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts
-from jast.estimate.importance import Traces, chunks, even, importance, traces
-from jast.estimate.intervals import checked_level, log_normal
+from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
+from jast.estimate.multilevel import failure_proposal
 from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import seek
+from jast.intervals import checked_level, log_normal
 from jast.policy import nominal_policy
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
@@ -171,7 +171,7 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     Gaussian, then importance sampling with the rest: `Estimate`.
 
     Of ``budget``, ``budget // 100`` episodes in each of 20 iterations find the proposal
-    (`jast.cross_entropy.failure_proposal`). It settles on one failure mode without a sign of the
+    (`jast.estimate.failure_proposal`). It settles on one failure mode without a sign of the
     others: a baseline, and quick where there is one. ValueError for a budget below 5000 and as
     `failure_proposal`.
     """

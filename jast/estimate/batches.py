@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.scipy.special import logsumexp
 
-from jast.estimate import latent
+from jast.estimate import limit_state as latent
 
 __all__ = ["Batch", "balanced", "drawn", "log_ratio", "numbers", "over_batches"]
 

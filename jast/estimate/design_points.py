@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.episode import rollout
-from jast.estimate.latent import _policy, dimension, normal_numbers, outcome, raw
+from jast.estimate.limit_state import _policy, dimension, normal_numbers, outcome, raw
 
 __all__ = ["DesignPoints", "design_points", "distinct"]
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast.estimate import diagnostics
-from jast.estimate.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
+from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
 __all__ = ["Estimate", "estimate", "of_counts"]
 
@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
     jeffreys: float | None = None
     """Of plain counts: upper bound at one-sided ``level`` by Jeffreys' prior (eq. 18)"""
     proposal: Any = None
-    """What it was drawn from, where the method found it itself: for `jast.estimate.failures`"""
+    """What it was drawn from, where the method found it: for `jast.estimate.failure_samples`"""
     history: Any = None
     """How that was found, a text a line"""
 

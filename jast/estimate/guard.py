@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
-from jast.estimate.fit import as_latent, unit
+from jast.estimate.gaussians import as_latent, unit
 from jast.estimate.populations import LAST, QUANTILE, Chain, explore
 
 __all__ = ["guarded"]

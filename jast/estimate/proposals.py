@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._checks import real
-from jast.check import contract
+from jast.contract import contract
 from jast.cross_entropy.sequences import latent
 from jast.cross_entropy.tilted import tilted
 from jast.episode import Episode, _fitted, _shapes, random_start, replay

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.counter import generator
-from jast.estimate import latent
+from jast.estimate import limit_state as latent
 from jast.estimate.batches import Batch, balanced, drawn, over_batches
 from jast.estimate.design_points import design_points, distinct
-from jast.estimate.fit import Gaussians, as_latent, effective, fit, together, unit
+from jast.estimate.gaussians import Gaussians, as_latent, effective, fit, together, unit
 from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore
 from jast.incidents import hosted

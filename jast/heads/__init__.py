@@ -3,8 +3,8 @@ trees.
 """
 
 from jast.heads.heads import Heads, Moments
+from jast.heads.histogram import as_policy
 from jast.heads.networks import Head, make_head
-from jast.heads.policy import as_policy
 from jast.heads.settings import MODES, HeadSettings, settings
 from jast.heads.storage import load, save
 from jast.heads.training import Lesson

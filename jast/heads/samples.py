@@ -60,8 +60,8 @@ def joined(parts):
 
 
 def of_edges(edges, target="own"):
-    """`Samples` for a value head from `jast.search.edges.Edges`: Q(s, a), or the Q of the edge that
-    leads to s, as published (``target="parent"``).
+    """`Samples` for a value head from `jast.search.tree.edges.Edges`: Q(s, a), or the Q of the edge
+    that leads to s, as published (``target="parent"``).
     """
     edges = _tree_by_tree(edges)
     return _finite(edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q)

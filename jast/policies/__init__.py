@@ -1,7 +1,7 @@
 """Learned failure policies: who is taught to make a system fail, in its likeliest ways."""
 
-from jast.policies.policy import FailurePolicy, History
-from jast.policies.sac import sac
+from jast.policies.failure_policy import FailurePolicy, History
+from jast.policies.soft_actor_critic import sac
 from jast.policies.storage import load, save
 
 __all__ = ["FailurePolicy", "History", "load", "sac", "save"]

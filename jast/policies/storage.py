@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.archive import arrays_of, check_array, named, read, write
-from jast.check import contract
+from jast.contract import contract
 from jast.episode import _shapes
 from jast.heads.heads import Moments, observed
+from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
 from jast.policies.latent import sizes
 from jast.policies.learner import Net, learner, networks
-from jast.policies.policy import FailurePolicy, History, Learned, assemble
 from jast.policies.start import Tilt
 
 __all__ = ["load", "save"]

@@ -17,12 +17,12 @@ from jax import lax
 from jast import _checks, rewards
 from jast import actions as choices
 from jast import distributions as D
-from jast.check import contract
+from jast.contract import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode, _shapes, accumulator, random_start
 from jast.incidents import hosted, incidents, since
-from jast.search import episodes as E
+from jast.search import lockstep as E
 from jast.search import proposals as P
 
 __all__ = ["cem"]

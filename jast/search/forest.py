@@ -4,7 +4,7 @@
 
 from jast import actions as A
 from jast import rewards
-from jast.search.trees import grow_trees, settled
+from jast.search.tree.grow import grow_trees, settled
 
 __all__ = ["MODES", "forest"]
 

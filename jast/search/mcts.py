@@ -4,7 +4,7 @@ classic of adaptive stress testing.
 
 from jast import rewards
 from jast.search.forest import PLAIN, SAMPLES
-from jast.search.trees import grow_trees, settled
+from jast.search.tree.grow import grow_trees, settled
 
 __all__ = ["MODES", "mcts"]
 

@@ -14,7 +14,7 @@ from jast import rewards
 from jast.counter import tree_keys
 from jast.episode import accumulator
 from jast.incidents import hosted, incidents, since
-from jast.search import episodes as E
+from jast.search import lockstep as E
 
 __all__ = ["monte_carlo"]
 

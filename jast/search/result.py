@@ -79,7 +79,7 @@ class SearchResult(NamedTuple):
     settings: dict | None
     """What was asked for: method, counts, seed."""
     roots: Any = None
-    """Of trees: the statistics of every root (`jast.search.prune.Roots`, one for each prune)."""
+    """Of trees: statistics of every root (`jast.search.tree.prune.Roots`, one for each prune)."""
     heads: Any = None
     """`jast.heads.Heads` as the search left them, to be used again; None without."""
     trials: Trials | None = None

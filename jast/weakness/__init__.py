@@ -9,7 +9,7 @@ from jast.weakness.measures import Judgement, Roc, auc, judge, roc
 from jast.weakness.result import History, Result, State
 from jast.weakness.selectors import default, random, thesis
 from jast.weakness.storage import load, save
-from jast.weakness.validate import validate
+from jast.weakness.validation import validate
 
 __all__ = [
     "Data",

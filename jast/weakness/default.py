@@ -7,8 +7,8 @@ import numpy as np
 from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import committee
-from jast.weakness.blend import logistic, sigmoid
 from jast.weakness.contract import Selector, Step
+from jast.weakness.logistic import logistic, sigmoid
 from jast.weakness.residual import residual
 from jast.weakness.views import components, difficulty_of_neighbours, reduce, views
 

@@ -6,7 +6,7 @@ Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), algorith
 
 import numpy as np
 
-from jast.weakness.blend import sigmoid
+from jast.weakness.logistic import sigmoid
 from jast.weakness.views import squared_distances
 
 __all__ = ["residual"]

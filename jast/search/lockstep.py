@@ -15,11 +15,11 @@ from jax import lax
 
 from jast import failures as archive
 from jast import rewards
-from jast.check import ACTIONS, contract
+from jast.contract import ACTIONS, contract
 from jast.episode import Episode, advance, begin, conclude, random_start, replay
-from jast.search.records import pack
 from jast.search.result import History, SearchResult, Trials
 from jast.search.threads import apart
+from jast.search.tree.packing import pack
 
 __all__ = [
     "Played",

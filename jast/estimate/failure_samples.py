@@ -11,11 +11,11 @@ import numpy as np
 
 from jast._checks import whole
 from jast.episode import Episode, random_start
-from jast.estimate import latent
+from jast.estimate import limit_state as latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
-from jast.estimate.fit import effective
-from jast.estimate.importance import played
+from jast.estimate.gaussians import effective
+from jast.estimate.importance_sampling import played
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal, latents
 

@@ -12,10 +12,10 @@ from jax import lax
 
 from jast import distributions as D
 from jast import rewards
-from jast.check import contract
+from jast.contract import contract
 from jast.episode import Episode, advance, begin, conclude, rollout
-from jast.estimate.intervals import clopper_pearson
 from jast.incidents import incidents, since
+from jast.intervals import clopper_pearson
 from jast.policy import undisturbed
 
 __all__ = ["Nominal", "nominal"]

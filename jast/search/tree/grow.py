@@ -16,13 +16,12 @@ from jast.heads.rounds import enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import checked
 from jast.incidents import hosted, incidents, since
-from jast.search import memory
-from jast.search.choice import Choice
-from jast.search.episodes import prepare, whole
-from jast.search.guide import guide
+from jast.search.lockstep import prepare, whole
 from jast.search.result import History, SearchResult, Trials
-from jast.search.run import Plan, bytes_per_tree, grow_all, grow_traced
-from jast.search.tree import (
+from jast.search.tree import memory
+from jast.search.tree.choice import Choice
+from jast.search.tree.guide import guide
+from jast.search.tree.layout import (
     FAILURE,
     FRESH,
     INVALID,
@@ -34,6 +33,7 @@ from jast.search.tree import (
     pages_of,
     widths,
 )
+from jast.search.tree.run import Plan, bytes_per_tree, grow_all, grow_traced
 
 __all__ = ["grow_trees", "settled"]
 

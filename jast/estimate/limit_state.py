@@ -16,7 +16,7 @@ from jax import lax
 
 from jast import actions as choices
 from jast import distributions as D
-from jast.check import contract
+from jast.contract import contract
 from jast.cross_entropy.sequences import player
 from jast.episode import _shapes, advance, begin, conclude, random_start, rollout
 from jast.heads.heads import unflat

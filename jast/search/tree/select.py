@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.search.lead import follows
-from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
+from jast.search.tree.incumbent import follows
+from jast.search.tree.layout import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS
 
 __all__ = ["Best", "Walk", "select"]
 

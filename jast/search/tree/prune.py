@@ -8,10 +8,20 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.search.lead import fed_of, follows
-from jast.search.records import unpack
-from jast.search.simulate import child_state, replay_to, select_lanes
-from jast.search.tree import CHILD, LINK, PAGE, RETURNS, REWARD, ROW, VISITS, choose, node_shapes
+from jast.search.tree.incumbent import fed_of, follows
+from jast.search.tree.layout import (
+    CHILD,
+    LINK,
+    PAGE,
+    RETURNS,
+    REWARD,
+    ROW,
+    VISITS,
+    choose,
+    node_shapes,
+)
+from jast.search.tree.packing import unpack
+from jast.search.tree.simulate import child_state, replay_to, select_lanes
 
 __all__ = ["Roots", "prune"]
 

@@ -17,13 +17,13 @@ from jax.scipy.special import logsumexp
 
 from jast import distributions as D
 from jast._checks import whole
-from jast.check import contract
+from jast.contract import contract
 from jast.episode import accumulator, advance, begin, conclude, rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
-from jast.estimate.intervals import checked_level
-from jast.estimate.latent import raw
+from jast.estimate.limit_state import raw
 from jast.estimate.proposals import as_proposal
+from jast.intervals import checked_level
 from jast.policy import nominal_policy
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]

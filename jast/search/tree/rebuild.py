@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.episode import Episode, blank
-from jast.search.lead import fed_of
-from jast.search.records import unpack
-from jast.search.tree import (
+from jast.search.tree.incumbent import fed_of
+from jast.search.tree.layout import (
     FAILURE,
     FRESH,
     choose,
@@ -19,6 +18,7 @@ from jast.search.tree import (
     of_lanes,
     take,
 )
+from jast.search.tree.packing import unpack
 
 __all__ = ["rebuild"]
 

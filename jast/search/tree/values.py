@@ -6,9 +6,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.search.guide import child_value
-from jast.search.records import unpack
-from jast.search.tree import LINK, PAGE, ROW, choose_child, levels, node_keys, node_shapes, of_lanes
+from jast.search.tree.guide import child_value
+from jast.search.tree.layout import (
+    LINK,
+    PAGE,
+    ROW,
+    choose_child,
+    levels,
+    node_keys,
+    node_shapes,
+    of_lanes,
+)
+from jast.search.tree.packing import unpack
 
 __all__ = ["foresee"]
 

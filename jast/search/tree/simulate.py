@@ -5,11 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.episode import Progress, blank, conclude, random_start
-from jast.search.foresee import foresee
-from jast.search.lead import Lead, fed_of, feed_level, follows, onward, packed
-from jast.search.records import pack, unpack
-from jast.search.select import select
-from jast.search.tree import (
+from jast.search.tree.incumbent import Lead, fed_of, feed_level, follows, onward, packed
+from jast.search.tree.layout import (
     CHILD,
     FAILURE,
     FRESH,
@@ -29,6 +26,9 @@ from jast.search.tree import (
     of_lanes,
     take,
 )
+from jast.search.tree.packing import pack, unpack
+from jast.search.tree.select import select
+from jast.search.tree.values import foresee
 
 __all__ = ["child_state", "grow", "replay_to", "select_lanes"]
 

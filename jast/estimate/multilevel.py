@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 from jast import actions as choices
 from jast import distributions as D
 from jast._checks import real, whole
-from jast.check import contract
+from jast.contract import contract
 from jast.cross_entropy import sequences
 from jast.cross_entropy.tilted import tilted
 from jast.episode import _shapes, random_start, rollout

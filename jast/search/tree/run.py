@@ -15,12 +15,12 @@ from jax.custom_batching import custom_vmap
 
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
-from jast.search import simulate
-from jast.search.edges import edges_of
-from jast.search.prune import prune
-from jast.search.rebuild import rebuild
 from jast.search.threads import handed_on
-from jast.search.tree import FAILURE, FRESH, INVALID, RAN, make
+from jast.search.tree import simulate
+from jast.search.tree.edges import edges_of
+from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
+from jast.search.tree.prune import prune
+from jast.search.tree.rebuild import rebuild
 
 __all__ = ["Plan", "Harvest", "bytes_per_tree", "grow_all", "grow_traced"]
 
@@ -35,7 +35,7 @@ class Plan(NamedTuple):
     """Greatest number of children of a node."""
     memoize: str
     pages: int | None = None
-    """Of a tree (`jast.search.tree.pages_of`)."""
+    """Of a tree (`jast.search.tree.layout.pages_of`)."""
     edges: bool = False
     """Whether all edges are kept for training."""
     record: bool = False
@@ -48,7 +48,7 @@ class Harvest(NamedTuple):
     log: Any
     """[S, B] reward of each simulation's episode."""
     outcome: Any
-    """[S, B] bits FAILURE, FRESH, INVALID, RAN of `jast.search.tree`."""
+    """[S, B] bits FAILURE, FRESH, INVALID, RAN of `jast.search.tree.layout`."""
     steps: Any
     """[B] simulator steps."""
     roots: Any

@@ -26,9 +26,9 @@ import numpy as np
 from jax import lax
 
 from jast.episode import advance, begin, blank, conclude, random_start
-from jast.search.guide import rolled
-from jast.search.lead import fed_or, feed_level, follows, lead_of
-from jast.search.records import pack
+from jast.search.tree.guide import rolled
+from jast.search.tree.incumbent import fed_or, feed_level, follows, lead_of
+from jast.search.tree.packing import pack
 from jast.simulator import never
 
 __all__ = [
@@ -76,10 +76,10 @@ class Problem(NamedTuple):
     sim: Any
     reward: Any
     choice: Any
-    """`jast.search.choice.Choice`."""
+    """`jast.search.tree.choice.Choice`."""
     settings: Settings
     guide: Any = ()
-    """`jast.search.guide.Guide`, or ``()`` for a search without heads."""
+    """`jast.search.tree.guide.Guide`, or ``()`` for a search without heads."""
 
     @property
     def values(self):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jast.episode import _shapes
-from jast.search.records import pack, shapes, unpack, width
+from jast.search.tree.packing import pack, shapes, unpack, width
 
 __all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onward", "packed"]
 

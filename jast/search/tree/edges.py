@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from jast.episode import random_start
 from jast.heads.heads import flat, observed
-from jast.search.records import unpack
-from jast.search.tree import (
+from jast.search.tree.layout import (
     FRESH,
     LINK,
     PAGE,
@@ -19,6 +18,7 @@ from jast.search.tree import (
     node_keys,
     node_shapes,
 )
+from jast.search.tree.packing import unpack
 
 __all__ = ["Edges", "edges_of"]
 

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import real, whole
-from jast.check import contract
+from jast.contract import contract
 from jast.episode import _shapes
 from jast.heads.heads import observed
 from jast.incidents import hosted
 from jast.policies import checkpoints
 from jast.policies import training as T
+from jast.policies.failure_policy import FAILING_SHARE, History, Learned, assemble, history, row
 from jast.policies.latent import sizes
 from jast.policies.learner import Rates, networks
-from jast.policies.policy import FAILING_SHARE, History, Learned, assemble, history, row
 
 __all__ = ["sac"]
 

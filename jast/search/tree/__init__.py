@@ -1,0 +1,1 @@
+"""Trees of a search: their layout in arrays, what grows them, and what is read off them."""
