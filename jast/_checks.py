@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._jax import is_traced
+
 __all__ = ["number", "real", "whole"]
 
 
@@ -36,7 +38,7 @@ def real(function, name, value, holds, expected):
     """``value`` as a float array []; one that is not traced must be a number for which
     ``holds``.
     """
-    if not isinstance(value, jax.core.Tracer):
+    if not is_traced(value):
         try:
             good = (
                 not isinstance(value, str | bool)

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
+from jast._jax import is_traced, is_tracing
 from jast.actions import Quantiles, Samples, UniformBox
 from jast.incidents import incidents, since
 from jast.simulator import Simulator
@@ -42,8 +43,7 @@ def check(sim, actions=None):
     and the first steps of another.
     """
     contract(sim, actions)
-    traced = any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves((sim, actions)))
-    if traced or isinstance(jnp.zeros(()) + 0, jax.core.Tracer):
+    if is_traced(sim, actions) or is_tracing():
         return sim
     before = incidents(sim)
     try:

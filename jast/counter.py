@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.random import define_prng_impl
+
+from jast._jax import define_prng_impl
 
 __all__ = ["COUNTER", "coin", "generator", "tree_keys"]
 

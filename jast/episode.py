@@ -12,6 +12,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast import rewards
+from jast._jax import is_traced
 from jast.policy import nominal_policy
 
 __all__ = [
@@ -221,7 +222,7 @@ def rollout(key, sim, policy=None, reward=rewards.STANDARD):
     """
     reward = rewards.as_pytree(reward)
     episode = _rollout(key, sim, policy, reward)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(episode)):
+    if is_traced(episode):
         return episode
     # a draw that is fused into the step is not rounded to what is recorded (a multiply-add), so the
     # recording is played

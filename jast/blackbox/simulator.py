@@ -12,7 +12,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast._checks import real, whole
-from jast.blackbox.callback import ask
+from jast._jax import host_call
 from jast.blackbox.host import Calls, Host
 from jast.blackbox.pool import Pool, packed
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
@@ -250,7 +250,7 @@ def _asked(host, size, live, t, x0, disturbances):
     """
     flag, number = (jax.ShapeDtypeStruct((), d) for d in (bool, jnp.zeros(()).dtype))
     shapes = flag, number, flag, jax.ShapeDtypeStruct((size,), number.dtype)
-    return ask(
+    return host_call(
         host.callback(number.dtype, size), shapes, live, t, *jax.tree.leaves((x0, disturbances))
     )
 

@@ -11,6 +11,8 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
+from jast._jax import is_traced
+
 __all__ = [
     "Gaussian",
     "as_gaussian",
@@ -66,9 +68,7 @@ def as_gaussian(proposal):
 
 def _normal(name, mean, covariance):
     given, dtype = (mean, covariance), float_of(mean, covariance)
-    traced = [
-        any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)) for value in given
-    ]
+    traced = [is_traced(value) for value in given]
     parts = [
         jnp.asarray(value) if skip else numbers(name, part, value, dtype)
         for part, value, skip in zip(("mean", "covariance"), given, traced, strict=True)

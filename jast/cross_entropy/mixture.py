@@ -11,6 +11,7 @@ from jax import lax
 from jax.lax import Precision
 from jax.scipy.special import logsumexp
 
+from jast._jax import is_traced
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
 
@@ -42,7 +43,7 @@ def as_mixture(proposal):
     """The `Mixture` with float arrays of one dtype and weights of sum 1. ValueError, naming
     ``proposal``, for one that is none; of traced parts only shapes.
     """
-    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(proposal)):
+    if is_traced(proposal):
         weights, means, covariances = (jnp.asarray(v) for v in proposal)
     else:
         dtype = gaussian.float_of(*proposal)
@@ -127,7 +128,7 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
         )
     least = x.shape[1] if least is None else least
     for name, value in dict(regularisation=regularisation, least=least).items():
-        if jnp.shape(value) != () or not (isinstance(value, jax.core.Tracer) or value >= 0):
+        if jnp.shape(value) != () or not (is_traced(value) or value >= 0):
             raise ValueError(
                 f"mixture.em: {name} must be a number of at least 0, received {value!r}"
             )

@@ -7,12 +7,12 @@ shape.
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
 from jax.tree_util import Partial
 
+from jast._jax import is_traced
 from jast.cross_entropy.gaussian import float_of
 
 __all__ = ["ackley", "branin", "paraboloid", "sierra"]
@@ -149,7 +149,7 @@ def _finite(name, value, shape, positive=False):
         else f"{shape[0]} finite numbers"
     )
     try:
-        if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)):
+        if is_traced(value):
             good = jnp.asarray(value).shape == shape
         else:
             a = np.asarray(value, np.float64)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import real, whole
+from jast._jax import is_traced
 from jast.cross_entropy.gaussian import as_gaussian
 from jast.cross_entropy.gaussian_process import KERNELS
 from jast.cross_entropy.loop import Plan, Settings
@@ -151,7 +152,7 @@ def _model(method, chosen, optimism, most, each, kept, d):
         evaluated=min(math.ceil(round(float(share) * most, 9)), max(kept), most // 2),
         memory=whole(method, "memory", chosen["memory"], 1),
         best=whole(method, "best", chosen["best"], 0),
-        optimistic=isinstance(optimism, jax.core.Tracer) or bool(optimism != 0),
+        optimistic=is_traced(optimism) or bool(optimism != 0),
         judged=judged,
         sub=(10 * elites, elites, 2),
         chosen=tuple(

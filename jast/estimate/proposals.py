@@ -16,6 +16,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._checks import real
+from jast._jax import is_traced
 from jast.contract import contract
 from jast.cross_entropy.sequences import latent
 from jast.cross_entropy.tilted import tilted
@@ -70,10 +71,7 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
         start, steps = latents(sim, recorded, tilt_start)
     except ValueError as error:
         raise ValueError(f"trace_proposal: disturbance: {error}") from None
-    if not all(
-        isinstance(a, jax.core.Tracer) or np.isfinite(a).all()
-        for a in jax.tree.leaves((start, steps))
-    ):
+    if not all(is_traced(a) or np.isfinite(a).all() for a in jax.tree.leaves((start, steps))):
         raise ValueError(
             "trace_proposal: episodes must hold finite disturbances that the model can draw,"
             " received others"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
+from jast._jax import is_traced
 from jast.episode import random_start
 from jast.heads.heads import Heads, Moments, flat, histogram, moments, observed, value
 from jast.heads.networks import make_head
@@ -35,7 +36,7 @@ def enrol(key, sim, actions, heads, settings):
     """
     n, d = sizes(sim, actions, heads)
     start = sim.init(D.sample(sim.start(), key))
-    if not isinstance(start_seen := observed(sim, start), jax.core.Tracer) and not bool(
+    if not is_traced(start_seen := observed(sim, start)) and not bool(
         jnp.all(jnp.isfinite(start_seen))
     ):
         raise ValueError(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._jax import is_traced
 from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
 from jast.heads.heads import Heads, Moments
 from jast.heads.networks import ACTIVATIONS, Head, _network
@@ -98,16 +99,14 @@ def _check(caller, heads):
 
 
 def _storable(leaf):
-    array = isinstance(leaf, np.ndarray | np.generic | jax.Array) and not isinstance(
-        leaf, jax.core.Tracer
-    )
+    array = isinstance(leaf, np.ndarray | np.generic | jax.Array) and not is_traced(leaf)
     return array and (leaf.dtype == bool or jnp.issubdtype(leaf.dtype, np.number))
 
 
 def _readable(leaf):
     if not hasattr(leaf, "dtype") or not hasattr(leaf, "shape"):
         return f"{type(leaf).__name__} {leaf!r}"
-    return f"{leaf.dtype}{list(leaf.shape)}" + ", traced" * isinstance(leaf, jax.core.Tracer)
+    return f"{leaf.dtype}{list(leaf.shape)}" + ", traced" * is_traced(leaf)
 
 
 def _specification(head):

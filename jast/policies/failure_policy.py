@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from jast._jax import is_traced
 from jast.heads.heads import observed
 from jast.policies.lanes import potential
 from jast.policies.latent import Blended
@@ -104,7 +105,7 @@ class FailurePolicy(Policy):
     history: History = None
 
     def __str__(self):
-        if any(isinstance(a, jax.core.Tracer) for a in jax.tree.leaves(self.history)):
+        if is_traced(self.history):
             return "FailurePolicy (traced)"
         h, last = self.history, len(self.history.episodes) - 1
         formats = dict(

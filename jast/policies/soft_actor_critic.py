@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import real, whole
+from jast._jax import is_traced
 from jast.contract import contract
 from jast.episode import _shapes
 from jast.heads.heads import observed
@@ -309,7 +310,7 @@ def _learn(training, rows, run, phase, plan, auto_scale, lanes, progress, callba
 
 def _float(name, value, holds, expected):
     value = real("sac", name, value, holds, expected)
-    if isinstance(value, jax.core.Tracer):
+    if is_traced(value):
         raise ValueError(
             f"sac: {name} must be a number {expected}, received a traced one: sac runs on the host"
         )

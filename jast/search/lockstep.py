@@ -15,6 +15,7 @@ from jax import lax
 
 from jast import failures as archive
 from jast import rewards
+from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
 from jast.episode import Episode, advance, begin, conclude, random_start, replay
 from jast.search.result import History, SearchResult, Trials
@@ -200,12 +201,6 @@ def distinct(failure, reward, tag, number, count, k):
     return places, jnp.zeros((k,), jnp.int32).at[to].add(count, mode="drop")
 
 
-def is_traced(*trees):
-    """Whether inputs are traced, or everything is."""
-    leaves = [*jax.tree.leaves(trees), jnp.zeros(()) + 0]
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
-
-
 def whole(function, **values):
     """The values as Python ints; ValueError naming the setting unless each is a whole number from 1
     to 2^31 - 1.
@@ -228,7 +223,7 @@ def prepare(function, key, sim, reward, actions, **settings):
     """
     contract(sim, actions, observed=False)
     reward = rewards.as_pytree(reward)
-    if is_traced(key, sim, reward, actions, settings):
+    if is_traced(key, sim, reward, actions, settings) or is_tracing():
         return reward, None
     seed = key if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else jax.random.key_data(key)
     func = getattr(reward, "func", reward)

@@ -1,8 +1,9 @@
 """Real-valued parameters of the simulators, as arrays that are traced."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jast._jax import is_traced
 
 __all__ = ["positive"]
 
@@ -12,7 +13,7 @@ def positive(function, **values):
     positive and finite (not looked at while traced).
     """
     for name, value in values.items():
-        if not (value.shape == () if isinstance(value, jax.core.Tracer) else _is_positive(value)):
+        if not (value.shape == () if is_traced(value) else _is_positive(value)):
             raise ValueError(f"{function}: {name} must be a positive number, received {value!r}")
     arrays = [jnp.asarray(value) for value in values.values()]
     floats = [a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]

@@ -7,12 +7,12 @@ Known truth (up = .4, start 1, goal 30), without a horizon: P = (r^start - 1) / 
 9.9e-4 of it (powers of the transition matrix).
 """
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
 from jast._checks import real, whole
+from jast._jax import is_traced
 from jast.distributions import Categorical
 from jast.simulator import Simulator
 
@@ -29,10 +29,10 @@ def ruin(up=0.4, start=1, goal=30, horizon=371):
     """
     up = _probability("ruin", up)
     start, goal = (
-        v if _traced(v) else whole("ruin", name, v)
+        v if is_traced(v) else whole("ruin", name, v)
         for name, v in (("start", start), ("goal", goal))
     )
-    if not _traced(start) and not _traced(goal) and goal <= start:
+    if not is_traced(start) and not is_traced(goal) and goal <= start:
         raise ValueError(f"ruin: goal must be above start = {start}, received {goal}")
     start, goal = jnp.asarray(start, jnp.int32), jnp.asarray(goal, jnp.int32)
     return Simulator(
@@ -78,10 +78,6 @@ def ruin_probability(up=0.4, start=1, goal=30, horizon=None):
 def _probability(function, up):
     up = real(function, "up", up, lambda p: 0 < p < 1, "between 0 and 1")
     return up.astype(up.dtype)  # no longer weakly typed
-
-
-def _traced(value):
-    return isinstance(value, jax.core.Tracer)
 
 
 def _init(start, x0):

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._jax import is_traced
 from jast.counter import tree_keys
 from jast.episode import Episode, replay
 from jast.failures import collect, identity
@@ -53,17 +54,16 @@ def settled(method, modes, mode, actions, **given):
     if chosen["focus"] is None:
         chosen["focus"] = getattr(actions, "focus", 1.0)
     widening, focus = chosen["widening"], chosen["focus"]
-    traced = lambda *values: any(isinstance(v, jax.core.Tracer) for v in values)
     if (
         not isinstance(widening, tuple | list)
         or len(widening) != 2
-        or not (traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1))
+        or not (is_traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1))
     ):
         raise ValueError(
             f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received"
             f" {widening!r}"
         )
-    if not traced(focus) and not focus > 0:
+    if not is_traced(focus) and not focus > 0:
         raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
     for name in SWITCHES:
         if not isinstance(chosen[name], bool):
@@ -128,14 +128,14 @@ def grow_trees(
     choice = Choice(
         actions,
         jnp.asarray(focus, jnp.float32),
-        focused=isinstance(focus, jax.core.Tracer) or focus != 1,
+        focused=is_traced(focus) or focus != 1,
         **switches,
     )
     problem = jax.tree.map(
         jnp.asarray,
         Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)),
     )
-    children = total + 1 if isinstance(table, jax.core.Tracer) else int(table.max())
+    children = total + 1 if is_traced(table) else int(table.max())
     plan = Plan(
         prunes,
         simulations,

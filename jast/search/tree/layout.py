@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast._jax import is_traced
 from jast.episode import advance, begin, blank, conclude, random_start
 from jast.search.tree.guide import rolled
 from jast.search.tree.incumbent import fed_or, feed_level, follows, lead_of
@@ -182,7 +183,7 @@ def widths(simulations, k, alpha):
     Algorithm 1; Moss's Algorithm 10 tests before it adds), which for alpha <= 1 comes to min(n,
     floor(k n^alpha) + 1). Made on the host in float64 unless ``k`` or ``alpha`` are traced.
     """
-    if isinstance(k, jax.core.Tracer) or isinstance(alpha, jax.core.Tracer):
+    if is_traced(k, alpha):
         n = jnp.arange(simulations + 2, dtype=jnp.int32)
         bound = jnp.floor(k * n.astype(jnp.float32) ** alpha * (1 + 4e-7)).astype(jnp.int32) + 1
         return jnp.minimum(n, bound)
@@ -205,9 +206,7 @@ def _pages(simulations, levels=0, table=None):
     if levels:  # at each level, the visits of all nodes are at most the simulations
         n = np.arange(1, simulations + 2)
         children = (
-            n
-            if isinstance(table, jax.core.Tracer)
-            else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
+            n if is_traced(table) else np.asarray(table).reshape(-1, simulations + 2).max(0)[1:]
         )
         more = int(simulations * levels * np.max((-(-children // PAGE) - 1) / n)) + levels
     return simulations + 1 + more + 1

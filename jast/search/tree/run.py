@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_batching import custom_vmap
 
+from jast._jax import custom_vmap
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
 from jast.search.threads import handed_on

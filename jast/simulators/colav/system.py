@@ -11,6 +11,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast._jax import is_traced
 from jast.simulator import Simulator
 from jast.simulators._parameter import positive
 from jast.simulators.colav import planner, tracker
@@ -138,7 +139,7 @@ def colav(
         ("longest_delay", longest_delay, BUFFER, " s, the past that is kept"),
         ("delay_easing", delay_easing, 1, ""),
     ):
-        if not isinstance(value, jax.core.Tracer) and float(value) > most:
+        if not is_traced(value) and float(value) > most:
             raise ValueError(f"colav: {name} must be at most {most:g}{why}, received {value!r}")
     dtype = jnp.zeros(()).dtype
     *scales, place, speed = (a.astype(dtype) for a in scales)
@@ -198,7 +199,7 @@ def _settled(scenario, dtype):
             raise ValueError(
                 f"colav: {name} of the scenario must be {expected}, received shape {a.shape}"
             )
-        if not isinstance(a, jax.core.Tracer) and not np.isfinite(a).all():
+        if not is_traced(a) and not np.isfinite(a).all():
             raise ValueError(f"colav: {name} of the scenario must be finite, received {value!r}")
         arrays[name] = a
     return Scenario(**arrays)

@@ -1,0 +1,125 @@
+"""What jast needs of JAX beyond its stable API, in one place: a new version of JAX that moves any
+of it is followed here, and ``tests/test_jax_shim.py`` says which part broke.
+
+ - `is_traced`, `is_tracing`: whether values are known yet (`jax.core.Tracer`);
+ - `host_call`: NumPy on the host inside of compiled programs (a primitive with lowerings of its
+   own, `jax.interpreters`);
+ - `custom_vmap`: a function that says itself what a batch of it is (`jax.custom_batching`);
+ - `define_prng_impl`: a key implementation (`jax.extend.random`).
+
+Nothing else in the package imports `jax.core`, `jax.extend`, `jax.interpreters`,
+`jax.custom_batching`, `jax.experimental` or `jax._src`.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.custom_batching import custom_vmap
+from jax.extend.core import Primitive
+from jax.extend.random import define_prng_impl
+from jax.interpreters import batching, mlir
+
+__all__ = ["custom_vmap", "define_prng_impl", "host_call", "is_traced", "is_tracing"]
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether a leaf of ``trees`` has no value yet, as under `jax.jit`, `jax.vmap` or
+    `jax.grad`.
+    """
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def is_tracing() -> bool:
+    """Whether this runs inside of a `jax.jit` (or of what traces alike), where even constants have
+    no value.
+    """
+    return isinstance(jnp.zeros(()) + 0, Tracer)
+
+
+def host_call(
+    callback: Callable[..., Sequence[np.ndarray]],
+    shapes: Sequence[jax.ShapeDtypeStruct],
+    *args: Any,
+) -> tuple[jax.Array, ...]:
+    """``callback(*args)`` on the host, with NumPy arrays as XLA gives them. One call under any
+    number of `jax.vmap`. No derivatives.
+
+    `jax.pure_callback` makes JAX arrays of the arguments first. To read those in the callback can
+    wait for a thread of XLA's, and where all of them are inside of callbacks that is for ever
+    (https://github.com/jax-ml/jax/issues/24255). Otherwise this is the same, with
+    ``vmap_method="expand_dims"``.
+
+    Args:
+        callback: arrays -> a tuple of arrays of ``shapes``. Under `jax.vmap` its arguments have
+            leading axes, and so must have its answers; an argument that a `jax.vmap` does not
+            batch has an axis of 1 there. It is known by its identity, must always answer the same,
+            and may be left out where nobody needs its answer.
+        shapes: of the answers, without batch axes.
+        args: arrays or numbers.
+    """
+    return tuple(
+        _host_call.bind(
+            *map(jnp.asarray, args),
+            callback=callback,
+            shapes=tuple((s.shape, np.dtype(s.dtype)) for s in shapes),
+        )
+    )
+
+
+_host_call = Primitive("jast_host_call")
+_host_call.multiple_results = True
+
+
+@_host_call.def_impl
+def _outside_of_programs(*args, callback, shapes):
+    return [jnp.asarray(a) for a in callback(*map(np.asarray, args))]
+
+
+@_host_call.def_abstract_eval
+def _shapes(*args, callback, shapes):
+    return [ShapedArray(*s) for s in shapes]
+
+
+def _batched(args, axes, *, callback, shapes):
+    (n,) = {a.shape[i] for a, i in zip(args, axes) if i is not None}
+    args = [a[None] if i is None else jnp.moveaxis(a, i, 0) for a, i in zip(args, axes)]
+    shapes = tuple(((n, *shape), dtype) for shape, dtype in shapes)
+    return _host_call.bind(*args, callback=callback, shapes=shapes), [0] * len(shapes)
+
+
+# an argument of JAX 0.8.2 and later; of effect on a TPU only
+_NO_TOKEN = (
+    {"returns_token": False}
+    if "returns_token" in inspect.signature(mlir.emit_python_callback).parameters
+    else {}
+)
+
+
+def _lowered(ctx, *args, callback, shapes):
+    # of arrays over several devices, JAX says who calls
+    if getattr(ctx.module_context.axis_context, "num_devices", 1) > 1:
+        structs = [jax.ShapeDtypeStruct(*s) for s in shapes]
+        return mlir.lower_fun(
+            lambda *a: jax.pure_callback(callback, structs, *a), multiple_results=True
+        )(ctx, *args)
+    out, _, _ = mlir.emit_python_callback(
+        ctx,
+        callback,
+        None,
+        list(args),
+        ctx.avals_in,
+        ctx.avals_out,
+        has_side_effect=False,
+        **_NO_TOKEN,
+    )
+    return out
+
+
+batching.primitive_batchers[_host_call] = _batched
+# each call of a program has its own number on the host
+mlir.register_lowering(_host_call, _lowered, cacheable=False)
