@@ -29,9 +29,8 @@ from jast.episode import Progress, begin
 from jast.rewards import as_pytree
 from jast.search.forest import MODES
 from jast.search.tree import run
-from jast.search.tree.choice import Choice
-from jast.search.tree.grow import settled
-from jast.search.tree.layout import Problem, Settings, choose_rollout, take, widths
+from jast.search.tree.layout import choose_rollout, take
+from jast.search.tree.settings import problem_of, settled
 from jast.simulator import Simulator
 
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
@@ -40,15 +39,9 @@ BOX = jast.actions.uniform(0.0, 1.0)
 
 def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
     """What `jast.search.forest` grows in this mode."""
-    mode, widening, spread, focus = settled("forest", MODES, mode, None, None, None, actions)
-    choice = Choice(actions, jnp.float32(focus), spread=spread, focused=focus != 1)
     sim = jast.simulators.ferry() if sim is None else sim
-    return jax.tree.map(
-        jnp.asarray,
-        Problem(
-            sim, as_pytree(reward), choice, Settings(jnp.float32(10.0), widths(total, *widening))
-        ),
-    )
+    chosen = settled("forest", MODES, mode, actions)
+    return problem_of(sim, as_pytree(reward), actions, chosen, 10.0, total)
 
 
 def cpu(function):
@@ -74,11 +67,8 @@ def rollouts(problem, keys, simulations):
                 problem, t, p, choose_rollout(problem, k, tree_key, t, p.state)
             )
             after = jax.vmap(draw)(key, keys, level, at)
-            kept = Progress(
-                after.state,
-                *(jnp.where(at.done, a, b) for a, b in zip(at[1:], after[1:], strict=True)),
-            )
-            return level + 1, kept._replace(log_prob=at.log_prob)
+            kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at[1:], after[1:])
+            return level + 1, Progress(after.state, *kept)._replace(log_prob=at.log_prob)
 
         _, end = lax.while_loop(
             lambda c: jnp.any(~c[1].done), roll, (jnp.zeros(keys.shape, jnp.int32), first)
@@ -181,15 +171,19 @@ def cores(repeats, trees=200):
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
 
 
-def alone(name, *arguments, module="engine"):
-    """A measurement of this module, or of another benchmark, in a process whose XLA has one
-    thread.
+ONE_THREAD = {"PJRT_NPROC": "1"}
+NO_CACHE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+
+
+def alone(name, *arguments, module="engine", settings=ONE_THREAD):
+    """A measurement of this module, or of another benchmark, in a process of its own with these
+    environment variables: an XLA of one thread, say.
     """
     code = (
         f"import json; from benchmarks import {module};"
         f" print(json.dumps({module}.{name}(*{arguments!r})))"
     )
-    env = dict(os.environ, PJRT_NPROC="1", PYTHONPATH=os.pathsep.join(sys.path))
+    env = os.environ | settings | {"PYTHONPATH": os.pathsep.join(sys.path)}
     return json.loads(
         subprocess.run(
             [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env
@@ -197,28 +191,25 @@ def alone(name, *arguments, module="engine"):
     )
 
 
-def compile_time():
-    """Seconds to trace and compile what a forest on S0 runs, in a fresh process without a cache."""
-    code = (
-        "import time, jax, jast; from benchmarks import engine; from jast.search import run; from"
-        " jast.counter import tree_keys\njax.config.update('jax_enable_compilation_cache',"
-        " False)\np, keys = engine.problem(9000, 'default'), tree_keys(jax.random.key(0), 100);"
-        " jax.block_until_ready(p.settings.widths)\nc, w = time.process_time(),"
-        " time.perf_counter(); out = {}\ndef lap(name):\n    global c, w; out[name] ="
-        " time.perf_counter() - w; c, w = time.process_time(), time.perf_counter()\nshapes ="
-        " jax.eval_shape(lambda: run.make(p, run._shared(p), keys, 9000, 'node')); lap('trace of"
-        " the arrays')\nrun._grow.lower(p, shapes, 0, 500, 'node').compile();"
-        " lap('grow')\nrun._make.lower(p, keys, 9000, 'node').compile();"
-        " lap('make')\nrun._prune.lower(p, shapes, 191, 'node').compile(); lap('prune')\nimport"
-        " json; print(json.dumps(out))\n"
-    )
-    env = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
-    env.pop("JAX_COMPILATION_CACHE_DIR", None)
-    return json.loads(
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env
-        ).stdout.splitlines()[-1]
-    )
+def compile_time(total=9000, lanes=100):
+    """Seconds to trace and compile what a forest on S0 runs."""
+    p, keys, out = problem(total, "default"), tree_keys(jax.random.key(0), lanes), {}
+    jax.block_until_ready(p.settings.widths)
+    start = time.perf_counter()
+
+    def lap(name):
+        nonlocal start
+        out[name], start = time.perf_counter() - start, time.perf_counter()
+
+    tree = jax.eval_shape(lambda: run.make(p, run._shared(p), keys, total, "node"))
+    lap("trace of the arrays")
+    run._grow.lower(p, tree, 0, 500, "node").compile()
+    lap("grow")
+    run._make.lower(p, keys, total, "node").compile()
+    lap("make")
+    run._prune.lower(p, tree, 191, "node").compile()
+    lap("prune")
+    return out
 
 
 def slow_ferry(substeps):
@@ -354,7 +345,7 @@ def main(argv=None):
         "capacity": alone("capacity", repeats),
         "cores": cores(repeats),
         "peer_at_200_x_500": alone("peer", repeats),
-        "compile_s": compile_time(),
+        "compile_s": alone("compile_time", settings=NO_CACHE),
         "memoization": alone("memoization", *((32, 4, 100) if args.quick else (100, 18, 100))),
     }
     if args.json:

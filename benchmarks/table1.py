@@ -18,7 +18,7 @@ from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
-from jast.search.tree.grow import LANES
+from jast.search.tree.memory import LANES
 
 VARIANTS = {"-/-": None, "MCTS-SA": None, "RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
 HEADS = {"none": None, "rollout": "rollout", "value": "value", "both": "both"}
@@ -127,7 +127,7 @@ def warm_up(search):
     learn, has one round of trees and one step of training.
     """
 
-    def end(done, total):
+    def end(*_):
         raise KeyboardInterrupt
 
     heads, trees = search.keywords.get("head_settings"), search.keywords["trees"]

@@ -4,12 +4,12 @@
 
 from jast import actions as A
 from jast import rewards
-from jast.search.tree.grow import grow_trees, settled
+from jast.search.tree.grow import grow_trees
+from jast.search.tree.settings import PLAIN, settled
 
 __all__ = ["MODES", "forest"]
 
 SAMPLES = A.samples()
-PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
 MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),

@@ -3,8 +3,9 @@ classic of adaptive stress testing.
 """
 
 from jast import rewards
-from jast.search.forest import PLAIN, SAMPLES
-from jast.search.tree.grow import grow_trees, settled
+from jast.search.forest import SAMPLES
+from jast.search.tree.grow import grow_trees
+from jast.search.tree.settings import PLAIN, settled
 
 __all__ = ["MODES", "mcts"]
 

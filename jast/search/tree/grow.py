@@ -1,121 +1,128 @@
 """A forest by its settings: what `jast.search.forest` and `jast.search.mcts` have in common, from
 their arguments to their result.
+
+`plan` says what is to be grown, `enlist` adds the heads that guide it, `grow_rounds` grows it, and
+`grow_trees` is all of them in a row.
 """
 
-import os
-import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from jast._jax import is_traced
 from jast.counter import tree_keys
-from jast.episode import Episode, replay
-from jast.failures import collect, identity
-from jast.heads.rounds import enrol, teach
+from jast.heads.rounds import School, enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
-from jast.heads.settings import checked
+from jast.heads.settings import HeadSettings, checked
 from jast.incidents import hosted, incidents, since
 from jast.search.lockstep import prepare, whole
-from jast.search.result import History, SearchResult, Trials
-from jast.search.tree import memory
-from jast.search.tree.choice import Choice
+from jast.search.result import SearchResult
 from jast.search.tree.guide import guide
-from jast.search.tree.layout import (
-    FAILURE,
-    FRESH,
-    INVALID,
-    RAN,
-    Problem,
-    Settings,
-    levels,
-    most_lanes,
-    pages_of,
-    widths,
-)
-from jast.search.tree.run import Plan, bytes_per_tree, grow_all, grow_traced
+from jast.search.tree.harvest import result, traced_result
+from jast.search.tree.layout import Problem, levels, pages_of
+from jast.search.tree.memory import LANES, fit
+from jast.search.tree.run import Harvest, Plan, grow_all, grow_traced
+from jast.search.tree.settings import problem_of
 
-__all__ = ["grow_trees", "settled"]
+__all__ = ["grow_trees"]
 
-SWITCHES = ("spread", "follow", "feed", "urgent")
-# trees in lockstep in one thread: enough to fill vector units, few enough to stay near the
-# processor
-LANES = 128
+MEMOIZE = ("auto", "node", "root", "none")
+CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
 
 
-def settled(method, modes, mode, actions, **given):
-    """The settings of a mode, those that the user gave (not None) in place of its own, and its
-    name; checked.
-    """
-    if mode not in modes:
-        raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
-    chosen = modes[mode] | {name: value for name, value in given.items() if value is not None}
-    if chosen["focus"] is None:
-        chosen["focus"] = getattr(actions, "focus", 1.0)
-    widening, focus = chosen["widening"], chosen["focus"]
-    if (
-        not isinstance(widening, tuple | list)
-        or len(widening) != 2
-        or not (is_traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1))
-    ):
-        raise ValueError(
-            f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received"
-            f" {widening!r}"
-        )
-    if not is_traced(focus) and not focus > 0:
-        raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
-    for name in SWITCHES:
-        if not isinstance(chosen[name], bool):
-            raise ValueError(f"{method}: {name} must be True or False, received {chosen[name]!r}")
-    return dict(mode=mode) | chosen
+class Job(NamedTuple):
+    """What is to be grown."""
+
+    method: str
+    problem: Problem
+    plan: Plan
+    trees: int
+    at_once: int
+    """Trees of a round: all of them where no heads learn."""
+    settings: dict | None
+    """What was asked for, for the result; None in a traced search."""
+    school: School | None = None
+    """The heads, where there are any."""
+    head_settings: HeadSettings | None = None
 
 
 def grow_trees(
-    method,
-    key,
-    sim,
-    chosen,
+    method: str,
+    key: jax.Array,
+    sim: Any,
+    chosen: dict[str, Any],
     *,
-    trees,
-    prunes,
-    simulations,
-    reward,
-    actions,
-    exploration,
-    memoize,
-    top,
-    record,
-    threads,
-    lanes,
-    available,
-    progress,
-    callback,
-    heads=None,
-    head_settings=None,
-):
+    trees: int,
+    prunes: int,
+    simulations: int,
+    reward: Any,
+    actions: Any,
+    exploration: Any,
+    memoize: str,
+    top: int,
+    record: bool,
+    threads: int | None,
+    lanes: int | None,
+    available: int | None,
+    progress: bool,
+    callback: Callable | None,
+    heads: Any = None,
+    head_settings: HeadSettings | None = None,
+) -> SearchResult:
     """A forest by its settings, all given: what `forest` and `mcts` call. ``chosen``: of
-    `settled`.
+    `jast.search.tree.settings.settled`.
     """
-    widening, focus = chosen["widening"], chosen["focus"]
-    given = {
-        name: value
-        for name, value in dict(threads=threads, lanes=lanes).items()
-        if value is not None
-    }
-    trees, prunes, simulations, top, *_ = whole(
-        method, trees=trees, prunes=prunes, simulations=simulations, top=top, **given
+    counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
+    given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
+    trees, prunes, simulations, top, *_ = whole(method, **counts, **given)
+    job = plan(
+        method, key, sim, chosen, trees, prunes, simulations, reward, actions, exploration, memoize
     )
-    if memoize not in ("auto", "node", "root", "none"):
+    if heads is not None:
+        job = enlist(job, key, heads, head_settings, chosen, memoize)
+    if job.settings is None:
+        return traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
+    wanted = job.plan._replace(record=bool(record))
+    fitted, threads, lanes = fit(
+        method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
+    )
+    job = job._replace(plan=fitted)
+    job.settings.update(prunes=job.plan.prunes, memoize=job.plan.memoize)
+    if job.school is not None:
+        job.settings.update(_of_heads(heads, job))
+    before, settings = incidents(sim), job.settings
+    with Watch(method, trees * job.plan.prunes * simulations, progress, callback) as watch:
+        harvests, school, interrupted = grow_rounds(job, key, threads, lanes, top, watch.more)
+    if interrupted:
+        settings = settings | dict(interrupted=f"after {watch.done} of {watch.total} simulations")
+    if not harvests:
+        raise KeyboardInterrupt
+    found = result(sim, job.problem.reward, harvests, settings, top, school)
+    return found._replace(incidents=since(before, incidents(sim)))
+
+
+def plan(
+    method: str,
+    key: jax.Array,
+    sim: Any,
+    chosen: dict[str, Any],
+    trees: int,
+    prunes: int,
+    simulations: int,
+    reward: Any,
+    actions: Any,
+    exploration: Any,
+    memoize: str,
+) -> Job:
+    """The `Job` without heads; ValueError for settings that do not fit one another or ``sim``."""
+    if memoize not in MEMOIZE:
         raise ValueError(
             f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}'
         )
-    names = (
-        dict(trees=trees, simulations=simulations, exploration=exploration)
-        | chosen
-        | dict(widening=list(widening))
-    )
-    reward, settings = prepare(method, key, sim, reward, actions, **names)
+    asked = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen
+    asked["widening"] = list(chosen["widening"])
+    reward, settings = prepare(method, key, sim, reward, actions, **asked)
     prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:
@@ -123,292 +130,135 @@ def grow_trees(
             f"{method}: prunes * simulations must be below 2**24, received {prunes} *"
             f" {simulations}: grow more trees instead"
         )
-    table = widths(total, *widening)
-    switches = {name: chosen[name] for name in SWITCHES}
-    choice = Choice(
-        actions,
-        jnp.asarray(focus, jnp.float32),
-        focused=is_traced(focus) or focus != 1,
-        **switches,
-    )
-    problem = jax.tree.map(
-        jnp.asarray,
-        Problem(sim, reward, choice, Settings(jnp.asarray(exploration, jnp.float32), table)),
-    )
+    problem = problem_of(sim, reward, actions, chosen, exploration, total)
+    table = problem.settings.widths
     children = total + 1 if is_traced(table) else int(table.max())
-    plan = Plan(
-        prunes,
-        simulations,
-        children,
-        "node" if memoize == "auto" else memoize,
-        record=bool(record) and settings is not None,
-    )
-    school, at_once = None, trees
-    if heads is not None:
-        head_settings = checked(
-            HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"])
-            if head_settings is None
-            else head_settings
-        )
-        school = enrol(jax.random.fold_in(key, trees), sim, actions, heads, head_settings)
-        if chosen["follow"] and school.value is not None:
-            mode = chosen["mode"]
-            raise ValueError(
-                f"{method}: follow must be False with a value head, which judges a child by an"
-                f" action of its own, received True (mode={mode!r})"
-            )
-        problem = problem._replace(guide=guide(school.heads, head_settings))
-        plan = plan._replace(
-            pages=pages_of(problem, total),
-            edges=head_settings.train and head_settings.edges == "all" and school.value is not None,
-        )
-        at_once = (
-            min(trees, head_settings.round or max(1, min(trees // 5, LANES)))
-            if head_settings.train
-            else trees
-        )
-        if settings is None and isinstance(heads, str):
-            raise ValueError(
-                f"{method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot"
-                " hold: pass jast.heads.Heads that were trained"
-            )
-        if plan.edges and memoize in ("root", "none"):
-            raise ValueError(
-                f"{method}: heads that learn from all edges (head_settings.edges) need states at"
-                f" every node, received memoize={memoize!r}"
-            )
-    if settings is None:
-        return _traced(grow_traced(problem, tree_keys(key, trees), plan))
-    plan, threads, lanes = _fit(
-        method, problem, plan, at_once, threads, lanes, available, auto=memoize == "auto"
-    )
-    settings |= dict(prunes=prunes, memoize=plan.memoize)
-    if school is not None:
-        kind = (
-            heads
-            if isinstance(heads, str)
-            else "/".join(name for name in ("policy", "value") if getattr(heads, name) is not None)
-        )
-        used = {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in head_settings._asdict().items()
-        }
-        settings |= dict(heads=kind, head_settings=used | dict(round=at_once))
-    if progress:
-        from tqdm import tqdm
-    bar = tqdm(total=trees * total, unit="sim", unit_scale=True, desc=method) if progress else None
-    done = [0]
+    kept = "node" if memoize == "auto" else memoize
+    return Job(method, problem, Plan(prunes, simulations, children, kept), trees, trees, settings)
 
-    def on_chunk(n):
-        done[0] += n
-        if bar is not None:
-            bar.update(n)
-        if callback is not None:
-            callback(done[0], trees * total)
 
-    chunk = max(1, min(simulations, 10 if hosted(sim) else 500))
-    keys, harvests, interrupted, before = tree_keys(key, trees), [], False, incidents(sim)
-    for first in range(0, trees, at_once):
+def enlist(
+    job: Job,
+    key: jax.Array,
+    heads: Any,
+    head_settings: HeadSettings | None,
+    chosen: dict[str, Any],
+    memoize: str,
+) -> Job:
+    """The `Job` with heads that guide it; ValueError where these do not fit its settings."""
+    if head_settings is None:
+        head_settings = HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"])
+    head_settings = checked(head_settings)
+    sim, actions = job.problem.sim, job.problem.choice.actions
+    school = enrol(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
+    if chosen["follow"] and school.value is not None:
+        raise ValueError(
+            f"{job.method}: follow must be False with a value head, which judges a child by an"
+            f" action of its own, received True (mode={chosen['mode']!r})"
+        )
+    problem = job.problem._replace(guide=guide(school.heads, head_settings))
+    learns = head_settings.train
+    edges = learns and head_settings.edges == "all" and school.value is not None
+    if job.settings is None and isinstance(heads, str):
+        raise ValueError(
+            f"{job.method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot"
+            " hold: pass jast.heads.Heads that were trained"
+        )
+    if edges and memoize in ("root", "none"):
+        raise ValueError(
+            f"{job.method}: heads that learn from all edges (head_settings.edges) need states at"
+            f" every node, received memoize={memoize!r}"
+        )
+    usual = max(1, min(job.trees // 5, LANES))
+    return job._replace(
+        problem=problem,
+        plan=job.plan._replace(
+            pages=pages_of(problem, job.plan.prunes * job.plan.simulations), edges=edges
+        ),
+        at_once=min(job.trees, head_settings.round or usual) if learns else job.trees,
+        school=school,
+        head_settings=head_settings,
+    )
+
+
+def grow_rounds(
+    job: Job, key: jax.Array, threads: int, lanes: int, top: int, more: Callable[[int], None]
+) -> tuple[list[Harvest], School | None, bool]:
+    """Grow all trees, a round at a time, and teach the heads between two rounds.
+
+    Args:
+        job: what is to be grown.
+        key: of the search.
+        threads: that trees grow in.
+        lanes: trees in lockstep in each of them.
+        top: failures that the archive is to hold.
+        more: is told how many simulations were done since it was last called.
+
+    Returns:
+        The harvests in the order of the trees, the heads as they are now, and whether a
+        KeyboardInterrupt ended it early.
+    """
+    problem, school, sim = job.problem, job.school, job.problem.sim
+    chunk = max(1, min(job.plan.simulations, HOST_CHUNK if hosted(sim) else CHUNK))
+    keys, harvests = tree_keys(key, job.trees), []
+    for first in range(0, job.trees, job.at_once):
         new, interrupted = grow_all(
             problem,
-            keys[first : first + at_once],
-            plan,
+            keys[first : first + job.at_once],
+            job.plan,
             threads=threads,
             lanes=lanes,
             chunk=chunk,
             candidates=max(256, 4 * top),
-            on_chunk=on_chunk,
+            on_chunk=more,
             first=first,
         )
         harvests += new
         if interrupted:
-            break
-        if school is not None and head_settings.train:
+            return harvests, school, True
+        if school is not None and job.head_settings.train:
+            own = jax.random.fold_in(key, job.trees + 1 + first)
+            actions = problem.choice.actions
             try:
-                school = teach(
-                    jax.random.fold_in(key, trees + 1 + first),
-                    school,
-                    sim,
-                    actions,
-                    head_settings,
-                    new,
-                )
+                school = teach(own, school, sim, actions, job.head_settings, new)
             except KeyboardInterrupt:
-                interrupted = True
-                break
-            problem = problem._replace(guide=guide(school.heads, head_settings))
-    if bar is not None:
-        bar.close()
-    if interrupted:
-        settings["interrupted"] = f"after {done[0]} of {trees * total} simulations"
-    if not harvests:
-        raise KeyboardInterrupt
-    return _result(sim, reward, harvests, settings, top, school)._replace(
-        incidents=since(before, incidents(sim))
-    )
+                return harvests, school, True
+            problem = problem._replace(guide=guide(school.heads, job.head_settings))
+    return harvests, school, False
 
 
-def _fit(method, problem, plan, trees, threads, lanes, available, auto):
-    """The plan with its memoization settled, and the threads and lanes with which it fits into
-    memory; ValueError if it does not.
-    """
-    if threads is None:
-        cores = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
-        threads = max(1, min(cores, trees // 8)) if jax.default_backend() == "cpu" else 1
-    given, free = lanes, memory.available() if available is None else available
-    if lanes is None:
-        rounds = -(-trees // (threads * LANES))
-        lanes = -(-trees // (threads * rounds)) if jax.default_backend() == "cpu" else trees
-    lanes = min(lanes, trees, most_lanes(pages_of(problem, plan.prunes * plan.simulations)))
-    threads = min(threads, -(-trees // lanes))
-    for memoize in ["node", "root"] if auto and not plan.edges else [plan.memoize]:
-        plan = plan._replace(memoize=memoize)
-        one = bytes_per_tree(problem, plan)
-        within = lanes if free is None else int(0.8 * free // (one * threads))
-        if within >= (lanes if given else min(lanes, 8)):
-            break
-    if within < 1 or (given and within < lanes):
-        asked = (
-            f"{lanes} trees in each of {threads} threads take"
-            f" {memory.readable(one * lanes * threads)}"
-        )
-        shape = (
-            f"{memory.readable(one)} a tree of {plan.prunes} x {plan.simulations} simulations,"
-            f" memoize={plan.memoize!r}"
-        )
-        raise ValueError(
-            f"{method}: {asked} ({shape}), {memory.readable(free)} are free; use fewer lanes,"
-            " threads or simulations"
-        )
-    if auto and plan.memoize == "root":
-        warnings.warn(
-            f"{method}: states at every node do not fit into memory, so they are kept at roots:"
-            ' memoize="root"',
-            stacklevel=4,
-        )
-    return plan, threads, max(1, min(lanes, within))
+class Watch:
+    """The progress bar and the callback of a search."""
+
+    def __init__(self, method: str, total: int, progress: bool, callback: Callable | None):
+        self.done, self.total, self._callback, self._bar = 0, total, callback, None
+        if progress:
+            from tqdm import tqdm  # slow to import
+
+            self._bar = tqdm(total=total, unit="sim", unit_scale=True, desc=method)
+
+    def more(self, n: int) -> None:
+        self.done += n
+        if self._bar is not None:
+            self._bar.update(n)
+        if self._callback is not None:
+            self._callback(self.done, self.total)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self._bar is not None:
+            self._bar.close()
 
 
-def _result(sim, reward, harvests, settings, top, school):
-    log, outcome = (
-        np.concatenate([getattr(h, field) for h in harvests], axis=1)
-        for field in ("log", "outcome")
-    )
-    has = lambda bit: (outcome & bit) > 0
-    ran, failed = has(RAN), has(FAILURE)
-    order = failed.reshape(-1)
-    episodes = int(ran.sum())
-    first = int(ran.reshape(-1)[: order.argmax() + 1].sum()) if order.any() else None
-    fresh_failure = failed & has(FRESH)
-    value = np.where(ran, log, -np.inf)
-    per_tree = np.where(
-        fresh_failure.any(0), np.where(fresh_failure, value, -np.inf).max(0), value.max(0)
-    )
-    found = jax.tree.map(lambda *parts: np.concatenate(parts), *(h.found for h in harvests))
-    tree, simulation = (
-        np.concatenate([getattr(h, f) for h in harvests]) for f in ("tree", "simulation")
-    )
-    chosen = _distinct(found, tree, simulation, top)
-    archive = collect(
-        sim,
-        reward,
-        _take(found, chosen),
-        tree[chosen],
-        simulation[chosen],
-        seen=int(failed.sum()),
-        top=top,
-    )
-    best = archive.best
-    if best is None:
-        best = _take(found, np.argmax(np.where(found.failure, -np.inf, found.reward)))
-    roots = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *(h.roots for h in harvests))
-    return SearchResult(
-        best=jax.device_get(replay(sim, best, reward=reward)),
-        best_reward_per_tree=per_tree,
-        failures=archive,
-        episodes=episodes,
-        simulator_steps=int(sum(h.steps.astype(np.int64).sum() for h in harvests)),
-        first_failure=first,
-        failing_share=float(failed.sum() / max(episodes, 1)),
-        failing=fresh_failure.any(0),
-        history=_history(value, fresh_failure, failed),
-        invalid=int(has(INVALID).sum()),
-        trials=_trials(harvests, value, failed, has(FRESH)),
-        settings=settings,
-        roots=roots,
-        heads=None if school is None else school.heads,
-        lessons=() if school is None else school.lessons,
-    )
-
-
-def _trials(harvests, value, failed, fresh):
-    if isinstance(harvests[0].trials, tuple):
-        return None
-    distance, log_prob = np.moveaxis(np.concatenate([h.trials for h in harvests], axis=2), 1, 0)
-    return Trials(
-        value,
-        np.where(fresh & np.isfinite(value), distance, np.inf),
-        log_prob,
-        failed & fresh,
-        fresh,
-    )
-
-
-def _distinct(found, tree, simulation, top):
-    """Candidates worth a replay: failures by falling reward, up to a few more distinct ones than
-    the archive holds.
-    """
-    names, chosen, seen = set(), [], set()
-    for i in np.argsort(-found.reward, kind="stable"):
-        if not found.failure[i] or (tree[i], simulation[i]) in seen:
-            continue
-        seen.add((tree[i], simulation[i]))
-        names.add(identity(_take(found, i)))
-        if len(names) > top + 8:
-            break
-        chosen.append(i)
-    return np.array(chosen, np.int64)
-
-
-def _history(value, failure, failed):
-    moments = np.unique(np.linspace(1, value.shape[0], min(value.shape[0], 200)).astype(int))
-    best = np.maximum.accumulate(value, axis=0)[moments - 1]
-    best_failure = np.maximum.accumulate(np.where(failure, value, -np.inf), axis=0)[moments - 1]
-    best = np.where(np.maximum.accumulate(failure, axis=0)[moments - 1], best_failure, best)
-    return History(moments, best, np.cumsum(failed.sum(1))[moments - 1])
-
-
-def _traced(found):
-    """`SearchResult` of traced arrays."""
-    steps = found.first.shape[0]
-    failing = found.best.failure
-    score = jnp.where(
-        jnp.any(failing), jnp.where(failing, found.best.reward, -jnp.inf), found.best.reward
-    )
-    episodes = jnp.sum(found.episodes)
-    first = jnp.where(
-        jnp.any(found.failures > 0),
-        jnp.min(found.first) * steps + jnp.argmin(found.first).astype(jnp.int32) + 1,
-        -1,
-    )
-    return SearchResult(
-        jax.tree.map(lambda a: a[jnp.argmax(score)], found.best),
-        found.best.reward,
-        None,
-        episodes,
-        jnp.sum(found.steps),
-        first,
-        jnp.sum(found.failures) / jnp.maximum(episodes, 1),
-        failing,
-        None,
-        jnp.sum(found.invalid),
-        None,
-    )
-
-
-def _take(episodes, i):
-    return Episode(*jax.tree.map(lambda a: a[i], tuple(episodes[:-1])))
+def _of_heads(heads: Any, job: Job) -> dict[str, Any]:
+    """What a result's settings say of heads."""
+    kind = heads
+    if not isinstance(heads, str):
+        kind = "/".join(name for name in ("policy", "value") if getattr(heads, name) is not None)
+    used = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in job.head_settings._asdict().items()
+    }
+    return dict(heads=kind, head_settings=used | dict(round=job.at_once))

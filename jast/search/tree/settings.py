@@ -1,0 +1,72 @@
+"""The settings of a tree search: its named modes, what the user gave in their place, and the
+`Problem` that they make.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast._jax import is_traced
+from jast.search.tree.choice import Choice
+from jast.search.tree.layout import Problem, Settings, widths
+
+__all__ = ["PLAIN", "problem_of", "settled"]
+
+SWITCHES = ("spread", "follow", "feed", "urgent")
+PLAIN = dict(spread=False, focus=1.0, follow=False, feed=False, urgent=False)
+"""The settings of a mode that adds nothing to the published search."""
+
+
+def settled(
+    method: str, modes: Mapping[str, dict], mode: str, actions: Any, **given: Any
+) -> dict[str, Any]:
+    """The settings of a mode, checked.
+
+    Args:
+        method: the search, for messages.
+        modes: name of a mode -> its settings: ``widening``, ``focus`` and the ``SWITCHES``.
+        mode: which one.
+        actions: of `jast.actions`; they say how near to the mode a ``focus`` of None draws.
+        **given: settings by name that take the place of the mode's own, where they are not None.
+
+    Returns:
+        The settings by name, and ``mode``.
+
+    Raises:
+        ValueError: for an unknown mode, or a setting out of range.
+    """
+    if mode not in modes:
+        raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
+    chosen = modes[mode] | {name: value for name, value in given.items() if value is not None}
+    if chosen["focus"] is None:
+        chosen["focus"] = getattr(actions, "focus", 1.0)
+    widening, focus = chosen["widening"], chosen["focus"]
+    pair = isinstance(widening, tuple | list) and len(widening) == 2
+    if not pair or not (is_traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
+        raise ValueError(
+            f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received"
+            f" {widening!r}"
+        )
+    if not is_traced(focus) and not focus > 0:
+        raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
+    for name in SWITCHES:
+        if not isinstance(chosen[name], bool):
+            raise ValueError(f"{method}: {name} must be True or False, received {chosen[name]!r}")
+    return dict(mode=mode) | chosen
+
+
+def problem_of(
+    sim: Any, reward: Any, actions: Any, chosen: Mapping[str, Any], exploration: Any, total: int
+) -> Problem:
+    """The `Problem` of trees of ``total`` simulations by the settings ``chosen`` (of `settled`)."""
+    focus = chosen["focus"]
+    choice = Choice(
+        actions,
+        jnp.asarray(focus, jnp.float32),
+        focused=is_traced(focus) or focus != 1,
+        **{name: chosen[name] for name in SWITCHES},
+    )
+    settings = Settings(jnp.asarray(exploration, jnp.float32), widths(total, *chosen["widening"]))
+    return jax.tree.map(jnp.asarray, Problem(sim, reward, choice, settings))
