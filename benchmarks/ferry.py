@@ -112,6 +112,9 @@ def rows(trees, quick):
         "forest, paper": forest(mode="paper"),
         "mcts, paper": mcts(mode="paper"),
         "forest, default": forest(),
+        "forest as typed, no actions": lambda key: jast.search.forest(
+            key, s0, trees=trees, reward=REWARD
+        ),
         "mcts, default": mcts(),
         "forest, S0b, paper": forest(s0b, mode="paper"),
         "forest, S0b, default": forest(s0b),

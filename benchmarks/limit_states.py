@@ -1,5 +1,5 @@
 """Rare events of known probability, fixed and drawn by seed, for studies of error and coverage:
-``python -m benchmarks.limit_states`` checks the truths.
+``python -m benchmarks.limit_states [--json] [--quick]`` checks the truths.
 
 ``cases()`` lists the fixed ones, ``draw(family, seed)`` gives one of a family of ``FAMILIES``:
 `Case`, (name, simulator, truth). Truths are closed forms or quadratures in float64 (SciPy), with P
@@ -11,6 +11,7 @@ I_d); it is written once for two array libraries.
 
 import argparse
 import functools
+import json
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -461,10 +462,13 @@ def main(argv=None):
         prog="python -m benchmarks.limit_states",
         description="Check the truths of the families by sampling.",
     )
-    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--seeds", type=int, help="problems of a family (default 8)")
+    parser.add_argument("--quick", action="store_true", help="2 problems of a family")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     args = parser.parse_args(argv)
+    seeds, report = args.seeds or (2 if args.quick else 8), {}
     for family in FAMILIES:
-        scores = [check(family, seed) for seed in range(args.seeds)]
+        scores = [check(family, seed) for seed in range(seeds)]
         easy, rare = (
             np.array([s[0] for s in scores]),
             np.array([s[1] for s in scores if len(s) > 1]),
@@ -475,11 +479,16 @@ def main(argv=None):
             if len(rare)
             else ""
         )
+        report[family] = {"easy": easy.tolist(), "rare": rare.tolist()}
+        if args.json:
+            continue
         print(
             f"{family:18} standard errors: rms {np.sqrt(np.mean(easy**2)):.2f}, greatest"
             f" {np.abs(easy).max():.2f}{note}",
             flush=True,
         )
+    if args.json:
+        print(json.dumps(report))
 
 
 if __name__ == "__main__":

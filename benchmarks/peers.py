@@ -1,5 +1,5 @@
 """Peers of jast's cross-entropy optimisers on the same budgets, in NumPy and float64: ``python -m
-benchmarks.peers --seeds 64 [--cases ...] [--peers ...]``.
+benchmarks.peers [--json] [--quick] [--cases ...] [--peers ...]``.
 
 A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every true evaluation in order, ``(x
 [n, d], value [n])`` with ``n <= budget``. Methods that start from a distribution get N(mean, diag
@@ -8,6 +8,7 @@ bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
 """
 
 import argparse
+import functools
 import importlib.metadata
 import json
 import time
@@ -222,7 +223,8 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.peers", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--seeds", type=int, default=64)
+    parser.add_argument("--seeds", type=int, help="runs of each pair (default 64)")
+    parser.add_argument("--quick", action="store_true", help="4 runs of each pair")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument(
         "--cases",
@@ -240,17 +242,19 @@ def main(argv=None):
         metavar="PEER",
         help=", ".join(PEERS),
     )
-    parser.add_argument("--json", metavar="FILE", help="write every run to this file")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, with all runs")
     args = parser.parse_args(argv)
+    say = (lambda text: None) if args.json else functools.partial(print, flush=True)
+    seeds = args.seeds or (4 if args.quick else 64)
     packages = ("numpy", "scipy", "scikit-learn", "cma", "bayesian-optimization")
     report = {"versions": {p: _version(p) for p in packages}, "results": []}
-    print(
+    say(
         f"{'case':14}{'peer':24}{'mean best':>12}{'se':>10}{'median':>12}{'distance':>10}"
         f"{'se':>8}{'F':>8}{'CPU s':>9}"
     )
     for name in args.cases:
         for peer in args.peers:
-            result = run(peer, name, range(args.first, args.first + args.seeds))
+            result = run(peer, name, range(args.first, args.first + seeds))
             s = summary(result["values"], result["distances"]) | {
                 "cpu_s": float(result["cpu_s"].mean())
             }
@@ -259,15 +263,14 @@ def main(argv=None):
                 if "F" in s
                 else f"{'-':>10}{'-':>8}{'-':>8}"
             )
-            print(
-                f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}{s['cpu_s']:9.4f}",
-                flush=True,
+            say(
+                f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}"
+                f"{s['cpu_s']:9.4f}"
             )
             raw = {k: None if v is None else v.tolist() for k, v in result.items()}
             report["results"].append({"case": name, "peer": peer, **s, "runs": raw})
-            if args.json:
-                with open(args.json, "w") as file:
-                    json.dump(report, file)
+    if args.json:
+        print(json.dumps(report))
 
 
 if __name__ == "__main__":

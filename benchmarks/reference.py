@@ -5,7 +5,7 @@ Algorithm 1 of Lytskjold and Mengshoel (MCFS-AP) without networks, with their se
 18 roots of 500 simulations each; MCTS-SA is the same code with one root of 9000. Only the standard
 library is used; states are kept in the tree, so a simulation never steps through its prefix again.
 
-    python -m benchmarks.reference --trees 60 [--sa] [--json]
+    python -m benchmarks.reference [--quick] [--sa] [--json]
 
 Expected share of trees that find a collision: 29.8 % (forest, n = 2000), 40.5 % (--sa, n = 1500).
 """
@@ -169,7 +169,8 @@ def interval(successes, n, z=1.959963984540054):
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description="MCFS-AP on the S0 ferry in plain Python.")
-    parser.add_argument("--trees", type=int, default=60)
+    parser.add_argument("--trees", type=int, help="how many (default 60)")
+    parser.add_argument("--quick", action="store_true", help="10 trees")
     parser.add_argument("--seed", type=int, default=0, help="of the first tree; the others follow")
     parser.add_argument("--sa", action="store_true", help="MCTS-SA: one root of 9000 simulations")
     parser.add_argument("--json", action="store_true")
@@ -177,7 +178,8 @@ def main(arguments=None):
     settings = dict(prunes=1, simulations=9000) if args.sa else dict(prunes=18, simulations=500)
 
     start = time.process_time()
-    trees = [forest(args.seed + i, **settings) for i in range(args.trees)]
+    count = args.trees or (10 if args.quick else 60)
+    trees = [forest(args.seed + i, **settings) for i in range(count)]
     seconds = time.process_time() - start
 
     best, done, steps = (list(column) for column in zip(*trees))
