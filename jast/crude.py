@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import distributions as D
-from jast import rewards
+from jast import results, rewards
 from jast.contract import contract
 from jast.episode import Episode, advance, begin, conclude, rollout
 from jast.incidents import incidents, since
@@ -23,6 +23,7 @@ __all__ = ["Nominal", "nominal"]
 LANES = 1024
 
 
+@results.result("episodes")
 class Nominal(NamedTuple):
     """What `nominal` found: Python numbers and one `Episode`."""
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import distributions as D
-from jast import rewards
+from jast import results, rewards
 from jast._jax import is_traced
 from jast.policy import nominal_policy
 
@@ -30,6 +30,7 @@ __all__ = [
 ]
 
 
+@results.shown()
 class Episode(NamedTuple):
     """One episode, or many along leading axes. Rows from ``length`` on are zero and mean
     nothing.

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jast import results
 from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
 from jast.episode import Episode, _shapes, accumulator, replay
 
@@ -21,6 +22,7 @@ FORMAT, VERSION, KIND = "jast failures", 1, "a jast archive of failures"
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 
 
+@results.shown("seen")
 class Failures(NamedTuple):
     """The n best distinct failures, by falling reward. ``failures[i]`` is the i-th field, as in any
     tuple; an episode is ``failures.episode(i)``.

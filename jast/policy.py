@@ -11,10 +11,12 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast import results
 
 __all__ = ["Policy", "nominal_policy", "recorded", "undisturbed"]
 
 
+@results.shown()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:

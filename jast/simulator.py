@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jast import results
 from jast.distributions import Fixed
 
 __all__ = ["Simulator", "fixed", "never", "ravel"]
@@ -31,6 +32,7 @@ def ravel(state):
     return jnp.concatenate([a.astype(dtype) for a in leaves]) if leaves else jnp.zeros((0,), dtype)
 
 
+@results.shown()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Simulator:

@@ -11,6 +11,7 @@ import numpy as np
 from jax.lax import Precision
 from jax.scipy.linalg import solve_triangular
 
+from jast import results
 from jast._jax import is_traced
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 
+@results.shown()
 class Gaussian(NamedTuple):
     """N(mean, covariance), floats; the covariance is positive definite."""
 

@@ -11,6 +11,7 @@ from jax import lax
 from jax.lax import Precision
 from jax.scipy.special import logsumexp
 
+from jast import results
 from jast._jax import is_traced
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
@@ -26,6 +27,7 @@ __all__ = [
 ]
 
 
+@results.shown()
 class Mixture(NamedTuple):
     """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is
     positive definite.

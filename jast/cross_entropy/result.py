@@ -4,9 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast import results
+
 __all__ = ["CEResult", "History", "Scores", "scores"]
 
 
+@results.shown()
 class History(NamedTuple):
     """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand
     together, in order.
@@ -29,6 +32,7 @@ class History(NamedTuple):
     """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
 
+@results.result("best_value", batches=True)
 class CEResult(NamedTuple):
     """The outcome. With a leading axis everywhere after `jax.vmap`."""
 
@@ -81,6 +85,7 @@ def _point(x):
     return f"({shown}{', ...' if x.size > 6 else ''})"
 
 
+@results.shown()
 class Scores(NamedTuple):
     """Of several runs, the means over them; distances are Euclidean, from the best point to the
     optimum.

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast import results
 from jast.estimate import diagnostics
 from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
@@ -13,6 +14,7 @@ __all__ = ["Estimate", "estimate", "of_counts"]
 INVALID = 0.01
 
 
+@results.result("samples")
 class Estimate(NamedTuple):
     """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why
     before any number where it must not be believed.

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import results
 from jast._checks import whole
 from jast.episode import Episode, random_start
 from jast.estimate import limit_state as latent
@@ -24,6 +25,7 @@ __all__ = ["FailureSamples", "failure_samples"]
 PER_SAMPLE = 10
 
 
+@results.result("ess")
 class FailureSamples(NamedTuple):
     """Failures drawn from p(x | failure)."""
 

@@ -16,6 +16,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jast import distributions as D
+from jast import results
 from jast._checks import whole
 from jast.contract import contract
 from jast.episode import accumulator, advance, begin, conclude, rollout
@@ -32,6 +33,7 @@ LANES = 16384
 PROBES = 256
 
 
+@results.shown()
 class Traces(NamedTuple):
     """Simulated episodes of a proposal, one a row of the leading axis [n]."""
 

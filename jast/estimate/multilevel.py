@@ -15,6 +15,7 @@ from jax.tree_util import Partial
 
 from jast import actions as choices
 from jast import distributions as D
+from jast import results
 from jast._checks import real, whole
 from jast.contract import contract
 from jast.cross_entropy import sequences
@@ -25,6 +26,7 @@ from jast.policy import Policy
 __all__ = ["FailureProposal", "failure_proposal"]
 
 
+@results.result("evaluations", batches=True)
 class FailureProposal(NamedTuple):
     """A proposal and how it was found. K iterations; with a leading axis everywhere after
     `jax.vmap`.

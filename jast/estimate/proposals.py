@@ -15,6 +15,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast import results
 from jast._checks import real
 from jast._jax import is_traced
 from jast.contract import contract
@@ -29,6 +30,7 @@ __all__ = ["Proposal", "as_proposal", "latents", "policy_proposal", "trace_propo
 MIXING = ("step", "trace")
 
 
+@results.shown()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Proposal:

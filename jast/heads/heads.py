@@ -12,6 +12,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast import results
 from jast.heads.networks import Head
 
 __all__ = [
@@ -75,6 +76,7 @@ def moments(before, x):
     )
 
 
+@results.shown()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Heads:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jast._jax import is_traced
+from jast import results
 from jast.heads.heads import observed
 from jast.policies.lanes import potential
 from jast.policies.latent import Blended
@@ -20,6 +20,7 @@ from jast.policy import Policy
 __all__ = ["FAILING_SHARE", "FailurePolicy", "History", "Learned", "assemble", "history", "row"]
 
 
+@results.shown()
 class History(NamedTuple):
     """The training, a row for each stretch of it: [rows] each."""
 
@@ -89,6 +90,7 @@ class Learned(NamedTuple):
     scale: Any
 
 
+@results.result("episodes")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FailurePolicy(Policy):
@@ -104,9 +106,22 @@ class FailurePolicy(Policy):
     learned: Learned = None
     history: History = None
 
+    @property
+    def episodes(self) -> Any:
+        """int: episodes simulated."""
+        return self.history.episodes[..., -1]
+
+    @property
+    def steps(self) -> Any:
+        """int: steps of the simulator."""
+        return self.history.steps[..., -1]
+
+    @property
+    def invalid(self) -> Any:
+        """int: transitions in which a number was not finite."""
+        return self.history.invalid[..., -1]
+
     def __str__(self):
-        if is_traced(self.history):
-            return "FailurePolicy (traced)"
         h, last = self.history, len(self.history.episodes) - 1
         formats = dict(
             episodes="9d",

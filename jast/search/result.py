@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
 
 __all__ = ["History", "SearchResult", "Trials", "table"]
 
 
+@results.shown()
 class History(NamedTuple):
     """How the search went, at C moments of it."""
 
@@ -23,6 +25,7 @@ class History(NamedTuple):
     """[C] int: failing episodes so far, over all trees."""
 
 
+@results.shown()
 class Trials(NamedTuple):
     """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they
     were simulated.
@@ -42,6 +45,7 @@ class Trials(NamedTuple):
     """
 
 
+@results.result("episodes")
 class SearchResult(NamedTuple):
     """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap`
     all are traced arrays and ``failures`` is None.

@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast import results
 from jast._checks import number, whole
 from jast.weakness.result import Result
 
 __all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
 
 
+@results.shown()
 class Roc(NamedTuple):
     """A receiver operating characteristic, from (0, 0) to (1, 1)."""
 
@@ -28,6 +30,7 @@ class Roc(NamedTuple):
         return float(np.trapezoid(self.true_positive, self.false_positive))
 
 
+@results.shown()
 class Judgement(NamedTuple):
     """How good the scores of each iteration are on the whole data set; R iterations."""
 

@@ -4,9 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast import results
+
 __all__ = ["History", "Result", "State"]
 
 
+@results.shown()
 class History(NamedTuple):
     """R iterations, each of a batch of calls and what was learned from it."""
 
@@ -32,6 +35,7 @@ class History(NamedTuple):
     """[R, n] float32: the scores after each iteration"""
 
 
+@results.shown()
 class State(NamedTuple):
     """All that `validate` needs to go on; for `save` and `load`."""
 
@@ -54,6 +58,7 @@ class State(NamedTuple):
     """The selector has made all its iterations"""
 
 
+@results.result("calls")
 class Result(NamedTuple):
     """The outcome of a validation of n inputs. NumPy arrays."""
 

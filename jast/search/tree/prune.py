@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast import results
 from jast.search.tree.incumbent import fed_of, follows
 from jast.search.tree.layout import (
     CHILD,
@@ -26,6 +27,7 @@ from jast.search.tree.simulate import child_state, replay_to, select_lanes
 __all__ = ["Roots", "prune"]
 
 
+@results.shown()
 class Roots(NamedTuple):
     """What is known of B roots at the end of their turn: K is the greatest number of children."""
 
