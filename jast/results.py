@@ -167,7 +167,7 @@ def _words(value: Any) -> str:
         return f"{value:.6g}"
     if isinstance(value, str):
         return repr(shorten(value, 60, placeholder=" ...")) if len(value) > 60 else repr(value)
-    if is_traced(value):
+    if hasattr(value, "dtype") and is_traced(value):
         return f"traced {value.dtype}{list(value.shape)}"
     if _number(value):
         if jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
