@@ -14,7 +14,7 @@ from jax import lax
 from jast import distributions as D
 from jast._jax import is_traced, is_tracing
 from jast.actions import Quantiles, Samples, UniformBox
-from jast.incidents import incidents, since
+from jast.incidents import incidents, since, sources
 from jast.simulator import Simulator
 
 __all__ = ["OBSERVED", "check", "contract"]
@@ -40,7 +40,8 @@ def check(sim, actions=None):
     ones; ``init``, ``step`` or ``evaluate`` with another answer the second time; actions that are
     impossible under p(x | s) in more than half of 64 draws at the start. Only the traced half runs
     where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system,
-    and the first steps of another.
+    and the first steps of another. Warns (UserWarning) where objects of `jast.blackbox` that are
+    judged at the end only (``episodic=True``) failed on the way in some of 16 more.
     """
     contract(sim, actions)
     if is_traced(sim, actions) or is_tracing():
@@ -53,6 +54,8 @@ def check(sim, actions=None):
     _densities(found)
     _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
+    for source in sources(sim, "compare"):  # a black box that is judged at the end only
+        source.compare(sim)
     if actions is not None and (share := found["actions"]) > 0.5:
         box = (
             f" on the box [{_show(actions.low)}, {_show(actions.high)}]"
@@ -104,7 +107,8 @@ def _trace(sim, actions, observed):
             raise ValueError(f"observe: returns {_kind(seen)}, expected a float vector")
         if jnp.size(seen) > OBSERVED:
             raise ValueError(
-                f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}"
+                f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}; pass"
+                " observe=, a function state -> float vector of those that matter"
             )
     _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state)
     if actions is not None:

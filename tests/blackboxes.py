@@ -98,3 +98,54 @@ class Forgetful(Walk):
 
     def transition(self, x):
         super().transition(x + self.random.normal())
+
+    def miss_distance(self):  # no two are the same, those of failures neither
+        return 4.0 - self.s
+
+
+class Leaves(Walk):
+    """Fails while it is 4 or more away from 0: it may come back."""
+
+    def is_event(self):
+        return abs(self.s) >= 4.0
+
+    def miss_distance(self):
+        return max(4.0 - abs(self.s), 0.0)
+
+    def is_terminal(self):
+        return False
+
+
+class Left(Leaves):
+    """`Leaves` that remembers."""
+
+    def initialize(self):
+        super().initialize()
+        self.farthest = 0.0
+
+    def transition(self, x):
+        super().transition(x)
+        self.farthest = max(self.farthest, abs(self.s))
+
+    def is_event(self):
+        return self.farthest >= 4.0
+
+
+class Delivered(Leaves):
+    """`Leaves` that knows nothing before its ``evaluate`` at the end, after 8 disturbances."""
+
+    def initialize(self):
+        super().initialize()
+        self.steps, self.late = 0, None
+
+    def transition(self, x):
+        super().transition(x)
+        self.steps += 1
+
+    def evaluate(self):
+        if self.steps < 8:
+            raise RuntimeError("asked before the end")
+        self.late = abs(self.s) >= 4.0
+
+    def is_event(self):
+        return self.late

@@ -43,6 +43,11 @@ def in_jax(horizon=4, **fields):
     )
 
 
+class Looks(blackboxes.Walk):
+    def observe(self):
+        return np.arange(135.0) + self.s
+
+
 def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     sim = box(blackboxes.walk, 4)
     ours, theirs = (
@@ -77,6 +82,64 @@ def test_objects_are_those_of_the_system_in_jax():
             *(jax.vmap(s.observe)(e.states)[: n + 1] for s, e in ((sim, a), (theirs, b)))
         )
     assert incidents(sim) == ()
+
+
+def test_an_object_is_judged_at_every_state_unless_said_otherwise(key):
+    leaves = jast.Simulator(
+        lambda x0: jnp.zeros(()),
+        lambda s, x: s + x,
+        lambda s: NORMAL,
+        lambda s: (jnp.abs(s) >= 4.0, jnp.maximum(4.0 - jnp.abs(s), 0.0)),
+        8,
+    )
+    sim = box(blackboxes.Leaves, 8)
+    now, theirs, at_the_end = (
+        jast.nominal(key, s, episodes=500)
+        for s in (sim, leaves, box(blackboxes.Leaves, 8, episodic=True))
+    )
+    assert not sim.episodic and now.failures == theirs.failures > at_the_end.failures
+    np.testing.assert_allclose(now.mean_distance, theirs.mean_distance, rtol=1e-5)
+    assert box(blackboxes.walk).episodic  # a function answers for a whole episode
+    assert not box(lambda: blackboxes.Leaves()).episodic
+
+
+def test_check_says_where_failures_on_the_way_are_lost():
+    sim = box(blackboxes.Leaves, 8, episodic=True)
+    with pytest.warns(
+        UserWarning, match=r"from_python: in (\d+) of 16 episodes is_event\(\)"
+    ) as said:
+        assert jast.check(sim) is sim
+    lost = int(str(said[0].message).split()[2])
+    before = blackbox.calls(sim)
+    host = next(jast.incidents.sources(sim, "compare")).host
+    # the first comes back; the others stay near, or are away at their end
+    rows = np.zeros((5, 8))
+    rows[:, :3] = [[5, -5, 0], [1, 5, 1], [1, 1, 1], [5, -5, 5], [4, -8, 0]]
+    assert host.lost([], [rows]) == 1
+    after = blackbox.calls(sim)
+    assert (after.episodes - before.episodes, after.transitions - before.transitions) == (5, 40)
+    assert 0 < lost <= 16
+    # one that remembers loses nothing, one that cannot be asked before the end is not compared
+    for system in (blackboxes.Left, blackboxes.Delivered):
+        assert jast.check(box(system, 8, episodic=True)).episodic
+
+
+def test_what_is_observed_may_be_chosen_from_more():
+    sim = jast.check(box(Looks, 3, observe=lambda s: s.seen[5:7]))
+    assert sim.observe(sim.step(sim.init(()), jnp.ones(()))).tolist() == [6, 7]
+
+
+def test_observations_of_an_environment_that_are_no_numbers_are_left_out():
+    class Env:
+        def reset(self, seed):
+            return {"speed": 1.0}, {}
+
+        def step(self, action):
+            return {"speed": 2.0}, 0.0, False, False, {}
+
+    system = blackbox.gymnasium_system(Env, lambda now: now.observation["speed"])
+    sim = jast.check(box(system, 2))
+    assert sim.init(()).seen.shape == (0,) and sim.observe(sim.init(())).shape == (2,)
 
 
 def test_a_tree_counts_what_the_host_runs(key):
@@ -292,7 +355,8 @@ def test_a_gymnasium_environment():
     np.testing.assert_allclose(one.states.seen[one.length], seen, rtol=1e-6)
     assert not jast.replay(sim, jnp.zeros(25), x0=jnp.uint32(3)).failure and incidents(sim) == ()
     # the disturbance is the action
-    whole = box(blackbox.gymnasium_system(make, upright, apply=lambda a, x: int(x > 0)), 25)
+    whole = blackbox.gymnasium_system(make, upright, apply=lambda a, x: int(x > 0))
+    whole = box(whole, 25, episodic=True)
     assert ends(whole, np.ones((1, 25)))[0].all() and incidents(whole) == ()
 
 
@@ -317,14 +381,15 @@ class Waits(blackboxes.Walk):
         (Mute, {}, "Mute lacks is_event"),
         (lambda: Mute(), {}, "Mute lacks is_event"),
         (lambda: 1 / 0, {}, "raised ZeroDivisionError"),
-        (Waits, {"episodic": False}, "observe must return a vector of numbers, received 'nothing'"),
+        (Waits, {}, "observe must return a vector of numbers, received 'nothing'"),
+        (Looks, {}, r"observe returns 135 numbers, .* pass observe=, .* lambda s: s.seen\[:64\]"),
         (
             blackboxes.walk,
             {"start": lambda: NORMAL},
             r"function of \(disturbances, x0\), as start is random, received walk\(disturbances\)",
         ),
         (blackboxes.walk, {"episodic": False}, "episodic=False needs a class"),
-        (blackboxes.walk, {"episodic": 1}, "episodic must be True or False"),
+        (blackboxes.walk, {"episodic": 1}, "episodic must be True, False or None"),
         (blackboxes.walk, {"horizon": 0}, "from_python: horizon"),
         (blackboxes.walk, {"workers": -1}, "from_python: workers"),
         (

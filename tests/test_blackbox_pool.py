@@ -18,7 +18,7 @@ import jast
 from jast import blackbox
 from jast.blackbox.pool import Pool
 from jast.distributions import Normal
-from jast.incidents import incidents
+from jast.incidents import incidents, sources
 
 pytest.importorskip("loky")
 LIMIT = 0.3
@@ -105,6 +105,26 @@ def test_workers_have_neither_jax_nor_this_package_and_share_the_rows():
     pids = ends(sim, np.arange(16.0))
     assert len(set(pids)) == 2 and os.getpid() not in pids
     assert scale and incidents(sim) == ()
+
+
+class Hangs(blackboxes.Leaves):
+    def is_event(self):
+        if self.s != 0:
+            time.sleep(60)
+        return False
+
+
+def test_check_looks_on_the_way_in_a_worker():
+    settings = dict(horizon=8, episodic=True, workers=1)
+    said = []
+    for each in (settings, settings | dict(workers=0, time_limit=None)):
+        with pytest.warns(UserWarning, match="is True on the way and False at the end") as warned:
+            jast.check(box(blackboxes.Leaves, **each))
+        said.append([str(w.message) for w in warned])
+    assert said[0] == said[1]
+    # what gives no answer is not compared
+    host = next(sources(box(Hangs, **settings), "compare")).host
+    assert host.lost([], [np.ones((2, 8))]) == 0
 
 
 def test_a_search_with_workers_is_that_without(key, equal):

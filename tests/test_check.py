@@ -141,7 +141,7 @@ SHAPES = {  # found by tracing
     ),
     "observe is long": (
         dict(observe=lambda s: jnp.zeros(200)),
-        r"observe: returns 200 numbers, expected at most 64",
+        r"observe: returns 200 numbers, expected at most 64; pass observe=",
     ),
     "step raises": (dict(step=explode), r"step: raised RuntimeError"),
     "step grows": (

@@ -81,7 +81,12 @@ class _Environment:
         return self.now.terminated or self.now.truncated
 
     def observe(self):
-        return np.ravel(self.now.observation)
+        """Its numbers; none where it is a dict, a text or rows of different lengths."""
+        try:
+            seen = np.ravel(self.now.observation)
+        except ValueError:
+            seen = np.zeros(0, object)
+        return seen if seen.dtype.kind in "fiub" else np.zeros(0)
 
 
 def gymnasium_system(make, distance, *, event=None, agent=None, apply=None, seed=0):

@@ -89,6 +89,20 @@ class Host:
                 whole[rows] = part
         return tuple(a.reshape((*batch, *a.shape[1:])) for a in out)
 
+    def lost(self, x0, xs):
+        """How many episodes of objects fail on the way and no longer at the end; ``x0``, ``xs``:
+        leaves [n, ...] and [n, horizon, ...].
+        """
+        rows = [[np.asarray(a) for a in leaves] for leaves in (x0, xs)]
+        with self.lock:
+            on_the_way, at_the_end = self.runner.judge(*rows).T
+            n = len(on_the_way)
+            self.done = self.done._replace(
+                episodes=self.done.episodes + n,
+                transitions=self.done.transitions + n * self.spec.horizon,
+            )
+        return int(np.sum(on_the_way & ~at_the_end))
+
     def _answer(self, lanes, t, x0, xs, dtype):
         reply = self.runner(t, x0, xs, lanes)
         count = self.done

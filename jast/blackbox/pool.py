@@ -51,7 +51,7 @@ class _Install:
         return worker.install, self.parts
 
 
-SERVE, PROBE, CONFIGURE = map(_Remote, ("serve", "probe", "configure"))
+SERVE, PROBE, CONFIGURE, JUDGE = map(_Remote, ("serve", "probe", "configure", "judge"))
 
 
 def packed(system, spec):
@@ -144,6 +144,19 @@ class Pool:
         except Exception as error:
             self.workers[0].kill()
             return _cause(error)
+
+    def judge(self, x0, xs):
+        """As `worker.Runner.judge`, in the first worker; neither of all episodes where it gives no
+        answer within their time limits.
+        """
+        n = len(xs[0])
+        limit = None if self.spec.limit is None else n * self.spec.limit + GRACE
+        self._start(self.workers[:1])
+        try:
+            return self.workers[0].submit(JUDGE, x0, xs).result(timeout=limit)
+        except Exception:
+            self.workers[0].kill()
+            return np.zeros((n, 2), bool)
 
     def __call__(self, t, x0, xs, lanes):
         """As `worker.Runner`: the `worker.Reply` for n rows; ``lanes`` [n]: their places in the

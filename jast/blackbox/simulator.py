@@ -14,6 +14,7 @@ from jast import distributions as D
 from jast._checks import real, whole
 from jast._jax import host_call
 from jast.blackbox.host import Calls, Host
+from jast.blackbox.judged import compare
 from jast.blackbox.pool import Pool, packed
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
 from jast.contract import OBSERVED
@@ -60,7 +61,7 @@ def from_python(
     horizon,
     disturbance=None,
     start=fixed,
-    episodic=True,
+    episodic=None,
     workers=0,
     time_limit=None,
     observe=None,
@@ -83,16 +84,21 @@ def from_python(
     ``disturbance``: a distribution of `jast.distributions`, the same at each step, or a function
     state -> distribution in JAX of the state `Record` or `Standing` (``like``: a value of it, where
     it cannot tell its shape without one); None: `distributions.seeds`, one uint32 a step of unknown
-    density. ``start``: p(x0) likewise, () -> distribution. ``observe``: state -> float vector; by
-    default what the object's ``observe`` returns, else t / horizon and the last disturbance (an
-    unsigned integer over its greatest value), 64 numbers at most.
+    density. ``start``: p(x0) likewise, () -> distribution. ``observe``: state -> float vector, 64
+    numbers at most; by default what the object's ``observe`` returns (``seen`` of `Standing`, of
+    any length where ``observe`` chooses from it), else t / horizon and the last disturbance (an
+    unsigned integer over its greatest value).
 
-    ``episodic=True``: the system is run once, at the end of an episode, which always has
-    ``horizon`` disturbances (fewer are an invalid episode): ``initialize``, each ``transition``,
-    then ``evaluate``. False, objects only: ``evaluate``, ``is_event``, ``miss_distance`` and
-    ``is_terminal`` after ``initialize`` and after each transition. An object is kept under its
-    history for the next disturbance; a tree that comes back to an older state repeats the history
-    in another one.
+    ``episodic``: when the system is judged. None, the default: a function at the end, an object
+    at every state. False, objects only: ``evaluate``, ``is_event``, ``miss_distance`` and
+    ``is_terminal`` are asked after ``initialize`` and after each transition, and the first failure
+    ends the episode; one host call a step for all lanes. An object is kept under its history for
+    the next disturbance; a tree that comes back to an older state repeats the history in another
+    one. True: the system is run once, at the end of an episode, which always has ``horizon``
+    disturbances (fewer are an invalid episode): ``initialize``, each ``transition``, then
+    ``evaluate``; one host call an episode. That suits an ``is_event`` that means something only at
+    the end, or that remembers what has happened. One that says "is it failing now" loses the
+    failures that are over by then: `jast.check` looks for some and warns.
 
     ``workers``: 0 runs the system in this process; n >= 1 in so many processes of their own (``pip
     install 'jast[blackbox]'``), started on first use and ended with this one. ``time_limit``:
@@ -108,8 +114,8 @@ def from_python(
     inside of a search where a worker process cannot load the system.
     """
     horizon, workers = whole(NAME, "horizon", horizon), whole(NAME, "workers", workers, 0)
-    if not isinstance(episodic, bool):
-        raise ValueError(f"{NAME}: episodic must be True or False, received {episodic!r}")
+    if episodic is not None and not isinstance(episodic, bool):
+        raise ValueError(f"{NAME}: episodic must be True, False or None, received {episodic!r}")
     if time_limit is not None:
         time_limit = float(
             real(
@@ -131,9 +137,10 @@ def from_python(
     like0 = jax.eval_shape(lambda: D.sample(start(), jax.random.key(0)))
     random = bool(jax.tree.leaves(like0))
     run = _is_run(system, random, episodic)
+    episodic = run if episodic is None else episodic
     spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit)
     runner = Pool(packed(system, spec), workers, spec) if workers else Runner(system, spec)
-    size = 0 if run else _probed(runner, start)
+    size = 0 if run else _probed(runner, start, limited=observe is None)
 
     disturbance = D.seeds() if disturbance is None else disturbance
     constant = _is_distribution(disturbance)
@@ -184,12 +191,10 @@ class _Asking:
     """A field of a simulator that asks the host."""
 
     def __init__(self, host, function):
-        self.host, self.function, self.incidents, self.calls = (
-            host,
-            function,
-            host.incidents,
-            host.calls,
-        )
+        self.host, self.function = host, function
+        self.incidents, self.calls = host.incidents, host.calls
+        if host.spec.episodic and not host.spec.run:
+            self.compare = partial(compare, host)
 
     def __call__(self, *args):
         return self.function(self.host, *args)
@@ -400,7 +405,7 @@ def _is_run(system, random, episodic):
             f"{NAME}: system must be a function of {expected}, received"
             f" {_name(system)}{inspect.signature(system)}"
         )
-    if not episodic:
+    if episodic is False:
         raise ValueError(
             f"{NAME}: episodic=False needs a class with the methods {', '.join(METHODS)};"
             f" {_name(system)} is a function of whole episodes"
@@ -412,16 +417,17 @@ def _name(system):
     return getattr(system, "__name__", type(system).__name__)
 
 
-def _probed(runner, start):
+def _probed(runner, start, limited):
     """The length of an observation, by a first object where all others will be. ValueError where it
-    does not work.
+    does not work, and where it is ``limited`` and too long.
     """
     x0 = [np.asarray(a) for a in jax.tree.leaves(D.sample(start(), jax.random.key(0)))]
     found = runner.probe(x0)
     if isinstance(found, str):
         raise ValueError(f"{NAME}: system: {found}")
-    if found > OBSERVED:
+    if limited and found > OBSERVED:
         raise ValueError(
-            f"{NAME}: system: observe returns {found} numbers, expected at most {OBSERVED}"
+            f"{NAME}: system: observe returns {found} numbers, expected at most {OBSERVED}; pass"
+            f" observe=, a function of the state that chooses, as lambda s: s.seen[:{OBSERVED}]"
         )
     return found

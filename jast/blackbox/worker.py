@@ -178,6 +178,30 @@ class Runner:
             time.perf_counter() - begin,
         )
 
+    def judge(self, x0, xs):
+        """[n, 2] bool of whole episodes of objects: whether ``is_event`` holds at a state before
+        the last, and at the last; neither where something goes wrong, as where it cannot be asked
+        before the end.
+        """
+        found = np.zeros((len(xs[0]), 2), bool)
+        for i in range(len(found)):
+            try:
+                thing = self._fresh()
+                with self.alarm:
+                    self._initialize(thing, [np.array(a[i]) for a in x0])
+                    events = [_event(thing.is_event())]
+                    for k in range(self.spec.horizon):
+                        thing.transition(fill(self.x, [np.array(a[i, k]) for a in xs]))
+                        _evaluate(thing)
+                        events.append(_event(thing.is_event()))
+            except KeyboardInterrupt:
+                raise
+            except BaseException:
+                continue
+            found[i] = any(events[:-1]), events[-1]
+            self.spare.append(thing)
+        return found
+
     def _episode(self, t, x0, xs):
         self.episodes += 1
         if self.spec.run:
@@ -357,7 +381,7 @@ def install(system, spec):
     module.runner = runner = Runner(system, spec)
     # a plain tuple: the class would travel with it
     module.serve = lambda *rows: tuple(runner(*rows))
-    module.probe, module.configure = runner.probe, runner.configure
+    module.probe, module.configure, module.judge = runner.probe, runner.configure, runner.judge
     sys.modules[NAME] = module
 
 

@@ -102,6 +102,7 @@ def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
         partial(Route, tolerance),
         horizon=waypoints,
         disturbance=disturbance,
+        episodic=True,  # a route is flown when it is whole
         workers=workers,
         time_limit=time_limit,
     )
