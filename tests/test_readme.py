@@ -12,6 +12,7 @@ import jast
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text()
+SYSTEMS = (ROOT / "docs/systems.md").read_text()
 
 
 @pytest.mark.long
@@ -34,7 +35,7 @@ def test_the_example_runs_and_finds_a_failure(tmp_path):
 
 
 def test_names_in_the_tables_exist():
-    names = set(re.findall(r"`(jast(?:\.\w+)+)", TEXT))
+    names = set(re.findall(r"`(jast(?:\.\w+)+)", TEXT + SYSTEMS))
     assert len(names) > 12
     for name in names:
         thing = jast
@@ -69,4 +70,4 @@ def test_the_test_command_is_the_one_that_is_run():
 
 
 def test_it_is_short():
-    assert len(TEXT.splitlines()) < 150
+    assert len(TEXT.splitlines()) <= 135
