@@ -17,6 +17,7 @@ from jast import (
     simulators,
     weakness,
 )
+from jast._doors import door, listed
 from jast.contract import check
 from jast.crude import nominal
 from jast.episode import Episode, replay, rollout
@@ -39,6 +40,7 @@ __all__ = [
     "heads",
     "incidents",
     "nominal",
+    "plot",
     "policies",
     "replay",
     "rewards",
@@ -47,3 +49,6 @@ __all__ = [
     "simulators",
     "weakness",
 ]
+
+__getattr__ = door(__name__, lazy={"plot": "jast.plot"})
+__dir__ = listed(__all__)

@@ -7,10 +7,10 @@
 import importlib
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-__all__ = ["door"]
+__all__ = ["door", "listed"]
 
 
 def door(
@@ -47,6 +47,12 @@ def door(
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return getattribute
+
+
+def listed(names: Iterable[str]) -> Callable[[], list[str]]:
+    """The ``__dir__`` of a module that shows its public ``names`` only, for tab completion."""
+    shown = sorted(names)
+    return lambda: shown
 
 
 def _found(place: str) -> Any:

@@ -7,25 +7,33 @@ dtype whatever the precision that JAX is set to.
 """
 
 import json
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from operator import index
+from typing import Any
 
 import jax
 import numpy as np
 
 from jast import results
+from jast._doors import listed
 from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
 from jast.episode import Episode, _shapes, accumulator, replay
 
-__all__ = ["Failures", "collect", "empty", "identity", "load", "merge", "save"]
+__all__ = ["Failures", "collect", "load", "merge", "save"]
+__dir__ = listed(__all__)
 
 FORMAT, VERSION, KIND = "jast failures", 1, "a jast archive of failures"
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 
 
 @results.shown("seen")
-class Failures(NamedTuple):
-    """The n best distinct failures, by falling reward. ``failures[i]`` is the i-th field, as in any
-    tuple; an episode is ``failures.episode(i)``.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Failures:
+    """The n best distinct failures, by falling reward: a sequence of them. ``len(failures)`` is n,
+    ``failures[i]`` the i-th best `Episode`, a slice is an archive of its own, and a loop goes over
+    the episodes. Also a pytree of arrays.
     """
 
     episodes: Episode
@@ -43,17 +51,35 @@ class Failures(NamedTuple):
     in the last digit.
     """
 
-    @property
-    def size(self):
-        """n, the number of episodes held."""
+    def __len__(self) -> int:
         return len(self.counts)
 
+    def __getitem__(self, i: int | slice) -> "Episode | Failures":
+        if not isinstance(i, slice):
+            return self.episode(index(i))
+        rows = _take((self.episodes, self.counts, self.tree, self.simulation), i)
+        return Failures(*rows, self.seen, self.dropped)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return (self.episode(i) for i in range(len(self)))
+
+    def replace(self, **changes: Any) -> "Failures":
+        """The archive with other fields."""
+        return replace(self, **changes)
+
+    _replace = replace
+
     @property
-    def best(self):
+    def size(self) -> int:
+        """n, the number of episodes held."""
+        return len(self)
+
+    @property
+    def best(self) -> Episode | None:
         """The `Episode` of the highest reward, or None where there is no failure."""
         return self.episode(0) if self.size else None
 
-    def episode(self, i):
+    def episode(self, i: int) -> Episode:
         """The i-th best `Episode`, unbatched; negative ``i`` counts from the end. IndexError
         outside the archive.
         """
@@ -171,7 +197,8 @@ def merge(a, b, top=64):
             "merge: both archives must be of one simulator, received episodes of shapes"
             f" {outline[0][1]} and {outline[1][1]}"
         )
-    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), a[:4], b[:4])
+    rows = lambda f: (f.episodes, f.counts, f.tree, f.simulation)
+    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), rows(a), rows(b))
     return _best("merge", Failures(*arrays, 0, 0), top)._replace(
         seen=a.seen + b.seen, dropped=a.dropped + b.dropped
     )

@@ -9,7 +9,10 @@ from typing import Any, NamedTuple
 import jax
 from jax.tree_util import Partial
 
-__all__ = ["GROUPS", "KINDS", "Incident", "Log", "hosted", "incidents", "since", "sources"]
+from jast._doors import listed
+
+__all__ = ["KINDS", "Incident", "incidents"]
+__dir__ = listed(__all__)
 
 GROUPS = 100
 """The most different messages that a `Log` keeps apart."""

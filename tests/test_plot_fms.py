@@ -47,7 +47,7 @@ def test_the_failing_arc_is_shown(x64):
     sim = fms()
     episode = jast.replay(sim, route())
     path = fms_path(sim, episode)
-    ground, turn = drawn(plot.fms(sim, episode))
+    ground, turn = drawn(plot.fms(episode, sim))
     title, other = ground.get_title(loc="left"), turn.get_title(loc="left")
     assert (
         "failure at step 12" in title
@@ -78,15 +78,15 @@ def test_the_failing_arc_is_shown(x64):
 def test_other_routes_are_drawn(x64):
     sim = fms()
     sound = plot.fms(
-        sim,
         jast.replay(sim, route((200.0, 180.0)).at[1, 1].set(30.0))._replace(states=None),
+        sim,
         plt.figure(layout="constrained").subplots(1, 2),
     )
     assert "no failure" in drawn(sound)[0].get_title(loc="left") and "was not fitted" not in sound[
         1
     ].get_title(loc="left")
-    drawn(plot.fms(sim, jast.replay(sim, route()[:3])))
-    empty = drawn(plot.fms(sim, jast.replay(sim, route()[:0])))
+    drawn(plot.fms(jast.replay(sim, route()[:3]), sim))
+    empty = drawn(plot.fms(jast.replay(sim, route()[:0]), sim))
     assert not empty[1].lines and len(lines(empty[0], "predicted path")[0]) == 2
 
 
@@ -96,12 +96,12 @@ def test_fms_asks_for_an_episode_of_its_own(x64):
     many = jax.tree.map(lambda a: jnp.stack([a, a]), episode)
     for bad, match in (
         (
-            lambda: plot.fms(sim, many),
+            lambda: plot.fms(many, sim),
             r"plot.fms: episode must be one Episode, received Episode with leading axes \(2,\)",
         ),
-        (lambda: plot.fms(walk1d(), episode), "fms_path: sim must be a jast.simulators.fms"),
+        (lambda: plot.fms(episode, walk1d()), "fms_path: sim must be a jast.simulators.fms"),
         (
-            lambda: plot.fms(sim, episode, plt.figure().subplots()),
+            lambda: plot.fms(episode, sim, plt.figure().subplots()),
             "plot.fms: axes must be at least 2",
         ),
     ):

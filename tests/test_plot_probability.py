@@ -154,7 +154,7 @@ def test_probability_refuses(arguments, text):
 
 
 def test_a_fan_replays_every_failure():
-    ax = drawn(plot.failure_fan(WALK, FAILED, lambda s: s, FEW))
+    ax = drawn(plot.failure_fan(FAILED, WALK, lambda s: s, FEW))
     behind = [line for line in ax.lines if line.get_color() == plot.style.GREY]
     lines = [
         line
@@ -177,12 +177,12 @@ def test_a_fan_replays_every_failure():
 
 
 def test_a_fan_of_miss_distances():
-    ax = drawn(plot.failure_fan(WALK, FailureSamples(FAILED, 5.0, 5, 0.5, 100), most=3))
+    ax = drawn(plot.failure_fan(FailureSamples(FAILED, 5.0, 5, 0.5, 100), WALK, most=3))
     lines = [line for line in ax.lines if len(line.get_xdata()) and line.get_linestyle() != "None"]
     assert len(lines) == 3 and legend(ax) == ["3 failures"] and ax.get_ylabel() == "miss distance"
     assert all(line.get_ydata()[-1] == 0 for line in lines)
     given = plt.figure().subplots()
-    assert plot.failure_fan(WALK, FAILED, ax=given) is given
+    assert plot.failure_fan(FAILED, WALK, ax=given) is given
 
 
 def test_a_fan_refuses():
@@ -198,13 +198,13 @@ def test_a_fan_refuses():
                 "plot.failure_fan: samples must be FailureSamples or Episodes with one leading axis"
             ),
         ):
-            plot.failure_fan(WALK, other)
+            plot.failure_fan(other, WALK)
     with pytest.raises(ValueError, match="plot.failure_fan: most must be"):
-        plot.failure_fan(WALK, FAILED, most=0)
+        plot.failure_fan(FAILED, WALK, most=0)
     with pytest.raises(
         ValueError, match=r"plot.failure_fan: value must return one number, received shape \(2,\)"
     ):
-        plot.failure_fan(WALK, FAILED, lambda s: jnp.zeros(2))
+        plot.failure_fan(FAILED, WALK, lambda s: jnp.zeros(2))
 
 
 def traces(log_w, failing=None):
@@ -252,3 +252,21 @@ def test_weights_of_any_kind():
         match="plot.weights: traces must hold at least 2 failures, received 0 for 'none'",
     ):
         plot.weights({"none": traces(np.zeros(9), np.zeros(9, bool))})
+
+
+def test_a_fan_of_an_archive_and_its_labels():
+    archive = jast.search.monte_carlo(jax.random.key(0), WALK, episodes=5000, top=8)
+    for found in (archive, archive.failures):
+        ax = drawn(plot.failure_fan(found, WALK, label="offset (m)"))
+        assert legend(ax) == [f"{len(archive.failures)} failures"] and len(archive.failures) > 1
+        assert ax.get_ylabel() == "offset (m)"
+
+    def wind_speed(state):
+        return state
+
+    named = plot.failure_fan(archive, WALK, wind_speed)
+    assert named.get_ylabel() == "wind speed"
+    unnamed = plot.failure_fan(archive, WALK, lambda s: s)
+    assert unnamed.get_ylabel() == "number of the state"
+    with pytest.warns(DeprecationWarning, match="failure_fan: the order is"):
+        plot.failure_fan(WALK, archive)

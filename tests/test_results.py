@@ -131,3 +131,44 @@ def test_a_repr_does_not_raise_whatever_the_leaves_are():
 def test_html_is_escaped():
     table = results.html_table("a<b", {"x": "<script>"})
     assert "<script>" not in table and "&lt;script&gt;" in table and "a&lt;b" in table
+
+
+# the archive is a sequence
+
+
+def test_an_archive_is_a_sequence_of_episodes(equal):
+    archive = made("failures")
+    assert len(archive) == archive.size == 64 and isinstance(archive[2], jast.Episode)
+    equal(archive[2], archive.episode(2))
+    equal(archive[-1], archive.episode(63))
+    every = list(archive)
+    assert len(every) == 64
+    equal(every[5], archive[5])
+    few = archive[3:7]
+    assert isinstance(few, jast.failures.Failures) and len(few) == 4 and few.seen == archive.seen
+    equal(few[1], archive[4])
+    np.testing.assert_array_equal(few.simulation, archive.simulation[3:7])
+    with pytest.raises(IndexError, match="within the 64 episodes held, received 64"):
+        archive[64]
+    with pytest.raises(TypeError):
+        archive["best"]
+
+
+def test_an_archive_is_a_pytree(equal):
+    archive = made("failures")
+    leaves, treedef = jax.tree.flatten(archive)
+    equal(treedef.unflatten(leaves), archive)
+    assert len(leaves) == len(jax.tree.leaves(archive.episodes)) + 5
+    shifted = jax.jit(lambda f: f.replace(seen=f.seen + 1))(archive)
+    assert shifted.seen == archive.seen + 1 and archive._replace(dropped=3).dropped == 3
+
+
+# doors
+
+
+def test_a_door_lists_its_public_names_only():
+    for door in (jast, jast.search, jast.estimate, jast.heads, jast.failures, jast.incidents):
+        assert dir(door) == sorted(door.__all__)
+        for name in dir(door):
+            assert getattr(door, name) is not None
+    assert "grow" not in dir(jast.search) and "plot" in dir(jast)

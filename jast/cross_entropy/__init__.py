@@ -2,7 +2,7 @@
 surrogates and mixtures.
 """
 
-from jast._doors import door
+from jast._doors import door, listed
 from jast.cross_entropy import schedules
 from jast.cross_entropy.gaussian import Gaussian, normal
 from jast.cross_entropy.methods import (
@@ -47,3 +47,4 @@ __all__ = [
 
 _MOVED = ("FailureProposal", "failure_proposal")
 __getattr__ = door(__name__, renamed={name: f"jast.estimate:{name}" for name in _MOVED})
+__dir__ = listed(__all__)

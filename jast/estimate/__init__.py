@@ -2,6 +2,7 @@
 estimators that find their own proposal.
 """
 
+from jast._doors import listed
 from jast.estimate.adaptive import (
     adaptive_cross_entropy,
     failure_probability,
@@ -37,3 +38,5 @@ __all__ = [
     "subset_simulation",
     "trace_proposal",
 ]
+
+__dir__ = listed(__all__)

@@ -2,6 +2,7 @@
 trees.
 """
 
+from jast._doors import listed
 from jast.heads.heads import Heads, Moments
 from jast.heads.histogram import as_policy
 from jast.heads.networks import Head, make_head
@@ -22,3 +23,5 @@ __all__ = [
     "save",
     "settings",
 ]
+
+__dir__ = listed(__all__)

@@ -2,22 +2,24 @@
 only when something is drawn.
 
 Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns
-the axes. The colours are Okabe and Ito's, told apart by colour-blind readers; what matters is told
-by shape or words as well.
+the axes. What is drawn comes first, then its simulator where a picture needs it. The colours are
+Okabe and Ito's, told apart by colour-blind readers; what matters is told by shape or words as well.
 
 Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one
 simulator: `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
 `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`,
-`failure_fan`, `weights`. Of weakness recognition: `failures_found`, `roc`, `failure_grid`,
-`influence`.
+`failure_fan`, `weights`, `levels`. Of failure policies: `training`. Of weakness recognition:
+`failures_found`, `roc`, `failure_grid`, `influence`.
 """
 
+from jast._doors import listed
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.failing_inputs import failure_grid, influence
 from jast.plot.ferry import ferry
 from jast.plot.fms import fms
 from jast.plot.general import distances, disturbances, history
+from jast.plot.learning import levels, training
 from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.trials import trial_distances, trials
@@ -39,11 +41,15 @@ __all__ = [
     "fms",
     "history",
     "influence",
+    "levels",
     "probability",
     "proposal_contours",
     "roc",
     "surrogate_samples",
+    "training",
     "trial_distances",
     "trials",
     "weights",
 ]
+
+__dir__ = listed(__all__)

@@ -3,12 +3,15 @@ predictor says of it.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast.episode import Episode
 from jast.plot import style
+from jast.simulator import Simulator
 from jast.simulators.fms import FIXES, KLAX, KSFO
 from jast.simulators.fms.events import EVENTS, FOOT, extent
 from jast.simulators.fms.geodesic import direct, inverse
@@ -21,7 +24,8 @@ POINTS = 181  # on an arc
 UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " rad"}
 
 
-def fms(sim, episode, axes=None):
+@style.result_first
+def fms(episode: Episode, sim: Simulator, axes: Any = None) -> list:
     """One `Episode` of an fms simulator: the route on a map (left; degrees), and the turn with the
     largest error of its arc, enlarged (right; nmi from its waypoint). Where the defect acted, it is
     the second of the turns that overlap. Returns the list of Axes.

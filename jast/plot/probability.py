@@ -2,13 +2,19 @@
 whether the weights can be trusted.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import numpy as np
 
 from jast._checks import whole
 from jast.episode import Episode, replay
 from jast.estimate import Estimate, FailureSamples, Traces, pareto_k
+from jast.failures import Failures
 from jast.plot import style
+from jast.search.result import SearchResult
+from jast.simulator import Simulator
 
 __all__ = ["failure_fan", "probability", "weights"]
 
@@ -85,18 +91,38 @@ def probability(estimates, truth=None, ax=None):
     return ax
 
 
-def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
+@style.result_first
+def failure_fan(
+    samples: SearchResult | Failures | FailureSamples | Episode,
+    sim: Simulator,
+    value: Callable[[Any], Any] | None = None,
+    nominal: Episode | None = None,
+    ax: Any = None,
+    most: int = 200,
+    label: str | None = None,
+) -> Any:
     """How a number of the state runs to failure, a line an episode with a mark where it fails, in
     two colours where some end above 0 and others below.
 
-    ``samples``: `jast.estimate.FailureSamples` or a batch of `Episode` with one leading axis; each
-    is replayed. ``value``: state -> number (default: the miss distance). ``nominal``: a batch of
-    other episodes, grey and behind. At most ``most`` of a batch are drawn, evenly taken. Returns
-    the Axes. ValueError for samples of another kind, a value that is not one number and ``most``
-    below 1.
+    Args:
+        samples: a result of a search, its archive, `jast.estimate.FailureSamples`, or a batch of
+            `Episode` with one leading axis; each is replayed.
+        sim: their simulator.
+        value: state -> number (default: the miss distance).
+        nominal: a batch of other episodes, grey and behind.
+        most: of a batch are drawn, evenly taken.
+        label: of the axis (default: the name of ``value``).
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for samples of another kind, a value that is not one number, and ``most`` below
+            1.
     """
     caller = "failure_fan"
-    samples = samples.episodes if isinstance(samples, FailureSamples) else samples
+    samples = samples.failures if isinstance(samples, SearchResult) else samples
+    samples = samples.episodes if isinstance(samples, FailureSamples | Failures) else samples
     lines = _lines(caller, "samples", sim, samples, value, most)
     behind = [] if nominal is None else _lines(caller, "nominal", sim, nominal, value, most)
     with style.axes(ax, (6.8, 3.8)) as ax:
@@ -138,7 +164,7 @@ def failure_fan(sim, samples, value=None, nominal=None, ax=None, most=200):
                 zorder=4,
             )
             ax.plot([], [], color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
-        ax.set(xlabel="step", ylabel="miss distance" if value is None else "value", xlim=(0, None))
+        ax.set(xlabel="step", ylabel=label or _name(value), xlim=(0, None))
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
     return ax
@@ -216,6 +242,14 @@ def weights(traces, ax=None):
     return ax
 
 
+def _name(value):
+    """What a picture calls a number of the state."""
+    if value is None:
+        return "miss distance"
+    name = getattr(value, "__name__", "<lambda>")
+    return "number of the state" if name == "<lambda>" else name.replace("_", " ")
+
+
 def _row(ax, e, y, interval):
     """One estimate at the height ``y``."""
     low, high = e.interval
@@ -237,7 +271,9 @@ def _row(ax, e, y, interval):
         if e.reliable
         else dict(color=style.VERMILION, linestyle=(0, (2, 1.5)))
     )
-    ax.plot([max(low, np.finfo(float).tiny), high], [y, y], **look, linewidth=1.6, zorder=3)
+    ends = [max(low, np.finfo(float).tiny), high]
+    # with caps that stand out of the dot, which is wider than a good interval
+    ax.plot(ends, [y, y], **look, linewidth=1.6, marker="|", markersize=11, zorder=3)
     marker, label = ("o", f"estimate, {interval}") if e.reliable else ("X", "UNRELIABLE")
     ax.plot(
         e.mean,

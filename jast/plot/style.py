@@ -1,13 +1,18 @@
 """What the pictures share: colours, settings of matplotlib, and small helpers."""
 
+import functools
+import warnings
+from collections.abc import Callable
 from contextlib import contextmanager
 from io import BytesIO
 from operator import index
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jast.episode import Episode
+from jast.simulator import Simulator
 
 __all__ = [
     "BLUE",
@@ -29,6 +34,7 @@ __all__ = [
     "iteration",
     "one",
     "panels",
+    "result_first",
     "shade",
     "styled",
     "writable",
@@ -139,6 +145,25 @@ def iteration(caller, name, k, run):
     if isinstance(k, bool) or not 1 <= number <= run:
         raise ValueError(f"plot.{caller}: {name} must be in 1 .. {run}, received {k!r}")
     return number
+
+
+def result_first(picture: Callable[..., Any]) -> Callable[..., Any]:
+    """A picture of (result, sim, ...) that also takes the order of earlier versions, (sim, result,
+    ...), with a DeprecationWarning.
+    """
+
+    @functools.wraps(picture)
+    def either(*args: Any, **named: Any) -> Any:
+        if len(args) > 1 and isinstance(args[0], Simulator):
+            text = (
+                f"plot.{picture.__name__}: the order is (result, sim) now; (sim, result) goes with"
+                " the next version"
+            )
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
+            args = (args[1], args[0], *args[2:])
+        return picture(*args, **named)
+
+    return either
 
 
 def panels(caller, axes, least, each):

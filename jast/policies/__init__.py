@@ -1,7 +1,10 @@
 """Learned failure policies: who is taught to make a system fail, in its likeliest ways."""
 
+from jast._doors import listed
 from jast.policies.failure_policy import FailurePolicy, History
 from jast.policies.soft_actor_critic import sac
 from jast.policies.storage import load, save
 
 __all__ = ["FailurePolicy", "History", "load", "sac", "save"]
+
+__dir__ = listed(__all__)

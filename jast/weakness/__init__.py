@@ -2,6 +2,7 @@
 a classifier gets wrong, found with few calls of it.
 """
 
+from jast._doors import listed
 from jast.weakness.contract import Seen, Selector, Step
 from jast.weakness.data import Data, digits, from_idx, idx
 from jast.weakness.influence import influence
@@ -35,3 +36,5 @@ __all__ = [
     "thesis",
     "validate",
 ]
+
+__dir__ = listed(__all__)

@@ -1,0 +1,86 @@
+"""How what draws failures was learned: the training of a policy, and the levels of a proposal."""
+
+from typing import Any
+
+import numpy as np
+
+from jast.estimate import FailureProposal
+from jast.plot import style
+from jast.policies import FailurePolicy
+
+__all__ = ["levels", "training"]
+
+
+def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = None) -> list:
+    """The training of a failure policy over its episodes: the share of them that fail, and the mean
+    log p of those in the latent numbers, relative to the mode, a panel each.
+
+    Args:
+        policies: of `jast.policies.sac`, or a dict of name -> policy.
+        axes: two, to draw into.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for what is no failure policy, and for too few axes.
+    """
+    policies = policies if isinstance(policies, dict) else {"": policies}
+    _check("training", "policies", policies, FailurePolicy)
+    with style.axes(axes, (6.8, 5.4), 2) as axes:
+        share, log_p = axes = style.panels("training", axes, 2, "quantity")[:2]
+        for i, (name, policy) in enumerate(policies.items()):
+            h, look = policy.history, dict(color=style.COLOURS[i % len(style.COLOURS)], label=name)
+            share.plot(h.episodes, h.failing_share, **look)
+            log_p.plot(h.episodes, h.log_p, **look)  # NaN where none failed: not drawn
+        share.set(ylabel="share that fails", ylim=(0, None))
+        log_p.set(ylabel="mean log p of failures", xlabel="episodes")
+        share.figure.align_ylabels(axes)
+        _legend(share, policies)
+    return axes
+
+
+def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Any = None) -> Any:
+    """The miss distance that the elites of each iteration of `jast.estimate.failure_proposal`
+    reached; 0 is a failure.
+
+    Args:
+        proposals: one run, or a dict of name -> run.
+        ax: to draw into.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for what is no such result, and a batch of runs.
+    """
+    proposals = proposals if isinstance(proposals, dict) else {"": proposals}
+    _check("levels", "proposals", proposals, FailureProposal)
+    with style.axes(ax, (6.8, 3.8)) as ax:
+        for i, (name, found) in enumerate(proposals.items()):
+            reached = np.asarray(found.levels, float)
+            if reached.ndim != 1:
+                raise ValueError(
+                    f"plot.levels: proposals must be one run each, received {reached.shape[:-1]}"
+                )
+            at = np.arange(1, len(reached) + 1)
+            look = dict(color=style.COLOURS[i % len(style.COLOURS)], marker=style.MARKERS[i % 6])
+            ax.plot(at, np.where(np.isfinite(reached), reached, np.nan), label=name, **look)
+        ax.set(xlabel="iteration", ylabel="miss distance of the elites", ylim=(0, None))
+        ax.xaxis.get_major_locator().set_params(integer=True)
+        _legend(ax, proposals)
+    return ax
+
+
+def _check(caller: str, name: str, given: dict, kind: type) -> None:
+    received = sorted({type(v).__name__ for v in given.values()}) or "none"
+    if not given or not all(isinstance(v, kind) for v in given.values()):
+        raise ValueError(
+            f"plot.{caller}: {name} must be a {kind.__name__} or a dict of name -> one, received"
+            f" {received}"
+        )
+
+
+def _legend(ax: Any, named: dict) -> None:
+    if set(named) != {""}:
+        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
