@@ -1,11 +1,17 @@
-"""Strict JAX for every test: no silent promotion, two CPU devices, warnings are errors.
-``JAST_X64=1`` runs the whole suite in float64.
+"""Strict JAX for every test: no silent promotion, two CPU devices, warnings are errors; one cache of
+compiled programs for workers, kernels of notebooks and other processes. ``JAST_X64=1`` runs the
+whole suite in float64.
 """
 
 import os
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy and SciPy are imported
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jast-tests"),
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -15,11 +21,27 @@ jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_enable_x64", os.environ.get("JAST_X64", "0") == "1")
-jax.config.update(
-    "jax_compilation_cache_dir",
-    str(Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "jast-tests"),
+
+QUICK = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    " --xla_cpu_parallel_codegen_split_count=1"
 )
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+"""Compiles small programs in a seventh of the time; they run slower and round otherwise."""
+
+
+def pytest_configure(config):
+    """The short tests are compiled quickly, the long ones as a user's programs are."""
+    if config.option.markexpr == "not long":
+        os.environ.setdefault("XLA_FLAGS", QUICK)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Tests of bits run twice: with the long ones too, where they are compiled as users have it."""
+    if config.option.markexpr == "long":
+        for item in items:
+            if "equal" in item.fixturenames or item.get_closest_marker("bits"):
+                item.add_marker("long")
 
 
 @pytest.fixture
@@ -52,10 +74,14 @@ def equal():
     return check
 
 
+MAPS = Path("/proc/self/maps")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def let_programs_go():
-    """Compiled programs of one file are of no use to the next, and a process can hold only so many
-    of them (each maps memory).
+    """A process may have 65,530 maps of memory, and each compiled program takes a few: forget them
+    before there are too many.
     """
     yield
-    jax.clear_caches()
+    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
