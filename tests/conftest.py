@@ -1,9 +1,10 @@
-"""Strict JAX for every test: no silent promotion, two CPU devices, warnings are errors; one cache of
-compiled programs for workers, kernels of notebooks and other processes. ``JAST_X64=1`` runs the
-whole suite in float64.
+"""Strict JAX for every test: no silent promotion, two CPU devices, warnings are errors; one cache
+of compiled programs for workers, kernels of notebooks and other processes. ``JAST_X64=1`` runs
+the whole suite in float64.
 """
 
 import os
+import sys
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy and SciPy are imported
@@ -55,6 +56,20 @@ def x64():
     """float64 for one test, whatever the suite runs in."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """float32, and float64 inside its context, whatever the suite runs in."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.fixture

@@ -7,8 +7,31 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 import jast
-from jast.distributions import Categorical, Independent, Joint, Normal
+from jast.distributions import Categorical, Independent, Joint, Normal, seeds
 
+PUBLISHED = [
+    0.9795401687709587,
+    0.931634727796635,
+    0.9182992945295753,
+    0.9875367896498295,
+    0.9540570304688828,
+    0.8771477273691892,
+    0.862390861979752,
+    0.8795539869456118,
+    0.8453253347665413,
+    0.8486280841264486,
+    0.6894060333380425,
+    0.6295909310314968,
+    0.41676262118668805,
+    0.4127368211497019,
+    0.41815086583326605,
+    0.4188880550807259,
+    0.4833180771470985,
+    0.4700646283098928,
+    0.44995750050640954,
+    0.454360642513824,
+]
+"""The best failure published for the ferry: reward 29.092054904933118, collision at step 20."""
 S0 = dict(
     reward=jast.rewards.standard(event_bonus=30.0, density="mode"),
     actions=jast.actions.uniform(0.0, 1.0),
@@ -116,3 +139,45 @@ def plane(threshold=3.0, sight=jnp.inf):
     return jast.Simulator(
         _plane_init, _plane_step, _plane_disturbance, evaluate, 5, observe=observe
     )
+
+
+def _dice_init(x0):
+    return jnp.zeros((), jnp.int32)
+
+
+def _dice_step(s, x):
+    return s + (x % 6).astype(jnp.int32)
+
+
+def _dice_disturbance(s):
+    return seeds()
+
+
+def _dice_evaluate(s):
+    return s >= 30, jnp.maximum(30 - s, 0).astype(jnp.zeros(()).dtype)
+
+
+def dice():
+    """Eight throws from seeds, whose density is unknown; fails at 30 points."""
+    return jast.Simulator(_dice_init, _dice_step, _dice_disturbance, _dice_evaluate, 8)
+
+
+def _gap(beta, x):
+    return beta - x.sum() / jnp.sqrt(x.size).astype(x.dtype)
+
+
+def hyperplane(beta=4.0, dimension=4):
+    """P(failure) = Phi(-beta)."""
+    return jast.simulators.limit_state(Partial(_gap, jnp.asarray(beta)), dimension)
+
+
+def line(**changes):
+    """A walk by given steps, as a simulator to be bent."""
+    fields = dict(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
+        horizon=10,
+    )
+    return jast.Simulator(**(fields | changes))

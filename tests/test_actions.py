@@ -15,13 +15,6 @@ from jast import actions
 from jast import distributions as D
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    """float32, and float64 inside its context, in every run of the suite."""
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def kinds(dtype):
     return dict(
         samples=actions.samples(),

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.tree_util import Partial
-from systems import S0, ring, two_densities, walk
+from checks import archive_replays
+from systems import S0, hyperplane, ring, two_densities, walk
 
 import jast
 from jast import actions, rewards
@@ -17,15 +17,6 @@ from jast.search.monte_carlo import monte_carlo
 
 SMALL = dict(samples=100, elites=10, iterations=10)
 WEIGHED = rewards.shaped(20.0, event_bonus=30.0, density="mode")
-
-
-def hyperplane(beta):
-    """P(failure) = Phi(-beta)."""
-    return jast.simulators.limit_state(Partial(_hyperplane, jnp.asarray(beta)), 4)
-
-
-def _hyperplane(beta, x):
-    return beta - x.sum() / 2
 
 
 def lock():
@@ -44,15 +35,6 @@ def lock():
     )
 
 
-def check_replays(sim, result, reward, equal):
-    f = result.failures
-    for i in range(f.size):
-        again = jax.device_get(jast.replay(sim, f.episode(i), reward=reward)._replace(states=None))
-        equal(again, f.episode(i))
-        assert again.failure
-    assert f.size and result.best.reward == f.episodes.reward[0] == f.episodes.reward.max()
-
-
 def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     """Phi(-6) = 1e-9, and the likeliest failure is x = 3 everywhere."""
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
@@ -61,7 +43,7 @@ def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     assert (
         r.failing.all() and r.failures.size == 64 and r.settings["actions"] == "actions.quantiles"
     )
-    check_replays(sim, r, reward, equal)
+    assert archive_replays(sim, r, reward, equal)
     np.testing.assert_allclose(r.best.disturbances[0], 3, atol=0.3)
 
 
@@ -82,7 +64,7 @@ def test_ferry(key, equal, choice):
         and r.simulator_steps <= 36_000 * 21
         and r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
     )
-    check_replays(sim, r, S0["reward"], equal)
+    assert archive_replays(sim, r, S0["reward"], equal)
     assert (
         r.history.best_reward.shape == (30, 4)
         and (np.diff(r.history.best_reward, axis=0) >= 0).all()
@@ -98,7 +80,7 @@ def test_ferry(key, equal, choice):
 def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim, reward = ring(), rewards.standard()
     r = cem(key, sim, actions=choice, trees=4)
-    check_replays(sim, r, reward, equal)
+    assert archive_replays(sim, r, reward, equal)
     assert (
         r.failing.all()
         and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
@@ -109,7 +91,7 @@ def test_random_start_of_a_rare_failure(key, equal):
     """P = 4e-13; the likeliest failure starts at .526 and drifts by .047 a step."""
     sim, reward = jast.simulators.landing(), rewards.Partial(_far_from_the_line)
     r = cem(key, sim, reward=reward)
-    check_replays(sim, r, reward, equal)
+    assert archive_replays(sim, r, reward, equal)
     assert abs(r.best.x0) == pytest.approx(0.526, abs=0.06) and abs(
         r.best.disturbances
     ).mean() == pytest.approx(0.0474, abs=0.006)
@@ -124,7 +106,7 @@ def test_seeds_of_unknown_density(key, equal):
     assert not monte_carlo(key, sim, episodes=9000).failing.any()
     r = cem(key, sim, trees=3)
     assert r.failing.all() and r.settings["actions"] == "actions.samples"
-    check_replays(sim, r, rewards.standard(), equal)
+    assert archive_replays(sim, r, rewards.standard(), equal)
 
 
 def test_trees_are_independent_of_their_number(key, equal):

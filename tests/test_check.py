@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from jax.tree_util import Partial
+from systems import line
 
 import jast
 from jast import actions
@@ -15,17 +16,6 @@ from jast import distributions as D
 from jast.contract import contract
 from jast.intervals import clopper_pearson
 from jast.simulators import ferry, landing, limit_state, walk1d
-
-
-def line(**changes):
-    fields = dict(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: D.Normal(0.0, 1.0),
-        evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
-        horizon=10,
-    )
-    return jast.Simulator(**(fields | changes))
 
 
 class Bare:

@@ -8,19 +8,11 @@ from hypothesis import strategies as st
 
 from jast import distributions as D
 
-DTYPES = ["float32", "float64"]
 unit = st.floats(0.0, 1.0, width=32)
 
 
 def tolerance(dtype, single, double):
     return single if dtype == "float32" else double
-
-
-@pytest.fixture(params=DTYPES)
-def dtype(request):
-    """float32, and float64 inside its context, in every run of the suite."""
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
 
 
 def supported(dtype):

@@ -1,4 +1,5 @@
 import json
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,34 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from systems import PUBLISHED
+from systems import line as walk_by_steps
 
 import jast
 from jast import distributions as D
 from jast import policy, rewards
 from jast.simulators import ferry, landing, walk1d
 
-PAPER = [
-    0.9795401687709587,
-    0.931634727796635,
-    0.9182992945295753,
-    0.9875367896498295,
-    0.9540570304688828,
-    0.8771477273691892,
-    0.862390861979752,
-    0.8795539869456118,
-    0.8453253347665413,
-    0.8486280841264486,
-    0.6894060333380425,
-    0.6295909310314968,
-    0.41676262118668805,
-    0.4127368211497019,
-    0.41815086583326605,
-    0.4188880550807259,
-    0.4833180771470985,
-    0.4700646283098928,
-    0.44995750050640954,
-    0.454360642513824,
-]
 # seeds -> reward, failure, steps, miss distance, log-likelihood by the mode; float64, of an
 # independent implementation
 FERRY = {
@@ -50,7 +31,7 @@ FERRY = {
         28.35724788567899,
         -12.96622688816233,
     ),
-    "paper": (PAPER, 29.092054904933118, True, 20, 4.7764725102288645, -0.9079450950668829),
+    "paper": (PUBLISHED, 29.092054904933118, True, 20, 4.7764725102288645, -0.9079450950668829),
     "near best": (
         [0.998] * 4 + [0.9273, 0.8188, 0.7135, 0.6448] + [0.6431] * 13,
         29.627684415379345,
@@ -114,7 +95,7 @@ def test_ferry_published_episodes(precision):
 
 
 def test_raw_density_differs_from_that_by_the_mode_by_the_normalisers(x64):
-    seeds = np.asarray(PAPER)
+    seeds = np.asarray(PUBLISHED)
     masses = [1 - ((1 - c) ** 2 + c**2) / 2 for c in seeds[:-1]]  # of the tent on [0, 1]
     episode = jast.replay(ferry(), floats(seeds), reward=REWARD)
     assert float(episode.log_prob) == pytest.approx(
@@ -149,7 +130,7 @@ def test_replay_of_fewer_rows_ends_there(equal):
 
 
 def test_padding_is_zero(key):
-    episode = jast.replay(ferry(), floats(PAPER + [0.9]))
+    episode = jast.replay(ferry(), floats(PUBLISHED + [0.9]))
     assert int(episode.length) == 20
     assert not np.asarray(episode.disturbances[20:]).any() and not any(
         np.asarray(leaf[21:]).any() for leaf in episode.states
@@ -180,17 +161,7 @@ def test_replay_names_what_does_not_fit(bad, match):
 
 # ends
 
-
-def line(**changes):
-    """A walk by given steps, as a simulator to be bent."""
-    fields = dict(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: D.Normal(0.0, 1.0),
-        evaluate=lambda s: (s >= 5, jnp.maximum(5 - s, 0)),
-        horizon=4,
-    )
-    return jast.Simulator(**(fields | changes))
+line = partial(walk_by_steps, horizon=4)
 
 
 def test_a_failure_at_the_start_has_length_zero(key):
@@ -223,7 +194,10 @@ def test_the_order_at_a_state_is_failure_then_terminal_then_horizon():
 
 def test_episodic_counts_the_end_only():
     passing = floats([6.0, -3.0, 0.0, 0.0])
-    every, end = jast.replay(line(), passing), jast.replay(line(episodic=True), passing)
+    every, end = (
+        jast.replay(line(), passing),
+        jast.replay(line(episodic=True), passing),
+    )
     assert (int(every.length), bool(every.failure)) == (1, True)
     assert (int(end.length), bool(end.failure), float(end.distance)) == (4, False, 2.0)
     stopped = jast.replay(line(episodic=True, is_terminal=lambda s: s >= 6), passing)

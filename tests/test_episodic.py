@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_tree import FERRY, grown
+from trees import FERRY, grown, problem
 
 import jast
 from jast.distributions import Independent, Normal
@@ -283,8 +283,6 @@ def episodes_of(sim, keys, simulations, memoize, **choices):
         actions=jast.actions.samples(),
         **choices,
     )
-    from test_tree import problem
-
     p = problem(sim, simulations, jast.rewards.episodic(1.0), jast.actions.samples(), **choices)
     n, lanes = tree.log.shape
     i, lane = np.divmod(np.arange(n * lanes, dtype=np.int32), lanes)

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from jax.tree_util import Partial
-from systems import ring, walk
+from systems import hyperplane, ring, walk
 
 import jast
 from jast import distributions as D
@@ -17,15 +16,6 @@ from jast.estimate import failure_proposal
 
 SEEDS = 3
 SMALL = dict(samples=400, iterations=6)
-
-
-def hyperplane(beta=4.0, dimension=4):
-    """P(failure) = Phi(-beta)."""
-    return jast.simulators.limit_state(Partial(_gap, jnp.asarray(beta)), dimension)
-
-
-def _gap(beta, x):
-    return beta - x.sum() / 2
 
 
 def corner():

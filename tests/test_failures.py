@@ -11,34 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from systems import PUBLISHED
 
 import jast
 from jast import failures as F
 from jast.distributions import Independent, Joint, Normal
 
-# the best failure published for the ferry: reward 29.092054904933118, collision at step 20
-P = [
-    0.9795401687709587,
-    0.931634727796635,
-    0.9182992945295753,
-    0.9875367896498295,
-    0.9540570304688828,
-    0.8771477273691892,
-    0.862390861979752,
-    0.8795539869456118,
-    0.8453253347665413,
-    0.8486280841264486,
-    0.6894060333380425,
-    0.6295909310314968,
-    0.41676262118668805,
-    0.4127368211497019,
-    0.41815086583326605,
-    0.4188880550807259,
-    0.4833180771470985,
-    0.4700646283098928,
-    0.44995750050640954,
-    0.454360642513824,
-]
 FERRY = jast.simulators.ferry()
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
 
@@ -91,7 +69,7 @@ def ferry_episodes(*sequences):
 
 
 def perturbed(i):
-    return P[:5] + [P[5] - 0.001 * i] + P[6:]
+    return PUBLISHED[:5] + [PUBLISHED[5] - 0.001 * i] + PUBLISHED[6:]
 
 
 def rollouts(sim, n, seed=0):
@@ -117,7 +95,9 @@ def archive(walks):
 
 
 def test_ferry_failures_are_deduplicated_counted_and_ranked():
-    candidates = ferry_episodes(perturbed(1), P, P, [0.5] * 21, perturbed(2), P)
+    candidates = ferry_episodes(
+        perturbed(1), PUBLISHED, PUBLISHED, [0.5] * 21, perturbed(2), PUBLISHED
+    )
     found = F.collect(
         FERRY, REWARD, candidates, tree=[3, 2, 1, 0, 5, 9], simulation=[7, 8, 8, 0, 1, 9]
     )
@@ -130,7 +110,7 @@ def test_ferry_failures_are_deduplicated_counted_and_ranked():
     assert np.all(np.diff(found.episodes.reward) <= 0) and found.episodes.failure.all()
     assert abs(found.best.reward - 29.092054904933118) < 1e-4 and found.best.length == 20
     np.testing.assert_array_equal(
-        found.best.disturbances[:20], np.asarray(P, found.best.disturbances.dtype)
+        found.best.disturbances[:20], np.asarray(PUBLISHED, found.best.disturbances.dtype)
     )
     assert not found.best.disturbances[20:].any()
 
@@ -145,7 +125,7 @@ def test_archived_numbers_replay_to_the_bit(archive):
 
 
 def test_candidates_that_no_longer_fail_are_dropped_and_counted():
-    calm = ferry_episodes([0.5] * 21, [0.5] * 21, P)
+    calm = ferry_episodes([0.5] * 21, [0.5] * 21, PUBLISHED)
     claimed = calm._replace(failure=np.ones(3, bool))
     found = F.collect(FERRY, REWARD, claimed)
     assert (found.size, found.dropped, found.seen) == (1, 2, 3)
@@ -153,7 +133,7 @@ def test_candidates_that_no_longer_fail_are_dropped_and_counted():
 
 
 def test_unused_rows_do_not_distinguish_failures():
-    pair = ferry_episodes(P, P)
+    pair = ferry_episodes(PUBLISHED, PUBLISHED)
     disturbances = np.array(pair.disturbances)
     disturbances[1, 20] = 0.3  # beyond the length
     assert list(F.collect(FERRY, REWARD, pair._replace(disturbances=disturbances)).counts) == [2]
@@ -187,10 +167,10 @@ def test_no_failure_works_and_says_so(tmp_path):
     back, header = F.load(tmp_path / "none", FERRY)
     same(back, none)
     assert header == dict(seed=1)
-    some = F.collect(FERRY, REWARD, ferry_episodes(P))
+    some = F.collect(FERRY, REWARD, ferry_episodes(PUBLISHED))
     same(F.merge(none, some), some)
     same(F.merge(some, none), some)
-    no_candidates = jax.tree.map(lambda a: a[:0], ferry_episodes(P))
+    no_candidates = jax.tree.map(lambda a: a[:0], ferry_episodes(PUBLISHED))
     same(F.collect(FERRY, REWARD, no_candidates), none)
 
 
@@ -203,7 +183,7 @@ def test_table():
         and lines[-1] == "... and 2 more"
     )
     assert "29.092" in lines[2] and max(map(len, lines)) < 100
-    assert str(F.collect(FERRY, REWARD, ferry_episodes(P))).startswith(
+    assert str(F.collect(FERRY, REWARD, ferry_episodes(PUBLISHED))).startswith(
         "1 distinct failure (1 failing episode simulated)"
     )
 
@@ -328,7 +308,7 @@ def test_interrupted_save_leaves_the_old_file(tmp_path, archive, monkeypatch):
 
 
 def test_precision_is_kept(tmp_path):
-    single = F.collect(FERRY, REWARD, ferry_episodes(P))
+    single = F.collect(FERRY, REWARD, ferry_episodes(PUBLISHED))
     F.save(tmp_path / "single", single)
     with jax.enable_x64(True):
         sim = jast.simulators.ferry((16.0, 0.0))
@@ -336,7 +316,7 @@ def test_precision_is_kept(tmp_path):
             same(F.load(tmp_path / "single", s)[0], single)
         replayed = jax.tree.map(
             lambda a: np.asarray(a)[None],
-            jax.device_get(jast.replay(sim, jnp.array(P), reward=REWARD)),
+            jax.device_get(jast.replay(sim, jnp.array(PUBLISHED), reward=REWARD)),
         )
         double = F.collect(sim, REWARD, replayed)
         assert (

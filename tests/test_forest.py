@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import S0, ring, walk
+from checks import honest, replays
+from systems import S0, dice, ring, walk
 
 import jast
 from jast import failures as F
-from jast.distributions import seeds
 from jast.search import forest, mcts
 from jast.search.tree import run
 
@@ -30,23 +30,10 @@ def _four_branches(x):
     return jnp.min(jnp.stack([near - diagonal, near + diagonal, across + 2, 2 - across]))
 
 
-def _dice(s):
-    return seeds()
-
-
-def _count(s):
-    return s >= 30, jnp.maximum(30 - s, 0).astype(jnp.zeros(()).dtype)
-
-
-DICE = jast.Simulator(
-    lambda x0: jnp.zeros((), jnp.int32),
-    lambda s, x: s + (x % 6).astype(jnp.int32),
-    _dice,
-    _count,
-    8,
-)
 WALK, STATIC = jast.simulators.walk1d(threshold=6.0), jast.simulators.limit_state(_four_branches, 2)
-SYSTEMS = dict(ferry=FERRY, landing=LANDING, ring=RING, walk1d=WALK, limit_state=STATIC, dice=DICE)
+SYSTEMS = dict(
+    ferry=FERRY, landing=LANDING, ring=RING, walk1d=WALK, limit_state=STATIC, dice=dice()
+)
 ACTIONS = dict(
     samples=jast.actions.samples(),
     quantiles=jast.actions.quantiles(),
@@ -60,38 +47,6 @@ def searched(name, **changed):
 
 
 once = functools.cache(searched)
-
-
-def honest(result, sim, reward):
-    """What holds in every result."""
-    archive, history = result.failures, result.history
-    assert archive.seen == history.failures[-1] == round(result.failing_share * result.episodes)
-    assert archive.episodes.failure.all() and archive.counts.sum() <= archive.seen
-    assert (np.diff(archive.episodes.reward) <= 0).all()
-    assert len({F.identity(archive.episode(i)) for i in range(archive.size)}) == archive.size
-    assert (result.first_failure is None) == (archive.seen == 0)
-    assert (
-        result.failing.any() == (archive.seen > 0) and result.failing_trees == result.failing.mean()
-    )
-    assert np.isfinite(result.roots.visits).all() and np.isfinite(result.roots.q).all()
-    if archive.size:
-        assert float(result.best.reward) == archive.episodes.reward[0]
-        np.testing.assert_allclose(
-            result.best_reward_per_tree[result.failing].max(), result.best.reward, rtol=1e-4
-        )
-        assert 1 <= result.first_failure <= result.episodes
-    if archive.seen == 0:
-        assert not result.best.failure
-        best = result.best_reward_per_tree[np.isfinite(result.best_reward_per_tree)]
-        assert not best.size or np.isclose(best.max(), result.best.reward, rtol=1e-4)
-    replays(result.best, sim, reward)
-
-
-def replays(episode, sim, reward):
-    again = jax.device_get(jast.replay(sim, episode, reward=reward))
-    for name in ("log_prob", "distance", "failure", "length", "reward"):
-        a, b = np.asarray(getattr(again, name)), np.asarray(getattr(episode, name))
-        assert a.dtype == b.dtype and a.tobytes() == b.tobytes(), name
 
 
 # --- what a result holds

@@ -30,12 +30,6 @@ FIT, SCORE, DRAW, DEFINITE = (
 )
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def three(dtype):
     return normal(jnp.asarray(MEAN, dtype), jnp.asarray(COVARIANCE, dtype))
 

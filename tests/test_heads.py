@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import honest, replays, same
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from scipy import special
-from systems import S0, plane, ring
-from test_forest import DICE, honest, replays
-from test_tree import same
+from systems import S0, dice, plane, ring
 
 import jast
 from jast import heads as H
@@ -1097,7 +1096,7 @@ def test_a_policy_head_needs_a_distribution_function():
                 " or actions.uniform: cdf: Seeds"
             ),
         ):
-            searched(heads=heads, sim=DICE)
+            searched(heads=heads, sim=dice())
 
 
 def test_heads_cannot_be_trained_in_a_traced_search():

@@ -9,25 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import honest, replays, same
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from jax.tree_util import Partial
+from plain_tree import drawn_as_published, drawn_by_default, plain_search
 from systems import walk
-from test_forest import honest, replays
-from test_tree import (
-    SYSTEMS,
-    counts_add_up,
-    drawn_as_published,
-    drawn_by_default,
-    grown,
-    large_copies,
-    nbytes,
-    plain_search,
-    problem,
-    same,
-    slots_of,
-)
+from trees import SYSTEMS, counts_add_up, grown, large_copies, nbytes, problem, slots_of
 
 import jast
 from jast.counter import tree_keys

@@ -29,12 +29,6 @@ SCORE, DENSITY, PARTS = jax.jit(log_likelihood), jax.jit(log_prob), jax.jit(resp
 DRAW = jax.jit(sample, static_argnums=2)
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def three(dtype):
     return Mixture(*(jnp.asarray(a, dtype) for a in (WEIGHTS, MEANS, COVARIANCES)))
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import archive_replays
 from systems import S0, ring, two_densities, walk
 
 import jast
@@ -45,27 +46,12 @@ def coins():
     )
 
 
-def check_replays(sim, result, reward, equal):
-    """Every archived failure fails again with the very same numbers, and they are distinct, best
-    first.
-    """
-    f = result.failures
-    for i in range(f.size):
-        again = jax.device_get(jast.replay(sim, f.episode(i), reward=reward)._replace(states=None))
-        equal(again, f.episode(i))
-        assert again.failure
-    assert list(f.episodes.reward) == sorted(f.episodes.reward, reverse=True)
-    assert f.seen == round(result.failing_share * result.episodes)
-    if f.size:
-        assert result.best.reward == f.episodes.reward[0] and result.best.failure
-
-
 def test_rate_of_a_known_system(key, equal):
     sim, n, p = jast.simulators.walk1d(), 40_000, 0.1087363323
     for choice in (actions.samples(), actions.quantiles()):
         r = monte_carlo(key, sim, episodes=n, actions=choice)
         assert abs(r.failing_share - p) < 4 * np.sqrt(p * (1 - p) / n)
-        check_replays(sim, r, rewards.standard(), equal)
+        archive_replays(sim, r, rewards.standard(), equal)
     assert (r.episodes, r.invalid, r.failures.size) == (n, 0, 64) and r.failing.tolist() == [True]
     assert r.best_reward_per_tree.shape == (1,) and r.history.best_reward.shape[1] == 1
     assert r.history.simulations[-1] == n and r.history.failures[-1] == r.failures.seen
@@ -126,7 +112,7 @@ def test_kinds_of_disturbances(key, equal, make):
     """Joint and integer disturbances, seeds of unknown density, random starts."""
     sim = make()
     r = monte_carlo(key, sim, episodes=3000)
-    check_replays(sim, r, rewards.standard(), equal)
+    archive_replays(sim, r, rewards.standard(), equal)
     assert r.failing.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
         assert (
@@ -158,7 +144,7 @@ def test_uniform_actions(key, equal):
         lambda s: (sim.evaluate(s)[0] | (sim.evaluate(s)[1] < 15), sim.evaluate(s)[1]),
         21,
     )
-    check_replays(near, monte_carlo(key, near, episodes=20_000, **S0), S0["reward"], equal)
+    archive_replays(near, monte_carlo(key, near, episodes=20_000, **S0), S0["reward"], equal)
 
 
 def test_invalid_episodes_are_counted_and_never_best(key):

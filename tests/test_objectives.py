@@ -24,12 +24,6 @@ MINIMA = {
 }
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def sierra_by_the_text(
     x,
     mean=(0, 0),

@@ -10,30 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pictures import drawn, matplotlib, plt
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-
-import jast  # noqa: E402
-from jast import plot  # noqa: E402
-from jast.distributions import Joint, MultivariateNormalDiag, Normal  # noqa: E402
+import jast
+from jast import plot
+from jast.distributions import Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
 STRAIGHT = jast.replay(FERRY, jnp.full(21, 0.5))
 HIT = jast.replay(FERRY, jnp.array([0.998] * 4 + [0.9273, 0.8188, 0.7135, 0.6448] + [0.6431] * 13))
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
-def drawn(ax):
-    ax.figure.canvas.draw()  # a layout that does not fit warns, and a warning is an error here
-    return ax
 
 
 def result(trees=5, best=None):

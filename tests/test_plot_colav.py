@@ -6,18 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import animation as mpl_animation
+from pictures import drawn, matplotlib, plt
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib import animation as mpl_animation  # noqa: E402
-
-import jast  # noqa: E402
-from jast import plot  # noqa: E402
-from jast.plot.colav import zone_outline  # noqa: E402
-from jast.simulators.colav import SCENARIOS, colav, planner  # noqa: E402
-from jast.simulators.colav.tracker import PERIOD  # noqa: E402
+import jast
+from jast import plot
+from jast.plot.colav import zone_outline
+from jast.simulators.colav import SCENARIOS, colav, planner
+from jast.simulators.colav.tracker import PERIOD
 
 SIM = colav("sharp turn")
 EPISODE = jast.replay(SIM, jnp.linspace(0.1, 0.6, 25))
@@ -27,22 +23,11 @@ KINDS = ("delay", "steering", "noise")
 SHORT = jast.replay(SIM, jnp.linspace(0.1, 0.3, 4))
 
 
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
 @pytest.fixture(scope="module")
 def three():
     """A simulator with every kind of disturbance and an episode of it."""
     sim = colav("crossing", KINDS)
     return sim, jast.rollout(jax.random.key(1), sim)
-
-
-def drawn(axes):
-    axes[0].figure.canvas.draw()  # a layout that does not fit warns, and a warning is an error here
-    return axes
 
 
 def labelled(ax):

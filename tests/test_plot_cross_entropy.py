@@ -6,16 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.patches import Ellipse
+from pictures import drawn, matplotlib, plt
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.patches import Ellipse  # noqa: E402
-
-from jast import cross_entropy as ce  # noqa: E402
-from jast import plot  # noqa: E402
-from jast.cross_entropy import (  # noqa: E402
+from jast import cross_entropy as ce
+from jast import plot
+from jast.cross_entropy import (
     CEResult,
     Gaussian,
     History,
@@ -62,17 +58,6 @@ GAUSSIANS = Gaussian(
     np.arange(2.0 * (K + 1)).reshape(K + 1, 2), np.arange(1.0, K + 2)[:, None, None] * np.eye(2)
 )
 MIXED, MODELLED = made(MIXTURES), made(GAUSSIANS)
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
-def drawn(axes):
-    axes[0].figure.canvas.draw()  # a layout that does not fit warns, and a warning is an error here
-    return axes
 
 
 def ellipses(ax):

@@ -4,29 +4,15 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
+from pictures import drawn, plt
 
 import jast
 from jast import plot
 from jast.search.result import Trials
 from jast.simulators import fms, fms_path, walk1d
 from jast.simulators.fms import KLAX, KSFO
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
-def drawn(axes):
-    axes[0].figure.canvas.draw()  # a layout that does not fit warns, and a warning is an error here
-    return axes
 
 
 def lines(ax, label):

@@ -8,17 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pictures import drawn, legend, plt, words
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-
-import jast  # noqa: E402
-from jast import plot  # noqa: E402
-from jast.estimate import FailureSamples, Traces, pareto_k  # noqa: E402
-from jast.estimate.estimate import Estimate  # noqa: E402
-from jast.plot.style import BLUE, VERMILION  # noqa: E402
+import jast
+from jast import plot
+from jast.estimate import FailureSamples, Traces, pareto_k
+from jast.estimate.estimate import Estimate
+from jast.plot.style import BLUE, VERMILION
 
 WALK = jast.simulators.walk1d()
 FEW = jax.device_get(
@@ -27,17 +23,6 @@ FEW = jax.device_get(
     )
 )
 FAILED = jax.tree.map(lambda a: a[np.asarray(FEW.failure)], FEW)
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
-def drawn(ax):
-    ax.figure.canvas.draw()  # a layout that does not fit warns, and a warning is an error here
-    return ax
 
 
 def made(mean=1e-9, error=0.1, reliable=True, interval=None, level=0.95):
@@ -72,14 +57,6 @@ def made(mean=1e-9, error=0.1, reliable=True, interval=None, level=0.95):
 
 
 NOTHING = made(np.nan, np.nan, False, (0.0, 3.7e-6))
-
-
-def words(ax):
-    return [text.get_text() for text in ax.texts]
-
-
-def legend(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
 
 
 def test_an_estimate_and_its_interval_are_where_the_numbers_say():

@@ -4,16 +4,12 @@ given, and refuses what it cannot draw.
 
 import numpy as np
 import pytest
+from pictures import drawn, legend, matplotlib, plt, words
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-
-from jast import plot  # noqa: E402
-from jast.plot.style import BLUE, GREY, VERMILION  # noqa: E402
-from jast.weakness.measures import auc, roc  # noqa: E402
-from jast.weakness.result import History, Result  # noqa: E402
+from jast import plot
+from jast.plot.style import BLUE, GREY, VERMILION
+from jast.weakness.measures import auc, roc
+from jast.weakness.result import History, Result
 
 N, CLASSES = 60, 4
 NUMBERS = np.random.default_rng(0)
@@ -63,33 +59,13 @@ SEEDS = [made(order) for order in ORDERS]
 NOTHING = made(BEST[::-1][:20])
 
 
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
-def drawn(ax):
-    # a layout that does not fit warns, and a warning is an error here
-    np.atleast_1d(np.asarray(ax, object))[0].figure.canvas.draw()
-    return ax
-
-
 def line(ax, label):
     [found] = [line for line in ax.lines if line.get_label() == label]
     return found
 
 
-def words(ax):
-    return [text.get_text() for text in ax.texts]
-
-
 def titles(axes):
     return [ax.get_title(loc="left") for ax in axes]
-
-
-def legend(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
 
 
 def counted(order):

@@ -15,12 +15,6 @@ from jast import distributions as D
 from jast.cross_entropy import sequences as S
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def scalar(dtype):
     return jax.ShapeDtypeStruct((), jnp.dtype(dtype))
 

@@ -16,12 +16,6 @@ from jast.cross_entropy import ask, ce_method, ce_surrogate, finish, over, start
 METHOD = dict(samples=50, elites=15, iterations=6)
 
 
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
-
-
 def test_points_of_a_walk(dtype):
     """z is the disturbance where it is N(0, 1): the miss distance, or -1 / (1 + c) with c = sum z^2
     / 2 up to the failure.

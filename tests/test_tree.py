@@ -4,16 +4,29 @@ and what it costs in memory and copies.
 
 import functools
 import re
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 import pytest
+from checks import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from systems import S0, ring
+from plain_tree import drawn_as_published, drawn_by_default, plain_search
+from systems import S0
+from trees import (
+    FERRY,
+    LANDING,
+    PLAIN,
+    SYSTEMS,
+    counts_add_up,
+    grown,
+    large_copies,
+    nbytes,
+    problem,
+    visited_children,
+)
 
 import jast
 from jast.counter import tree_keys
@@ -21,317 +34,13 @@ from jast.search import forest
 from jast.search.tree import layout as T
 from jast.search.tree import packing as records
 from jast.search.tree import run
-from jast.search.tree.choice import Choice
 from jast.search.tree.packing import pack, unpack
 
-FERRY, LANDING, RING = jast.simulators.ferry(), jast.simulators.landing(b=0.3), ring()
-PLAIN = dict(reward=jast.rewards.standard(event_bonus=30.0), actions=jast.actions.samples())
-SYSTEMS = dict(ferry=(FERRY, S0), landing=(LANDING, PLAIN), ring=(RING, PLAIN))
 SIZE = dict(trees=5, prunes=3, simulations=120, lanes=3, threads=1)
-
-
-def problem(
-    sim,
-    simulations,
-    reward,
-    actions,
-    widening=(2.0, 0.5),
-    spread=False,
-    focus=1.0,
-    guide=(),
-    **switches,
-):
-    choice = Choice(
-        actions, jnp.asarray(focus, jnp.float32), spread=spread, focused=focus != 1.0, **switches
-    )
-    parts = T.Problem(
-        sim,
-        reward,
-        choice,
-        T.Settings(jnp.asarray(10.0, jnp.float32), T.widths(simulations, *widening)),
-        guide,
-    )
-    return jax.tree.map(jnp.asarray, parts)
-
-
-def grown(sim, keys, prunes=3, simulations=120, memoize="node", **choices):
-    """The tree after its last prune, the visits N(root) before each, and the `Roots` of each."""
-    total = prunes * simulations
-    p = problem(sim, total, **choices)
-    children = int(p.settings.widths.max())
-    tree = run._make(p, keys, total, memoize, T.pages_of(p, total))
-    visits, roots = [], []
-    for turn in range(prunes):
-        tree = run._grow(p, tree, turn * simulations, (turn + 1) * simulations, memoize)
-        visits.append(np.asarray(tree.root_visits))
-        tree, turned = run._prune(p, tree, children, memoize)
-        roots.append(jax.device_get(turned))
-    return tree, visits, roots
-
-
-def slots_of(tree, lane):
-    """What one tree holds: node -> [(visits, sum of returns, child's id, child's reward, v)], the
-    slots of its pages; the only place that knows the layout.
-    """
-    lanes = tree.key.shape[0]
-    pages = np.asarray(tree.edges, np.float64).reshape(-1, lanes, T.ROW)[:, lane]
-    values = (
-        np.asarray(tree.values, np.float64).reshape(-1, lanes, T.PAGE + 1)[:, lane]
-        if len(tree.values)
-        else np.zeros((len(pages), T.PAGE + 1))
-    )
-    made = np.flatnonzero((np.asarray(tree.outcome)[:, lane] & T.FRESH) > 0) + 1
-    out = {}
-    for node in [0, *made]:
-        page, found = node, []
-        while True:
-            row = pages[page]
-            columns = (row[c : c + T.PAGE] for c in (T.VISITS, T.RETURNS, T.CHILD, T.REWARD))
-            found += [
-                (int(n), w, int(i), r, v)
-                for n, w, i, r, v in zip(*columns, values[page, : T.PAGE], strict=True)
-            ]
-            page = int(row[T.LINK])
-            if page == 0:
-                break
-        out[int(node)] = found
-    return out
-
-
-def visited_children(tree, lane):
-    """Of the children that were visited, without v."""
-    return {
-        node: [found[:4] for found in slots if found[0] > 0]
-        for node, slots in slots_of(tree, lane).items()
-    }
 
 
 # --- against an independent search
 # ----------------------------------------------------------------------------
-
-
-def drawn_as_published(keys, simulations, slots):
-    """For each tree: ``child(node, slot, last)`` and ``rollout(i, level, state)``, uniform numbers
-    addressed by the keys of the tree, drawn beforehand.
-    """
-    node_slot = jnp.stack(jnp.divmod(jnp.arange((simulations + 1) * slots), slots), axis=1).astype(
-        jnp.int32
-    )
-
-    @jax.jit
-    def table(key):
-        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(node_slot[:, 0])
-        children = jax.vmap(lambda k, slot: jax.random.uniform(jax.random.fold_in(k, slot), ()))(
-            nodes, node_slot[:, 1]
-        )
-        return children.reshape(-1, slots), rollouts(key, simulations)[0]
-
-    def draw(of_child, of_level):
-        return (
-            lambda node, slot, last: of_child[node, slot],
-            lambda i, level, state: of_level[i, level],
-        )
-
-    return [draw(*(np.asarray(a, np.float64) for a in table(key))) for key in keys]
-
-
-def drawn_by_default(keys, simulations, focus):
-    """The same for spread and focused actions: golden-ratio steps from a random place for each
-    node; every second child, and steps by a coin, near the last.
-
-    The steps only in half of the trees, by a coin of each.
-    """
-
-    @jax.jit
-    def table(key):
-        nodes = jax.vmap(lambda n: T.node_keys(key[None], n[None])[0])(
-            jnp.arange(simulations + 1, dtype=jnp.int32)
-        )
-        return (
-            jax.vmap(lambda k: jax.random.bits(k, (), jnp.uint32))(nodes),
-            *rollouts(key, simulations),
-            jax.random.key_data(key)[1] & 1,
-        )
-
-    near = lambda pred, a, last: (
-        min(max((0.5 if last is None else last) + focus * (a - 0.5), 0.0), 1.0) if pred else a
-    )
-    step = int((5**0.5 - 1) / 2 * 2**32)
-
-    def draw(shift, of_level, coin, of_tree):
-        place = lambda node, slot: ((int(shift[node]) + step * (slot // 2)) % 2**32 >> 8) / 2**24
-        child = lambda node, slot, last: near(slot % 2, place(node, slot), last)
-        return child, lambda i, level, state: near(
-            coin[i, level] & of_tree, float(of_level[i, level]), state[4]
-        )
-
-    return [draw(*map(np.asarray, table(key))) for key in keys]
-
-
-def rollouts(key, simulations):
-    """[simulations, 21] the uniform number and the coin of each level of each simulation."""
-    at = lambda i, level: jax.random.fold_in(jax.random.fold_in(key, i), level)
-    keys = jax.vmap(
-        lambda i: jax.vmap(lambda level: at(i, level))(jnp.arange(21, dtype=jnp.int32))
-    )(jnp.arange(simulations, dtype=jnp.int32))
-    return (
-        jax.vmap(jax.vmap(lambda k: jax.random.uniform(k, ())))(keys),
-        jax.random.key_data(keys)[..., 1] & 1,
-    )
-
-
-class Slot(NamedTuple):
-    """A place for a child."""
-
-    visits: int
-    q: float
-    id: int
-    v: float
-
-
-def plain_search(
-    child,
-    rollout,
-    prunes,
-    simulations,
-    k,
-    alpha,
-    c,
-    value=None,
-    weights=(1.0, 0.0),
-    one=False,
-    follow=False,
-    feed=False,
-    urgent=False,
-    x=16.0,
-):
-    """MCFS-AP on S0 as its pseudo-code has it, in plain Python: the visits of the root's children
-    at each prune, and the reward of every simulation.
-
-    With ``value(state, a)``, of ``weights`` (of Q, of v); ``one``: of a node's children that were
-    not visited only the first is to be had. Third: of each node the children to be had, (visits, Q,
-    id, v), 0 where there is none; the v of an only child is never asked for.
-
-    ``urgent``: children that were not visited first. ``follow``: after a failure better than all
-    before, its actions are put into the tree one by one. ``feed``: at level 11 of 21 a rollout
-    takes what the best episode's rollout took there (with ``follow``, of the failures).
-    """
-
-    def step(state, a):
-        ferry, x, y, heading, last, nearest = state
-        heading = heading + (10 * a - 5) * np.pi / 100
-        ferry, x, y = ferry + 5, x + 5 * np.sin(heading), y + 5 * np.cos(heading)
-        distance = np.hypot(x - ferry, y - 50)
-        nearest = min(nearest, distance)
-        gain = 0.0 if last is None else np.log(1 - abs(a - last))
-        end = distance < 5 or ferry > 100
-        if end:
-            gain += 30.0 if distance < 5 else -nearest
-        return (ferry, x, y, heading, a, nearest), gain, end
-
-    children, count, visits, q, gains, ends, states = (
-        {0: []},
-        {0: 0},
-        {0: 1},
-        {0: 0.0},
-        {0: 0.0},
-        {},
-        {0: (0.0, x, 0.0, 0.0, None, np.hypot(x, 50))},
-    )
-    root, ancestors, log, at_prune = 0, [], [], []
-    # way: the best episode's nodes; ahead: the same while there are more to come
-    best, source, way, ahead, fed, feeds = -np.inf, None, (), None, None, {}
-
-    def rolled(i, level, state):
-        return (
-            feeds[i] if feed and level == 11 and feeds[i] is not None else rollout(i, level, state)
-        )
-
-    def score(n, bonus):
-        if urgent:
-            return np.inf if n.visits == 0 else n.q + c * bonus / np.sqrt(n.visits)
-        return weights[0] * n.q + weights[1] * n.v + c * bonus / np.sqrt(1 + n.visits)
-
-    @functools.cache
-    def v(node, slot):
-        return value(states[node], child(node, slot, states[node][4]))
-
-    def to_be_had(node):
-        ids = [n for n in children[node] if n is not None] + [None] if one else children[node]
-        lonely = value is None or len(children[node]) < 2
-        return [
-            Slot(
-                *((0, 0.0, 0) if n is None else (visits[n], q[n], n)),
-                0.0 if lonely else v(node, slot),
-            )
-            for slot, n in enumerate(ids[: len(children[node])])
-        ]
-
-    for turn in range(prunes):
-        for i in range(turn * simulations, (turn + 1) * simulations):
-            feeds[i] = fed
-            follows, middle = ahead is not None, None
-            node, path = (ahead[-1], ahead[:-1]) if follows else (root, list(ancestors))
-            while True:
-                path.append(node)
-                if ends.get(node):
-                    level = total = None
-                    break
-                # widen by at most one child a visit; 32^0.6 is 8, not a little less
-                if count[node] <= k * visits[node] ** alpha * (1 + 1e-14):
-                    count[node] += 1
-                    children[node].append(None)
-                bonus = np.sqrt(np.log(visits[node]))
-                scores = [score(n, bonus) for n in to_be_had(node)]
-                slot = int(np.argmax(scores))
-                if children[node][slot] is None:
-                    new = i + 1
-                    a = (
-                        rolled(source, len(path) - 1, states[node])
-                        if follows
-                        else child(node, slot, states[node][4])
-                    )
-                    states[new], gains[new], ends[new] = step(states[node], a)
-                    children[node][slot], children[new], count[new], visits[new], q[new] = (
-                        new,
-                        [],
-                        0,
-                        0,
-                        0.0,
-                    )
-                    path.append(new)
-                    node, level, total = new, len(path) - 1, 0.0
-                    break
-                node = children[node][slot]
-            if total is None:
-                total = 0.0
-            else:
-                state, end = states[node], ends[node]
-                while not end:
-                    a = rolled(i, level, state)
-                    middle = a if level == 11 else middle
-                    state, gain, end = step(state, a)
-                    total, level = total + gain, level + 1
-                reward = total + sum(gains[n] for n in path)
-                better = reward > best and (
-                    not follow or np.hypot(state[1] - state[0], state[2] - 50) < 5
-                )
-                if better:
-                    best, source, fed = reward, i, fed if middle is None else middle
-                if follow and (better or follows):
-                    way = list(path)
-                    ahead = None if ends[node] else way
-            for n in reversed(path):
-                total += gains[n]
-                visits[n] += 1
-                q[n] += (total - q[n]) / (visits[n] - (n == 0))
-            log.append(total)
-        at_prune.append([visits[n] for n in children[root] if n is not None])
-        ancestors.append(root)
-        root = max((n for n in children[root] if n is not None), key=visits.get)
-        if root not in way:  # of another branch
-            ahead, best = None, -np.inf if follow else best
-    return at_prune, log, {node: to_be_had(node) for node in children}
 
 
 def agree(key, k, alpha, focus=1.0, x=16.0, **switches):
@@ -398,32 +107,6 @@ def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
 # ----------------------------------------------------------------------------
 
 
-def counts_add_up(tree, k, alpha):
-    """In every node; the greatest number of children of one."""
-    log, outcome = np.asarray(tree.log), np.asarray(tree.outcome)
-    widest = 0
-    for lane in range(log.shape[1]):
-        nodes = visited_children(tree, lane)
-        ran = (outcome[:, lane] & T.RAN) > 0
-        visits, ends = {0: 1 + int(ran.sum())}, set()
-        for found in nodes.values():
-            visits |= {abs(child): n for n, _, child, _ in found}
-            ends |= {-child for _, _, child, _ in found if child < 0}
-        assert set(visits) == set(nodes)  # every node made has one edge that leads to it
-        for node, found in nodes.items():
-            if node in ends:
-                assert not found
-            else:
-                assert visits[node] == 1 + sum(n for n, *_ in found)
-                assert len(found) <= np.floor(k * visits[node] ** alpha) + 1
-            widest = max(widest, len(found))
-        total = sum(w for _, w, _, _ in nodes[0])
-        np.testing.assert_allclose(
-            total / (visits[0] - 1), log[ran, lane].astype(np.float64).mean(), rtol=1e-5
-        )
-    return widest
-
-
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_counts_of_every_node_add_up(name, key):
     sim, choices = SYSTEMS[name]
@@ -448,24 +131,6 @@ def test_the_most_visited_child_becomes_the_root(key):
         np.testing.assert_array_equal(root_visits[turn + 1], most + 120)
     np.testing.assert_array_equal(roots[2].depth, 2)
     np.testing.assert_array_equal(tree.depth, 3)
-
-
-def same(a, b):
-    """Whether two results are of the same trees, to the bit."""
-    np.testing.assert_array_equal(a.best_reward_per_tree, b.best_reward_per_tree)
-    np.testing.assert_array_equal(a.history.best_reward, b.history.best_reward)
-    np.testing.assert_array_equal(a.history.failures, b.history.failures)
-    np.testing.assert_array_equal(a.roots.visits, b.roots.visits)
-    np.testing.assert_array_equal(a.roots.q, b.roots.q)
-    assert (a.episodes, a.first_failure, a.failing_share, a.invalid) == (
-        b.episodes,
-        b.first_failure,
-        b.failing_share,
-        b.invalid,
-    )
-    np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
-    np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
-    assert a.failures.seen == b.failures.seen
 
 
 def searched(name, **changed):
@@ -641,20 +306,6 @@ def compiled_text(sim, simulations, memoize, record=False, **choices):
     return run._grow.lower(p, tree, 0, 100, memoize).compile().as_text()
 
 
-def large_copies(text, capacity):
-    """Lines outside ENTRY that copy or select as many numbers as the tree has nodes, or more."""
-    found, entry = [], False
-    for line in text.splitlines():
-        if line and not line[0].isspace():
-            entry = line.startswith("ENTRY")
-        made = re.match(
-            r"\s+(?:ROOT )?%?[\w.-]+ = \w+\[([\d,]*)\]\S* (copy|select|copy-start)\(", line
-        )
-        if made and not entry and np.prod([int(n) for n in made[1].split(",") if n]) >= capacity:
-            found.append(line.strip())
-    return found
-
-
 def test_large_copies_are_seen():
     """The test below would see one: a select of the whole array in a loop."""
     body = lambda i, a: jnp.where(a[i % 1000] > 0, a.at[i].set(1.0), a[::-1])
@@ -703,13 +354,6 @@ def test_the_program_does_not_grow_with_the_simulations():
 
 # --- memory
 # ----------------------------------------------------------------------------
-
-
-def nbytes(tree):
-    return sum(
-        jax.random.key_data(a).nbytes if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a.nbytes
-        for a in jax.tree.leaves(tree)
-    )
 
 
 @pytest.mark.parametrize("memoize", ["node", "root"])

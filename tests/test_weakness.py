@@ -2,8 +2,6 @@
 answered is lost, and scores are judged as scikit-learn does.
 """
 
-import importlib
-
 import jax
 import numpy as np
 import pytest
@@ -13,11 +11,9 @@ from sklearn.metrics import roc_auc_score, roc_curve
 
 from jast import weakness
 from jast.counter import generator
-from jast.weakness import Selector, Step, validate
+from jast.weakness import Selector, Step, validate, validation
 
 KEY = jax.random.key(0)
-# the package's own `validate` is the function
-validation = importlib.import_module("jast.weakness.validate")
 
 
 def same(a, b):

@@ -1,0 +1,73 @@
+"""What holds in every result of a search."""
+
+import jax
+import numpy as np
+
+import jast
+from jast import failures as F
+
+
+def honest(result, sim, reward):
+    """What holds in every result."""
+    archive, history = result.failures, result.history
+    assert archive.seen == history.failures[-1] == round(result.failing_share * result.episodes)
+    assert archive.episodes.failure.all() and archive.counts.sum() <= archive.seen
+    assert (np.diff(archive.episodes.reward) <= 0).all()
+    assert len({F.identity(archive.episode(i)) for i in range(archive.size)}) == archive.size
+    assert (result.first_failure is None) == (archive.seen == 0)
+    assert (
+        result.failing.any() == (archive.seen > 0) and result.failing_trees == result.failing.mean()
+    )
+    assert np.isfinite(result.roots.visits).all() and np.isfinite(result.roots.q).all()
+    if archive.size:
+        assert float(result.best.reward) == archive.episodes.reward[0]
+        np.testing.assert_allclose(
+            result.best_reward_per_tree[result.failing].max(), result.best.reward, rtol=1e-4
+        )
+        assert 1 <= result.first_failure <= result.episodes
+    if archive.seen == 0:
+        assert not result.best.failure
+        best = result.best_reward_per_tree[np.isfinite(result.best_reward_per_tree)]
+        assert not best.size or np.isclose(best.max(), result.best.reward, rtol=1e-4)
+    replays(result.best, sim, reward)
+
+
+def archive_replays(sim, result, reward, equal):
+    """Every archived failure fails again with the very same numbers, the best comes first; how many
+    there are.
+    """
+    f = result.failures
+    for i in range(f.size):
+        again = jax.device_get(jast.replay(sim, f.episode(i), reward=reward)._replace(states=None))
+        equal(again, f.episode(i))
+        assert again.failure
+    assert list(f.episodes.reward) == sorted(f.episodes.reward, reverse=True)
+    assert f.seen == round(result.failing_share * result.episodes)
+    if f.size:
+        assert result.best.reward == f.episodes.reward[0] and result.best.failure
+    return f.size
+
+
+def replays(episode, sim, reward):
+    again = jax.device_get(jast.replay(sim, episode, reward=reward))
+    for name in ("log_prob", "distance", "failure", "length", "reward"):
+        a, b = np.asarray(getattr(again, name)), np.asarray(getattr(episode, name))
+        assert a.dtype == b.dtype and a.tobytes() == b.tobytes(), name
+
+
+def same(a, b):
+    """Whether two results are of the same trees, to the bit."""
+    np.testing.assert_array_equal(a.best_reward_per_tree, b.best_reward_per_tree)
+    np.testing.assert_array_equal(a.history.best_reward, b.history.best_reward)
+    np.testing.assert_array_equal(a.history.failures, b.history.failures)
+    np.testing.assert_array_equal(a.roots.visits, b.roots.visits)
+    np.testing.assert_array_equal(a.roots.q, b.roots.q)
+    assert (a.episodes, a.first_failure, a.failing_share, a.invalid) == (
+        b.episodes,
+        b.first_failure,
+        b.failing_share,
+        b.invalid,
+    )
+    np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
+    np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
+    assert a.failures.seen == b.failures.seen
