@@ -25,7 +25,7 @@ from jax.tree_util import Partial
 import jast
 from benchmarks import reference
 from jast.counter import tree_keys
-from jast.episode import Progress, begin
+from jast.progress import Progress, begin
 from jast.rewards import as_pytree
 from jast.search.forest import MODES
 from jast.search.tree import run

@@ -15,6 +15,7 @@ from jast import distributions as D
 from jast._jax import is_traced, is_tracing
 from jast.actions import Quantiles, Samples, UniformBox
 from jast.incidents import incidents, since, sources
+from jast.outline import outline
 from jast.simulator import Simulator
 
 __all__ = ["OBSERVED", "check", "contract"]
@@ -87,7 +88,8 @@ def contract(sim, actions=None, observed=True):
 
 
 def _trace(sim, actions, observed):
-    x0 = _draw("start", _call("start", sim.start))
+    start = _call("start", sim.start)
+    x0 = _draw("start", start)
     state = _arrays("init", _call("init", sim.init, x0))
     dist = _call("disturbance", sim.disturbance, state)
     x = _draw("disturbance", dist)
@@ -119,9 +121,7 @@ def _trace(sim, actions, observed):
             _box(actions, x)
         _same(f"{name}: disturbance", _call(name, actions.draw, jax.random.key(0), dist), x)
         if jax.tree.leaves(x0):
-            _same(
-                f"{name}: x0", _call(name, actions.draw_start, jax.random.key(0), sim.start()), x0
-            )
+            _same(f"{name}: x0", _call(name, actions.draw_start, jax.random.key(0), start), x0)
 
 
 def _call(name, function, *args):
@@ -215,9 +215,8 @@ def _probe(sim, actions):
     """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps
     of each (all, of an episodic system).
     """
-    has_mode = D.has_mode(sim.start()) and D.has_mode(
-        sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))
-    )
+    about = outline(sim)
+    has_mode = about.start.mode and about.disturbance.mode
 
     def episode(key, undisturbed):
         def choose(dist, key):

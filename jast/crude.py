@@ -13,10 +13,12 @@ from jax import lax
 from jast import distributions as D
 from jast import results, rewards
 from jast.contract import contract
-from jast.episode import Episode, advance, begin, conclude, rollout
+from jast.episode import Episode, rollout
 from jast.incidents import incidents, since
 from jast.intervals import clopper_pearson
+from jast.outline import outline
 from jast.policy import undisturbed
+from jast.progress import advance, begin, conclude
 
 __all__ = ["Nominal", "nominal"]
 
@@ -79,7 +81,9 @@ def nominal(key, sim, episodes=100_000):
         )
     contract(sim, observed=False)
     episodes, before = int(episodes), incidents(sim)
-    quiet = rollout(key, sim, undisturbed(sim)) if _has_undisturbed(sim) else None  # draws nothing
+    about = outline(sim)
+    calm = about.start.mode and about.disturbance.mode
+    quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
     failures, invalid, mean = jax.device_get(
         _count(key, sim, jnp.asarray(episodes, jnp.int32), LANES)
     )
@@ -137,9 +141,8 @@ def _count(key, sim, episodes, lanes):
         )
 
     zero = jnp.zeros((), jnp.int32)
-    distance = jax.eval_shape(lambda: _outcome(key, sim, True).distance)
     failures, invalid, mean = lax.fori_loop(
-        0, (episodes - 1) // lanes + 1, chunk, (zero, zero, jnp.zeros((), distance.dtype))
+        0, (episodes - 1) // lanes + 1, chunk, (zero, zero, jnp.zeros((), outline(sim).dtype))
     )
     return failures, invalid, jnp.where(invalid < episodes, mean, jnp.nan)
 
@@ -161,15 +164,3 @@ def _outcome(key, sim, live):
     first = first._replace(done=first.done | ~jnp.asarray(live))
     last, _ = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
     return conclude(sim, reward, last, live)
-
-
-def _has_undisturbed(sim):
-    def has():
-        start = sim.start()
-        return D.has_mode(start) and D.has_mode(
-            sim.disturbance(sim.init(D.sample(start, jax.random.key(0))))
-        )
-
-    found = []
-    jax.eval_shape(lambda: found.append(has()))
-    return found[0]

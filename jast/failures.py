@@ -18,7 +18,8 @@ import numpy as np
 from jast import results
 from jast._doors import listed
 from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
-from jast.episode import Episode, _shapes, accumulator, replay
+from jast.episode import Episode, replay
+from jast.outline import outline
 
 __all__ = ["Failures", "collect", "load", "merge", "save"]
 __dir__ = listed(__all__)
@@ -114,12 +115,10 @@ class Failures:
 
 def empty(sim):
     """`Failures` with n = 0, of the shapes and dtypes of ``sim``."""
-    x0, x = jax.eval_shape(_shapes, sim)
-    zero = np.zeros(0, accumulator(sim))
-    x0, x = (
-        jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), x0),
-        jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), x),
-    )
+    like = outline(sim)
+    zero = np.zeros(0, like.dtype)
+    x0 = jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), like.x0)
+    x = jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), like.x)
     none = np.zeros(0, np.int32)
     return Failures(
         Episode(x0, x, zero, zero, np.zeros(0, bool), none, zero), none, none, none, 0, 0
@@ -238,7 +237,8 @@ def load(path, sim=None):
     x0, x = (arrays_of(arrays, name) for name in ("x0", "disturbances"))
     structure = header["structure"]
     if sim is not None:
-        like_x0, like_x = jax.eval_shape(_shapes, sim)
+        like = outline(sim)
+        like_x0, like_x = like.x0, like.x
         _fits(path, "x0", structure["x0"], x0, like_x0, ())
         _fits(path, "disturbances", structure["disturbances"], x, like_x, (sim.horizon,))
         x0, x = jax.tree.structure(like_x0).unflatten(x0), jax.tree.structure(like_x).unflatten(x)

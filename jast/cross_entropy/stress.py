@@ -2,6 +2,7 @@
 cross-entropy methods.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,8 +18,10 @@ from jast import failures as archive
 from jast.contract import contract
 from jast.cross_entropy.gaussian import normal
 from jast.cross_entropy.sequences import player
-from jast.episode import _shapes, random_start, rollout
+from jast.episode import rollout
+from jast.outline import outline
 from jast.rewards import as_pytree
+from jast.simulator import Simulator
 
 __all__ = ["LogLikelihood", "Stress", "over"]
 
@@ -124,31 +127,17 @@ def over(sim, *, reward=None, actions=None):
             f" {actions!r}"
         )
     contract(sim, observed=False)
-    found = {}
-
-    def look():
-        start = sim.start()
-        dist = sim.disturbance(sim.init(D.sample(start, jax.random.key(0))))
-        found["mode"] = D.has_mode(start) and D.has_mode(dist)
-        for name, d, other in (
-            ("start", start, ""),
-            ("disturbance", dist, "; give actions=jast.actions.uniform(low, high)"),
-        ):
-            needed = (
-                random_start(sim) if name == "start" else isinstance(actions, choices.Quantiles)
-            )
-            if needed and not D.has_quantile(d):
-                raise ValueError(
-                    f"over: {name}: {_without_quantile(d)} has no quantile function{other}"
-                )
-
-    jax.eval_shape(look)
+    about = outline(sim)
+    box = isinstance(actions, choices.UniformBox)
+    for name, offer, other in (
+        ("start", about.start, ""),
+        ("disturbance", about.disturbance, "; give actions=jast.actions.uniform(low, high)"),
+    ):
+        if not offer.quantile and not (box and name == "disturbance"):
+            raise ValueError(f"over: {name}: {offer.lacking} has no quantile function{other}")
     contract(sim, actions, observed=False)
-    return Stress(
-        sim,
-        LogLikelihood("mode" if found["mode"] else "raw") if reward is None else as_pytree(reward),
-        actions,
-    )
+    density = "mode" if about.start.mode and about.disturbance.mode else "raw"
+    return Stress(sim, LogLikelihood(density) if reward is None else as_pytree(reward), actions)
 
 
 def _value(sim, reward, actions, z):
@@ -179,24 +168,12 @@ def _policy(sim, actions, z):
     return player(sim, actions, *unflat(z.astype(like.dtype)))
 
 
-def _flat(sim):
+def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:
     """Zeros [D], in the widest float dtype of x0 and x, and the function from a point to the
     latents (of x0, of x [horizon, ...]).
     """
-    x0, x = jax.eval_shape(_shapes, sim)
+    about = outline(sim)
     full = lambda like, *rows: jax.tree.map(
         lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like
     )
-    return ravel_pytree((full(x0), full(x, sim.horizon)))
-
-
-def _without_quantile(dist):
-    """The name of the distribution, or of the first part, that has no quantile function."""
-    if isinstance(dist, D.Joint):
-        parts = jax.tree.leaves(dist.distributions, is_leaf=lambda d: isinstance(d, D.Distribution))
-        return _without_quantile(next(d for d in parts if not D.has_quantile(d)))
-    return (
-        _without_quantile(dist.distribution)
-        if isinstance(dist, D.Independent)
-        else type(dist).__name__
-    )
+    return ravel_pytree((full(about.x0), full(about.x, sim.horizon)))

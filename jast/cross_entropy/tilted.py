@@ -2,6 +2,8 @@
 N(mean, deviation^2) in place of N(0, 1).
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr, ndtri
@@ -9,7 +11,7 @@ from jax.scipy.special import ndtr, ndtri
 from jast import distributions as D
 from jast.cross_entropy.sequences import cells, latent, quantile
 
-__all__ = ["Tilted", "tilted"]
+__all__ = ["Tilted", "tilted", "untiltable"]
 
 
 class Tilted(D.Distribution):
@@ -100,6 +102,18 @@ def tilted(dist, mean, deviation):
             " a distribution function that inverts it"
         )
     return Tilted(dist, mean, deviation)
+
+
+def untiltable(dist: Any) -> str | None:
+    """Why `tilted` cannot serve ``dist``; None where it can."""
+    full = lambda v: jax.tree.map(
+        lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist)
+    )
+    try:
+        tilted(dist, full(0), full(1))
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 def _above(edge, mean, deviation):

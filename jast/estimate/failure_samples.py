@@ -11,7 +11,7 @@ import numpy as np
 
 from jast import results
 from jast._checks import whole
-from jast.episode import Episode, random_start
+from jast.episode import Episode
 from jast.estimate import limit_state as latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
@@ -19,6 +19,7 @@ from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal, latents
+from jast.outline import outline
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -84,7 +85,8 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
-        z = latent.flat(sim, *latents(sim, (e.x0, e.disturbances, e.length), random_start(sim)))
+        recorded = e.x0, e.disturbances, e.length
+        z = latent.flat(sim, *latents(sim, recorded, outline(sim).random_start))
         z, failure, log_w = jax.device_get((z, e.failure, log_w))
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():

@@ -19,13 +19,15 @@ from jast import distributions as D
 from jast import results
 from jast._checks import whole
 from jast.contract import contract
-from jast.episode import accumulator, advance, begin, conclude, rollout
+from jast.episode import rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
 from jast.estimate.limit_state import raw
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
+from jast.outline import outline
 from jast.policy import nominal_policy
+from jast.progress import advance, begin, conclude
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
 
@@ -164,7 +166,7 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
             else 0
         )
         own = jax.tree.map(lambda a: a[k], proposal.policies)
-    dtype, (components,) = accumulator(sim), proposal.log_weights.shape
+    dtype, (components,) = outline(sim).dtype, proposal.log_weights.shape
 
     def weigh(ratio, p, make, x):  # of log q_k - log p [K], and whether p is 0
         ratios, impossible = ratio

@@ -11,15 +11,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jast import actions as choices
 from jast import distributions as D
 from jast.contract import contract
 from jast.cross_entropy.sequences import player
-from jast.episode import _shapes, advance, begin, conclude, random_start, rollout
+from jast.episode import rollout
 from jast.heads.heads import unflat
+from jast.outline import outline
+from jast.policy import Policy
+from jast.progress import advance, begin, conclude
+from jast.pytrees import count
+from jast.simulator import Simulator
 
 __all__ = [
     "Latent",
@@ -71,41 +75,33 @@ class Latent(NamedTuple):
     """[K, D, D] their inverses"""
 
 
-def check(function, sim):
+def check(function: str, sim: Simulator) -> None:
     """ValueError unless the simulator fits the contract and its disturbances have a quantile
     function.
     """
     contract(sim, observed=False)
-    missing = []
-
-    def look():
-        start = sim.start()
-        dists = [("disturbance", sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))] + (
-            [("start", start)] if random_start(sim) else []
-        )
-        missing.extend(f"{name}: {type(d).__name__}" for name, d in dists if not D.has_quantile(d))
-
-    jax.eval_shape(look)
-    if missing:
-        raise ValueError(
-            f"{function}: {missing[0]} has no quantile function; jast.estimate.monte_carlo needs"
-            " none"
-        )
+    about = outline(sim)
+    for name, offer in (("disturbance", about.disturbance), ("start", about.start)):
+        if not offer.quantile:
+            raise ValueError(
+                f"{function}: {name}: {offer.kind} has no quantile function;"
+                " jast.estimate.monte_carlo needs none"
+            )
 
 
-def dimension(sim):
-    """D, a Python int."""
-    first, row = _sizes(sim)
-    return first + sim.horizon * row
+def dimension(sim: Simulator) -> int:
+    """D."""
+    about = outline(sim)
+    return count(about.x0) + sim.horizon * count(about.x)
 
 
-def normal_numbers(sim):
+def normal_numbers(sim: Simulator) -> Any:
     """The float dtype of z."""
-    like = jax.eval_shape(_shapes, sim)
-    return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves(like)))
+    about = outline(sim)
+    return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
 
 
-def outcome(sim, z):
+def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
     policy, last = _policy(sim, z), jnp.asarray(sim.horizon, jnp.int32)
     first = begin(sim, raw, D.mode(policy.start()))
@@ -121,8 +117,9 @@ def outcome(sim, z):
 
     end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
     end = conclude(sim, raw, end)
-    size0, row = _sizes(sim)
-    return Outcomes(end.failure, end.distance, size0 + length * row, length, end.invalid)
+    about = outline(sim)
+    used = count(about.x0) + length * count(about.x)
+    return Outcomes(end.failure, end.distance, used, length, end.invalid)
 
 
 @jax.jit
@@ -178,18 +175,18 @@ def raw(log_p, event, distance, terminal, approach=0.0):
     return log_p
 
 
-def _policy(sim, z):
-    like0, like = jax.eval_shape(_shapes, sim)
-    size0, _ = _sizes(sim)
+def _policy(sim: Simulator, z: jax.Array) -> Policy:
+    like = outline(sim)
+    size0 = count(like.x0)
     return player(
         sim,
         choices.quantiles(),
-        unflat(z[:size0], like0),
-        jax.vmap(lambda row: unflat(row, like))(z[size0:].reshape(sim.horizon, -1)),
+        unflat(z[:size0], like.x0),
+        jax.vmap(lambda row: unflat(row, like.x))(z[size0:].reshape(sim.horizon, -1)),
     )
 
 
-def flat(sim, z0, z):
+def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
     """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
     rows = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
     first = [a.reshape(a.shape[0], -1) for a in jax.tree.leaves(z0)]
@@ -201,10 +198,3 @@ def flat(sim, z0, z):
         ],
         axis=1,
     )
-
-
-def _sizes(sim):
-    """How many numbers x0 and x are."""
-    like0, like = jax.eval_shape(_shapes, sim)
-    count = lambda like: sum(int(np.prod(s.shape)) for s in jax.tree.leaves(like))
-    return count(like0) if random_start(sim) else 0, count(like)

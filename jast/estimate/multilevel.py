@@ -14,14 +14,15 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jast import actions as choices
-from jast import distributions as D
 from jast import results
 from jast._checks import real, whole
 from jast.contract import contract
 from jast.cross_entropy import sequences
-from jast.cross_entropy.tilted import tilted
-from jast.episode import _shapes, random_start, rollout
+from jast.cross_entropy.tilted import tilted, untiltable
+from jast.episode import rollout
+from jast.outline import ask, outline
 from jast.policy import Policy
+from jast.simulator import Simulator
 
 __all__ = ["FailureProposal", "failure_proposal"]
 
@@ -118,10 +119,10 @@ def failure_proposal(
 
 @partial(jax.jit, static_argnums=(3, 4, 5))
 def _search(key, sim, settings, tilt_start, samples, iterations):
-    like0, like = jax.eval_shape(_shapes, sim)
+    like = outline(sim)
     first = (
-        sequences.standard(like0, 1) if tilt_start else (),
-        sequences.standard(like, sim.horizon),
+        sequences.standard(like.x0, 1) if tilt_start else (),
+        sequences.standard(like.x, sim.horizon),
     )
 
     def iterate(proposal, key):
@@ -227,26 +228,9 @@ def _disturbance(disturbance, steps, state, t):
     )
 
 
-def _tilts_start(sim):
+def _tilts_start(sim: Simulator) -> bool:
     """Whether x0 is tilted; ValueError where x cannot be."""
-
-    def build(dist):
-        full = lambda v: jax.tree.map(
-            lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist)
-        )
-        tilted(dist, full(0), full(1))
-
-    def step():
-        build(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
-
-    try:
-        jax.eval_shape(step)
-    except ValueError as error:
-        raise ValueError(f"failure_proposal: disturbance: {error}") from None
-    if not random_start(sim):
-        return False
-    try:
-        jax.eval_shape(lambda: build(sim.start()))
-    except ValueError:
-        return False
-    return True
+    start, step = ask(sim, lambda start, state, dist: (untiltable(start), untiltable(dist)))
+    if step is not None:
+        raise ValueError(f"failure_proposal: disturbance: {step}")
+    return outline(sim).random_start and start is None

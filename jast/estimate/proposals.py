@@ -21,9 +21,11 @@ from jast._jax import is_traced
 from jast.contract import contract
 from jast.cross_entropy.sequences import latent
 from jast.cross_entropy.tilted import tilted
-from jast.episode import Episode, _fitted, _shapes, random_start, replay
+from jast.episode import Episode, replay
 from jast.estimate.blend import blend
+from jast.outline import ask, outline
 from jast.policy import Policy
+from jast.pytrees import fitted
 
 __all__ = ["Proposal", "as_proposal", "latents", "policy_proposal", "trace_proposal"]
 
@@ -68,7 +70,7 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
-    recorded, tilt_start = _stacked(sim, episodes), tilt_start and random_start(sim)
+    recorded, tilt_start = _stacked(sim, episodes), tilt_start and outline(sim).random_start
     try:
         start, steps = latents(sim, recorded, tilt_start)
     except ValueError as error:
@@ -119,7 +121,7 @@ def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"
         raise ValueError(
             f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}"
         )
-    tilt_start = tilt_start and random_start(sim)
+    tilt_start = tilt_start and outline(sim).random_start
     share = epsilon if mixing == "step" else None
     on = jnp.ones((), epsilon.dtype)
     strength = on[None] if mixing == "step" else jnp.stack([on, on * 0])
@@ -137,10 +139,10 @@ def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"
         else jnp.log(jnp.stack([1 - epsilon, epsilon]))
     )
     many, one = make(strength), make(strength[0])
-    _try(
-        lambda: one.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))), jnp.int32(0)),
-        "policy_proposal",
-    )
+    try:
+        ask(sim, lambda start, state, dist: one.disturbance(state, jnp.int32(0)))
+    except ValueError as error:
+        raise ValueError(f"policy_proposal: disturbance: {error}") from None
     return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
 
 
@@ -159,20 +161,14 @@ def as_proposal(function, sim, proposal):
             f" {type(proposal).__name__}"
         )
 
-    def look():
+    def plays_one_value(start: Any, state: Any, dist: Any) -> bool:
         policy = jax.tree.map(lambda a: a[0], proposal.policies)
-        x0 = D.sample(sim.start(), jax.random.key(0))
-        pairs = (
-            (policy.start(), sim.start()),
-            (policy.disturbance(sim.init(x0), jnp.int32(0)), None),
+        pairs = (policy.start(), start), (policy.disturbance(state, jnp.int32(0)), None)
+        return any(
+            isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic) for q, p in pairs
         )
-        return [
-            q
-            for q, p in pairs
-            if isinstance(q, D.Deterministic) and not isinstance(p, D.Deterministic)
-        ]
 
-    if _host(look):
+    if ask(sim, plays_one_value):
         raise ValueError(
             f"{function}: a policy that plays one value has no density; make a proposal of it with"
             " trace_proposal or policy_proposal"
@@ -208,16 +204,15 @@ def _stacked(sim, episodes):
             "trace_proposal: episodes must have at most one leading axis, of at least 1, received"
             f" lengths {[np.shape(b[2]) for b in batched]}"
         )
-    like_x0, like = jax.eval_shape(_shapes, sim)
-    full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like)
+    like = outline(sim)
+    full = jax.tree.map(lambda s: jax.ShapeDtypeStruct((sim.horizon, *s.shape), s.dtype), like.x)
     for x0, x, _ in batched:
         one = jax.tree.map(lambda a: a[0], (x0, x))
         try:
-            _fitted("x0", one[0], like_x0), _fitted("disturbances", one[1], full)
+            fitted("x0", one[0], like.x0), fitted("disturbances", one[1], full)
         except ValueError as error:
             raise ValueError(
-                "trace_proposal: episodes do not fit the simulator:"
-                f" {str(error).removeprefix('replay: ')}"
+                f"trace_proposal: episodes do not fit the simulator: {error}"
             ) from None
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
 
@@ -239,24 +234,6 @@ def latents(sim, recorded, of_start):
         return latent(sim.start(), x0) if of_start else (), z
 
     return jax.vmap(one)(*recorded)
-
-
-def _host(look):
-    """What ``look`` returns while it is traced: a Python value."""
-    found = []
-
-    def traced():
-        found.append(look())
-
-    jax.eval_shape(traced)
-    return found[0]
-
-
-def _try(look, function):
-    try:
-        _host(look)
-    except ValueError as error:
-        raise ValueError(f"{function}: disturbance: {error}") from None
 
 
 def _stack(many, one, k):

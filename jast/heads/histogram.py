@@ -2,13 +2,17 @@
 density.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast.heads.heads import flat, histogram, in_bins, observed, unflat
+from jast.heads.heads import Heads, flat, histogram, in_bins, observed, unflat
+from jast.outline import outline
 from jast.policy import Policy
+from jast.simulator import Simulator
 
 __all__ = ["Histogram", "as_policy"]
 
@@ -57,7 +61,7 @@ class Histogram(D.Distribution):
         return base + jnp.sum(logs).astype(base.dtype)
 
 
-def as_policy(sim, heads, actions, power=1.0):
+def as_policy(sim: Simulator, heads: Heads, actions: Any, power: Any = 1.0) -> Policy:
     """The policy head of ``heads`` as a `jast.Policy` of ``sim``, with the ``actions`` that it was
     trained on; x0 is drawn from the system's own start.
 
@@ -66,11 +70,7 @@ def as_policy(sim, heads, actions, power=1.0):
     """
     if heads.policy is None:
         raise ValueError("heads.as_policy: expected heads with a policy head, received none")
-    like = jax.eval_shape(
-        lambda: D.sample(
-            sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))), jax.random.key(0)
-        )
-    )
+    like = outline(sim).x
     if not all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like)):
         raise ValueError(f"heads.as_policy: expected a disturbance of floats, received {like}")
     return Policy(

@@ -2,6 +2,7 @@
 finished.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -10,11 +11,14 @@ import numpy as np
 
 from jast import distributions as D
 from jast._jax import is_traced
-from jast.episode import random_start
-from jast.heads.heads import Heads, Moments, flat, histogram, moments, observed, value
+from jast.contract import contract
+from jast.heads.heads import Heads, Moments, histogram, moments, observed, value
 from jast.heads.networks import make_head
 from jast.heads.samples import joined, of_edges, of_episodes, of_roots
 from jast.heads.training import learn, learner
+from jast.outline import ask, outline
+from jast.pytrees import count
+from jast.simulator import Simulator
 
 __all__ = ["School", "enrol", "teach"]
 
@@ -63,7 +67,7 @@ def enrol(key, sim, actions, heads, settings):
     )
 
 
-def sizes(sim, actions, heads):
+def sizes(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
     """The numbers that ``observe`` gives and that a disturbance has; ValueError where heads cannot
     serve.
     """
@@ -77,25 +81,18 @@ def sizes(sim, actions, heads):
             "forest: heads must have a policy or a value head, received Heads(None, None)"
         )
 
-    def start():
-        state = sim.init(D.sample(sim.start(), jax.random.key(0)))
-        dist = sim.disturbance(state)
-        return observed(sim, state), flat(D.sample(dist, jax.random.key(0)))
-
-    def located():
-        dist = sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0))))
-        return actions.locate(D.sample(dist, jax.random.key(0)), dist)
-
     if heads in ("rollout", "both") if isinstance(heads, str) else heads.policy is not None:
         try:
-            jax.eval_shape(located)
+            ask(sim, lambda _, state, p: actions.locate(D.sample(p, jax.random.key(0)), p))
         except ValueError as e:
             raise ValueError(
                 "forest: a rollout head needs disturbances with a distribution function; use"
                 f' heads="value", or actions.uniform: {e}'
             ) from e
-    seen, x = jax.eval_shape(start)
-    return seen.shape[0], x.shape[0]
+    about = outline(sim)
+    if about.observation is None:
+        contract(sim)  # raises: it says what is wrong with observe
+    return math.prod(about.observation), count(about.x)
 
 
 def filled(heads, n, d):
@@ -199,7 +196,8 @@ def teach(key, school, sim, actions, settings, harvests):
 
 def _samples(heads, sim, actions, settings, harvests):
     """What the policy head (None without one) and the value head learn from."""
-    n, first = heads.inputs.mean.shape[0] - _numbers(sim), int(random_start(sim))
+    about = outline(sim)
+    n, first = heads.inputs.mean.shape[0] - count(about.x), int(about.random_start)
     bins = (
         None
         if heads.policy is None
@@ -232,16 +230,3 @@ def best_trees(harvests, share):
     best = [np.where(np.isfinite(h.log), h.log, -np.inf).max(0) for h in harvests]
     least = np.quantile(np.concatenate(best), 1 - share, method="lower")
     return [b >= least for b in best]
-
-
-def _numbers(sim):
-    """In a disturbance."""
-    like = jax.eval_shape(
-        lambda: flat(
-            D.sample(
-                sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))),
-                jax.random.key(0),
-            )
-        )
-    )
-    return like.shape[0]

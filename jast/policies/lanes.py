@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast.episode import _select, _strong
 from jast.heads.heads import observed
 from jast.policies.latent import x_of
+from jast.pytrees import select, strong
 
 __all__ = ["Lane", "Rows", "at", "begin", "empty", "potential", "put", "step"]
 
@@ -60,7 +60,7 @@ class Rows(NamedTuple):
 
 def at(sim, dense, x0, drift=()):
     """A `Lane` at the start ``x0``; ``dense``: the distance counts at every state."""
-    state = _strong(sim.init(x0))
+    state = strong(sim.init(x0))
     distance, failed, over = _judge(sim, state, jnp.zeros((), bool))
     zero = jnp.zeros((), jnp.float32)
     return Lane(
@@ -92,7 +92,7 @@ def step(sim, dense, lane, z):
     A lane that was ``over`` stays as it is.
     """
     x = x_of(sim.disturbance(lane.state), z)
-    state = _strong(sim.step(lane.state, x))
+    state = strong(sim.step(lane.state, x))
     distance, failed, done = _judge(sim, state, lane.t + 1 >= sim.horizon)
     potential, seen = _potential(distance, failed, dense | done), observed(sim, state)
     before = jnp.all(jnp.isfinite(lane.seen)) & jnp.isfinite(lane.potential)
@@ -117,7 +117,7 @@ def step(sim, dense, lane, z):
     row = Rows(
         lane.seen, lane.t.astype(jnp.float32), lane.potential, z, approach, failed, done, seen
     )
-    return _select(lane.over, stopped, moved), row, ~lane.over & ~invalid, invalid
+    return select(lane.over, stopped, moved), row, ~lane.over & ~invalid, invalid
 
 
 def _judge(sim, state, last):

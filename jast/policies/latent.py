@@ -9,9 +9,11 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast.cross_entropy.sequences import quantile
-from jast.cross_entropy.tilted import tilted
-from jast.episode import _shapes, random_start
+from jast.cross_entropy.tilted import tilted, untiltable
 from jast.heads.heads import unflat
+from jast.outline import ask, outline
+from jast.pytrees import count
+from jast.simulator import Simulator
 
 __all__ = ["Blended", "Moved", "log_normal", "sizes", "x_of"]
 
@@ -30,36 +32,20 @@ def log_normal(z, mean=None, deviation=None):
     return -0.5 * jnp.sum(((z - mean) / deviation) ** 2 + LOG_2PI) - jnp.sum(jnp.log(deviation))
 
 
-def sizes(sim):
+def sizes(sim: Simulator) -> tuple[int, int]:
     """``(n, n0)``: how many numbers x and x0 are made of; n0 is 0 where the start is fixed, or not
     of floats with quantiles, and then drawn as it is.
 
     ValueError naming ``disturbance`` where x is not of floats, or has no quantile function with an
     inverse.
     """
-    like0, like = jax.eval_shape(_shapes, sim)
-
-    def build(dist):
-        full = lambda v: jax.tree.map(
-            lambda s: jnp.full(s.shape, v, D.float_dtype(s.dtype)), D.event_like(dist)
-        )
-        return tilted(dist, full(0), full(1)).log_prob(D.sample(dist, jax.random.key(0)))
-
-    if not _floats(like):
-        raise ValueError(f"sac: disturbance: expected floats, received {_kinds(like)}")
-    try:
-        jax.eval_shape(
-            lambda: build(sim.disturbance(sim.init(D.sample(sim.start(), jax.random.key(0)))))
-        )
-    except ValueError as error:
-        raise ValueError(f"sac: disturbance: {error}") from None
-    if not random_start(sim) or not _floats(like0):
-        return _count(like), 0
-    try:
-        jax.eval_shape(lambda: build(sim.start()))
-    except ValueError:
-        return _count(like), 0
-    return _count(like), _count(like0)
+    like = outline(sim)
+    if not _floats(like.x):
+        raise ValueError(f"sac: disturbance: expected floats, received {_kinds(like.x)}")
+    start, step = ask(sim, lambda start, state, dist: (untiltable(start), untiltable(dist)))
+    if step is not None:
+        raise ValueError(f"sac: disturbance: {step}")
+    return count(like.x), count(like.x0) if _floats(like.x0) and start is None else 0
 
 
 class Moved(D.Distribution):
@@ -134,7 +120,3 @@ def _floats(like):
 
 def _kinds(like):
     return ", ".join(f"{s.dtype}{list(s.shape)}" for s in jax.tree.leaves(like)) or "nothing"
-
-
-def _count(like):
-    return sum(math.prod(s.shape) for s in jax.tree.leaves(like))

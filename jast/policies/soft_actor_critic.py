@@ -13,9 +13,8 @@ import numpy as np
 from jast._checks import real, whole
 from jast._jax import is_traced
 from jast.contract import contract
-from jast.episode import _shapes
-from jast.heads.heads import observed
 from jast.incidents import hosted
+from jast.outline import outline
 from jast.policies import checkpoints
 from jast.policies import training as T
 from jast.policies.failure_policy import FAILING_SHARE, History, Learned, assemble, history, row
@@ -169,8 +168,7 @@ def sac(
     )
     contract(sim)
     n, n0 = sizes(sim)
-    like0, _ = jax.eval_shape(_shapes, sim)
-    m = jax.eval_shape(lambda x0: observed(sim, sim.init(x0)), like0).shape[0]
+    (m,) = outline(sim).observation
     shape = T.Shape(
         m, n, n0, hidden, components, shaping == "steps", lanes, batch, max(buffer, lanes)
     )

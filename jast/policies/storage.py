@@ -8,8 +8,8 @@ import numpy as np
 
 from jast.archive import arrays_of, check_array, named, read, write
 from jast.contract import contract
-from jast.episode import _shapes
-from jast.heads.heads import Moments, observed
+from jast.heads.heads import Moments
+from jast.outline import outline
 from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
 from jast.policies.latent import sizes
 from jast.policies.learner import Net, learner, networks
@@ -66,9 +66,7 @@ def load(path, sim):
             f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} start,"
             f" expected {'one' if n0 else 'none'}"
         )
-    m = jax.eval_shape(
-        lambda x0: observed(sim, sim.init(x0)), jax.eval_shape(_shapes, sim)[0]
-    ).shape[0]
+    (m,) = outline(sim).observation
     hidden, components = tuple(header["hidden"]), header["components"]
     new = jax.eval_shape(
         lambda: learner(jax.random.key(0), m, n, hidden, components, jnp.float32(1))

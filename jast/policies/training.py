@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.episode import _select
 from jast.heads.heads import Moments
 from jast.policies import lanes as L
 from jast.policies import start as starts
 from jast.policies.latent import x_of
 from jast.policies.learner import Learner, Net, act, draw, learner, see, soft_value, update
+from jast.pytrees import select
 
 __all__ = ["Count", "Phase", "Shape", "Training", "first", "settle", "stretch", "tilt"]
 
@@ -201,7 +201,7 @@ def _step(key, sim, shape, applies, rates, training, phase):
         loss,
         updates,
     )
-    lanes = jax.vmap(_select)(moved.over, again, moved)
+    lanes = jax.vmap(select)(moved.over, again, moved)
     return (
         training._replace(
             lanes=lanes, buffer=buffer, stored=stored, learner=new_learner, at=training.at + 1

@@ -16,14 +16,15 @@ from jax import lax
 
 from jast import _checks, rewards
 from jast import actions as choices
-from jast import distributions as D
 from jast.contract import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
-from jast.episode import Episode, _shapes, accumulator, random_start
+from jast.episode import Episode
 from jast.incidents import hosted, incidents, since
+from jast.outline import outline
 from jast.search import lockstep as E
 from jast.search import proposals as P
+from jast.simulator import Simulator
 
 __all__ = ["cem"]
 
@@ -227,7 +228,7 @@ def _propose(keys, sim, real, plan, pool, proposals):
     horizon, ...] those of x.
     """
     elite = jax.tree.map(lambda a: a[: plan.elites], pool.episode)
-    start = random_start(sim)
+    start = outline(sim).random_start
     known = jnp.where(elite.reward > -jnp.inf, 1, -1)
     parents = (
         (jax.tree.map(lambda a: a[:, None], elite.x0), known),
@@ -273,7 +274,8 @@ def _merge(pool, new):
 
 def _nothing(sim, plan, trees, k):
     """An empty `Pool` and the first proposals, of every tree."""
-    likes = jax.eval_shape(_shapes, sim)
+    about = outline(sim)
+    likes = about.x0, about.x
     latent = [
         kind == "latent" and bool(jax.tree.leaves(like))
         for kind, like in zip(plan.kinds, likes, strict=True)
@@ -285,7 +287,7 @@ def _nothing(sim, plan, trees, k):
     zero = lambda dtype: jnp.zeros((k,), dtype)
     x0 = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), likes[0])
     x = jax.tree.map(lambda s: jnp.zeros((k, sim.horizon, *s.shape), s.dtype), likes[1])
-    real = zero(accumulator(sim))
+    real = zero(about.dtype)
     episode = Episode(x0, x, real, real, zero(bool), zero(jnp.int32), real - jnp.inf)
     z = tuple(
         jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
@@ -325,16 +327,8 @@ def _take(tree, places):
     return jax.tree.map(lambda a: a.at[places].get(mode="fill", fill_value=0), tree)
 
 
-def _chosen(sim):
+def _chosen(sim: Simulator) -> choices.Quantiles | choices.Samples:
     """Quantiles where x0 and x have a quantile function, else samples."""
-    found = []
-
-    def look():
-        start = sim.start()
-        found.append(
-            D.has_quantile(start)
-            and D.has_quantile(sim.disturbance(sim.init(D.sample(start, jax.random.key(0)))))
-        )
-
-    jax.eval_shape(look)
-    return choices.quantiles() if found[0] else choices.samples()
+    about = outline(sim)
+    both = about.start.quantile and about.disturbance.quantile
+    return choices.quantiles() if both else choices.samples()

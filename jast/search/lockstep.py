@@ -17,7 +17,9 @@ from jast import failures as archive
 from jast import rewards
 from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
-from jast.episode import Episode, advance, begin, conclude, random_start, replay
+from jast.episode import Episode, replay
+from jast.outline import outline
+from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
 from jast.search.threads import apart
 from jast.search.tree.packing import pack
@@ -82,7 +84,8 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
     summed up is masked (and the state, where it is yet to be judged). Without ``judge`` an episodic
     system is not evaluated: for the disturbances of episodes whose outcome is known.
     """
-    start = int(random_start(sim))
+    like = outline(sim)
+    start = int(like.random_start)
     rows = ((), ()) if rows is None else rows
     at = lambda level, rows, t: (
         jax.vmap(jax.random.fold_in, (0, None))(keys, level),
@@ -102,8 +105,8 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
     x0, progress, tag = jax.vmap(first)(*at(0, rows[0], 0))
     xs = None
     if record:
-        like = jax.eval_shape(lambda p: move(*at(start, rows[1], 0), p, tag, False)[0], progress)
-        xs = jax.tree.map(lambda s: jnp.zeros((sim.horizon, *s.shape), s.dtype), like)
+        lanes = live.shape
+        xs = jax.tree.map(lambda s: jnp.zeros((sim.horizon, *lanes, *s.shape), s.dtype), like.x)
 
     def step(carry):
         t, length, tag, xs, before = carry

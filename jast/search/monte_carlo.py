@@ -12,8 +12,8 @@ from jax import lax
 from jast import actions as choices
 from jast import rewards
 from jast.counter import tree_keys
-from jast.episode import accumulator
 from jast.incidents import hosted, incidents, since
+from jast.outline import outline
 from jast.search import lockstep as E
 
 __all__ = ["monte_carlo"]
@@ -134,7 +134,7 @@ def monte_carlo(
 
 
 def _nothing(sim, top):
-    zero, lowest = jnp.zeros((), jnp.int32), jnp.asarray(-jnp.inf, accumulator(sim))
+    zero, lowest = jnp.zeros((), jnp.int32), jnp.asarray(-jnp.inf, outline(sim).dtype)
     none = jnp.zeros((top,), jnp.int32)
     return Found(
         jnp.zeros((), bool),

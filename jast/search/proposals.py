@@ -2,13 +2,16 @@
 (`jast.cross_entropy.sequences`), or copied from good episodes.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast import actions as choices
-from jast import distributions as D
 from jast.cross_entropy.sequences import place
+from jast.outline import outline
+from jast.simulator import Simulator
 
 __all__ = ["copies", "drawer", "kinds"]
 
@@ -16,14 +19,14 @@ __all__ = ["copies", "drawer", "kinds"]
 _CHOICE = np.uint32(1 << 31)
 
 
-def kinds(sim, actions):
+def kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     """How x0 and x are proposed: "latent" where they have a quantile function or a box, else
     "copy".
     """
     if isinstance(actions, choices.Quantiles):
         return "latent", "latent"
     if isinstance(actions, choices.UniformBox):  # a start is not of the box
-        return "latent" if D.has_quantile(sim.start()) else "copy", "latent"
+        return "latent" if outline(sim).start.quantile else "copy", "latent"
     return "copy", "copy"
 
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jast.episode import random_start
 from jast.heads.heads import flat, observed
+from jast.outline import outline
 from jast.search.tree.layout import (
     FRESH,
     LINK,
@@ -77,6 +77,6 @@ def edges_of(problem, axes, tree, children):
     seen, x = jax.vmap(one, in_axes=(axes, 0, 1, 1, 1), out_axes=1)(
         problem, tree.key, node.state, parent, slot
     )
-    if random_start(problem.sim):  # the first level chooses x0
+    if outline(problem.sim).random_start:  # the first level chooses x0
         valid = valid & (parent > 0)
     return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)

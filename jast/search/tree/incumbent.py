@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jast.episode import _shapes
+from jast.outline import outline
 from jast.search.tree.packing import pack, shapes, unpack, width
+from jast.simulator import Simulator
 
 __all__ = ["Lead", "feed_level", "fed_of", "fed_or", "follows", "lead_of", "onward", "packed"]
 
@@ -67,11 +68,9 @@ def follows(tree):
     return isinstance(tree.lead, Lead) and not isinstance(tree.lead.on, tuple)
 
 
-def feed_level(sim, start):
-    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9); ``start``: levels
-    before the first step.
-    """
-    return sim.horizon - sim.horizon // 2 + start
+def feed_level(sim: Simulator) -> int:
+    """The level at which floor(horizon / 2) steps remain (thesis Algorithm 9)."""
+    return sim.horizon - sim.horizon // 2 + outline(sim).random_start
 
 
 def fed_of(tree, simulation, lane):
@@ -124,5 +123,5 @@ def packed(there, x):
     return jnp.concatenate([there.astype(jnp.uint32)[None], pack(x)])
 
 
-def _like(sim):
-    return shapes(jax.eval_shape(_shapes, sim)[1])
+def _like(sim: Simulator) -> Any:
+    return shapes(outline(sim).x)

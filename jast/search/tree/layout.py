@@ -26,11 +26,12 @@ import numpy as np
 from jax import lax
 
 from jast._jax import is_traced
-from jast.episode import advance, begin, blank, conclude, random_start
+from jast.outline import outline
+from jast.progress import advance, begin, blank, conclude
 from jast.search.tree.guide import rolled
 from jast.search.tree.incumbent import fed_or, feed_level, follows, lead_of
 from jast.search.tree.packing import pack
-from jast.simulator import never
+from jast.simulator import Simulator, never
 
 __all__ = [
     "Node",
@@ -193,9 +194,9 @@ def widths(simulations, k, alpha):
     )
 
 
-def levels(sim):
+def levels(sim: Simulator) -> int:
     """Levels of choices in an episode: x_1 .. x_horizon, and x0 where the start is random."""
-    return sim.horizon + random_start(sim)
+    return sim.horizon + outline(sim).random_start
 
 
 def _pages(simulations, levels=0, table=None):
@@ -243,7 +244,7 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None, record=Fa
         )
 
     def origin(problem, key):
-        if random_start(problem.sim):
+        if outline(problem.sim).random_start:
             # any state will do: the first level chooses x0
             x0 = problem.choice.actions.draw_start(key, problem.sim.start())
             return blank(problem.sim, begin(problem.sim, problem.reward, x0).state)
@@ -328,8 +329,8 @@ def choose_child(problem, node_key, slot, state):
     """One lane: (x0, x), the action of a node's child, for a first level that chooses x0 and for
     any other; x0 is ``()`` for a system with one start.
     """
-    sim, choice = problem.sim, problem.choice
-    x0 = choice.child(node_key, slot, sim.start(), start=True) if random_start(sim) else ()
+    sim, choice, chosen = problem.sim, problem.choice, outline(problem.sim).random_start
+    x0 = choice.child(node_key, slot, sim.start(), start=True) if chosen else ()
     return x0, choice.child(node_key, slot, sim.disturbance(state))
 
 
@@ -350,9 +351,9 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
     """One lane: (x0, x) of a level of a rollout, by the keys of its simulation and its tree, and
     what it is fed.
     """
-    sim, choice = problem.sim, problem.choice
+    sim, choice, chosen = problem.sim, problem.choice, outline(problem.sim).random_start
     simulation, key = key, jax.random.fold_in(key, level)
-    x0 = choice.roll(key, tree_key, sim.start(), start=True) if random_start(sim) else ()
+    x0 = choice.roll(key, tree_key, sim.start(), start=True) if chosen else ()
     dist = sim.disturbance(state)
     x = choice.roll(key, tree_key, dist)
     if problem.guide != () and problem.guide.heads.policy is not None:
@@ -364,7 +365,7 @@ def choose_rollout(problem, key, tree_key, level, state, fed=()):
             lambda: x,
         )
     if problem.choice.feed:
-        x = fed_or(sim, fed, level == feed_level(sim, int(random_start(sim))), x)
+        x = fed_or(sim, fed, level == feed_level(sim), x)
     return x0, x
 
 
@@ -374,7 +375,7 @@ def take(problem, level, before, action, rolling=False):
     """
     sim, reward = problem.sim, problem.reward
     x0, x = action
-    start = int(random_start(sim))
+    start = levels(sim) - sim.horizon
     after = advance(sim, reward, before, x, level + 1 - start >= sim.horizon)
     if start and not rolling:
         after = jax.tree.map(

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.episode import Episode, blank
+from jast.episode import Episode
+from jast.progress import blank
 from jast.search.tree.incumbent import fed_of
 from jast.search.tree.layout import (
     FAILURE,

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast.episode import Progress, blank, conclude, random_start
+from jast.progress import Progress, blank, conclude
 from jast.search.tree.incumbent import Lead, fed_of, feed_level, follows, onward, packed
 from jast.search.tree.layout import (
     CHILD,
@@ -100,7 +100,7 @@ def _simulation(problem, axes, tree, i, memoize):
     # roll out; lanes that have ended step on, and only what is summed up is masked (and the state,
     # where it is yet to be judged)
     key = jax.vmap(jax.random.fold_in, in_axes=(0, None))(tree.key, i)
-    middle = feed_level(problem.sim, int(random_start(problem.sim)))
+    middle = feed_level(problem.sim)
 
     def roll(carry):
         level, steps, at, taken = carry

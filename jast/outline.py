@@ -1,0 +1,143 @@
+"""What is known of a simulator before it runs: shapes, dtypes, and what its distributions offer.
+
+Whoever needs to know asks `outline`, at any place and as often as it likes: JAX keeps the answer.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast import distributions as D
+from jast.pytrees import strong
+from jast.simulator import Simulator
+
+__all__ = ["Offer", "Outline", "ask", "outline"]
+
+_static = dict(metadata=dict(static=True))
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What a distribution offers beside draws and densities."""
+
+    kind: str
+    """Name of its class."""
+    mode: bool
+    """`jast.distributions.mode` is defined."""
+    lacking: str
+    """Name of the class, of the first part in a joint, that has no quantile function; "" where
+    `jast.distributions.quantile` is defined.
+    """
+
+    @property
+    def quantile(self) -> bool:
+        """Whether `jast.distributions.quantile` is defined."""
+        return not self.lacking
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Outline:
+    """See `outline`. A pytree whose leaves are the `jax.ShapeDtypeStruct` of x0, x and state."""
+
+    x0: Any
+    """Of the initial disturbance: ``()`` with one start."""
+    x: Any
+    """Of the disturbance of a step."""
+    state: Any
+    dtype: Any = field(**_static)
+    """The float dtype in which an episode's numbers are summed: the widest of the disturbance's log
+    density and the distance.
+    """
+    start: Offer = field(**_static)
+    """What p(x0) offers."""
+    disturbance: Offer = field(**_static)
+    """What p(x | s) offers."""
+    observation: tuple[int, ...] | None = field(**_static)
+    """Shape of what ``observe`` returns; None where it does not return an array."""
+
+    @property
+    def random_start(self) -> bool:
+        """Whether x0 is a choice: ``start`` is not `jast.simulator.fixed`."""
+        return bool(jax.tree.leaves(self.x0))
+
+
+def outline(sim: Simulator) -> Outline:
+    """The `Outline` of ``sim``: each of its functions but ``step`` and ``is_terminal`` is traced
+    once, at a state that ``init`` makes; none is run.
+
+    It depends on the functions and on the shapes and dtypes of their parameters alone, by which
+    `jax.eval_shape` keeps it: asking again costs a look-up, also inside `jax.jit` and `jax.vmap`,
+    and no tracer is held. What ``start``, ``init``, ``disturbance`` and ``evaluate`` raise passes
+    through.
+    """
+    return jax.eval_shape(_outlined, sim)
+
+
+def ask(sim: Simulator, question: Callable[[Any, Any, Any], Any]) -> Any:
+    """What ``question(p(x0), state, p(x | state))`` returns while all is traced: values of Python,
+    for what `Outline` does not say of distributions. What it raises passes through.
+    """
+    found = []
+
+    def traced() -> None:
+        start, _, state, dist = _opened(sim)
+        found.append(question(start, state, dist))
+
+    jax.eval_shape(traced)
+    return found[0]
+
+
+def _opened(sim: Simulator) -> tuple[Any, Any, Any, Any]:
+    start = sim.start()
+    x0 = D.sample(start, jax.random.key(0))
+    state = strong(sim.init(x0))
+    return start, x0, state, sim.disturbance(state)
+
+
+def _outlined(sim: Simulator) -> Outline:
+    # traced: what is static travels in the structure of the result, so that it is kept with it
+    start, x0, state, dist = _opened(sim)
+    x = D.sample(dist, jax.random.key(0))
+    numbers = dist.log_prob(x), sim.evaluate(state)[1]
+    return Outline(
+        x0,
+        x,
+        state,
+        dtype=jnp.result_type(*(jnp.asarray(a).dtype for a in numbers)),
+        start=_offer(start),
+        disturbance=_offer(dist),
+        observation=_observation(sim, state),
+    )
+
+
+def _offer(dist: Any) -> Offer:
+    lacking = "" if _can(D.has_quantile, dist) else _without_quantile(dist)
+    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking)
+
+
+def _can(question: Callable[[Any], bool], dist: Any) -> bool:
+    try:
+        return question(dist)
+    except Exception:  # of a user's distribution: what it cannot do without one, it does not offer
+        return False
+
+
+def _without_quantile(dist: Any) -> str:
+    if isinstance(dist, D.Joint):
+        parts = jax.tree.leaves(dist.distributions, is_leaf=lambda d: isinstance(d, D.Distribution))
+        lacking = [_without_quantile(d) for d in parts if not _can(D.has_quantile, d)]
+        return lacking[0] if lacking else type(dist).__name__
+    if isinstance(dist, D.Independent):
+        return _without_quantile(dist.distribution)
+    return type(dist).__name__
+
+
+def _observation(sim: Simulator, state: Any) -> tuple[int, ...] | None:
+    try:
+        return jnp.asarray(sim.observe(state)).shape
+    except Exception:  # most searches look at no observation; `jast.check` says what is wrong
+        return None

@@ -1,0 +1,63 @@
+"""Small functions of pytrees of arrays that several rooms need."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+__all__ = ["clear", "count", "fitted", "padded", "select", "strong"]
+
+
+def strong(tree: Any) -> Any:
+    """Arrays of explicit dtype: a weak type would change on its way through a step."""
+    return jax.tree.map(lambda a: lax.convert_element_type(a, jnp.result_type(a)), tree)
+
+
+def select(pred: Any, a: Any, b: Any) -> Any:
+    """``a`` where the scalar ``pred`` holds, else ``b``."""
+    return jax.tree.map(lambda x, y: jnp.where(pred, x, y), a, b)
+
+
+def clear(pred: Any, tree: Any) -> Any:
+    """Zeros where the scalar ``pred`` holds, else ``tree``."""
+    return jax.tree.map(lambda a: jnp.where(pred, jnp.zeros((), a.dtype), a), tree)
+
+
+def padded(rows: Any, length: int) -> Any:
+    """``rows`` [T, ...] with zeros behind them, [length, ...]."""
+    return jax.tree.map(
+        lambda a: jnp.zeros((length, *a.shape[1:]), a.dtype).at[: a.shape[0]].set(a), rows
+    )
+
+
+def count(like: Any) -> int:
+    """How many numbers ``like``, arrays or their shapes, holds."""
+    return sum(math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like))
+
+
+def fitted(name: str, value: Any, like: Any) -> Any:
+    """``value`` as arrays of the shapes and dtypes of ``like``.
+
+    Raises ValueError, which calls it ``name``, for another structure or shape, and for floats where
+    integers belong.
+    """
+
+    def refusal() -> ValueError:
+        return ValueError(f"{name} must be {_text(like)}, received {_text(value)}")
+
+    def fit(v: Any, s: Any) -> jax.Array:
+        v = jnp.asarray(v)
+        kinds = [jnp.issubdtype(d, jnp.floating) for d in (v.dtype, s.dtype)]
+        if v.shape != s.shape or (kinds[0] and not kinds[1]):
+            raise refusal()
+        return v.astype(s.dtype)
+
+    if jax.tree.structure(value) != jax.tree.structure(like):
+        raise refusal()
+    return jax.tree.map(fit, value, like)
+
+
+def _text(tree: Any) -> str:
+    return str(jax.tree.map(lambda a: f"{jnp.result_type(a)}{list(jnp.shape(a))}", tree))
