@@ -196,7 +196,7 @@ def test_under_jit_and_vmap(key):
 
 
 def test_interruption(key, equal):
-    def callback(done, total):
+    def callback(done, total, _):
         assert total == 2000
         if done == 600:
             raise KeyboardInterrupt

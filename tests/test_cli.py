@@ -160,7 +160,7 @@ def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch)
     whole = cli.forest
 
     def stopped(*args, **kwargs):
-        def callback(done, total):
+        def callback(done, total, _):
             raise KeyboardInterrupt
 
         return whole(*args, callback=callback, threads=1, lanes=1, **kwargs)

@@ -216,7 +216,7 @@ def test_the_least_budget_is_kept(key):
 def test_interrupts_keep_whole_chunks(two):
     seen = []
 
-    def stop(done, total):
+    def stop(done, total, _):
         seen.append((done, total))
         raise KeyboardInterrupt
 

@@ -303,7 +303,7 @@ def test_trees_that_end_early_end_apart():
 
 
 def test_an_interrupted_search_says_so():
-    def stop(done, total):
+    def stop(done, total, _):
         assert 0 < done <= total == 12 * 18 * 400
         raise KeyboardInterrupt
 
@@ -325,7 +325,7 @@ def test_an_interrupted_search_says_so():
 
 
 def test_an_error_of_the_callback_ends_the_search_at_once():
-    def fail(done, total):
+    def fail(done, total, _):
         raise RuntimeError("enough")
 
     began = time.perf_counter()
@@ -346,7 +346,7 @@ def test_an_error_of_the_callback_ends_the_search_at_once():
 
 def test_the_callback_is_told_of_every_simulation():
     told = []
-    searched("ferry", callback=lambda done, total: told.append((done, total)))
+    searched("ferry", callback=lambda done, total, _: told.append((done, total)))
     assert told[-1] == (EPISODES, EPISODES) and sorted(told) == told
 
 

@@ -900,7 +900,7 @@ def test_a_system_that_fails_at_its_start():
 def test_a_search_interrupted_between_rounds_says_so():
     """In the second round: what the first has taught is there."""
 
-    def stop(done, total):
+    def stop(done, total, _):
         assert total == 8 * 120
         if done > 4 * 120:
             raise KeyboardInterrupt

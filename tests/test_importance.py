@@ -472,7 +472,9 @@ def test_chunks_are_those_of_log_weights(key):
     """
     q = trace_proposal(SIM, BOTH)
     seen = []
-    found = importance(key, SIM, q, MORE, callback=lambda done, total: seen.append((done, total)))
+    found = importance(
+        key, SIM, q, MORE, callback=lambda done, total, _: seen.append((done, total))
+    )
     own, _ = jax.random.split(key)
     parts = [
         jax.device_get(log_weights(jax.random.fold_in(own, i), SIM, q, even(MORE))) for i in (0, 1)
@@ -500,7 +502,7 @@ def test_chunks_are_those_of_log_weights(key):
 def test_interrupts_keep_whole_chunks(key, capsys):
     """The first chunk is the estimate, with a word on it; before any, there is none to give."""
 
-    def stop(done, total):
+    def stop(done, total, _):
         raise KeyboardInterrupt
 
     q = trace_proposal(SIM, BOTH)

@@ -212,7 +212,7 @@ def test_interruption_and_callback(key, equal, monkeypatch):
     monkeypatch.setattr(module, "LANES", 128)
     seen = []
 
-    def callback(done, total):
+    def callback(done, total, _):
         seen.append((done, total))
         if done == 256:
             raise KeyboardInterrupt

@@ -162,7 +162,7 @@ def whole_run(tmp_path_factory):
         WALK,
         **TINY,
         checkpoint=path,
-        callback=lambda n, row: rows.append((n, row)),
+        callback=lambda done, total, so_far: rows.append((done, total, so_far)),
     )
     return policy, rows, path
 
@@ -170,10 +170,10 @@ def whole_run(tmp_path_factory):
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
     policy, rows, _ = whole_run
     assert len(rows) == len(policy.history.episodes) >= 10
-    assert [n for n, _ in rows] == policy.history.episodes.tolist()
-    np.testing.assert_array_equal(
-        [row.failing_share for _, row in rows], policy.history.failing_share
-    )
+    assert all(done <= total for done, total, _ in rows) and rows[-1][0] == rows[-1][1]
+    assert [h.episodes[-1] for *_, h in rows] == policy.history.episodes.tolist()
+    for n, (*_, so_far) in enumerate(rows):
+        np.testing.assert_array_equal(so_far.failing_share, policy.history.failing_share[: n + 1])
 
 
 def test_the_same_key_gives_the_same_policy(whole_run, equal):
@@ -189,8 +189,8 @@ def test_the_same_key_gives_the_same_policy(whole_run, equal):
 def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_path):
     seen = []
 
-    def stop(episodes, row):
-        seen.append(episodes)
+    def stop(done, total, so_far):
+        seen.append(done)
         if len(seen) == 4:
             raise KeyboardInterrupt
 

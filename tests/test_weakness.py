@@ -361,7 +361,11 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
             "save",
             lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a),
         )
-    at = (lambda i, r: boom() if i == 3 else None) if where == "callback" else None
+    at = (
+        (lambda done, n, r: boom() if len(r.history.calls) == 3 else None)
+        if where == "callback"
+        else None
+    )
     with pytest.warns(
         RuntimeWarning,
         match="disk full" if where != "scores" else r"scores must be \[60\] in \[0, 1\]",
@@ -478,11 +482,10 @@ def test_progress_and_callback(capsys):
         labels,
         selector=in_turn(),
         progress=True,
-        callback=lambda i, r: calls.append((i, r.calls)),
+        callback=lambda done, total, r: calls.append((done, total, r.calls)),
     )
     assert (
-        calls == [(1, 14), (2, 28), (3, 42), (4, 56), (5, 60)]
-        and "60/60" in capsys.readouterr().err
+        calls == [(n, 60, n) for n in (14, 28, 42, 56, 60)] and "60/60" in capsys.readouterr().err
     )
 
 

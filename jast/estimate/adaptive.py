@@ -49,9 +49,9 @@ def failure_probability(
     how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
 
     The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
-    total)`` and a KeyboardInterrupt as in `importance`, for the last part. Raises ValueError for a
-    budget below 5000, a level outside (0, 1), disturbances without a quantile function, and where
-    the simulator's functions do not fit together.
+    total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. Raises ValueError
+    for a budget below 5000, a level outside (0, 1), disturbances without a quantile function, and
+    where the simulator's functions do not fit together.
     """
     name = "failure_probability"
     budget = whole(name, "budget", budget, LEAST)

@@ -28,6 +28,7 @@ from jast.intervals import checked_level
 from jast.outline import outline
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
+from jast.watch import Watch
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
 
@@ -91,8 +92,8 @@ def importance(
     on a few of the model's own episodes. It says nothing of failures that it hardly draws:
     `Estimate` on how to know. ``mode`` as in `log_weights`; ``level`` of the interval. Memory does
     not grow with ``samples``. The key is consumed; chunk i is drawn with ``jax.random.fold_in(key,
-    i)``. ``progress=True`` shows a bar, ``callback(done, total)`` is called after each chunk; a
-    KeyboardInterrupt ends it with the estimate of the whole chunks, and a word in ``warnings``.
+    i)``. ``progress=True`` shows a bar, ``callback(done, total, None)`` is called after each chunk;
+    a KeyboardInterrupt ends it with the estimate of the whole chunks, and a word in ``warnings``.
     Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
 
     Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
@@ -121,12 +122,8 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
     """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces``
     [lanes]; of the last chunk the first ones count.
     """
-    bar = None
-    if progress:
-        from tqdm import tqdm  # slow to import
-
-        bar = tqdm(total=samples, unit="episode", unit_scale=True, desc=name)
     total, done, notes = sums.nothing(samples), 0, ()
+    watch = Watch(name, samples, "episode", progress, callback)
     try:
         ahead = simulate(0)
         while done < samples:
@@ -135,17 +132,13 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
                 ahead = simulate(done // lanes + 1)  # the device goes on while the host sums
             total = sums.add(total, jax.tree.map(lambda a, n=n: a[:n], jax.device_get(now)))
             done += n
-            if bar is not None:
-                bar.update(n)
-            if callback is not None:
-                callback(done, samples)
+            watch.more(n)
     except KeyboardInterrupt:
         if not done:
             raise
         notes = (f"interrupted after {done} of {samples} episodes",)
     finally:
-        if bar is not None:
-            bar.close()
+        watch.close()
     return total, notes
 
 

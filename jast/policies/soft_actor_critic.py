@@ -20,6 +20,7 @@ from jast.policies import training as T
 from jast.policies.failure_policy import FAILING_SHARE, History, Learned, assemble, history, row
 from jast.policies.latent import sizes
 from jast.policies.learner import Rates, networks
+from jast.watch import Watch
 
 __all__ = ["sac"]
 
@@ -114,13 +115,13 @@ def sac(
                         ``hidden``: widths of their layers
     ==================  ============================================================================
 
-    ``progress`` shows a bar; ``callback(episodes, row)`` is called twenty times, with the episodes
-    so far and a `History` row. A KeyboardInterrupt ends the training after its last whole stretch
-    and gives what was learned by then (it is raised again where there is none). ``checkpoint``: a
-    file to which each stretch is saved, and from which a call with the same arguments goes on: to
-    the bit as if nothing had been between (the functions of ``sim`` cannot be compared, its
-    parameters are). The loop runs on the host, so not under `jax.jit` or `jax.vmap`; the result
-    does. The key is consumed.
+    ``progress`` shows a bar; ``callback(done, total, history)`` is called twenty times, with the
+    steps of all lanes and the `History` so far. A KeyboardInterrupt ends the training after its
+    last whole stretch and gives what was learned by then (it is raised again where there is none).
+    ``checkpoint``: a file to which each stretch is saved, and from which a call with the same
+    arguments goes on: to the bit as if nothing had been between (the functions of ``sim`` cannot be
+    compared, its parameters are). The loop runs on the host, so not under `jax.jit` or `jax.vmap`;
+    the result does. The key is consumed.
 
     Transitions in which a number is not finite are counted (``history.invalid``), end their episode
     and are never learned from. More ways to fail out of one certain state than ``components`` are
@@ -266,18 +267,17 @@ def _before(training, run, phase, plan, horizon, scale, widen):
 
 def _learn(training, rows, run, phase, plan, auto_scale, lanes, progress, callback, keep):
     """``(Training, rows)`` after all stretches that ``rows`` do not hold yet."""
-    bar = None
-    if progress:
-        from tqdm import tqdm  # slow to import
-
-        bar = tqdm(
-            total=sum(plan[:3]) * lanes,
-            initial=int(training.at) * lanes,
-            unit="step",
-            unit_scale=True,
-            desc="sac",
-        )
-    kept = training, rows
+    kept, done = (training, rows), int(training.at) * lanes
+    last = lambda h: jax.tree.map(lambda a: a[-1], h)
+    watch = Watch(
+        "sac",
+        sum(plan[:3]) * lanes,
+        "step",
+        progress,
+        callback,
+        done=done,
+        former=lambda done, total, h: (int(h.episodes[-1]), last(h)),
+    )
     try:
         while (left := sum(plan[:3]) - int(kept[0].at)) > 0:
             training, count = run(kept[0], phase, min(left, plan.stretch))
@@ -288,21 +288,14 @@ def _learn(training, rows, run, phase, plan, auto_scale, lanes, progress, callba
             kept = training, rows  # at once: an interruption finds all of a stretch or nothing
             if keep is not None:
                 keep(*kept)
-            if bar is not None:
-                bar.update(int(training.at) * lanes - bar.n)
-                bar.set_postfix(
-                    failing=f"{rows[-1, FAILING_SHARE]:.1%}",
-                    log_p=f"{rows[-1, FAILING_SHARE + 1]:.4g}",
-                    refresh=False,
-                )
-            if callback is not None:
-                callback(int(rows[-1, 0]), jax.tree.map(lambda a: a[0], history(rows[-1:])))
+            failing, log_p = rows[-1, FAILING_SHARE : FAILING_SHARE + 2]
+            watch.reach(int(training.at) * lanes, failing=f"{failing:.1%}", log_p=f"{log_p:.4g}")
+            watch.tell(lambda rows=rows: history(rows[1:]))
     except KeyboardInterrupt:
         if len(kept[1]) < 2:
             raise
     finally:
-        if bar is not None:
-            bar.close()
+        watch.close()
     return kept
 
 

@@ -92,8 +92,8 @@ def cem(
     Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
     ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed.
     ``top``: distinct failures kept; ``record=True`` keeps the numbers of every episode
-    (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total)`` is called after
-    every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
+    (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
+    after every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
     result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and
     `jax.vmap`, without archive, history and callbacks.
 

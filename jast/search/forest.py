@@ -82,9 +82,9 @@ def forest(
 
     Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither
     changes a result. ``available``: bytes that the trees in flight may take (default: what is
-    free). ``progress=True`` shows a bar; ``callback(done, total)`` is called now and then with the
-    simulations of all trees. A KeyboardInterrupt ends the search with an honest result of what was
-    done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
+    free). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called now and then
+    with the simulations of all trees. A KeyboardInterrupt ends the search with an honest result of
+    what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
 
     ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw,
     "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier

@@ -17,12 +17,13 @@ from jast import failures as archive
 from jast import rewards
 from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
-from jast.episode import Episode, replay
+from jast.episode import Episode, advance, begin, conclude, replay
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
 from jast.search.threads import apart
 from jast.search.tree.packing import pack
+from jast.watch import Watch
 
 __all__ = [
     "Played",
@@ -257,16 +258,12 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
     stretch up to the next of ``ends`` (episodes of each tree).
 
     ``best`` [trees]: the best reward so far; ``trials``: `Trials` [end - begin, trees] or None.
-    ``host``: the system runs on the host. ``callback(done, total)`` after each chunk: the episodes
-    of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is raised
-    again where there is none.
+    ``host``: the system runs on the host. ``callback(done, total, None)`` after each chunk: the
+    episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is
+    raised again where there is none.
     """
-    whole, bar = ends[-1] * trees, None
-    if progress:
-        from tqdm import tqdm  # slow to import
-
-        bar = tqdm(total=whole, unit="sim", unit_scale=True, desc=name)
-    kept = carry, 0, None, []
+    whole, kept = ends[-1] * trees, (carry, 0, None, [])
+    watch = Watch(name, whole, "sim", progress, callback)
     try:
         for end in ends:
             carry, done, total, moments = kept
@@ -282,17 +279,13 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
                 )
             # at once: an interruption finds all of a chunk or nothing
             kept = carry, end, counted, [*moments, (end, best, counted.failures, record)]
-            if bar is not None:
-                bar.update(end * trees - bar.n)
-                bar.set_postfix(failures=counted.failures, best=f"{best.max():.4g}", refresh=False)
-            if callback is not None:
-                callback(end * trees, whole)
+            watch.reach(end * trees, failures=counted.failures, best=f"{best.max():.4g}")
+            watch.tell()
     except KeyboardInterrupt:
         if kept[2] is None:
             raise
     finally:
-        if bar is not None:
-            bar.close()
+        watch.close()
     carry, done, total, moments = kept
     *moments, records = zip(*moments, strict=True)
     record = None if records[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *records)

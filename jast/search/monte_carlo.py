@@ -62,9 +62,9 @@ def monte_carlo(
     The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``:
     distinct failures kept, static like ``episodes``. ``record=True`` keeps the numbers of every
     episode (``result.trials``); without it memory does not grow with ``episodes``.
-    ``progress=True`` shows a bar; ``callback(done, total)`` is called after every chunk, of which
-    there are about 200 (a black box has one each 64 episodes); KeyboardInterrupt ends the search
-    with the result of the whole chunks, and ``settings["interrupted"]``.
+    ``progress=True`` shows a bar; ``callback(done, total, None)`` is called after every chunk, of
+    which there are about 200 (a black box has one each 64 episodes); KeyboardInterrupt ends the
+    search with the result of the whole chunks, and ``settings["interrupted"]``.
 
     Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError
     for a count below 1 and where the simulator's functions or the actions do not fit together.

@@ -10,6 +10,7 @@ import numpy as np
 
 from jast._checks import whole
 from jast.counter import generator
+from jast.watch import Watch
 from jast.weakness.contract import Seen, Selector
 from jast.weakness.data import arrays, fingerprint, within
 from jast.weakness.measures import auc
@@ -57,8 +58,9 @@ def validate(
     ``state``: of an earlier result of the same data and selector, to go on from there: after an
     interruption as if there had been none, after a budget that was spent with new batches.
     ``checkpoint``: a file to which the state is written after every call of ``predict``, and from
-    which an existing one goes on. ``progress=True`` shows a bar of calls; ``callback(iteration,
-    result)`` is called after each iteration. The key is consumed; a ``state`` goes on with its own.
+    which an existing one goes on. ``progress=True`` shows a bar of calls; ``callback(done, total,
+    result)`` is called after each iteration, with the calls and the result so far. The key is
+    consumed; a ``state`` goes on with its own.
 
     Where ``predict`` raises, or answers with something else than m labels in range, or at a
     KeyboardInterrupt, the search ends, with a RuntimeWarning, and the result so far says so in
@@ -77,10 +79,6 @@ def validate(
             f" {predict!r}"
         )
     budget = n if budget is None else min(whole("validate", "budget", budget), n)
-    if callback is not None and not callable(callback):
-        raise ValueError(
-            f"validate: callback must be callable, (iteration, result), received {callback!r}"
-        )
     if checkpoint is not None and not os.path.isdir(os.path.dirname(os.path.abspath(checkpoint))):
         raise ValueError(
             f"validate: checkpoint must be a file in a folder that exists, received {checkpoint}"
@@ -164,7 +162,15 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     # what whole iterations have seen of it
     seen = _seen(state.order[: state.complete], answers, data.labels)
     memory, history, finished, incidents = state.memory, state.history, state.finished, []
-    bar = _bar(progress, budget, len(answered))
+    watch = Watch(
+        "validate",
+        budget,
+        "call",
+        progress,
+        callback,
+        done=len(answered),
+        former=lambda done, total, result: (len(result.history.calls), result),
+    )
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)
@@ -198,7 +204,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             batch = np.asarray(fresh[at : at + CHUNK])
             answers[batch] = _answers(predict, data, batch)
             answered.extend(batch.tolist())
-            bar.update(len(batch))
+            watch.reach(len(answered))
             if checkpoint is not None:
                 save(checkpoint, kept())
         current = _seen(
@@ -222,8 +228,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
                 + np.asarray(answered, int)[~current.tried[answered]].tolist()
             )
             seen, memory, history, answered = current, step.memory, row, order
-            if callback is not None:
-                callback(len(history.calls), _result(kept(), data, ()))
+            watch.tell(lambda: _result(kept(), data, ()))
             if idle == IDLE:
                 incidents.append(f"the selector asked for nothing new in {IDLE} iterations")
                 break
@@ -245,7 +250,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             raise
         incidents.append("interrupted")
     finally:
-        bar.close()
+        watch.close()
     if incidents:
         warnings.warn(
             f"validate: ended after {len(answered)} of {budget} calls: {incidents[0]}",
@@ -355,9 +360,3 @@ def _result(state, data, incidents):
         incidents,
         state,
     )
-
-
-def _bar(progress, budget, at):
-    from tqdm import tqdm
-
-    return tqdm(total=budget, initial=at, unit="call", disable=not progress)

@@ -24,6 +24,7 @@ from jast.search.tree.layout import Problem, levels, pages_of
 from jast.search.tree.memory import LANES, fit
 from jast.search.tree.run import Harvest, Plan, grow_all, grow_traced
 from jast.search.tree.settings import problem_of
+from jast.watch import Watch
 
 __all__ = ["grow_trees"]
 
@@ -92,7 +93,8 @@ def grow_trees(
     if job.school is not None:
         job.settings.update(_of_heads(heads, job))
     before, settings = incidents(sim), job.settings
-    with Watch(method, trees * job.plan.prunes * simulations, progress, callback) as watch:
+    total = trees * job.plan.prunes * simulations
+    with Watch(method, total, "sim", progress, callback) as watch:
         harvests, school, interrupted = grow_rounds(job, key, threads, lanes, top, watch.more)
     if interrupted:
         settings = settings | dict(interrupted=f"after {watch.done} of {watch.total} simulations")
@@ -225,31 +227,6 @@ def grow_rounds(
                 return harvests, school, True
             problem = problem._replace(guide=guide(school.heads, job.head_settings))
     return harvests, school, False
-
-
-class Watch:
-    """The progress bar and the callback of a search."""
-
-    def __init__(self, method: str, total: int, progress: bool, callback: Callable | None):
-        self.done, self.total, self._callback, self._bar = 0, total, callback, None
-        if progress:
-            from tqdm import tqdm  # slow to import
-
-            self._bar = tqdm(total=total, unit="sim", unit_scale=True, desc=method)
-
-    def more(self, n: int) -> None:
-        self.done += n
-        if self._bar is not None:
-            self._bar.update(n)
-        if self._callback is not None:
-            self._callback(self.done, self.total)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        if self._bar is not None:
-            self._bar.close()
 
 
 def _of_heads(heads: Any, job: Job) -> dict[str, Any]:

@@ -1,0 +1,110 @@
+"""Long work that is watched: one bar, one callback, one signature of it."""
+
+import inspect
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["Watch"]
+
+Callback = Callable[[int, int, Any], Any]
+
+
+class Watch:
+    """A bar of tqdm and the user's callback; a context manager, which closes the bar.
+
+    The callback is called as ``callback(done, total, result)``, with the result so far or None. One
+    of two arguments, as in earlier versions, still works, and warns once (DeprecationWarning).
+    """
+
+    def __init__(
+        self,
+        name: str,
+        total: int,
+        unit: str,
+        progress: bool,
+        callback: Callable[..., Any] | None,
+        *,
+        done: int = 0,
+        former: Callable[[int, int, Any], tuple] | None = None,
+    ):
+        """
+        Args:
+            name: of the function that works, before the bar and in errors.
+            total: units of all the work.
+            unit: their name.
+            progress: whether there is a bar.
+            callback: the user's, or None.
+            done: units that are done already.
+            former: the two arguments of earlier versions, from the three; default: the first two.
+
+        Raises:
+            ValueError: for a callback that cannot be called.
+        """
+        self.done, self.total = done, total
+        self._callback = None if callback is None else _of_three(name, callback, former)
+        self._bar = None
+        if progress:
+            from tqdm import tqdm  # slow to import
+
+            self._bar = tqdm(
+                total=total, initial=done, unit=unit, unit_scale=total >= 1000, desc=name
+            )
+
+    def reach(self, done: int, **words: Any) -> None:
+        """``done`` units are done; ``words``: numbers beside the bar."""
+        self.done = done
+        if self._bar is not None:
+            if words:
+                self._bar.set_postfix(**words, refresh=False)
+            self._bar.update(done - self._bar.n)
+
+    def tell(self, result: Callable[[], Any] | None = None) -> None:
+        """Call the callback; ``result()``, the result so far, is only made where there is one."""
+        if self._callback is not None:
+            self._callback(self.done, self.total, None if result is None else result())
+
+    def more(self, n: int) -> None:
+        """``n`` more units are done: the bar and the callback."""
+        self.reach(self.done + n)
+        self.tell()
+
+    def close(self) -> None:
+        """Close the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def __enter__(self) -> "Watch":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _of_three(name: str, callback: Any, former: Callable[..., tuple] | None) -> Callback:
+    """``callback`` as a function of (done, total, result)."""
+    if not callable(callback):
+        raise ValueError(
+            f"{name}: callback must be callable, (done, total, result so far or None), received"
+            f" {callback!r}"
+        )
+    if _takes(callback, 3) or not _takes(callback, 2):
+        return callback
+    warnings.warn(
+        f"{name}: callback takes (done, total, result so far or None) now; one of two arguments"
+        " goes with the next version",
+        DeprecationWarning,
+        stacklevel=4,
+    )
+    two = (lambda done, total, result: (done, total)) if former is None else former
+    return lambda *three: callback(*two(*three))
+
+
+def _takes(callback: Callable[..., Any], n: int) -> bool:
+    try:
+        inspect.signature(callback).bind(*range(n))
+    except TypeError:
+        return False
+    except ValueError:  # a builtin that does not say
+        return True
+    return True

@@ -1,0 +1,66 @@
+"""Long work that is watched."""
+
+import warnings
+
+import pytest
+
+from jast.watch import Watch
+
+
+def watched(callback, **named):
+    with Watch("search", 1000, "sim", False, callback, **named) as watch:
+        watch.more(10)
+        watch.reach(30, best=1)
+        watch.tell(lambda: "so far")
+
+
+def test_the_callback_takes_three():
+    seen = []
+    watched(lambda *three: seen.append(three))
+    assert seen == [(10, 1000, None), (30, 1000, "so far")]
+
+
+def test_one_of_two_arguments_warns_once_and_gets_what_it_got():
+    seen = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        watched(lambda done, total: seen.append((done, total)))
+        watched(lambda a, b: seen.append((a, b)), former=lambda done, total, r: (r, done))
+    assert [w.category for w in caught] == [DeprecationWarning] * 2
+    assert "search: callback takes (done, total, result so far or None) now" in str(
+        caught[0].message
+    )
+    assert seen == [(10, 1000), (30, 1000), (None, 10), ("so far", 30)]
+
+
+def test_defaults_and_methods_are_callbacks():
+    seen = []
+
+    class Log:
+        def add(self, done, total, result=None):
+            seen.append(done)
+
+    watched(Log().add)
+    watched(print_nothing := (lambda done, total, result, more=1: seen.append(more)))
+    assert seen == [10, 30, 1, 1] and callable(print_nothing)
+
+
+@pytest.mark.parametrize("bad", [3, "x"])
+def test_what_cannot_be_called_is_refused(bad):
+    with pytest.raises(ValueError, match="search: callback must be callable, .*received"):
+        Watch("search", 10, "sim", False, bad)
+
+
+def test_the_bar_says_how_far(capsys):
+    with Watch("search", 20, "sim", True, None, done=5) as watch:
+        watch.reach(12, failures=3)
+        watch.more(8)
+    text = capsys.readouterr().err
+    assert "search: " in text and "20/20" in text and "failures=3" in text
+
+
+def test_the_result_so_far_is_made_for_a_callback_only():
+    watch = Watch("search", 10, "sim", False, None)
+    watch.tell(lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        Watch("search", 10, "sim", False, print).tell(lambda: 1 / 0)
