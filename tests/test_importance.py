@@ -521,7 +521,7 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         and "importance" in capsys.readouterr().err
     )
     with pytest.raises(KeyboardInterrupt):
-        chunks(lambda i: stop(0, 0), LANES, MORE)
+        chunks(lambda i: stop(0, 0, None), LANES, MORE)
 
 
 # Refusals

@@ -17,7 +17,7 @@ from jast import failures as archive
 from jast import rewards
 from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
-from jast.episode import Episode, advance, begin, conclude, replay
+from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
