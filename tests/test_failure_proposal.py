@@ -11,7 +11,7 @@ from systems import hyperplane, ring, walk
 
 import jast
 from jast import distributions as D
-from jast.cross_entropy.tilted import Tilted, tilted
+from jast.distributions import Tilted, tilted
 from jast.estimate import failure_proposal
 
 SEEDS = 3

@@ -13,6 +13,7 @@ import jast
 from jast import actions
 from jast import distributions as D
 from jast.cross_entropy import sequences as S
+from jast.distributions.numerics import normal_score
 from jast.outline import outline
 
 
@@ -59,26 +60,26 @@ def test_quantile_is_exact_for_normals_far_out(dtype):
     factor = jnp.asarray([[2.0, 0.0], [1.0, 0.5]], dtype)
     z = jnp.asarray([8.0, -7.0], dtype)
     expected = [5, -23]
-    np.testing.assert_allclose(S.quantile(D.MultivariateNormalDiag(loc, scale), z), expected)
-    np.testing.assert_allclose(S.quantile(D.Independent(D.Normal(loc, scale), 1), z), expected)
-    np.testing.assert_allclose(S.quantile(D.MultivariateNormalTri(loc, factor), z), [17, 2.5])
-    joint = S.quantile(
+    np.testing.assert_allclose(D.from_normal(D.MultivariateNormalDiag(loc, scale), z), expected)
+    np.testing.assert_allclose(D.from_normal(D.Independent(D.Normal(loc, scale), 1), z), expected)
+    np.testing.assert_allclose(D.from_normal(D.MultivariateNormalTri(loc, factor), z), [17, 2.5])
+    joint = D.from_normal(
         D.Joint({"a": D.Normal(loc[0], scale[0]), "b": D.Normal(loc[1], scale[1])}),
         {"a": z[0], "b": z[1]},
     )
     assert (float(joint["a"]), float(joint["b"])) == (5, -23)
     one, other = D.Normal(loc[0], scale[0]), D.Normal(loc[1], scale[1])
     assert [
-        float(S.quantile(D.where(jnp.asarray(p), one, other), z[0])) for p in (True, False)
+        float(D.from_normal(D.where(jnp.asarray(p), one, other), z[0])) for p in (True, False)
     ] == [5, 22]
 
 
 def test_other_disturbances_by_their_quantile_function(dtype):
     z = jnp.asarray([-9.0, -1.0, 0.0, 2.0, 9.0], dtype)
-    x = S.quantile(D.Uniform(jnp.full(5, 2.0, dtype), jnp.full(5, 4.0, dtype)), z)
+    x = D.from_normal(D.Uniform(jnp.full(5, 2.0, dtype), jnp.full(5, 4.0, dtype)), z)
     np.testing.assert_allclose(x, 2 + 2 * scipy.stats.norm.cdf(np.asarray(z, float)), rtol=1e-6)
     coin = D.Bernoulli(probs=jnp.asarray(0.1, dtype))
-    assert [int(S.quantile(coin, v)) for v in z] == [0, 0, 0, 1, 1]
+    assert [int(D.from_normal(coin, v)) for v in z] == [0, 0, 0, 1, 1]
     box = S.place(
         actions.uniform(-1.0, 1.0), D.Normal(jnp.zeros((), dtype), jnp.ones((), dtype)), z[4]
     )
@@ -173,13 +174,13 @@ def test_latent_is_the_inverse_of_quantile(dtype):
         )
         joint = D.Joint({"a": normal, "b": (others[0],)}), {"a": far, "b": (z,)}
         pairs = [*((d, far) for d in normals), *((d, z) for d in (*normals, *others)), joint]
-        return [(v, S.latent(d, S.quantile(d, v))) for d, v in pairs]
+        return [(v, D.to_normal(d, D.from_normal(d, v))) for d, v in pairs]
 
     for latent, found in there_and_back():
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(latent), strict=True):
             assert a.dtype == dtype
             np.testing.assert_allclose(a, b, rtol=3e-4)
-    assert S.latent(D.Fixed(), ()) == ()
+    assert D.to_normal(D.Fixed(), ()) == ()
 
 
 def test_latent_of_whole_numbers(dtype):
@@ -187,16 +188,18 @@ def test_latent_of_whole_numbers(dtype):
     it goes back to it.
     """
     dice = D.Categorical(probs=jnp.asarray([0.2, 0.5, 0.3], dtype))
-    z = jax.jit(jax.vmap(lambda x: S.latent(dice, x)))(jnp.arange(3, dtype=jnp.int32))
+    z = jax.jit(jax.vmap(lambda x: D.to_normal(dice, x)))(jnp.arange(3, dtype=jnp.int32))
     np.testing.assert_allclose(z, scipy.stats.norm.ppf([0.9, 0.25, 0.65]), atol=1e-4)
-    assert jax.vmap(lambda z: S.quantile(dice, z))(z).tolist() == [0, 1, 2]
+    assert jax.vmap(lambda z: D.from_normal(dice, z))(z).tolist() == [0, 1, 2]
 
 
 def test_latent_is_finite(dtype):
     """At and beyond the ends of what a distribution can give, and at what rounds to them."""
     flat, tiny = D.Uniform(jnp.zeros((), dtype), jnp.ones((), dtype)), jnp.finfo(dtype).tiny
     z = np.asarray(
-        jax.jit(lambda x: S.latent(flat, x))(jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype))
+        jax.jit(lambda x: D.to_normal(flat, x))(
+            jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype)
+        )
     )
     assert (
         np.isfinite(z).all()
@@ -204,9 +207,11 @@ def test_latent_is_finite(dtype):
         and z[3] == 0
         and z[0] == z[1] < -5 < 5 < z[4] == z[5]
     )
-    assert S.normal_score(jnp.asarray([0.5, 1.0], dtype)).dtype == dtype
+    assert normal_score(jnp.asarray([0.5, 1.0], dtype)).dtype == dtype
 
 
 def test_latent_names_what_has_none(dtype):
     with pytest.raises(ValueError, match="Gamma"):
-        S.latent(D.Gamma(jnp.asarray(2.0, dtype), jnp.asarray(1.0, dtype)), jnp.asarray(0.3, dtype))
+        D.to_normal(
+            D.Gamma(jnp.asarray(2.0, dtype), jnp.asarray(1.0, dtype)), jnp.asarray(0.3, dtype)
+        )

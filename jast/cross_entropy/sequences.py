@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import log_ndtr, ndtr, ndtri
 from jax.tree_util import Partial
 
 from jast import actions as choices
@@ -19,21 +17,13 @@ from jast.policy import Policy
 
 __all__ = [
     "Steps",
-    "cells",
     "fit",
-    "latent",
     "log_ratio",
     "noise",
-    "normal_score",
-    "phi",
     "place",
     "player",
-    "quantile",
     "standard",
 ]
-
-
-LOG_2 = 0.6931471805599453
 
 
 class Steps(NamedTuple):
@@ -123,117 +113,8 @@ def place(actions, dist, z):
     the actions' proposal, by its quantile function.
     """
     if isinstance(actions, choices.UniformBox):
-        return actions.place(jax.tree.map(phi, z), dist)
-    return quantile(actions.of(dist), z)
-
-
-def quantile(dist, z):
-    """``jast.distributions.quantile(dist, Phi(z))``, exact for normal distributions also where
-    Phi(z) rounds to 1.
-    """
-    if isinstance(dist, D.Normal):
-        return dist.loc + dist.scale * z
-    if isinstance(dist, D.MultivariateNormalDiag):
-        return dist.loc + dist.scale_diag * z
-    if isinstance(dist, D.MultivariateNormalTri):
-        return dist.loc + dist.scale_tri @ z
-    if isinstance(dist, D.Independent):
-        return quantile(dist.distribution, z)
-    if isinstance(dist, D.Where):
-        return dist._select(quantile(dist._a, z), quantile(dist._b, z))
-    if isinstance(dist, D.Joint):
-        return jax.tree.map(
-            quantile, dist.distributions, z, is_leaf=lambda d: isinstance(d, D.Distribution)
-        )
-    # not by way of Phi(z), whose grid below 1 is 6e-8 in float32
-    if isinstance(dist, D.Laplace):
-        return dist.loc - dist.scale * jnp.sign(z) * (LOG_2 + log_ndtr(-jnp.abs(z)))
-    if isinstance(dist, D.Logistic):
-        return dist.loc + dist.scale * (log_ndtr(z) - log_ndtr(-z))
-    if isinstance(dist, D.Uniform):
-        width = dist.high - dist.low
-        return jnp.where(z < 0, dist.low + width * ndtr(z), dist.high - width * ndtr(-z))
-    if isinstance(dist, D.Bernoulli):
-        return jnp.asarray(z >= -ndtri(dist.probs), dist.dtype)
-    if isinstance(dist, D.Categorical):
-        order, edges = cells(dist.probs)
-        i = jnp.sum(z[..., None] >= edges, axis=-1)
-        return jnp.take_along_axis(order, i[..., None], axis=-1)[..., 0].astype(dist.dtype)
-    return D.quantile(dist, jax.tree.map(phi, z))
-
-
-def cells(probs):
-    """(the whole numbers by falling probability [..., k], the z between them [..., k - 1]): rare
-    ones lie in the upper tail, where more noise reaches them.
-    """
-    order = jnp.argsort(-probs, axis=-1)
-    p = jnp.take_along_axis(probs / jnp.sum(probs, axis=-1, keepdims=True), order, axis=-1)
-    below = jnp.cumsum(p, axis=-1)[..., :-1]
-    above = jnp.flip(jnp.cumsum(jnp.flip(p, axis=-1), axis=-1), axis=-1)[..., 1:]
-    return order, jnp.where(below < 0.5, ndtri(below), -ndtri(above))
-
-
-def latent(dist, x):
-    """The inverse of `quantile`: z with ``quantile(dist, z) == x``, for a whole number the middle
-    (in probability) of those; ValueError where none is known.
-    """
-    if isinstance(dist, D.Normal):
-        return (x - dist.loc) / dist.scale
-    if isinstance(dist, D.MultivariateNormalDiag):
-        return (x - dist.loc) / dist.scale_diag
-    if isinstance(dist, D.MultivariateNormalTri):
-        return solve_triangular(dist.scale_tri, x - dist.loc, lower=dist.is_lower)
-    if isinstance(dist, D.Independent):
-        return latent(dist.distribution, x)
-    if isinstance(dist, D.Where):
-        return dist._select(latent(dist._a, x), latent(dist._b, x))
-    if isinstance(dist, D.Joint):
-        return jax.tree.map(
-            latent, dist.distributions, x, is_leaf=lambda d: isinstance(d, D.Distribution)
-        )
-    if isinstance(dist, D.Laplace):
-        v = (x - dist.loc) / dist.scale
-        return -jnp.sign(v) * ndtri(jnp.exp(-jnp.abs(v)) / 2)
-    if isinstance(dist, D.Logistic):
-        v = (x - dist.loc) / dist.scale
-        return -jnp.sign(v) * ndtri(jax.nn.sigmoid(-jnp.abs(v)))
-    if isinstance(dist, D.Uniform):
-        x = jnp.clip(x, dist.low, dist.high)
-        # at an end of the support half a unit of rounding from there
-        least = jnp.maximum(jnp.abs(x) * (jnp.finfo(x.dtype).eps / 4), jnp.finfo(x.dtype).tiny)
-        below, above = (
-            jnp.maximum(gap, least) / (dist.high - dist.low)
-            for gap in (x - dist.low, dist.high - x)
-        )
-        return jnp.where(
-            below < above, ndtri(jnp.minimum(below, 0.5)), -ndtri(jnp.minimum(above, 0.5))
-        )
-    if isinstance(dist, D.Categorical):
-        order, edges = cells(dist.probs)
-        i = jnp.argmax(order == x[..., None].astype(order.dtype), axis=-1)[..., None]
-        end = jnp.full((*edges.shape[:-1], 1), jnp.inf, edges.dtype)
-        low, high = (
-            jnp.take_along_axis(e, i, axis=-1)[..., 0]
-            for e in (jnp.concatenate([-end, edges], -1), jnp.concatenate([edges, end], -1))
-        )
-        # the middle in probability, from the side where the numbers are small
-        return jnp.where(
-            low + high > 0,
-            -ndtri((ndtr(-low) + ndtr(-high)) / 2),
-            ndtri((ndtr(low) + ndtr(high)) / 2),
-        )
-    return jax.tree.map(normal_score, D.cdf(dist, x))
-
-
-def normal_score(u):
-    """Phi^-1(u), finite: what rounds to 0 or 1 counts as half a unit of rounding from there."""
-    eps = jnp.finfo(u.dtype).eps
-    return ndtri(jnp.where(u > 0, jnp.minimum(u, 1 - eps / 2), eps / 2))
-
-
-def phi(z):
-    """The normal distribution function, kept below 1."""
-    return jnp.minimum(ndtr(z), 1 - jnp.finfo(z.dtype).epsneg)
+        return actions.place(jax.tree.map(D.phi, z), dist)
+    return D.from_normal(actions.of(dist), z)
 
 
 def player(sim, actions, z0, z):
@@ -247,7 +128,7 @@ def player(sim, actions, z0, z):
 
 
 def _start(start, z0):
-    return D.Deterministic(quantile(start(), z0))
+    return D.Deterministic(D.from_normal(start(), z0))
 
 
 def _disturbance(disturbance, actions, z, state, t):

@@ -18,7 +18,6 @@ from jast import results
 from jast._checks import real, whole
 from jast.contract import contract
 from jast.cross_entropy import sequences
-from jast.cross_entropy.tilted import tilted, untiltable
 from jast.episode import rollout
 from jast.outline import ask, outline
 from jast.policy import Policy
@@ -219,18 +218,18 @@ def _elites(e, log_w, quantile):
 
 
 def _start(start, steps):
-    return tilted(start(), *jax.tree.map(lambda a: a[0], steps))
+    return D.tilted(start(), *jax.tree.map(lambda a: a[0], steps))
 
 
 def _disturbance(disturbance, steps, state, t):
-    return tilted(
+    return D.tilted(
         disturbance(state), *jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], steps)
     )
 
 
 def _tilts_start(sim: Simulator) -> bool:
     """Whether x0 is tilted; ValueError where x cannot be."""
-    start, step = ask(sim, lambda start, state, dist: (untiltable(start), untiltable(dist)))
+    start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
         raise ValueError(f"failure_proposal: disturbance: {step}")
     return outline(sim).random_start and start is None

@@ -19,8 +19,6 @@ from jast import results
 from jast._checks import real
 from jast._jax import is_traced
 from jast.contract import contract
-from jast.cross_entropy.sequences import latent
-from jast.cross_entropy.tilted import tilted
 from jast.episode import Episode, replay
 from jast.estimate.blend import blend
 from jast.outline import ask, outline
@@ -228,10 +226,10 @@ def latents(sim, recorded, of_start):
             sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(()))
         )
         states = jax.tree.map(lambda a: a[:-1], e.states)
-        z = jax.vmap(lambda s, x: latent(sim.disturbance(s), x))(states, e.disturbances)
+        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
         z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
-        return latent(sim.start(), x0) if of_start else (), z
+        return D.to_normal(sim.start(), x0) if of_start else (), z
 
     return jax.vmap(one)(*recorded)
 
@@ -252,7 +250,7 @@ def _stack(many, one, k):
 
 
 def _moved(p, z):
-    return tilted(p, z, jax.tree.map(jnp.ones_like, z))
+    return D.tilted(p, z, jax.tree.map(jnp.ones_like, z))
 
 
 def _mixed(share, p, q):
@@ -286,4 +284,4 @@ def _policy_step(disturbance, policy, strength, share, state, t):
 
 def _towards(p, x, strength):
     """p moved so that its middle is x (eq. 10-11)."""
-    return _moved(p, jax.tree.map(lambda z: strength.astype(z.dtype) * z, latent(p, x)))
+    return _moved(p, jax.tree.map(lambda z: strength.astype(z.dtype) * z, D.to_normal(p, x)))

@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast.cross_entropy.sequences import quantile
-from jast.cross_entropy.tilted import tilted, untiltable
 from jast.heads.heads import unflat
 from jast.outline import ask, outline
 from jast.pytrees import count
@@ -22,7 +20,7 @@ LOG_2PI = math.log(2 * math.pi)
 
 def x_of(dist, z):
     """The disturbance at the latents ``z`` [n], which are N(0, I) under ``dist``."""
-    return quantile(dist, unflat(z, D.event_like(dist)))
+    return D.from_normal(dist, unflat(z, D.event_like(dist)))
 
 
 def log_normal(z, mean=None, deviation=None):
@@ -42,7 +40,7 @@ def sizes(sim: Simulator) -> tuple[int, int]:
     like = outline(sim)
     if not _floats(like.x):
         raise ValueError(f"sac: disturbance: expected floats, received {_kinds(like.x)}")
-    start, step = ask(sim, lambda start, state, dist: (untiltable(start), untiltable(dist)))
+    start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
         raise ValueError(f"sac: disturbance: {step}")
     return count(like.x), count(like.x0) if _floats(like.x0) and start is None else 0
@@ -57,7 +55,7 @@ class Moved(D.Distribution):
         super().__init__()
         like = D.event_like(dist)
         self.mean_z, self.deviation_z, self.model = mean, deviation, dist
-        self._inner = tilted(dist, unflat(mean, like), unflat(deviation, like))
+        self._inner = D.tilted(dist, unflat(mean, like), unflat(deviation, like))
 
     @property
     def event_shape(self):

@@ -1,0 +1,104 @@
+"""Distributions of disturbances: the usual families, and what stress testing needs beside them.
+
+A disturbance model returns any object with ``sample(seed=key)``, ``log_prob(x)`` and, where it
+exists, ``mode()``: those made here are light; distrax's are accepted wherever a distribution is, and
+each of its names is found here, too (``jast.distributions.Transformed``): distrax is loaded then.
+
+What a search and a proposal ask of a distribution (`quantile`, `cdf`, `from_normal`, `to_normal`,
+`mode`, `tilted`) stands in a table, one row a family: `register` adds a user's own.
+"""
+
+import importlib
+import sys
+from typing import Any
+
+from jast.distributions import families as _families
+from jast.distributions import rows as _rows
+from jast.distributions.base import Distribution, is_distribution
+from jast.distributions.containers import Independent, Joint
+from jast.distributions.continuous import Beta, Gamma, Laplace, Logistic, Uniform
+from jast.distributions.discrete import Bernoulli, Categorical
+from jast.distributions.kinds import Deterministic, Fixed, Seeds, Tent, Where, seeds, tent, where
+from jast.distributions.normal import MultivariateNormalDiag, MultivariateNormalTri, Normal
+from jast.distributions.numerics import float_dtype, fraction, phi
+from jast.distributions.table import register
+from jast.distributions.tilted import Tilted, tilted, untiltable
+from jast.distributions.verbs import (
+    cdf,
+    event_like,
+    from_normal,
+    has_cdf,
+    has_exact_tails,
+    has_mode,
+    has_quantile,
+    log_density,
+    log_mode,
+    mode,
+    quantile,
+    sample,
+    sum_parts,
+    to_normal,
+)
+
+__all__ = [
+    "Bernoulli",
+    "Beta",
+    "Categorical",
+    "Deterministic",
+    "Distribution",
+    "Fixed",
+    "Gamma",
+    "Independent",
+    "Joint",
+    "Laplace",
+    "Logistic",
+    "MultivariateNormalDiag",
+    "MultivariateNormalTri",
+    "Normal",
+    "Seeds",
+    "Tent",
+    "Tilted",
+    "Transformed",  # noqa: F822  (distrax's, by __getattr__)
+    "Uniform",
+    "Where",
+    "cdf",
+    "event_like",
+    "float_dtype",
+    "fraction",
+    "from_normal",
+    "has_cdf",
+    "has_exact_tails",
+    "has_mode",
+    "has_quantile",
+    "is_distribution",
+    "log_density",
+    "log_mode",
+    "mode",
+    "phi",
+    "quantile",
+    "register",
+    "sample",
+    "seeds",
+    "sum_parts",
+    "tent",
+    "tilted",
+    "to_normal",
+    "untiltable",
+    "where",
+]
+
+del _families, _rows  # imported for the rows that they register
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def __getattr__(name: str) -> Any:
+    """distrax's ``name``."""
+    if not name.startswith("_"):
+        distrax = importlib.import_module(f"{__name__}.other").distrax
+        if hasattr(distrax, name):
+            setattr(sys.modules[__name__], name, getattr(distrax, name))
+            return getattr(distrax, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

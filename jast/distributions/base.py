@@ -1,0 +1,143 @@
+"""What every distribution of jast is: a pytree with samples and log densities."""
+
+from collections.abc import Callable, Sequence
+from math import prod
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+__all__ = ["Distribution", "float_array", "is_distribution", "tree_map"]
+
+
+class _Kind(type):
+    """``isinstance(d, Distribution)`` holds for distrax's distributions, too, without a need to
+    import distrax.
+    """
+
+    def __instancecheck__(cls, d: Any) -> bool:
+        return super().__instancecheck__(d) or (
+            cls is Distribution
+            and any(
+                c.__name__ == "Distribution" and c.__module__.partition(".")[0] == "distrax"
+                for c in type(d).__mro__
+            )
+        )
+
+
+class Distribution(metaclass=_Kind):
+    """Base of jast's distributions, and of a user's own: a pytree whose leaves are the arrays among
+    its attributes.
+
+    A subclass defines ``event_shape`` (a pytree of shapes: that of one value),
+    ``_sample_n(key, n)`` (n values on a new leading axis) and ``log_prob(value)``; where they
+    exist, ``mode()``, and ``quantile(u)`` with ``cdf(x)``, its inverse.
+    """
+
+    event_shape: Any
+
+    def __init_subclass__(cls, **settings: Any):
+        super().__init_subclass__(**settings)
+        jax.tree_util.register_pytree_node(cls, _flatten, lambda static, a: _build(cls, static, a))
+
+    def _sample_n(self, key: jax.Array, n: int) -> Any:
+        raise NotImplementedError(f"{self.name} does not define _sample_n(key, n)")
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Log density of ``value``."""
+        raise NotImplementedError(f"{self.name} does not define log_prob(value)")
+
+    def prob(self, value: Any) -> jax.Array:
+        """Density of ``value``."""
+        return jnp.exp(self.log_prob(value))
+
+    def sample(self, *, seed: Any, sample_shape: int | Sequence[int] = ()) -> Any:
+        """Values of shape ``sample_shape + batch_shape + event_shape``, drawn with the key (or
+        whole number) ``seed``.
+        """
+        if not isinstance(sample_shape, Sequence):
+            sample_shape = (sample_shape,)
+        shape = tuple(map(int, sample_shape))
+        key = jax.random.PRNGKey(seed) if isinstance(seed, (int, np.signedinteger)) else seed
+        values = self._sample_n(key, prod(shape))
+        return jax.tree.map(lambda a: a.reshape(shape + a.shape[1:]), values)
+
+    def sample_and_log_prob(self, *, seed: Any, sample_shape: int | Sequence[int] = ()) -> Any:
+        """(`sample`, its log density)."""
+        value = self.sample(seed=seed, sample_shape=sample_shape)
+        return value, self.log_prob(value)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The shape of a value in front of ``event_shape``; that of the first part of a structure."""
+        like, shapes = _like(self), self.event_shape
+        leaves, treedef = jax.tree.flatten(like)
+        events = treedef.flatten_up_to(shapes) if shapes else [()] * len(leaves)
+        parts = [a.shape[: a.ndim - len(e)] for a, e in zip(leaves, events, strict=True)]
+        return parts[0] if parts else ()
+
+    @property
+    def dtype(self) -> Any:
+        """The dtype of a value (a pytree of them where values are structures)."""
+        return jax.tree.map(lambda a: a.dtype, _like(self))
+
+    @property
+    def name(self) -> str:
+        return type(self).__name__
+
+
+def is_distribution(d: Any) -> bool:
+    """Whether ``d`` is a distribution of jast or of distrax, or else draws and scores as they do."""
+    return isinstance(d, Distribution) or (
+        not isinstance(d, type)
+        and callable(getattr(d, "sample", None))
+        and callable(getattr(d, "log_prob", None))
+    )
+
+
+def tree_map(function: Callable[..., Any], distributions: Any, *rest: Any) -> Any:
+    """``jax.tree.map`` over a structure whose leaves are distributions."""
+    return jax.tree.map(function, distributions, *rest, is_leaf=is_distribution)
+
+
+def float_array(x: Any) -> Any:
+    """``x`` as an array of floats; an array of floats is returned as it is.
+
+    Raises:
+        ValueError: of other numbers than integers and floats.
+    """
+    if not isinstance(x, (jax.Array, np.ndarray)):
+        x = jnp.asarray(x)
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    if jnp.issubdtype(x.dtype, jnp.integer):
+        return x.astype(float)
+    raise ValueError(f"a distribution's numbers: expected floats or integers, received {x.dtype}")
+
+
+def _like(d: Distribution) -> Any:
+    return jax.eval_shape(lambda: d.sample(seed=jax.random.PRNGKey(0)))
+
+
+def _flatten(d: Distribution) -> tuple[list[Any], tuple[Any, ...]]:
+    """Arrays (and what JAX puts in their place) are leaves; numbers, shapes, dtypes and functions
+    are part of the structure.
+    """
+    leaves, treedef = jax.tree.flatten(vars(d))
+    data = tuple(_is_data(a) for a in leaves)
+    static = tuple(None if own else a for a, own in zip(leaves, data, strict=True))
+    return [a for a, own in zip(leaves, data, strict=True) if own], (static, data, treedef)
+
+
+def _build(cls: type, structure: tuple[Any, ...], arrays: Any) -> Any:
+    static, data, treedef = structure
+    arrays = iter(arrays)
+    d = object.__new__(cls)
+    leaves = [next(arrays) if own else a for a, own in zip(static, data, strict=True)]
+    d.__dict__.update(treedef.unflatten(leaves))
+    return d
+
+
+def _is_data(x: Any) -> bool:
+    return isinstance(x, (jax.Array, np.ndarray, np.generic)) or type(x) is object

@@ -1,0 +1,152 @@
+"""Distributions of vectors and structures whose parts are independent."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast.distributions.base import Distribution, is_distribution, tree_map
+from jast.distributions.verbs import mode
+
+__all__ = ["Independent", "Joint"]
+
+
+class Independent(Distribution):
+    """The last ``reinterpreted_batch_ndims`` axes of a batch of distributions as one value.
+
+    Args:
+        distribution: of arrays, with a ``batch_shape``.
+        reinterpreted_batch_ndims: how many axes; None: all but the first.
+
+    Raises:
+        ValueError: where values are structures, or there are fewer axes than that.
+    """
+
+    def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None):
+        self._distribution = distribution = _accepted(distribution)
+        event, n = distribution.event_shape, reinterpreted_batch_ndims
+        if not (isinstance(event, tuple) and all(isinstance(i, int) for i in event)):
+            raise ValueError(
+                f"Independent: distribution: expected one of arrays, received {_name(distribution)}"
+                f" with event shape {event!r}"
+            )
+        ndim = len(distribution.batch_shape)
+        n = max(ndim - 1, 0) if n is None else n
+        if not 0 <= n <= ndim:
+            raise ValueError(
+                f"Independent: reinterpreted_batch_ndims: {_name(distribution)} has {ndim} batch"
+                f" dimensions, received {n}"
+            )
+        self._reinterpreted_batch_ndims = n
+
+    @property
+    def distribution(self) -> Any:
+        return self._distribution
+
+    @property
+    def reinterpreted_batch_ndims(self) -> int:
+        return self._reinterpreted_batch_ndims
+
+    @property
+    def event_shape(self):
+        batch = self._distribution.batch_shape
+        return (
+            batch[len(batch) - self._reinterpreted_batch_ndims :] + self._distribution.event_shape
+        )
+
+    @property
+    def batch_shape(self):
+        batch = self._distribution.batch_shape
+        return batch[: len(batch) - self._reinterpreted_batch_ndims]
+
+    def _sample_n(self, key, n):
+        return self._distribution.sample(seed=key, sample_shape=n)
+
+    def log_prob(self, value):
+        log_p = self._distribution.log_prob(value)
+        return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self._reinterpreted_batch_ndims)))
+
+    def mean(self):
+        return self._distribution.mean()
+
+    def variance(self):
+        return self._distribution.variance()
+
+    def stddev(self):
+        return self._distribution.stddev()
+
+    def median(self):
+        return self._distribution.median()
+
+    def mode(self):
+        return mode(self._distribution)
+
+
+class Joint(Distribution):
+    """A structure (dict, tuple, NamedTuple, ...) of independent distributions of one batch shape:
+    values are structures alike.
+
+    Raises:
+        ValueError: where a leaf is no distribution, or the batch shapes differ.
+    """
+
+    def __init__(self, distributions: Any):
+        self._distributions = tree_map(_accepted, distributions)
+        batches = {d.batch_shape for d in leaves(self._distributions)}
+        if len(batches) > 1:
+            each = ", ".join(f"{_name(d)} {d.batch_shape}" for d in leaves(self._distributions))
+            raise ValueError(f"Joint: expected one batch shape, received {each}")
+
+    @property
+    def distributions(self) -> Any:
+        return self._distributions
+
+    @property
+    def event_shape(self):
+        return tree_map(lambda d: d.event_shape, self._distributions)
+
+    @property
+    def batch_shape(self):
+        return leaves(self._distributions)[0].batch_shape
+
+    @property
+    def dtype(self):
+        return tree_map(lambda d: d.dtype, self._distributions)
+
+    def _sample_n(self, key, n):
+        treedef = jax.tree.structure(self._distributions, is_leaf=is_distribution)
+        keys = treedef.unflatten(list(jax.random.split(key, treedef.num_leaves)))
+        return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self._distributions, keys)
+
+    def log_prob(self, value):
+        parts = tree_map(lambda d, v: d.log_prob(v), self._distributions, value)
+        return jnp.sum(jnp.stack(jax.tree.leaves(parts)), axis=0)
+
+    def mean(self):
+        return tree_map(lambda d: d.mean(), self._distributions)
+
+    def median(self):
+        return tree_map(lambda d: d.median(), self._distributions)
+
+    def mode(self):
+        return tree_map(mode, self._distributions)
+
+
+def leaves(distributions: Any) -> list[Any]:
+    """The distributions of a structure of them."""
+    return jax.tree.leaves(distributions, is_leaf=is_distribution)
+
+
+def _accepted(d: Any) -> Any:
+    """``d``, one of tensorflow-probability as distrax sees it."""
+    if isinstance(d, Distribution):
+        return d
+    if type(d).__module__.partition(".")[0] != "tensorflow_probability":
+        raise ValueError(f"expected a distribution, received {d!r}")
+    import distrax
+
+    return distrax.as_distribution(d)
+
+
+def _name(d: Any) -> str:
+    return type(d).__name__

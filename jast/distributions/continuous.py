@@ -1,0 +1,194 @@
+"""Families of floats beside the normal ones. Draws and log densities of those that distrax has,
+too, agree with its to the bit.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax.lax import lgamma
+
+from jast.distributions.base import Distribution, float_array
+from jast.distributions.normal import Symmetric
+
+__all__ = ["Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
+
+LOG_2 = math.log(2.0)
+
+
+class Laplace(Symmetric):
+    """Density exp(-|x - loc| / scale) / (2 scale)."""
+
+    def _sample_n(self, key, n):
+        return self._placed(jax.random.laplace(key, **self._like_n(n)))
+
+    def log_prob(self, value):
+        return -jnp.abs(self._standardize(value)) - LOG_2 - jnp.log(self._scale)
+
+    def stddev(self):
+        return math.sqrt(2.0) * self.scale
+
+    def variance(self):
+        return 2.0 * jnp.square(self.scale)
+
+
+class Logistic(Symmetric):
+    """Distribution function 1 / (1 + exp(-(x - loc) / scale))."""
+
+    def _sample_n(self, key, n):
+        tiny = jnp.finfo(self.dtype).tiny
+        u = jax.random.uniform(key, **self._like_n(n), minval=tiny, maxval=1.0)
+        return self._placed(jnp.log(u) - jnp.log1p(-u))
+
+    def log_prob(self, value):
+        v = self._standardize(value)
+        return -v - 2.0 * jax.nn.softplus(-v) - jnp.log(self._scale)
+
+    def stddev(self):
+        return self.scale * math.pi / math.sqrt(3.0)
+
+    def variance(self):
+        return jnp.square(self.stddev())
+
+
+class Uniform(Distribution):
+    """On [``low``, ``high``], which broadcast."""
+
+    event_shape = ()
+
+    def __init__(self, low=0.0, high=1.0):
+        self._low, self._high = float_array(low), float_array(high)
+
+    @property
+    def batch_shape(self):
+        return jax.lax.broadcast_shapes(self._low.shape, self._high.shape)
+
+    @property
+    def low(self) -> jax.Array:
+        return jnp.broadcast_to(self._low, self.batch_shape)
+
+    @property
+    def high(self) -> jax.Array:
+        return jnp.broadcast_to(self._high, self.batch_shape)
+
+    @property
+    def range(self) -> jax.Array:
+        return self.high - self.low
+
+    @property
+    def dtype(self):
+        return jnp.result_type(self._low, self._high)
+
+    def _sample_n(self, key, n):
+        u = jax.random.uniform(key, (n, *self.batch_shape), self.range.dtype)
+        return self.low[None] + self.range[None] * u
+
+    def prob(self, value):
+        outside = (value < self.low) | (value > self.high)
+        return jnp.where(outside, jnp.zeros_like(value), jnp.ones_like(value) / self.range)
+
+    def log_prob(self, value):
+        return jnp.log(self.prob(value))
+
+    def mean(self):
+        return (self.low + self.high) / 2.0
+
+    median = mean
+
+    def stddev(self):
+        return self.range / math.sqrt(12.0)
+
+    def variance(self):
+        return jnp.square(self.range) / 12.0
+
+
+class _Pair(Distribution):
+    """Of two positive parameters that broadcast."""
+
+    event_shape = ()
+
+    def __init__(self, a, b):
+        self._a, self._b = float_array(a), float_array(b)
+
+    @property
+    def batch_shape(self):
+        return jax.lax.broadcast_shapes(self._a.shape, self._b.shape)
+
+    @property
+    def dtype(self):
+        return jnp.result_type(self._a, self._b)
+
+    @property
+    def _both(self):
+        return tuple(jnp.broadcast_to(v, self.batch_shape) for v in (self._a, self._b))
+
+
+class Gamma(_Pair):
+    """Density proportional to x^(concentration - 1) exp(-rate x), x > 0."""
+
+    def __init__(self, concentration, rate):
+        super().__init__(concentration, rate)
+
+    concentration = property(lambda self: self._both[0])
+    rate = property(lambda self: self._both[1])
+
+    def _sample_n(self, key, n):
+        a, rate = self._both
+        return jax.random.gamma(key, a, (n, *a.shape), self.dtype) / rate[None]
+
+    def log_prob(self, value):
+        a, rate = self._a, self._b
+        return a * jnp.log(rate) + (a - 1) * jnp.log(value) - rate * value - lgamma(a)
+
+    def mean(self):
+        return self._a / self._b
+
+    def variance(self):
+        return self._a / jnp.square(self._b)
+
+    def stddev(self):
+        return jnp.sqrt(self._a) / self._b
+
+    def mode(self):
+        """(concentration - 1) / rate; NaN where the density has no maximum."""
+        return jnp.where(self._a >= 1.0, (self._a - 1.0) / self._b, jnp.nan)
+
+
+class Beta(_Pair):
+    """Density proportional to x^(alpha - 1) (1 - x)^(beta - 1) on [0, 1]."""
+
+    def __init__(self, alpha, beta):
+        super().__init__(alpha, beta)
+
+    alpha = property(lambda self: self._both[0])
+    beta = property(lambda self: self._both[1])
+
+    def _sample_n(self, key, n):
+        a, b = self._both
+        return jax.random.beta(key, a, b, (n, *a.shape), self.dtype)
+
+    def log_prob(self, value):
+        a, b = self._a, self._b
+        norm = lgamma(a) + lgamma(b) - lgamma(a + b)
+        inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - norm
+        flat = ((a == 1.0) & (value == 0.0)) | ((b == 1.0) & (value == 1.0))
+        return jnp.where(flat, -norm, inner)
+
+    def mean(self):
+        return self._a / (self._a + self._b)
+
+    def variance(self):
+        total = self._a + self._b
+        return self._a * self._b / (jnp.square(total) * (total + 1.0))
+
+    def stddev(self):
+        return jnp.sqrt(self.variance())
+
+    def mode(self):
+        """NaN where the density has no single maximum."""
+        a, b = self._a, self._b
+        inner = (a - 1.0) / (a + b - 2.0)
+        at_end = jnp.where(
+            (a <= 1.0) & (b > 1.0), 0.0, jnp.where((a > 1.0) & (b <= 1.0), 1.0, jnp.nan)
+        )
+        return jnp.where((a > 1.0) & (b > 1.0), inner, at_end)

@@ -1,0 +1,209 @@
+"""Distributions that stress testing needs and no library has: certain values, seeds of unknown
+density, the tent of the MCFS-AP paper, one of two classes.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast.distributions.base import Distribution
+from jast.distributions.numerics import fraction
+from jast.distributions.verbs import log_density, mode
+
+__all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
+
+
+class Fixed(Distribution):
+    """The certain, empty disturbance ``()``: a system with one start."""
+
+    event_shape = ()
+
+    def sample(self, *, seed=None, sample_shape=()):
+        return ()
+
+    def _sample_n(self, key, n):
+        return ()
+
+    def log_prob(self, value):
+        return jnp.zeros(())
+
+    log_prob_from_mode = log_prob
+
+    def mode(self):
+        return ()
+
+
+class Deterministic(Distribution):
+    """All mass on ``value``, a pytree of arrays: a recorded disturbance. ``log_prob`` is 0: it is a
+    point, not a density.
+    """
+
+    def __init__(self, value: Any):
+        self._value = value
+
+    @property
+    def event_shape(self):
+        return jax.tree.map(jnp.shape, self._value)
+
+    def sample(self, *, seed=None, sample_shape=()):
+        return self._value
+
+    def _sample_n(self, key, n):
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *a.shape)), self._value)
+
+    def log_prob(self, value):
+        return jnp.zeros(())
+
+    log_prob_from_mode = log_prob
+
+    def mode(self):
+        return self._value
+
+
+class Seeds(Distribution):
+    """Random seeds of ``shape``, uint32, for a system whose disturbance density is unknown:
+    ``log_prob`` is 0 and there is no mode.
+    """
+
+    def __init__(self, shape=()):
+        self._shape = tuple(shape)
+
+    @property
+    def event_shape(self):
+        return self._shape
+
+    def _sample_n(self, key, n):
+        return jax.random.bits(key, (n, *self._shape), jnp.uint32)
+
+    def log_prob(self, value):
+        return jnp.zeros(())
+
+    log_prob_from_mode = log_prob
+
+
+class Tent(Distribution):
+    """Density proportional to ``1 - |x - center| / width`` on ``[low, high]`` (elementwise over
+    ``center``), zero elsewhere.
+
+    With ``width=1`` on [0, 1] its mode-normalised log density is ``ln(1 - |x - center|)``, the step
+    reward of the MCFS-AP paper (eq. 1 as a sum of logs).
+    """
+
+    event_shape = ()
+
+    def __init__(self, center, width=1.0, low=0.0, high=1.0):
+        center = jnp.asarray(center)
+        self._center, self._width, self._low, self._high = (
+            jnp.asarray(v, center.dtype) for v in (center, width, low, high)
+        )
+
+    @property
+    def batch_shape(self):
+        return self._center.shape
+
+    def _masses(self):
+        """Unnormalised masses left of the start of the support, and its whole span, of the full
+        tent of mass ``width``.
+        """
+        lower, upper = self._cdf_full(self._low), self._cdf_full(self._high)
+        return lower, upper - lower
+
+    def _cdf_full(self, x):
+        z = jnp.clip((x - self._center) / self._width, -1.0, 1.0)
+        return self._width * jnp.where(z < 0, 0.5 * (1 + z) ** 2, 1 - 0.5 * (1 - z) ** 2)
+
+    def log_prob_from_mode(self, x):
+        """Log density less the log density of the mode, without the normaliser: exactly ``log(1 -
+        |x - center| / width)``.
+        """
+        inside = (x >= self._low) & (x <= self._high)
+        height = jnp.where(inside, 1 - jnp.abs(x - self._center) / self._width, 0.0)
+        return jnp.where(height > 0, jnp.log(jnp.where(height > 0, height, 1.0)), -jnp.inf)
+
+    def log_prob(self, value):
+        return self.log_prob_from_mode(value) - jnp.log(self._masses()[1])
+
+    def quantile(self, u):
+        lower, span = self._masses()
+        mass = (lower + u * span) / self._width  # of the full tent of unit mass
+        z = jnp.where(
+            mass < 0.5, jnp.sqrt(2 * mass) - 1, 1 - jnp.sqrt(jnp.maximum(2 - 2 * mass, 0))
+        )
+        return jnp.clip(self._center + self._width * z, self._low, self._high)
+
+    def cdf(self, value):
+        return fraction(*(self._cdf_full(v) for v in (value, self._low, self._high)))
+
+    def _sample_n(self, key, n):
+        return self.quantile(jax.random.uniform(key, (n, *self.batch_shape), self._center.dtype))
+
+    def mode(self):
+        return self._center
+
+
+class Where(Distribution):
+    """``a`` where the scalar ``pred`` holds, else ``b``: two classes of distribution over the same
+    kind of value.
+    """
+
+    def __init__(self, pred, a, b):
+        self._pred, self._a, self._b = jnp.asarray(pred), a, b
+
+    @property
+    def pred(self) -> jax.Array:
+        return self._pred
+
+    @property
+    def parts(self) -> tuple[Any, Any]:
+        """``(a, b)``."""
+        return self._a, self._b
+
+    @property
+    def event_shape(self):
+        return self._a.event_shape
+
+    def select(self, a: Any, b: Any) -> Any:
+        """The pytree ``a`` where ``pred`` holds, else ``b``."""
+        return jax.tree.map(
+            lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
+        )
+
+    def sample(self, *, seed, sample_shape=()):
+        # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
+        # reused keys that it is meant
+        other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
+        return self.select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
+
+    def _sample_n(self, key, n):
+        return self.sample(seed=key, sample_shape=(n,))
+
+    def log_prob(self, value):
+        return self.select(self._a.log_prob(value), self._b.log_prob(value))
+
+    def log_prob_from_mode(self, value):
+        return self.select(log_density(self._a, value, "mode"), log_density(self._b, value, "mode"))
+
+    def mode(self):
+        return self.select(mode(self._a), mode(self._b))
+
+
+def tent(center, width=1.0, low=0.0, high=1.0) -> Tent:
+    """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero
+    ``width`` away, cut to ``[low, high]``.
+    """
+    return Tent(center, width, low, high)
+
+
+def seeds(shape=()) -> Seeds:
+    """`Seeds` of ``shape``, uint32: the density of the disturbance is unknown (log p = 0), only its
+    seed is chosen.
+    """
+    return Seeds(shape)
+
+
+def where(pred, a: Any, b: Any) -> Where:
+    """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of
+    one shape and dtype.
+    """
+    return Where(pred, a, b)

@@ -1,0 +1,99 @@
+"""Numbers that several families need: the normal distribution in both tails, fractions and cells."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import log_ndtr, ndtr, ndtri
+
+__all__ = [
+    "cell",
+    "cells",
+    "float_dtype",
+    "fraction",
+    "inside",
+    "log_tails",
+    "normal_of_log_tails",
+    "normal_score",
+    "phi",
+    "standard",
+]
+
+
+def float_dtype(dtype: Any) -> Any:
+    """``dtype`` where it is floating, else the default float."""
+    return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.zeros(()).dtype
+
+
+def phi(z: jax.Array) -> jax.Array:
+    """The normal distribution function, kept below 1."""
+    return jnp.minimum(ndtr(z), 1 - jnp.finfo(z.dtype).epsneg)
+
+
+def normal_score(u: jax.Array) -> jax.Array:
+    """Phi^-1(u), finite: what rounds to 0 or 1 counts as half a unit of rounding from there."""
+    eps = jnp.finfo(u.dtype).eps
+    return ndtri(jnp.where(u > 0, jnp.minimum(u, 1 - eps / 2), eps / 2))
+
+
+def inside(u: jax.Array) -> jax.Array:
+    """Keep ``u`` off 0 and 1, where an unbounded quantile is infinite."""
+    eps = jnp.finfo(u.dtype).eps
+    return jnp.clip(u, eps / 2, 1 - eps)
+
+
+def fraction(x: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is
+    no way.
+    """
+    none = high == low
+    return jnp.where(none, 0.5, jnp.clip((x - low) / jnp.where(none, 1, high - low), 0, 1))
+
+
+def standard(gap: jax.Array, scale: jax.Array) -> jax.Array:
+    """``gap / scale``; where the scale is 0, a gap of 0 stays 0."""
+    return gap / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
+
+
+def cell(x: jax.Array, inner: jax.Array) -> jax.Array:
+    """Middle of the ``x``-th of the intervals of [0, 1] that begin at 0 and at each of ``inner``
+    (on the last axis); 0 or 1 where there is none.
+    """
+    end = jnp.zeros((*inner.shape[:-1], 1), inner.dtype)
+    starts, last = jnp.concatenate([end, inner, end + 1], axis=-1), inner.shape[-1]
+    v = jnp.asarray(x).astype(inner.dtype)
+    i = jnp.clip(jnp.floor(v), 0, last).astype(jnp.int32)[..., None]
+    low, high = (jnp.take_along_axis(starts, j, axis=-1)[..., 0] for j in (i, i + 1))
+    middle = (low + high) / 2
+    middle = jnp.where(middle < high, middle, low)  # an interval holds its start alone
+    return jnp.clip(jnp.where((v < 0) | (v > last), v, middle), 0, 1).astype(
+        float_dtype(jnp.result_type(x))
+    )
+
+
+def cells(probs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(the whole numbers by falling probability [..., k], the z between them [..., k - 1]): rare
+    ones lie in the upper tail, where more noise reaches them.
+    """
+    order = jnp.argsort(-probs, axis=-1)
+    p = jnp.take_along_axis(probs / jnp.sum(probs, axis=-1, keepdims=True), order, axis=-1)
+    below = jnp.cumsum(p, axis=-1)[..., :-1]
+    above = jnp.flip(jnp.cumsum(jnp.flip(p, axis=-1), axis=-1), axis=-1)[..., 1:]
+    return order, jnp.where(below < 0.5, ndtri(below), -ndtri(above))
+
+
+def log_tails(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(log Phi(z), log Phi(-z)), each to the precision of its own size: ``log_ndtr`` of a positive
+    number is the log of a float below 1, of which in float32 an eighth is lost at z = 5.
+    """
+    small = log_ndtr(-jnp.abs(z))
+    large = jnp.log1p(-jnp.exp(small))
+    return jnp.where(z < 0, small, large), jnp.where(z < 0, large, small)
+
+
+def normal_of_log_tails(log_below: jax.Array, log_above: jax.Array) -> jax.Array:
+    """The z of `log_tails`, from the smaller of the two; finite where one of them is 0."""
+    least = math.log(jnp.finfo(log_below.dtype).tiny)  # z = -12.9 in float32, -37.4 in float64
+    small = jnp.clip(jnp.minimum(log_below, log_above), least, -math.log(2.0))
+    return jnp.where(log_below < log_above, 1, -1).astype(small.dtype) * ndtri(jnp.exp(small))

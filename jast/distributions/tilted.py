@@ -1,0 +1,84 @@
+"""A distribution seen through its latent normal number and moved there: x = Q(Phi(z)) with z ~
+N(mean, deviation^2) in place of N(0, 1).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast.distributions.base import Distribution
+from jast.distributions.numerics import float_dtype
+from jast.distributions.table import row
+from jast.distributions.verbs import event_like, from_normal, has_cdf, to_normal
+
+__all__ = ["Tilted", "tilted", "untiltable"]
+
+
+class Tilted(Distribution):
+    """What `tilted` makes of a distribution of floats that has a quantile function and its inverse,
+    taken number by number.
+    """
+
+    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array):
+        self._distribution, self._mean, self._deviation = distribution, mean, deviation
+
+    @property
+    def event_shape(self):
+        return self._distribution.event_shape
+
+    @property
+    def batch_shape(self):
+        return self._distribution.batch_shape
+
+    def _sample_n(self, key, n):
+        z = self._mean[None] + self._deviation[None] * jax.random.normal(
+            key, (n, *self._mean.shape), self._mean.dtype
+        )
+        return jax.vmap(lambda z: from_normal(self._distribution, z))(z)
+
+    def log_prob(self, value):
+        """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is
+        the same in both.
+        """
+        log_p = self._distribution.log_prob(value)
+        z = to_normal(self._distribution, value)
+        e = (z - self._mean) / self._deviation
+        gain = 0.5 * (z - e) * (z + e) - jnp.log(self._deviation)
+        return log_p + jnp.sum(gain, axis=tuple(range(log_p.ndim, gain.ndim)))
+
+
+def tilted(dist: Any, mean: Any, deviation: Any) -> Any:
+    """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of
+    ``dist``; ``mean`` and ``deviation`` are like a value, floats.
+
+    It has samples and log densities. Normal distributions are shifted and scaled, of whole numbers
+    only the probabilities change: these are exact. Others are as exact as `from_normal`.
+
+    Raises:
+        ValueError: naming a distribution that cannot.
+    """
+    known = row(dist, "tilt", "quantile").tilt
+    if known is not None:
+        return known(dist, mean, deviation)
+    like = event_like(dist)
+    if not has_cdf(dist) or not (
+        hasattr(like, "dtype") and jnp.issubdtype(like.dtype, jnp.floating)
+    ):
+        raise ValueError(
+            f"{type(dist).__name__} cannot be tilted: expected floats with a quantile function and"
+            " a distribution function that inverts it"
+        )
+    return Tilted(dist, mean, deviation)
+
+
+def untiltable(dist: Any) -> str | None:
+    """Why `tilted` cannot serve ``dist``; None where it can."""
+    full = lambda v: jax.tree.map(
+        lambda s: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist)
+    )
+    try:
+        tilted(dist, full(0), full(1))
+    except ValueError as error:
+        return str(error)
+    return None

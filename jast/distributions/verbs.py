@@ -1,0 +1,192 @@
+"""What jast asks of a distribution: a draw, its mode, its log density, and the ways between its
+values, the unit interval and normal numbers. Each is a look-up in the table of families.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jast.distributions.numerics import float_dtype, normal_score, phi
+from jast.distributions.table import row
+
+__all__ = [
+    "cdf",
+    "event_like",
+    "from_normal",
+    "has_cdf",
+    "has_exact_tails",
+    "has_mode",
+    "has_quantile",
+    "log_density",
+    "log_mode",
+    "mode",
+    "quantile",
+    "sample",
+    "sum_parts",
+    "to_normal",
+]
+
+
+def sample(d: Any, key: jax.Array) -> Any:
+    """One draw from ``d``."""
+    return d.sample(seed=key)
+
+
+def mode(d: Any) -> Any:
+    """The likeliest value of ``d``; its median where no mode is known.
+
+    Raises:
+        ValueError: if there is neither.
+    """
+    known = row(d, "mode").mode
+    try:
+        if known is not None:
+            return known(d)
+    except NotImplementedError:  # distrax's base class has the method
+        pass
+    half = _half(d)
+    try:
+        return quantile(d, half)
+    except ValueError:
+        raise ValueError(
+            f"{type(d).__name__} has neither a mode nor a median: the undisturbed system is not"
+            " defined"
+        ) from None
+
+
+def log_mode(d: Any) -> jax.Array:
+    """The log density of ``d`` at its mode: scalar."""
+    known = row(d, "log_mode").log_mode
+    return known(d) if known is not None else d.log_prob(mode(d))
+
+
+def log_density(d: Any, x: Any, density: str = "raw") -> jax.Array:
+    """Log density of ``x``: ``"raw"``, or ``"mode"``: less that of the mode, so that the likeliest
+    value has 0.
+    """
+    if density == "raw":
+        return d.log_prob(x)
+    known = row(d, "log_prob_from_mode").log_prob_from_mode
+    return known(d, x) if known is not None else d.log_prob(x) - log_mode(d)
+
+
+def quantile(d: Any, u: Any) -> Any:
+    """The value of ``d`` at the quantile ``u`` in [0, 1] (a pytree like a value of ``d``, floats),
+    so that ``u ~ U(0, 1)`` gives a draw of ``d``.
+
+    Vectors are taken coordinate by coordinate; integers by the inverse of their distribution
+    function.
+
+    Raises:
+        ValueError: naming a distribution that cannot.
+    """
+    known = row(d, "quantile").quantile
+    if known is None:
+        raise no_quantile(d)
+    return known(d, u)
+
+
+def cdf(d: Any, x: Any) -> Any:
+    """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with
+    ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
+
+    An integer has the middle of the interval of ``u`` that gives it. Outside of the support: 0 or
+    1.
+
+    Raises:
+        ValueError: naming a distribution that cannot.
+    """
+    if row(d, "quantile").quantile is None:
+        raise ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
+    # a cdf of a base may be that of another quantile function
+    known = row(d, "quantile", "cdf").cdf
+    if known is None:
+        raise ValueError(
+            f"cdf: {type(d).__name__} has a method quantile, but no method cdf that inverts it"
+        )
+    return known(d, x)
+
+
+def from_normal(d: Any, z: Any) -> Any:
+    """The value of ``d`` at the normal number ``z`` (a pytree like a value, floats): ``quantile(d,
+    Phi(z))``, so that ``z ~ N(0, I)`` gives a draw of ``d``.
+
+    Exact in both tails where `has_exact_tails`; else by way of Phi(z), a float below 1.
+
+    Raises:
+        ValueError: naming a distribution that has no quantile function.
+    """
+    known = row(d, "from_normal", "quantile").from_normal
+    return known(d, z) if known is not None else quantile(d, jax.tree.map(phi, z))
+
+
+def to_normal(d: Any, x: Any) -> Any:
+    """The inverse of `from_normal`: z with ``from_normal(d, z) == x``, for a whole number the
+    middle (in probability) of those.
+
+    Raises:
+        ValueError: naming a distribution for which none is known.
+    """
+    known = row(d, "to_normal", "quantile", "cdf").to_normal
+    return known(d, x) if known is not None else jax.tree.map(normal_score, cdf(d, x))
+
+
+def has_mode(d: Any) -> bool:
+    """Whether `mode` is defined for ``d`` (host-side)."""
+    return _defined(lambda: mode(d))
+
+
+def has_quantile(d: Any) -> bool:
+    """Whether `quantile` is defined for ``d`` (host-side)."""
+    return _defined(lambda: quantile(d, _half(d)))
+
+
+def has_cdf(d: Any) -> bool:
+    """Whether `cdf` is defined for ``d`` (host-side)."""
+    return _defined(lambda: cdf(d, sample(d, jax.random.key(0))))
+
+
+def has_exact_tails(d: Any) -> bool:
+    """Whether `from_normal` of ``d`` is exact however far out (host-side); where it is not, in
+    float32 all z > 5.4 are one value.
+    """
+    known = row(d, "from_normal", "quantile")
+    return known.from_normal is not None and (known.exact is None or known.exact(d))
+
+
+def event_like(d: Any) -> Any:
+    """Shapes and dtypes of one value of ``d``."""
+    return jax.eval_shape(lambda: sample(d, jax.random.key(0)))
+
+
+def sum_parts(parts: Any) -> jax.Array:
+    """The sum of a pytree of scalars, in the widest of their dtypes."""
+    leaves = jax.tree.leaves(parts)
+    dtype = jnp.result_type(*leaves)
+    return sum(
+        (lax.convert_element_type(v, dtype) for v in leaves[1:]),
+        lax.convert_element_type(leaves[0], dtype),
+    )
+
+
+def no_quantile(d: Any) -> ValueError:
+    """The error of a distribution that has no quantile function."""
+    return ValueError(
+        f"quantile: {type(d).__name__} has no quantile function here; use jast.actions.samples()"
+    )
+
+
+def _defined(function: Callable[[], Any]) -> bool:
+    try:
+        jax.eval_shape(function)  # of no arguments, as a distribution need not be a pytree
+    except ValueError:
+        return False
+    return True
+
+
+def _half(d: Any) -> Any:
+    """0.5 for each number of a value of ``d``."""
+    return jax.tree.map(lambda s: jnp.full(s.shape, 0.5, float_dtype(s.dtype)), event_like(d))
