@@ -1,8 +1,8 @@
 """Distributions of disturbances: the usual families, and what stress testing needs beside them.
 
 A disturbance model returns any object with ``sample(seed=key)``, ``log_prob(x)`` and, where it
-exists, ``mode()``: those made here are light; distrax's are accepted wherever a distribution is, and
-each of its names is found here, too (``jast.distributions.Transformed``): distrax is loaded then.
+exists, ``mode()``: those made here are light; distrax's are accepted wherever a distribution is,
+and each of its names is found here, too (``jast.distributions.Transformed``): it is loaded then.
 
 What a search and a proposal ask of a distribution (`quantile`, `cdf`, `from_normal`, `to_normal`,
 `mode`, `tilted`) stands in a table, one row a family: `register` adds a user's own.

@@ -70,7 +70,7 @@ class Distribution(metaclass=_Kind):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """The shape of a value in front of ``event_shape``; that of the first part of a structure."""
+        """The shape of a value in front of ``event_shape``; of a structure, of its first part."""
         like, shapes = _like(self), self.event_shape
         leaves, treedef = jax.tree.flatten(like)
         events = treedef.flatten_up_to(shapes) if shapes else [()] * len(leaves)
@@ -88,7 +88,7 @@ class Distribution(metaclass=_Kind):
 
 
 def is_distribution(d: Any) -> bool:
-    """Whether ``d`` is a distribution of jast or of distrax, or else draws and scores as they do."""
+    """Whether ``d`` is a distribution of jast or of distrax, or draws and scores as they do."""
     return isinstance(d, Distribution) or (
         not isinstance(d, type)
         and callable(getattr(d, "sample", None))

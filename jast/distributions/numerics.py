@@ -1,4 +1,4 @@
-"""Numbers that several families need: the normal distribution in both tails, fractions and cells."""
+"""What several families need: the normal distribution in both tails, fractions, cells."""
 
 import math
 from typing import Any

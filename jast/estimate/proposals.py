@@ -55,7 +55,7 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     ``episodes``: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a
     list of either. Each is replayed; its disturbance x*_t moves p(x | s) so that its middle is
     where x*_t lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq.
-    10-11), in general `jast.cross_entropy.tilted`, which keeps within bounds and suits whole
+    10-11), in general `jast.distributions.tilted`, which keeps within bounds and suits whole
     numbers too. Steps after the end of a trace are the model's own.
 
     ``epsilon``: the share of the model, above 0 and at most 1 (traced). With ``mixing="step"`` it
