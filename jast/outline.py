@@ -127,11 +127,11 @@ def _can(question: Callable[[Any], bool], dist: Any) -> bool:
 
 
 def _without_quantile(dist: Any) -> str:
-    if isinstance(dist, D.Joint):
-        parts = jax.tree.leaves(dist.distributions, is_leaf=lambda d: isinstance(d, D.Distribution))
+    if hasattr(dist, "distributions"):
+        parts = jax.tree.leaves(dist.distributions, is_leaf=D.is_distribution)
         lacking = [_without_quantile(d) for d in parts if not _can(D.has_quantile, d)]
         return lacking[0] if lacking else type(dist).__name__
-    if isinstance(dist, D.Independent):
+    if hasattr(dist, "distribution"):
         return _without_quantile(dist.distribution)
     return type(dist).__name__
 

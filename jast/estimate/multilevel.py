@@ -14,6 +14,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jast import actions as choices
+from jast import distributions as D
 from jast import results
 from jast._checks import real, whole
 from jast.contract import contract
