@@ -38,10 +38,10 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Tests of bits run twice: with the long ones too, where they are compiled as users have it."""
+    """What depends on the compiler runs twice: with the long ones, compiled as users have it."""
     if config.option.markexpr == "long":
         for item in items:
-            if "equal" in item.fixturenames or item.get_closest_marker("bits"):
+            if "equal" in item.fixturenames or item.get_closest_marker("compiled"):
                 item.add_marker("long")
 
 

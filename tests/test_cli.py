@@ -51,7 +51,14 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
     )
 
 
-@pytest.mark.parametrize("simulator", [name for name in cli.SYSTEMS if name != "ferry"])
+@pytest.mark.parametrize(
+    "simulator",
+    [
+        pytest.param(name, marks=pytest.mark.long if name == "colav" else ())
+        for name in cli.SYSTEMS
+        if name != "ferry"
+    ],
+)
 def test_every_simulator(capsys, tmp_path, simulator):
     status, text, out = run(capsys, tmp_path, "--simulator", simulator, "--prunes", "2", "--paper")
     assert status == 0 and text.startswith(f"{simulator}, seed 0")

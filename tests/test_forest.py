@@ -90,11 +90,13 @@ def test_fields_are_as_documented(name):
     )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["ferry", "landing", "ring"])
 def test_results_are_honest(name):
     honest(once(name), SYSTEMS[name], (S0 if name == "ferry" else dict(reward=BONUS))["reward"])
 
 
+@pytest.mark.compiled
 def test_every_archived_failure_replays_to_the_bit():
     archive = once("ring").failures
     assert archive.size > 10

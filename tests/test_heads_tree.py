@@ -351,6 +351,7 @@ KEPT = [
 ]
 
 
+@pytest.mark.long  # rounding alike in programs that differ is the optimised compiler's
 @pytest.mark.parametrize(("name", "candidates", "memoize"), KEPT)
 def test_memoization_changes_the_steps_and_nothing_else(name, candidates, memoize, equal):
     node, other = built(name, candidates)[0], built(name, candidates, memoize)[0]
@@ -359,6 +360,7 @@ def test_memoization_changes_the_steps_and_nothing_else(name, candidates, memoiz
     assert (np.asarray(node.steps) < other.steps).all()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("candidates", CANDIDATES)
 def test_a_tree_is_the_same_whatever_trees_grow_beside_it(candidates):
     few, many = built("ferry", candidates, lanes=2)[0], built("ferry", candidates)[0]
@@ -435,6 +437,7 @@ def test_children_that_wait_need_more_pages():
 # ----------------------------------------------------------------------------
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ("name", "candidates", "memoize"), [(*each, "node") for each in EACH] + KEPT
 )
@@ -518,10 +521,12 @@ def searched(name, candidates="one", heads="known", key=7, **changed):
 once = functools.cache(searched)
 
 
+@pytest.mark.compiled
 def test_the_same_key_gives_the_same_result():
     same(once("landing", "all"), searched("landing", "all"))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("name", "candidates"), [("ferry", "one"), ("landing", "all")])
 def test_threads_change_nothing(name, candidates):
     """Groups of three, the last one filled up, in one thread or two."""
@@ -532,6 +537,7 @@ def test_threads_change_nothing(name, candidates):
     )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("name", "candidates"), [("ferry", "one"), ("landing", "all")])
 def test_results_are_honest_and_failures_replay_to_the_bit(name, candidates):
     (sim, choices), result = SYSTEMS[name], once(name, candidates)
@@ -559,6 +565,7 @@ def without(heads):
     return Heads(heads.policy, heads.value, heads.inputs, heads.returns, 0)
 
 
+@pytest.mark.compiled
 def test_heads_that_have_learned_nothing_change_nothing():
     """Nor do heads without weight and without a share of the rollouts."""
     same(once("ferry", heads=None), searched("ferry", heads=without(KNOWN["ferry"])))

@@ -64,9 +64,11 @@ def test_the_test_command_is_the_one_that_is_run():
         'python3 -m venv .venv && .venv/bin/pip install -q -e ".[test]" && .venv/bin/python -m'
         " pytest"
     )
-    assert (
-        command in TEXT.splitlines() and (ROOT / ".ci/run").read_text().splitlines()[-1] == command
-    )
+    assert command in TEXT.splitlines()
+    assert (ROOT / ".ci/run").read_text().splitlines()[-2:] == [
+        command,
+        ".venv/bin/python -m pytest -m long",
+    ]
 
 
 def test_it_is_short():

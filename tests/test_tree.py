@@ -141,11 +141,13 @@ def searched(name, **changed):
 once = functools.cache(searched)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_same_key_gives_the_same_result(name):
     same(once(name), searched(name))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["ferry", "ring"])
 def test_threads_and_lanes_change_nothing(name):
     """Groups of three, the last one filled up, in one thread or two; and all trees in one group."""
@@ -154,6 +156,7 @@ def test_threads_and_lanes_change_nothing(name):
         assert once(name).simulator_steps == other.simulator_steps
 
 
+@pytest.mark.compiled
 def test_a_tree_is_the_same_alone_and_among_others():
     alone, among = once("ferry", trees=1), once("ferry")
     np.testing.assert_array_equal(alone.best_reward_per_tree, among.best_reward_per_tree[:1])
@@ -161,6 +164,7 @@ def test_a_tree_is_the_same_alone_and_among_others():
     np.testing.assert_array_equal(alone.history.best_reward, among.history.best_reward[:, :1])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_memoization_changes_the_steps_and_nothing_else(name):
     node, root, none = once(name), once(name, memoize="root"), once(name, memoize="none")
@@ -318,17 +322,20 @@ def test_large_copies_are_seen():
     assert large_copies(text, 1000)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("memoize", ["node", "root", "none"])
 def test_no_array_of_the_tree_is_copied_in_a_loop(memoize):
     assert not large_copies(compiled_text(FERRY, 307, memoize, **S0), 307)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["landing", "ring"])
 def test_nor_with_other_states(name):
     sim, choices = SYSTEMS[name]
     assert not large_copies(compiled_text(sim, 307, "node", **choices), 307)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("sim", [FERRY, LANDING], ids=["ferry", "landing"])
 def test_nor_when_the_best_episode_is_followed_and_trials_are_recorded(sim):
     assert not large_copies(
