@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jast import actions, failures, nominal, plot, rewards, simulators
+from jast.actions import UniformBox
 from jast.contract import check
 from jast.intervals import clopper_pearson
 from jast.search.cem import cem
@@ -138,8 +139,8 @@ def _run(options):
     sim = check(make(), chosen)
     keys = jax.random.split(jax.random.key(options.seed), 3)
     print(
-        f"{options.simulator}, seed {options.seed}: as it is, without a"
-        f" search\n{nominal(keys[0], sim, episodes=100_000)}\n",
+        f"{options.simulator}, seed {options.seed}: as it is, without a search, its disturbances"
+        f" drawn from its own model\n{nominal(keys[0], sim, episodes=100_000)}\n",
         flush=True,
     )
 
@@ -151,7 +152,9 @@ def _run(options):
         with contextlib.suppress(KeyboardInterrupt):
             results["monte-carlo"] = monte_carlo(keys[2], sim, episodes=found.episodes, **common)
         stopped = "monte-carlo" not in results or "interrupted" in results["monte-carlo"].settings
-    print(f"{table(results)}\n{_shares(results)}\n\n{_episode(found.best)}\n\n{found.failures}\n")
+    print(
+        f"{table(results)}\n{_shares(results)}{_drawn_from(chosen)}\n\n{_episode(found.best)}\n\n{found.failures}\n"
+    )
 
     archive = options.output / "failures.npz"
     failures.save(archive, found.failures, found.settings | dict(simulator=options.simulator))
@@ -214,6 +217,16 @@ def _shares(results):
         )
         lines.append(f"{name:14} failing {what} {k} of {n}: {100 * k / n:.4g} %, {interval}")
     return "\n".join(lines)
+
+
+def _drawn_from(chosen):
+    """What the shares of failures are of, where they are not of the system's own disturbances."""
+    if not isinstance(chosen, UniformBox):
+        return ""
+    return (
+        "\nthese draw disturbances uniformly from the box that the search chooses from: what a"
+        " search is compared with. How often the system fails by itself is the rate at the top"
+    )
 
 
 def _episode(episode):

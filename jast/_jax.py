@@ -2,6 +2,7 @@
 of it is followed here, and ``tests/test_jax_shim.py`` says which part broke.
 
  - `is_traced`, `is_tracing`: whether values are known yet (`jax.core.Tracer`);
+ - `was_interrupted`: whether an error was Ctrl-C (how a callback's error comes out);
  - `host_call`: NumPy on the host inside of compiled programs (a primitive with lowerings of its
    own, `jax.interpreters`);
  - `custom_vmap`: a function that says itself what a batch of it is (`jax.custom_batching`);
@@ -24,7 +25,14 @@ from jax.extend.core import Primitive
 from jax.extend.random import define_prng_impl
 from jax.interpreters import batching, mlir
 
-__all__ = ["custom_vmap", "define_prng_impl", "host_call", "is_traced", "is_tracing"]
+__all__ = [
+    "custom_vmap",
+    "define_prng_impl",
+    "host_call",
+    "is_traced",
+    "is_tracing",
+    "was_interrupted",
+]
 
 
 def is_traced(*trees: Any) -> bool:
@@ -39,6 +47,12 @@ def is_tracing() -> bool:
     no value.
     """
     return isinstance(jnp.zeros(()) + 0, Tracer)
+
+
+def was_interrupted(error: BaseException) -> bool:
+    """Whether ``error`` is a KeyboardInterrupt, or what JAX makes of one that met a callback."""
+    met = isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" in str(error)
+    return met or isinstance(error, KeyboardInterrupt)
 
 
 def host_call(

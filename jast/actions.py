@@ -7,8 +7,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jast import distributions as D
+from jast._jax import is_traced
 
 __all__ = ["Quantiles", "Samples", "UniformBox", "quantiles", "samples", "uniform"]
 
@@ -211,9 +213,26 @@ def uniform(low, high):
     """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or
     pytrees of them where x is one.
 
-    The ferry's published actions are ``uniform(0., 1.)``.
+    The ferry's published actions are ``uniform(0., 1.)``. Raises ValueError where ``low`` is above
+    ``high``, unless they are traced.
     """
+    if not is_traced(low, high):
+        _ordered(low, high)
     return UniformBox(low, high)
+
+
+def _ordered(low, high):
+    ends = [jax.tree.leaves(end) for end in (low, high)]
+    most = max(map(len, ends))
+    for a, b in zip(*(end * most if len(end) == 1 else end for end in ends)):
+        try:
+            above = bool(np.any(np.asarray(a) > np.asarray(b)))
+        except (TypeError, ValueError):  # no numbers, or shapes that do not fit: `check` says which
+            continue
+        if above:
+            raise ValueError(
+                f"actions.uniform: low must not be above high, received low={low!r}, high={high!r}"
+            )
 
 
 def _as(dtype, *values):

@@ -2,7 +2,10 @@
 is compared with.
 """
 
+import math
+import time
 import warnings
+from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -12,6 +15,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards
+from jast._threads import apart
 from jast.contract import contract
 from jast.episode import Episode, rollout
 from jast.incidents import incidents, since
@@ -23,6 +27,8 @@ from jast.progress import advance, begin, conclude
 __all__ = ["Nominal", "nominal"]
 
 LANES = 1024
+PIECE = 0.2
+"""Seconds between two looks at the keyboard, about; at least `LANES` episodes."""
 
 
 @results.result("episodes")
@@ -47,6 +53,8 @@ class Nominal(NamedTuple):
     """Episodes in which the simulator returned a number that is not finite; they count as not
     failing.
     """
+    settings: Mapping = {}
+    """``method``, the ``episodes`` asked for, and ``interrupted`` where not all were played."""
 
     def __str__(self):
         quiet = "not defined: a disturbance has neither a mode nor a median"
@@ -63,6 +71,9 @@ class Nominal(NamedTuple):
             ("mean distance", f"{self.mean_distance:.4g}"),
             ("invalid", f"{self.invalid}"),
         ]
+        if "interrupted" in self.settings:
+            done = f"after {self.episodes} of {self.settings['episodes']} episodes"
+            rows.append(("interrupted", done))
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
 
 
@@ -72,22 +83,23 @@ def nominal(key, sim, episodes=100_000):
 
     The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not
     grow with ``episodes``. Warns (UserWarning) where the system fails undisturbed and where
-    episodes are invalid. Raises ValueError for ``episodes`` below 1 and where the simulator's
-    functions do not fit together.
+    episodes are invalid. A KeyboardInterrupt ends it with the result of the episodes played by
+    then, and is raised where there are none. Raises ValueError for ``episodes`` below 1 and where
+    the simulator's functions do not fit together.
     """
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
         raise ValueError(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
     contract(sim, observed=False)
-    episodes, before = int(episodes), incidents(sim)
+    asked, before = int(episodes), incidents(sim)
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
-    failures, invalid, mean = jax.device_get(
-        _count(key, sim, jnp.asarray(episodes, jnp.int32), LANES)
-    )
-    failures, invalid = int(failures), int(invalid)
+    episodes, (failures, invalid, mean) = _played(key, sim, asked)
+    settings = dict(method="nominal", episodes=asked)
+    if episodes < asked:
+        settings["interrupted"] = True
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
             "the system fails undisturbed: its likeliest disturbances already lead to a failure, so"
@@ -106,15 +118,38 @@ def nominal(key, sim, episodes=100_000):
         episodes,
         failures / episodes,
         clopper_pearson(failures, episodes),
-        float(mean),
+        mean if invalid < episodes else math.nan,
         invalid,
+        settings,
     )
 
 
-@partial(jax.jit, static_argnums=3)
-def _count(key, sim, episodes, lanes):
-    """Failures, invalid episodes and the mean distance of the valid ones, ``lanes`` episodes at a
-    time.
+def _played(key, sim, episodes):
+    """How many episodes were played, all unless interrupted, and of these: failures, invalid ones,
+    and the mean distance of the valid ones.
+    """
+    zero = jnp.zeros((), jnp.int32)
+    counts = zero, zero, jnp.zeros((), outline(sim).dtype)
+    chunks, done, more = -(-episodes // LANES), 0, 1
+    try:
+        while done < chunks:
+            begin, end = time.perf_counter(), min(done + more, chunks)
+            bounds = (jnp.asarray(n, jnp.int32) for n in (episodes, done, end))
+            piece = partial(_count, key, sim, *bounds, counts, LANES)
+            counts, done = apart(lambda piece=piece: jax.block_until_ready(piece())), end
+            if time.perf_counter() - begin < PIECE:
+                more *= 2
+    except KeyboardInterrupt:
+        if not done:
+            raise
+    failures, invalid, mean = jax.device_get(counts)
+    return min(done * LANES, episodes), (int(failures), int(invalid), float(mean))
+
+
+@partial(jax.jit, static_argnums=6)
+def _count(key, sim, episodes, begin, end, counts, lanes):
+    """``counts``, (failures, invalid episodes, mean distance of the valid ones), with the chunks
+    ``begin`` to ``end`` of ``lanes`` episodes as well.
     """
 
     def chunk(i, carry):
@@ -140,11 +175,7 @@ def _count(key, sim, episodes, lanes):
             mean,
         )
 
-    zero = jnp.zeros((), jnp.int32)
-    failures, invalid, mean = lax.fori_loop(
-        0, (episodes - 1) // lanes + 1, chunk, (zero, zero, jnp.zeros((), outline(sim).dtype))
-    )
-    return failures, invalid, jnp.where(invalid < episodes, mean, jnp.nan)
+    return lax.fori_loop(begin, end, chunk, counts)
 
 
 def _outcome(key, sim, live):

@@ -179,6 +179,26 @@ def test_check_says_what_is_wrong_with_the_ends_of_a_box():
 # ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    "low, high",
+    [
+        (1.0, -1.0),
+        (np.array([0.0, 2.0]), 1.0),
+        ({"a": 0.0, "b": 1.0}, {"a": 1.0, "b": 0.5}),
+        (0.5, {"a": 1.0, "b": 0.0}),
+    ],
+)
+def test_a_box_with_its_ends_swapped_is_refused(low, high):
+    with pytest.raises(ValueError, match="actions.uniform: low must not be above high, received"):
+        actions.uniform(low, high)
+
+
+def test_a_box_may_have_no_width_or_traced_ends():
+    assert actions.uniform(1.0, 1.0).high == 1.0
+    width = jax.jit(lambda low: actions.uniform(low, 0.0).high - actions.uniform(low, 0.0).low)
+    assert width(1.0) == -1.0
+
+
 @pytest.mark.parametrize("search", ["monte_carlo", "cem", "mcts"])
 def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
     """Of landing: drifts from N(.2, .01^2), so that all fail; offsets at the start from the

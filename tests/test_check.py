@@ -1,6 +1,7 @@
 import dataclasses
 import random
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jax.tree_util import Partial
 from systems import line
 
 import jast
-from jast import actions
+from jast import actions, crude
 from jast import distributions as D
 from jast.contract import contract
 from jast.intervals import clopper_pearson
@@ -378,6 +379,39 @@ def test_nominal_is_a_loop_of_rollouts(key):
     assert (
         "no failure" in text and f"{found.failures} of {n}" in text and len(text.splitlines()) < 8
     )
+
+
+def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeypatch):
+    """And the pieces in which it is done change nothing."""
+    calls = []
+
+    def apart(function, stop_at=None):
+        calls.append(1)
+        if len(calls) == stop_at:
+            raise KeyboardInterrupt
+        return function()
+
+    monkeypatch.setattr(crude, "PIECE", 0.0)
+    monkeypatch.setattr(crude, "apart", apart)
+    whole = jast.nominal(key, walk1d(), episodes=2100)
+    assert len(calls) == 3 and whole.settings == dict(method="nominal", episodes=2100)
+    calls.clear()
+    monkeypatch.setattr(crude, "PIECE", np.inf)
+    equal(jast.nominal(key, walk1d(), episodes=2100)[:-1], whole[:-1])
+    assert len(calls) == 2  # a chunk, then two
+    calls.clear()
+    monkeypatch.setattr(crude, "PIECE", 0.0)
+    monkeypatch.setattr(crude, "apart", partial(apart, stop_at=3))
+    part = jast.nominal(key, walk1d(), episodes=2100)
+    assert part.settings == dict(method="nominal", episodes=2100, interrupted=True)
+    calls.clear()
+    monkeypatch.setattr(crude, "apart", apart)
+    equal(part[:-1], jast.nominal(key, walk1d(), episodes=2048)[:-1])
+    assert str(part).endswith("interrupted    after 2048 of 2100 episodes")
+    calls.clear()
+    monkeypatch.setattr(crude, "apart", partial(apart, stop_at=1))
+    with pytest.raises(KeyboardInterrupt):
+        jast.nominal(key, walk1d(), episodes=2100)
 
 
 def test_nominal_says_when_the_system_fails_undisturbed(key):

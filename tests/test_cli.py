@@ -64,6 +64,9 @@ def test_every_simulator(capsys, tmp_path, simulator):
     assert status == 0 and text.startswith(f"{simulator}, seed 0")
     assert ("\n  x0: " in text) == (simulator == "landing")
     make, reward, chosen = cli.SYSTEMS[simulator]
+    assert "its disturbances drawn from its own model\nundisturbed" in text
+    box = isinstance(chosen, jast.actions.UniformBox)  # its rate is not the one at the top
+    assert ("the rate at the top" in text) == box
     jast.check(make(), chosen)
     held, settings = jast.failures.load(out / "failures.npz", make())
     assert settings["mode"] == "paper" and settings["widening"] == [0.5, 0.6]

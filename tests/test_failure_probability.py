@@ -19,6 +19,8 @@ from jast.estimate import (
     adaptive_cross_entropy,
     failure_probability,
     failure_samples,
+    guard,
+    seek,
     subset_simulation,
     trace_proposal,
 )
@@ -234,6 +236,45 @@ def test_interrupts_keep_whole_chunks(two):
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
 
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, jax.errors.JaxRuntimeError])
+def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
+    fit, fits = seek._fit, []
+
+    def interrupted(s):
+        fits.append(s.spent)
+        if len(fits) == 2:
+            raise raised("INTERNAL: CpuCallback error: KeyboardInterrupt: ")
+        return fit(s)
+
+    monkeypatch.setattr(seek, "_fit", interrupted)
+    found = failure_probability(jax.random.key(5), planes(4.0, 4.5), BUDGET)
+    [why] = [w for w in found.warnings if "interrupted" in w]
+    assert why.startswith(f"interrupted after {fits[1]} of {BUDGET} evaluations")
+    assert not found.reliable and found.evaluations == fits[1] < BUDGET / 2
+    assert found.samples == 2 * (BUDGET // 25) >= found.failures_seen > 100
+    truth = norm.sf(4) + norm.sf(4.5)
+    assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error < 1
+
+
+def test_interrupted_before_any_batch_there_is_nothing(monkeypatch):
+    for error in (KeyboardInterrupt(), jax.errors.JaxRuntimeError("... KeyboardInterrupt: ...")):
+
+        def stop(*_, error=error):
+            raise error
+
+        monkeypatch.setattr(seek, "_explore", stop)
+        with pytest.raises(KeyboardInterrupt):
+            failure_probability(jax.random.key(5), planes(4.0), BUDGET)
+    monkeypatch.setattr(seek, "_explore", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        failure_probability(jax.random.key(5), planes(4.0), BUDGET)
+
+
+def test_shares_beyond_the_whole_are_in_words():
+    said = [guard._share(v) for v in (0.034, 0.3, 1.0, 14.25, 1.4539e13)]
+    assert said == ["3% of", "30% of", "1 times", "14 times", "far more than"]
+
+
 def test_subset_simulation(key):
     """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30
     %; each population is counted.
@@ -244,6 +285,7 @@ def test_subset_simulation(key):
         and found.relative_error < 0.3
         and found.reliable
     )
+    assert "k-hat" not in str(found) and "ESS" in str(found)  # its weights have no tail to fit
     assert found.samples == found.failures_seen == 5000 and found.evaluations == sum(
         int(h.split()[-2]) for h in found.history
     )

@@ -159,6 +159,7 @@ def test_a_result_is_readable():
         assert max(map(len, text.splitlines())) < 120
     assert "likeliest failure: reward" in found
     assert "no failure was found; the nearest episode came to distance" in none
+    assert "to find one: more episodes; a reward" in none
 
 
 def test_random_starts_are_found():

@@ -12,7 +12,14 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jast
-from jast._jax import custom_vmap, define_prng_impl, host_call, is_traced, is_tracing
+from jast._jax import (
+    custom_vmap,
+    define_prng_impl,
+    host_call,
+    is_traced,
+    is_tracing,
+    was_interrupted,
+)
 
 FRAGILE = (
     "jax._src",
@@ -101,6 +108,19 @@ def test_an_answer_of_another_shape_is_an_error():
     program = jax.jit(lambda x: host_call(lambda a: (a,), shapes, x))
     with pytest.raises(Exception, match="(?i)shape"):
         jax.block_until_ready(program(jnp.zeros(2)))
+
+
+def test_an_interruption_that_met_a_callback_is_one():
+    def callback(a):
+        raise KeyboardInterrupt
+
+    shapes = (jax.ShapeDtypeStruct((), jnp.zeros(()).dtype),)
+    program = jax.jit(lambda x: host_call(callback, shapes, x))
+    with pytest.raises((KeyboardInterrupt, jax.errors.JaxRuntimeError)) as met:
+        jax.block_until_ready(program(jnp.zeros(())))
+    assert was_interrupted(met.value) and was_interrupted(KeyboardInterrupt())
+    assert not was_interrupted(jax.errors.JaxRuntimeError("INTERNAL: RuntimeError: no"))
+    assert not was_interrupted(ValueError("KeyboardInterrupt"))
 
 
 def test_the_host_is_called_for_arrays_over_several_devices():

@@ -506,6 +506,14 @@ def test_results_print_as_a_table():
         "~expected",
     ]
     assert [line.split()[:2] for line in lines[2:]] == [["1", "14"], ["2", "28"]]
+    assert "guide" not in lines[0]
+
+
+def test_the_default_selector_says_how_rough_its_expectation_is():
+    inputs, labels, answers = problem(60)
+    result = validate(KEY, System(answers), inputs, labels, budget=20)
+    head = str(result).splitlines()[0]
+    assert f"roughly {result.expected:.0f} expected among the 40 not run (a guide only: " in head
 
 
 GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])

@@ -10,15 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import whole
+from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import limit_state as latent
-from jast.estimate.batches import drawn, numbers
+from jast.estimate import sums
+from jast.estimate.batches import balanced, drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
 from jast.estimate.multilevel import failure_proposal
 from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
-from jast.estimate.seek import seek
+from jast.estimate.seek import Seeker, seek
 from jast.intervals import checked_level, log_normal
 from jast.policy import nominal_policy
 
@@ -49,17 +51,32 @@ def failure_probability(
     how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
 
     The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
-    total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. Raises ValueError
-    for a budget below 5000, a level outside (0, 1), disturbances without a quantile function, and
-    where the simulator's functions do not fit together.
+    total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. One that comes
+    before it ends in an UNRELIABLE estimate from the batches of the search, and is raised where
+    there is none yet. Raises ValueError for a budget below 5000, a level outside (0, 1),
+    disturbances without a quantile function, and where the simulator's functions do not fit
+    together.
     """
     name = "failure_probability"
     budget = whole(name, "budget", budget, LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
     for_search, key = jax.random.split(key)
-    s = seek(for_search, sim, budget, gradients)
-    n = budget - s.spent
+    s = Seeker(for_search, sim, budget)
+    try:
+        seek(s, gradients)
+        return _with_the_rest(key, s, level, progress, callback)
+    except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+        if not was_interrupted(error):
+            raise
+        if not s.batches:
+            raise KeyboardInterrupt from error
+        return _of_the_search(s, level)
+
+
+def _with_the_rest(key, s, level, progress, callback):
+    """The `Estimate` of what is left of the budget, by the proposal that was found."""
+    name, sim, n = "failure_probability", s.sim, s.budget - s.spent
     lanes = s.batch  # one program for the search and for this
     about = dict(level=level, reasons=s.reasons, history=tuple(s.history))
     if s.log_mean is None or _plain_is_better(s):
@@ -80,6 +97,29 @@ def failure_probability(
         groups=groups,
         proposal=s.q,
         **about,
+    )
+
+
+def _of_the_search(s, level):
+    """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
+    log_w, failing = balanced(s.batches)
+    rows = len(failing)
+    log_weights = np.full(rows, -np.inf)
+    log_weights[failing] = log_w
+    none = np.zeros(rows)
+    seen = Traces(log_weights, none[:, None], failing, none.astype(bool), none.astype(int))
+    against = (
+        f"interrupted after {s.spent} of {s.budget} evaluations: this is of episodes that have"
+        " chosen the proposal"
+    )
+    return estimate(
+        "failure_probability",
+        sums.add(sums.nothing(rows), seen),
+        level=level,
+        reasons=[against],
+        evaluations=s.spent,
+        proposal=s.q,
+        history=tuple(s.history),
     )
 
 

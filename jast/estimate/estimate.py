@@ -111,7 +111,7 @@ class Estimate(NamedTuple):
                 (
                     "weights",
                     (
-                        f"ESS {self.ess:.4g}   k-hat {self.k_hat:.2f}   greatest share"
+                        f"ESS {self.ess:.4g}{_tail(self.k_hat)}   greatest share"
                         f" {100 * self.max_share:.2g} %"
                     ),
                 )
@@ -243,6 +243,10 @@ def of_counts(
         proposal=proposal,
         history=history,
     )
+
+
+def _tail(k_hat):
+    return "" if math.isnan(k_hat) else f"   k-hat {k_hat:.2f}"
 
 
 def _if_invalid_failed(sums):

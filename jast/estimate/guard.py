@@ -82,12 +82,19 @@ def guarded(s, i, last):
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
         s.reasons.append(
-            f"failures that the proposal hardly draws may carry {asked:.0%} of what it found"
+            f"failures that the proposal hardly draws may carry {_share(asked)} what it found"
         )
         return True
     for share, points, used in found:
         s.add(s.fitted(points, used), min(max(share / (1 + share), 0.15), 0.85))
     return False
+
+
+def _share(share):
+    """``share`` of a whole in words: of large ones the size is not known, only that they are."""
+    if share < 1:
+        return f"{share:.0%} of"
+    return f"{share:.2g} times" if share < 100 else "far more than"
 
 
 def _bare(s, points, used):

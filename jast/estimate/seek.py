@@ -95,14 +95,13 @@ class Seeker:
         )
 
 
-def seek(key, sim, budget, gradients=True):
-    """`Seeker` at the end of the search, whose ``q`` is the proposal; None where no failure was
-    found.
+def seek(s, gradients=True):
+    """Take the `Seeker` ``s`` to the end of the search: its ``q`` is the proposal, None where no
+    failure was found.
     """
-    s = Seeker(key, sim, budget)
-    parts = _explore(s, gradients and not hosted(sim))
+    parts = _explore(s, gradients and not hosted(s.sim))
     if not parts:
-        return s
+        return
     if s.populations:
         s.rare = max(p.log_mean for p in s.populations) < RARE
     for i, g in enumerate(parts, 1):
@@ -112,7 +111,6 @@ def seek(key, sim, budget, gradients=True):
         if s.log_mean is None or guarded(s, i, GUARDS - 1):
             break
         _refine(s, 2)
-    return s
 
 
 def _explore(s, gradients):

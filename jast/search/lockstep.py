@@ -16,12 +16,12 @@ from jax import lax
 from jast import failures as archive
 from jast import rewards
 from jast._jax import is_traced, is_tracing
+from jast._threads import apart
 from jast.contract import ACTIONS, contract
 from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
-from jast.search.threads import apart
 from jast.search.tree.packing import pack
 from jast.watch import Watch
 

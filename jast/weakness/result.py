@@ -9,6 +9,9 @@ from jast import results
 __all__ = ["History", "Result", "State"]
 
 
+ROUGH = " (a guide only: where it was measured, between a seventh and six times the truth)"
+
+
 @results.shown()
 class History(NamedTuple):
     """R iterations, each of a batch of calls and what was learned from it."""
@@ -95,6 +98,7 @@ class Result(NamedTuple):
             ""
             if np.isnan(self.expected)
             else f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
+            + ROUGH * self.state.selector.startswith("default")
         )
         head = f"{len(self.failures)} failures in {self.calls} calls ({n} inputs){left}"
         names = (

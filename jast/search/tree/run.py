@@ -13,9 +13,9 @@ import numpy as np
 from jax import lax
 
 from jast._jax import custom_vmap
+from jast._threads import handed_on
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
-from jast.search.threads import handed_on
 from jast.search.tree import simulate
 from jast.search.tree.edges import edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make

@@ -1,4 +1,4 @@
-"""Running a part of a search in a thread of its own, with the settings of JAX of the one that it is
+"""Running work in a thread of its own, with the settings of JAX of the one that it is
 started from.
 """
 
