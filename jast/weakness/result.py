@@ -1,5 +1,6 @@
 """What a validation returns."""
 
+import json
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ class State(NamedTuple):
     """All that `validate` needs to go on; for `save` and `load`."""
 
     selector: str
-    """The selector's name and settings, as text"""
+    """The selector's name and settings, as JSON"""
     data: str
     """Fingerprint of the inputs and labels"""
     key: Any
@@ -98,7 +99,7 @@ class Result(NamedTuple):
             ""
             if np.isnan(self.expected)
             else f"; roughly {self.expected:.0f} expected among the {n - self.calls} not run"
-            + ROUGH * self.state.selector.startswith("default")
+            + ROUGH * (json.loads(self.state.selector)[0] == "default")
         )
         head = f"{len(self.failures)} failures in {self.calls} calls ({n} inputs){left}"
         names = (
