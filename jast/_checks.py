@@ -3,6 +3,7 @@ expected and what came.
 """
 
 import operator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,20 @@ import numpy as np
 
 from jast._jax import is_traced
 
-__all__ = ["number", "real", "whole"]
+__all__ = ["number", "random_key", "real", "whole"]
+
+
+def random_key(function: str, key: Any) -> None:
+    """ValueError unless ``key`` is one key of `jax.random`."""
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    raw = dtype == np.uint32 and len(shape) == 1  # of jax.random.PRNGKey
+    if not (typed or raw):
+        received = f"{type(key).__name__} {key!r}" if dtype is None else f"{dtype}{list(shape)}"
+        hint = f": jax.random.key({key})" if type(key) is int else ""
+        raise ValueError(
+            f"{function}: key must be a jax.random.key{hint}, received {received[:80]}"
+        )
 
 
 def whole(function, name, value, least=1):

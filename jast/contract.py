@@ -135,7 +135,8 @@ def _draw(name, dist):
     """One traced value of ``dist``, which must be a distribution with a scalar log density."""
     if not (callable(getattr(dist, "sample", None)) and callable(getattr(dist, "log_prob", None))):
         raise ValueError(
-            f"{name}: expected a distribution (with sample and log_prob), received {_kind(dist)}"
+            f"{name}: expected a distribution (with sample and log_prob), received"
+            f" {_kind(dist)}{_several(dist)}"
         )
     x = _arrays(
         f"{name}: sample", _call(f"{name}: sample", lambda: D.sample(dist, jax.random.key(0)))
@@ -147,6 +148,13 @@ def _draw(name, dist):
         )
     _scalar(f"{name}: log_prob", log_p, float)
     return x
+
+
+def _several(dist):
+    """What to do where a distribution should be and several are."""
+    if not isinstance(dist, dict | list | tuple):
+        return ""
+    return "; several that are independent are one as jast.distributions.Joint(them)"
 
 
 def _arrays(name, tree):

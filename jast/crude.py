@@ -15,6 +15,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards
+from jast._checks import random_key
 from jast._threads import apart
 from jast.contract import contract
 from jast.episode import Episode, rollout
@@ -87,6 +88,7 @@ def nominal(key, sim, episodes=100_000):
     then, and is raised where there are none. Raises ValueError for ``episodes`` below 1 and where
     the simulator's functions do not fit together.
     """
+    random_key("nominal", key)
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
         raise ValueError(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"

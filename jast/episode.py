@@ -12,6 +12,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards
+from jast._checks import random_key
 from jast._jax import is_traced
 from jast.outline import outline
 from jast.policy import Policy, nominal_policy
@@ -64,6 +65,7 @@ def rollout(
     no failure, distance inf and reward -inf. Its `replay` is the same to the bit; inside a
     transformation, where drawing and stepping are one program, up to rounding.
     """
+    random_key("rollout", key)
     reward = rewards.as_pytree(reward)
     episode = _rollout(key, sim, policy, reward)
     if is_traced(episode):

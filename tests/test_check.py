@@ -122,6 +122,10 @@ SHAPES = {  # found by tracing
         dict(is_terminal=lambda s: True if s > 3 else False),
         r"is_terminal: raised TracerBoolConversionError",
     ),
+    "disturbance is a dict": (
+        dict(disturbance=lambda s: {"gust": D.Normal(0.0, 1.0)}),
+        r"disturbance: expected a distribution .*received dict.*; .* jast.distributions.Joint\(",
+    ),
     "observe is a scalar": (
         dict(observe=lambda s: s),
         r"observe: returns float..\[\], expected a float vector",

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast._checks import random_key
 from jast.cross_entropy import loop
 from jast.cross_entropy.settle import MODES, checked, settled
 
@@ -153,6 +154,7 @@ def ce_mixture(
 
 
 def _run(method, key, objective, proposal, samples, elites, iterations, schedule, mode, more):
+    random_key(method, key)
     plan, settings, proposal = settled(
         method,
         proposal,
@@ -212,6 +214,7 @@ def start(
     """
     if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
+    random_key("start", key)
     plan, real, proposal = settled(
         method,
         proposal,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import whole
+from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import limit_state as latent
@@ -58,6 +58,7 @@ def failure_probability(
     together.
     """
     name = "failure_probability"
+    random_key(name, key)
     budget = whole(name, "budget", budget, LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
@@ -131,6 +132,7 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     Arguments and errors as in `importance`.
     """
     name = "monte_carlo"
+    random_key(name, key)
     samples = whole(name, "samples", samples)
     level = checked_level(name, level)
     contract(sim, observed=False)
@@ -151,6 +153,7 @@ def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
     100 samples or 3 replicates, and as `failure_probability`.
     """
     name = "subset_simulation"
+    random_key(name, key)
     samples, replicates = (
         whole(name, "samples", samples, 100),
         whole(name, "replicates", replicates, 3),
@@ -216,6 +219,7 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     `failure_proposal`.
     """
     name = "adaptive_cross_entropy"
+    random_key(name, key)
     budget = whole(name, "budget", budget, LEAST)
     level = checked_level(name, level)
     for_search, key = jax.random.split(key)

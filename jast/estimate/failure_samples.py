@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import results
-from jast._checks import whole
+from jast._checks import random_key, whole
 from jast.episode import Episode
 from jast.estimate import limit_state as latent
 from jast.estimate.batches import drawn, numbers
@@ -64,6 +64,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
     disturbances without a quantile function.
     """
     name = "failure_samples"
+    random_key(name, key)
     samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
     latent.check(name, sim)
     key, for_draws, for_rows = jax.random.split(key, 3)

@@ -17,7 +17,7 @@ from jax.scipy.special import logsumexp
 
 from jast import distributions as D
 from jast import results
-from jast._checks import whole
+from jast._checks import random_key, whole
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
@@ -62,6 +62,7 @@ def log_weights(key, sim, proposal, samples, *, mode="default"):
     goes on to the horizon, as the paper does. Both are unbiased. ValueError for another mode or
     proposal.
     """
+    random_key("log_weights", key)
     if mode not in ("default", "paper"):
         raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
     return traces(
@@ -99,6 +100,7 @@ def importance(
     Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
     without a density, and where the simulator's functions do not fit together.
     """
+    random_key("importance", key)
     samples = whole("importance", "samples", samples, 2)
     if mode not in ("default", "paper"):
         raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')

@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 from jast import actions as choices
 from jast import distributions as D
 from jast import results
-from jast._checks import real, whole
+from jast._checks import random_key, real, whole
 from jast.contract import contract
 from jast.cross_entropy import sequences
 from jast.episode import rollout
@@ -104,6 +104,7 @@ def failure_proposal(
     key is consumed. An invalid episode is counted and never an elite. Raises ValueError for a count
     below 1, a setting outside its range, and a disturbance that cannot be tilted.
     """
+    random_key("failure_proposal", key)
     samples, iterations = (
         whole("failure_proposal", "samples", samples, 2),
         whole("failure_proposal", "iterations", iterations),

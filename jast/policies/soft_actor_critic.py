@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import real, whole
+from jast._checks import random_key, real, whole
 from jast._jax import is_traced
 from jast.contract import contract
 from jast.incidents import hosted
@@ -167,6 +167,7 @@ def sac(
         if _auto(widen)
         else _float("widen", widen, lambda v: 1 <= v < math.inf, "of at least 1")
     )
+    random_key("sac", key)
     contract(sim)
     n, n0 = sizes(sim)
     (m,) = outline(sim).observation

@@ -15,6 +15,7 @@ from jax import lax
 
 from jast import failures as archive
 from jast import rewards
+from jast._checks import random_key
 from jast._jax import is_traced, is_tracing
 from jast._threads import apart
 from jast.contract import ACTIONS, contract
@@ -225,6 +226,7 @@ def prepare(function, key, sim, reward, actions, **settings):
     """``(reward, settings)`` as the search takes them, once `contract` holds: the reward as a
     pytree, the settings with names and seed (None if traced).
     """
+    random_key(function, key)
     contract(sim, actions, observed=False)
     reward = rewards.as_pytree(reward)
     if is_traced(key, sim, reward, actions, settings) or is_tracing():

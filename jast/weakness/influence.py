@@ -4,6 +4,7 @@ that imitate the system.
 
 import numpy as np
 
+from jast._checks import random_key
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.data import arrays, fingerprint, within
@@ -28,6 +29,7 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
 
     ValueError for other inputs or labels than the result's, and indices out of range.
     """
+    random_key("influence", key)
     if not isinstance(result, Result):
         raise ValueError(f"influence: result must be a Result, received {type(result).__name__}")
     if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":

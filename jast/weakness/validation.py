@@ -8,7 +8,7 @@ import warnings
 import jax
 import numpy as np
 
-from jast._checks import whole
+from jast._checks import random_key, whole
 from jast.counter import generator
 from jast.watch import Watch
 from jast.weakness.contract import Seen, Selector
@@ -114,6 +114,7 @@ def _described(selector):
 
 
 def _begin(key, data, selector):
+    random_key("validate", key)
     n = data.size
     history = History(
         *(np.zeros(0, int) for _ in range(2)),
