@@ -21,6 +21,7 @@ from jast._doors import door, listed
 from jast.contract import check
 from jast.crude import nominal
 from jast.episode import Episode, replay, rollout
+from jast.files import load, save
 from jast.policy import Policy
 from jast.simulator import Simulator
 
@@ -39,12 +40,14 @@ __all__ = [
     "failures",
     "heads",
     "incidents",
+    "load",
     "nominal",
     "plot",
     "policies",
     "replay",
     "rewards",
     "rollout",
+    "save",
     "search",
     "simulators",
     "weakness",

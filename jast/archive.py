@@ -10,12 +10,22 @@ import io
 import json
 import os
 import zipfile
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["arrays_of", "check_array", "check_structure", "describe", "named", "read", "write"]
+__all__ = [
+    "arrays_of",
+    "check_array",
+    "check_structure",
+    "describe",
+    "format_of",
+    "named",
+    "read",
+    "write",
+]
 
 
 def write(path, format, version, header, arrays):
@@ -98,6 +108,22 @@ def read(path, format, version, kind):
     if header.pop("sha256", None) != _checksum(header, arrays):
         raise ValueError(f"load: {path} is damaged: its checksum does not match")
     return header, arrays
+
+
+def format_of(path: str | os.PathLike) -> Any:
+    """The format of a file of `write`; ValueError where it is none or damaged."""
+    with open(path, "rb") as file:
+        if file.read(2) != b"PK":
+            raise ValueError(f"load: {path} is not a file of jast.save")
+    try:
+        with zipfile.ZipFile(path) as pack:
+            array = np.lib.format.read_array(io.BytesIO(pack.read("header.npy")))
+            return json.loads(array.tobytes())["format"]
+    except Exception as error:  # a damaged zip fails in many ways
+        raise ValueError(
+            f"load: {path} is damaged, truncated or not a file of jast.save"
+            f" ({type(error).__name__}: {error})"
+        ) from None
 
 
 def named(parts):

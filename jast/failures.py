@@ -7,6 +7,7 @@ dtype whatever the precision that JAX is set to.
 """
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from operator import index
@@ -15,16 +16,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jast import results
+from jast import files, results
 from jast._doors import listed
-from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
+from jast.archive import arrays_of, check_array, check_structure, describe, named
 from jast.episode import Episode, replay
 from jast.outline import outline
+from jast.simulator import Simulator
 
 __all__ = ["Failures", "collect", "load", "merge", "save"]
 __dir__ = listed(__all__)
 
-FORMAT, VERSION, KIND = "jast failures", 1, "a jast archive of failures"
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 
 
@@ -203,45 +204,50 @@ def merge(a, b, top=64):
     )
 
 
-def save(path, failures, settings=None):
-    """Write ``failures`` and ``settings`` (a dict that JSON can hold: method, seed, counts ...) to
-    the one file ``path``.
+def save(path: str | os.PathLike, failures: Failures, settings: dict | None = None) -> None:
+    """`jast.save` of an archive, with ``settings`` (a dict that JSON can hold: method, seed, counts
+    ...) beside it; goes with the next version: save the result of the search, which has both.
 
-    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON: format, version,
-    settings, the structure of x0 and x, and a checksum. An older file of that name stays whole
-    until the new one is. ValueError for settings that JSON cannot hold.
+    ValueError for settings that JSON cannot hold.
     """
     try:
         settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
     except (TypeError, ValueError) as error:
         raise ValueError(f"save: settings must be a dict that JSON can hold: {error}") from None
+    files.store(path, "jast failures", failures, settings=settings)
+
+
+def load(path: str | os.PathLike, sim: Simulator | None = None) -> tuple[Failures, dict]:
+    """``(Failures, settings)`` of a file of `save`: `jast.load` of an archive and the settings
+    beside it; goes with the next version.
+    """
+    failures, header = files.restore(path, "jast failures", sim)
+    return failures, header["settings"]
+
+
+def parts(failures: Failures) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and arrays of an archive's file."""
     e = failures.episodes
-    parts = {"x0": e.x0, "disturbances": e.disturbances} | {
+    arrays = {"x0": e.x0, "disturbances": e.disturbances} | {
         name: getattr(e, name) for name in SCALARS
     }
-    parts |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
-    header = dict(settings=settings, seen=int(failures.seen), dropped=int(failures.dropped))
+    arrays |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
+    header = dict(settings={}, seen=int(failures.seen), dropped=int(failures.dropped))
     header["structure"] = {name: describe(getattr(e, name)) for name in ("x0", "disturbances")}
-    write(path, FORMAT, VERSION, header, named(parts))
+    return header, named(arrays)
 
 
-def load(path, sim=None):
-    """Read a file of `save`: ``(Failures, settings)``. Arrays keep the dtypes they were saved with.
-
-    ``sim``, where given, must fit the archive (horizon, structure, shapes, kinds of number; the
-    float precision may differ). It is needed where x0 or x is another structure than dicts, lists,
-    tuples and None. ValueError says why a file is refused: no jast archive, a version unknown here,
-    damaged, or no fit to ``sim``.
-    """
-    header, arrays = read(path, FORMAT, VERSION, KIND)
+def whole(
+    path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], sim: Simulator | None
+) -> Failures:
+    """The archive of `parts`; ValueError where it does not fit ``sim``, or needs one."""
     x0, x = (arrays_of(arrays, name) for name in ("x0", "disturbances"))
     structure = header["structure"]
     if sim is not None:
         like = outline(sim)
-        like_x0, like_x = like.x0, like.x
-        _fits(path, "x0", structure["x0"], x0, like_x0, ())
-        _fits(path, "disturbances", structure["disturbances"], x, like_x, (sim.horizon,))
-        x0, x = jax.tree.structure(like_x0).unflatten(x0), jax.tree.structure(like_x).unflatten(x)
+        _fits(path, "x0", structure["x0"], x0, like.x0, ())
+        _fits(path, "disturbances", structure["disturbances"], x, like.x, (sim.horizon,))
+        x0, x = jax.tree.structure(like.x0).unflatten(x0), jax.tree.structure(like.x).unflatten(x)
     else:
         x0, x = (
             _rebuild(path, structure["x0"], iter(x0)),
@@ -251,10 +257,17 @@ def load(path, sim=None):
         [arrays[f"{name}.0"] for name in names]
         for names in (SCALARS, ("counts", "tree", "simulation"))
     )
-    return (
-        Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"]),
-        header["settings"],
-    )
+    return Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"])
+
+
+def fits(path: str | os.PathLike, sim: Simulator, x0: Any, x: Any, axes: int) -> None:
+    """ValueError unless x0 and x of episodes with so many leading axes are those of ``sim``."""
+    like = outline(sim)
+    for name, value, own, rows in (
+        ("x0", x0, like.x0, ()),
+        ("disturbances", x, like.x, (sim.horizon,)),
+    ):
+        _fits(path, name, describe(value), jax.tree.leaves(value), own, rows, axes)
 
 
 def _take(episodes, i):
@@ -333,7 +346,7 @@ def _rebuild(path, structure, leaves):
     }[kind]()
 
 
-def _fits(path, name, structure, arrays, like, rows):
+def _fits(path, name, structure, arrays, like, rows, axes=1):
     check_structure(path, "sim", name, structure, like)
     for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
-        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes=1)
+        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)

@@ -1,6 +1,7 @@
 """What all results have in common: one vocabulary, how they print, and their files."""
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,8 @@ from jast import results
 KEY = jax.random.key(0)
 
 
-@functools.cache
-def sim():
-    """A walk that fails in about one of 40 episodes."""
-    return jast.simulators.walk1d(threshold=3.0, horizon=8)
+WALK = jast.simulators.walk1d(threshold=3.0, horizon=8)
+"""A walk that fails in about one of 40 episodes."""
 
 
 def heads():
@@ -35,12 +34,12 @@ def validation():
 
 
 def importance():
-    e = jast.search.monte_carlo(KEY, sim(), episodes=2000).best
-    return jast.estimate.importance(KEY, sim(), jast.estimate.trace_proposal(sim(), e), 200)
+    e = jast.search.monte_carlo(KEY, WALK, episodes=2000).best
+    return jast.estimate.importance(KEY, WALK, jast.estimate.trace_proposal(WALK, e), 200)
 
 
 def small_forest():
-    return jast.search.forest(KEY, sim(), trees=3, prunes=3, simulations=20, record=True)
+    return jast.search.forest(KEY, WALK, trees=3, prunes=3, simulations=20, record=True)
 
 
 def ce():
@@ -50,28 +49,28 @@ def ce():
 
 
 MAKERS = {
-    "monte_carlo": lambda: jast.search.monte_carlo(KEY, sim(), episodes=2000, record=True),
+    "monte_carlo": lambda: jast.search.monte_carlo(KEY, WALK, episodes=2000, record=True),
     "forest": small_forest,
-    "cem": lambda: jast.search.cem(KEY, sim(), samples=50, elites=5, iterations=3),
-    "crude": lambda: jast.estimate.monte_carlo(KEY, sim(), 500),
+    "cem": lambda: jast.search.cem(KEY, WALK, samples=50, elites=5, iterations=3),
+    "crude": lambda: jast.estimate.monte_carlo(KEY, WALK, 500),
     "importance": importance,
     "ce": ce,
-    "nominal": lambda: jast.nominal(KEY, sim(), episodes=500),
-    "failure_proposal": lambda: jast.estimate.failure_proposal(KEY, sim(), samples=200),
+    "nominal": lambda: jast.nominal(KEY, WALK, episodes=500),
+    "failure_proposal": lambda: jast.estimate.failure_proposal(KEY, WALK, samples=200),
     "failure_samples": lambda: jast.estimate.failure_samples(
-        KEY, sim(), jast.policy.nominal_policy(sim()), 5, moves=1
+        KEY, WALK, jast.policy.nominal_policy(WALK), 5, moves=1
     ),
-    "sac": lambda: jast.policies.sac(KEY, sim(), episodes=400, lanes=16, hidden=(8,)),
+    "sac": lambda: jast.policies.sac(KEY, WALK, episodes=400, lanes=16, hidden=(8,)),
     "validation": validation,
 }
 OTHERS = {
     "episode": lambda: made("monte_carlo").best,
     "failures": lambda: made("monte_carlo").failures,
-    "simulator": sim,
-    "policy": lambda: jast.policy.nominal_policy(sim()),
-    "proposal": lambda: jast.estimate.trace_proposal(sim(), made("monte_carlo").best),
+    "simulator": lambda: WALK,
+    "policy": lambda: jast.policy.nominal_policy(WALK),
+    "proposal": lambda: jast.estimate.trace_proposal(WALK, made("monte_carlo").best),
     "heads": heads,
-    "traces": lambda: jast.estimate.log_weights(KEY, sim(), OTHERS["policy"](), 20),
+    "traces": lambda: jast.estimate.log_weights(KEY, WALK, OTHERS["policy"](), 20),
     "history": lambda: made("monte_carlo").history,
     "roots": lambda: made("forest").roots,
 }
@@ -108,7 +107,7 @@ def test_a_batched_and_a_traced_result_print_and_say_so():
     seen = []
 
     def search(key):
-        found = jast.search.monte_carlo(key, sim(), episodes=200)
+        found = jast.search.monte_carlo(key, WALK, episodes=200)
         seen.extend([repr(found), str(found), repr(found.best), found._repr_html_()])
         return found
 
@@ -172,3 +171,198 @@ def test_a_door_lists_its_public_names_only():
         for name in dir(door):
             assert getattr(door, name) is not None
     assert "grow" not in dir(jast.search) and "plot" in dir(jast)
+
+
+# files
+
+
+def same(a, b, at="result"):
+    """That ``b``, loaded, is ``a`` to the bit; arrays come back as NumPy's."""
+    if isinstance(a, jax.Array | np.ndarray | np.generic):
+        assert type(b) is (type(a) if isinstance(a, np.generic) else np.ndarray), at
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), at
+        assert np.asarray(a).tobytes() == b.tobytes(), at
+    elif isinstance(a, dict):
+        assert list(a) == list(b), at
+        for name in a:
+            same(a[name], b[name], f"{at}.{name}")
+    elif isinstance(a, tuple | list):
+        assert type(a) is type(b) and len(a) == len(b), at
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            same(x, y, f"{at}.{i}")
+    elif isinstance(a, jast.failures.Failures | jast.heads.Heads | jast.policies.FailurePolicy):
+        assert type(a) is type(b), at
+        assert jax.tree.structure(a) == jax.tree.structure(b), at
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            same(np.asarray(x), np.asarray(y), at)
+    elif isinstance(a, float) and np.isnan(a):
+        assert np.isnan(b), at
+    else:
+        assert type(a) is type(b) and a == b, at
+
+
+FILED = [*MAKERS, "episode", "failures", "heads", "traces", "history", "roots"]
+
+
+@pytest.mark.parametrize("name", FILED)
+def test_a_file_gives_the_result_back_to_the_bit(name, tmp_path):
+    value, path = made(name), tmp_path / "result"
+    jast.save(path, value)
+    back = jast.load(path, WALK)
+    assert repr(back) == repr(value) and str(back) == str(value)
+    if name == "failure_proposal":  # its policy is functions, made again from its numbers
+        keys = jax.random.split(KEY, 4)
+        for key in keys:
+            same(
+                np.asarray(jast.rollout(key, WALK, value.policy).disturbances),
+                np.asarray(jast.rollout(key, WALK, back.policy).disturbances),
+            )
+        value, back = value._replace(policy=None), back._replace(policy=None)
+    same(value, back)
+    if name not in ("sac", "failure_proposal"):
+        same(value, jast.load(path))  # no simulator is needed
+    with np.load(path, allow_pickle=False) as pack:
+        assert "header" in pack.files
+    assert [p.name for p in tmp_path.iterdir()] == ["result"]
+
+
+class Own(NamedTuple):
+    """A state of a simulator's own class."""
+
+    position: jax.Array
+    more: dict
+
+
+def own_simulator():
+    return jast.Simulator(
+        init=lambda x0: Own(jnp.zeros(()), {"none": None, "pair": (jnp.zeros(2), jnp.int32(1))}),
+        step=lambda s, x: s._replace(position=s.position + x["push"]),
+        disturbance=lambda s: jast.distributions.Joint(
+            {"push": jast.distributions.Normal(jnp.zeros(()), 1.0)}
+        ),
+        evaluate=lambda s: (s.position > 2, jnp.maximum(2 - s.position, 0)),
+        horizon=4,
+    )
+
+
+def test_states_of_an_own_class_need_the_simulator(tmp_path):
+    own, path = own_simulator(), tmp_path / "s"
+    found = jast.search.monte_carlo(KEY, own, episodes=300, top=3)
+    jast.save(path, found)
+    same(found, jast.load(path, own))
+    with pytest.raises(ValueError, match="the class Own, which only its simulator can restore"):
+        jast.load(path)
+    with pytest.raises(ValueError, match="does not fit sim: "):
+        jast.load(path, WALK)
+
+
+def test_a_batch_nested_none_and_texts_are_kept(tmp_path):
+    keys = jax.random.split(KEY, 2)
+    batch = jax.vmap(lambda key: jast.search.monte_carlo(key, WALK, episodes=100))(keys)
+    deep = made("nominal")._replace(
+        undisturbed=None, interval=(None, [("é", {"a": True, "b": (1, float("inf"))})], np.int8(3))
+    )
+    for value in (batch, deep):
+        jast.save(tmp_path / "r", value)
+        same(value, jast.load(tmp_path / "r"))
+
+
+def test_a_search_can_be_run_again_from_its_file(tmp_path, equal):
+    reward = jast.rewards.standard(event_bonus=30.0, density="mode")
+    box = jast.actions.uniform(-1.5, 1.5)
+    found = jast.search.monte_carlo(KEY, WALK, episodes=300, reward=reward, actions=box)
+    jast.save(tmp_path / "r", found)
+    s = jast.load(tmp_path / "r", WALK).settings
+    assert (s["reward"], s["actions"]) == ("rewards.standard", "actions.uniform")
+    assert s["reward_settings"] == {"event_bonus": 30.0, "density": "mode"}
+    assert s["action_settings"] == {"low": -1.5, "high": 1.5}
+    again = jast.search.monte_carlo(
+        jax.random.wrap_key_data(jnp.asarray(s["seed"], jnp.uint32), impl=jax.random.key_impl(KEY)),
+        WALK,
+        episodes=s["episodes"],
+        reward=jast.rewards.standard(**s["reward_settings"]),
+        actions=jast.actions.uniform(**s["action_settings"]),
+    )
+    equal(again.failures, found.failures)
+    assert again.settings == found.settings
+
+
+def test_what_a_file_cannot_hold_is_named(tmp_path):
+    value = made("nominal")
+    for bad, match in (
+        (value._replace(rate=object()), "save: result.rate must be an array, a number or a text"),
+        (value._replace(rate=KEY), "save: result.rate must be numbers, received a key"),
+        (value._replace(rate=np.array(["a"])), "save: result.rate must be an array of numbers"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            jast.save(tmp_path / "r", bad)
+    assert not list(tmp_path.iterdir())
+
+    def inside(x):
+        jast.save(tmp_path / "r", value._replace(rate=x))
+
+    with pytest.raises(ValueError, match="save: result.rate must have a value, received a traced"):
+        jax.jit(inside)(1.0)
+
+
+def test_bad_files_are_refused(tmp_path, monkeypatch):
+    from jast import archive, files
+
+    path = tmp_path / "r"
+    jast.save(path, made("monte_carlo"))
+    whole = path.read_bytes()
+    with pytest.raises(ValueError, match="does not fit sim: .*30"):
+        jast.load(path, jast.simulators.walk1d(horizon=30))
+    for bad, match in (
+        (b"text", "is not a file of jast.save"),
+        (whole[: len(whole) // 2], "damaged"),
+        (whole[:-40], "damaged"),
+    ):
+        path.write_bytes(bad)
+        with pytest.raises(ValueError, match=match):
+            jast.load(path)
+    with open(path, "wb") as file:
+        np.savez(file, a=np.zeros(2))
+    with pytest.raises(ValueError, match="not a file of jast.save"):
+        jast.load(path)
+    archive.write(path, "jast result", 2, {}, {})
+    with pytest.raises(ValueError, match="has version 2; this jast reads version 1"):
+        jast.load(path)
+    archive.write(path, "jast sac checkpoint", 1, {}, {})
+    with pytest.raises(ValueError, match="its format is 'jast sac checkpoint'"):
+        jast.load(path)
+    archive.write(path, "jast result", 1, {"result": {"record": ["Unknown", {}]}}, {})
+    with pytest.raises(ValueError, match="holds a Unknown, unknown here"):
+        jast.load(path)
+    with pytest.raises(FileNotFoundError):
+        jast.load(tmp_path / "none")
+    header, arrays = files.parts(made("nominal"))
+    first = next(iter(arrays))
+    archive.write(path, "jast result", 1, header, arrays)
+    monkeypatch.setattr(archive, "_checksum", lambda *_: "other")
+    with pytest.raises(ValueError, match="its checksum does not match"):
+        jast.load(path)
+    assert first
+
+
+def test_a_failure_policy_needs_its_simulator(tmp_path):
+    jast.save(tmp_path / "p", made("sac"))
+    with pytest.raises(ValueError, match="only its simulator can restore: load"):
+        jast.load(tmp_path / "p")
+
+
+def test_files_of_the_former_functions_are_the_same(tmp_path, equal):
+    archive, path = made("failures"), tmp_path / "f"
+    jast.failures.save(path, archive, {"method": "forest", "n": np.int64(3)})
+    equal(jast.load(path), archive)
+    equal(jast.load(path, WALK), archive)
+    back, settings = jast.failures.load(path)
+    equal(back, archive)
+    assert settings == {"method": "forest", "n": 3}
+    jast.save(path, archive)
+    assert jast.failures.load(path)[1] == {}
+    state = made("validation").state
+    jast.weakness.save(path, state)
+    same(state, jast.load(path))
+    jast.save(path, heads())
+    equal(jast.heads.load(path), jast.load(path))

@@ -159,10 +159,7 @@ def _search(key, sim, settings, tilt_start, samples, iterations):
     last, (levels, failures, ess, invalid, fails) = lax.scan(
         iterate, first, jax.random.split(key, iterations)
     )
-    policy = Policy(
-        Partial(_start, sim.start, last[0]) if tilt_start else sim.start,
-        Partial(_disturbance, sim.disturbance, last[1]),
-    )
+    policy = proposing(sim, *last)
     evaluations = jnp.asarray(samples * iterations, jnp.int32)
     return FailureProposal(
         policy,
@@ -173,6 +170,16 @@ def _search(key, sim, settings, tilt_start, samples, iterations):
         evaluations,
         jnp.sum(invalid, dtype=jnp.int32),
         fails[-1] & (ess[-1] >= 2),
+    )
+
+
+def proposing(sim: Simulator, start: Any, steps: Any) -> Policy:
+    """The `Policy` of a simulator's disturbances, tilted by `Steps` of x0 (``()``: not tilted) and
+    of x.
+    """
+    return Policy(
+        Partial(_start, sim.start, start) if start != () else sim.start,
+        Partial(_disturbance, sim.disturbance, steps),
     )
 
 

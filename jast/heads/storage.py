@@ -3,40 +3,56 @@ its function is made of.
 """
 
 import operator
+import os
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import files
 from jast._jax import is_traced
-from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
+from jast.archive import arrays_of, check_array, check_structure, describe, named
 from jast.heads.heads import Heads, Moments
 from jast.heads.networks import ACTIVATIONS, Head, _network
 
 __all__ = ["load", "save"]
 
-FORMAT, VERSION, KIND = "jast heads", 1, "a file of jast heads"
 HEADS, MOMENTS = ("policy", "value"), ("inputs", "returns")
 
 
-def save(path, heads):
-    """Write trained ``heads`` (`jast.heads.Heads`) to the one file ``path``.
+def save(path: str | os.PathLike, heads: Heads) -> None:
+    """`jast.save` of heads; goes with the next version.
 
-    An npz that `numpy.load` opens without pickle; its entry ``header`` is JSON. The function of a
-    network of `jast.heads.make_head` is in it by its sizes and its activation; a function of your
-    own cannot be, and `load` asks for it. An older file of that name stays whole until the new one
-    is. ValueError for heads with neither head, for parameters and moments that are not arrays of
-    numbers, and for levels that are no integer.
+    The function of a network of `jast.heads.make_head` is in the file by its sizes and its
+    activation; a function of your own cannot be, and `load` asks for it. ValueError for heads with
+    neither head, for parameters and moments that are not arrays of numbers, and for levels that are
+    no integer.
     """
+    files.store(path, "jast heads", heads)
+
+
+def load(path: str | os.PathLike, heads: Heads | None = None) -> Heads:
+    """`jast.load` of heads, with ``heads=heads``; goes with the next version.
+
+    A network of `jast.heads.make_head` gets the very function that such networks of one shape
+    share, so that what was compiled for them serves here too. ``heads`` (`Heads`) is needed where a
+    head has a function of your own: its functions are taken, the file's parameters must be like its
+    own (structure, shapes, kinds of number; the precision may differ), and the rest is the file's.
+    """
+    return files.restore(path, "jast heads", heads=heads)[0]
+
+
+def parts(heads: Heads) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and arrays of a file of heads."""
     _check("save", heads)
     try:
         levels = operator.index(heads.levels)
     except TypeError:
         raise ValueError(f"save: levels must be an integer, received {heads.levels!r}") from None
-    parts, about = {}, {}
+    arrays, about = {}, {}
     for name in HEADS:
         if (head := getattr(heads, name)) is not None:
-            parts[name] = head.params
+            arrays[name] = head.params
             about[name] = dict(network=_specification(head), structure=describe(head.params))
     for name in MOMENTS:
         moments = getattr(heads, name)
@@ -45,30 +61,23 @@ def save(path, heads):
                 f"save: {name} must be jast.heads.Moments or None, received"
                 f" {type(moments).__name__}"
             )
-        parts[name] = moments
-    for name, part in parts.items():
+        arrays[name] = moments
+    for name, part in arrays.items():
         for at, leaf in jax.tree_util.tree_leaves_with_path(part):
             if not _storable(leaf):
                 raise ValueError(
                     f"save: {name}{jax.tree_util.keystr(at)} must be an array of numbers, received"
                     f" {_readable(leaf)}"
                 )
-    write(path, FORMAT, VERSION, dict(levels=levels, heads=about), named(parts))
+    return dict(levels=levels, heads=about), named(arrays)
 
 
-def load(path, heads=None):
-    """Read a file of `save`: `Heads`, whose arrays are NumPy's and equal to those saved to the bit.
-
-    A network of `jast.heads.make_head` gets the very function that such networks of one shape
-    share, so that what was compiled for them serves here too. ``heads`` (`Heads`) is needed where a
-    head has a function of your own: its functions are taken, the file's parameters must be like its
-    own (structure, shapes, kinds of number; the precision may differ), and the rest is the file's.
-    ValueError says why a file is refused: no file of heads, a version unknown here, damaged, or no
-    fit to ``heads``.
-    """
+def whole(
+    path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], heads: Heads | None
+) -> Heads:
+    """The heads of `parts`, with the functions of ``heads``, if any."""
     if heads is not None:
         _check("load", heads)
-    header, arrays = read(path, FORMAT, VERSION, KIND)
     loaded = {
         name: _head(path, name, header, arrays_of(arrays, name), getattr(heads, name, None))
         for name in HEADS
@@ -182,7 +191,7 @@ def _head(path, name, header, leaves, given):
     elif network["activation"] not in ACTIVATIONS:
         raise ValueError(
             f"load: {path} has the activation {network['activation']!r}, unknown here: use the jast"
-            f" that wrote it, {header['package']}"
+            f" that wrote it, {header.get('package')}"
         )
     like, apply = _made(network) if given is None else given
     other = "its network" if given is None else "heads"

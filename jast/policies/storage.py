@@ -2,11 +2,14 @@
 simulator's functions are not in it.
 """
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast.archive import arrays_of, check_array, named, read, write
+from jast import files
+from jast.archive import arrays_of, check_array, named
 from jast.contract import contract
 from jast.heads.heads import Moments
 from jast.outline import outline
@@ -14,18 +17,27 @@ from jast.policies.failure_policy import FailurePolicy, History, Learned, assemb
 from jast.policies.latent import sizes
 from jast.policies.learner import Net, learner, networks
 from jast.policies.start import Tilt
+from jast.simulator import Simulator
 
 __all__ = ["load", "save"]
 
-FORMAT, VERSION, KIND = "jast policy", 1, "a file of a jast failure policy"
 
-
-def save(path, policy):
-    """Write a `FailurePolicy` to the one file ``path``, an npz that `numpy.load` opens without
-    pickle; an older one stays whole until the new one is.
-
-    ValueError for a policy of another kind.
+def save(path: str | os.PathLike, policy: FailurePolicy) -> None:
+    """`jast.save` of a `FailurePolicy`; goes with the next version. ValueError for a policy of
+    another kind.
     """
+    files.store(path, "jast policy", policy)
+
+
+def load(path: str | os.PathLike, sim: Simulator) -> FailurePolicy:
+    """`jast.load` of a `FailurePolicy`, with the simulator that it was taught on, or one like it;
+    goes with the next version.
+    """
+    return files.restore(path, "jast policy", sim)[0]
+
+
+def parts(policy: FailurePolicy) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and arrays of a policy's file."""
     if not isinstance(policy, FailurePolicy):
         raise ValueError(
             f"save: policy must be a jast.policies.FailurePolicy, received {type(policy).__name__}"
@@ -43,17 +55,20 @@ def save(path, policy):
         tilted=learned.tilt != (),
         dense=bool(dense),
     )
-    write(path, FORMAT, VERSION, header, named(learned._asdict() | dict(history=policy.history)))
+    return header, named(learned._asdict() | dict(history=policy.history))
 
 
-def load(path, sim):
-    """Read a file of `save` for the simulator ``sim`` that the policy was taught on, or one like
-    it: `FailurePolicy`, its arrays as saved to the bit.
-
-    ValueError says why a file is refused: no policy's, a version unknown here, damaged, or no fit
-    to ``sim`` (horizon, numbers seen, sizes of x and x0).
+def whole(
+    path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], sim: Simulator | None
+) -> FailurePolicy:
+    """The policy of `parts`; ValueError where it does not fit ``sim`` (horizon, numbers seen, sizes
+    of x and x0), or there is none.
     """
-    header, arrays = read(path, FORMAT, VERSION, KIND)
+    if sim is None:
+        raise ValueError(
+            f"load: {path} holds a failure policy, which only its simulator can restore: load(path,"
+            " sim)"
+        )
     contract(sim)
     if header["horizon"] != sim.horizon:
         raise ValueError(

@@ -6,6 +6,7 @@ the start, where it is random, is level 0. So an episode is known by its number,
 it was simulated in.
 """
 
+from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -242,8 +243,30 @@ def prepare(function, key, sim, reward, actions, **settings):
         **settings,
         seed=np.asarray(seed).tolist(),
         reward=name,
+        reward_settings=_settings(reward),
         actions=ACTIONS.get(type(actions), type(actions).__name__),
+        action_settings=_settings(actions),
     )
+
+
+def _settings(part: Any) -> dict[str, Any]:
+    """The numbers and texts of a reward or of actions, as JSON can hold them."""
+    if is_dataclass(part):
+        given = {f.name: getattr(part, f.name) for f in fields(part)}
+    else:
+        args = getattr(part, "args", ())
+        given = dict(getattr(part, "keywords", {})) | ({"args": args} if args else {})
+    return {name: _plain(value) for name, value in given.items()}
+
+
+def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
 
 
 class Log(NamedTuple):

@@ -1,20 +1,30 @@
 """States of a validation in files."""
 
+import os
+from typing import Any
+
 import numpy as np
 
-from jast import archive
+from jast import files
 from jast.weakness.result import History, State
 
 __all__ = ["load", "save"]
 
-FORMAT, VERSION, KIND = "jast validation", 1, "a validation of jast.weakness"
 PLAIN = ("selector", "data", "complete", "finished")
 
 
-def save(path, state):
-    """Write a `State` to the one file ``path``; an older file of that name stays whole until the
-    new one is.
-    """
+def save(path: str | os.PathLike, state: State) -> None:
+    """`jast.save` of a `State`; goes with the next version."""
+    files.store(path, "jast validation", state)
+
+
+def load(path: str | os.PathLike) -> State:
+    """`jast.load` of a `State`; goes with the next version."""
+    return files.restore(path, "jast validation", None)[0]
+
+
+def parts(state: State) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and arrays of a state's file."""
     if not isinstance(state, State):
         raise ValueError(
             f"save: state must be the state of a Result, received {type(state).__name__}"
@@ -23,14 +33,11 @@ def save(path, state):
     arrays |= {f"memory.{name}": np.asarray(a) for name, a in state.memory.items()} | {
         f"history.{name}": a for name, a in state.history._asdict().items()
     }
-    archive.write(path, FORMAT, VERSION, {name: getattr(state, name) for name in PLAIN}, arrays)
+    return {name: getattr(state, name) for name in PLAIN}, arrays
 
 
-def load(path):
-    """The `State` of a file of `save`. ValueError for a file that is none, damaged, or of another
-    version.
-    """
-    header, arrays = archive.read(path, FORMAT, VERSION, KIND)
+def whole(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], _: Any) -> State:
+    """The state of `parts`."""
     part = lambda name: {
         k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")
     }

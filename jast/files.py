@@ -1,0 +1,170 @@
+"""Results in files: `save` and `load`, one pair for all kinds.
+
+A file is an npz that `numpy.load` opens without pickle; its entry ``header`` is JSON with a format,
+a version and a checksum (`jast.archive`). Archives of failures, heads, failure policies and states
+of validations have formats of their own, which version 0.1.0 reads and wrote; all other results are
+records (`jast.records`), in which those stand as parts.
+"""
+
+import importlib
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast import archive
+from jast.records import decode, encode, place_of
+
+__all__ = ["load", "save"]
+
+
+class Kind(NamedTuple):
+    """A format: ``module.parts(value) -> (header, arrays)``, and back ``module.whole(path, header,
+    arrays, sim)`` (of heads: ``heads`` in place of ``sim``).
+    """
+
+    version: int
+    words: str
+    """What a file of it is called."""
+    place: str
+    """ "module:Class" of what it holds."""
+    module: str
+
+
+KINDS = {
+    "jast failures": Kind(
+        1, "a jast archive of failures", "jast.failures:Failures", "jast.failures"
+    ),
+    "jast heads": Kind(1, "a file of jast heads", "jast.heads.heads:Heads", "jast.heads.storage"),
+    "jast policy": Kind(
+        1,
+        "a file of a jast failure policy",
+        "jast.policies.failure_policy:FailurePolicy",
+        "jast.policies.storage",
+    ),
+    "jast validation": Kind(
+        1, "a validation of jast.weakness", "jast.weakness.result:State", "jast.weakness.storage"
+    ),
+    "jast result": Kind(1, "a result of jast", "", "jast.files"),
+}
+FORMATS = {kind.place: format for format, kind in KINDS.items() if kind.place}
+FUNCTIONS = ("jast.policy:Policy", "jast.estimate.proposals:Proposal")
+"""Made of functions, which are in no file."""
+
+
+def save(path: str | os.PathLike, result: Any) -> None:
+    """Write a result to the one file ``path``; an older file of that name stays whole until the new
+    one is.
+
+    Args:
+        path: of the file, by any name.
+        result: of a search, an estimate, a cross-entropy method, `jast.nominal` or a validation; an
+            archive of failures, an `jast.Episode`, `jast.heads.Heads`, a failure policy, or the
+            state of a validation; also a batch of them, of `jax.vmap`. A proposal that is made of
+            functions is left out, and None after `load`.
+
+    Raises:
+        ValueError: that names what a file cannot hold.
+    """
+    store(path, FORMATS.get(place_of(result), "jast result"), result)
+
+
+def load(path: str | os.PathLike, sim: Any = None, *, heads: Any = None) -> Any:
+    """What `save` wrote, equal to the bit; its arrays are NumPy's and keep their dtypes.
+
+    Args:
+        path: of the file, also one of version 0.1.0.
+        sim: the simulator that it is of, which must fit (horizon, structure, shapes, kinds of
+            number; the float precision may differ). A failure policy needs it, and so do x0, x and
+            states that hold classes of its own.
+        heads: `jast.heads.Heads` with functions of your own, for a file that holds such heads.
+
+    Raises:
+        ValueError: that says why the file is refused: none of jast, of an unknown version, damaged,
+            or no fit to ``sim`` or ``heads``.
+    """
+    format = archive.format_of(path)
+    if format not in KINDS:
+        raise ValueError(f"load: {path} is not a file of jast.save: its format is {format!r}")
+    return restore(path, format, sim, heads)[0]
+
+
+def store(path: Any, format: str, value: Any, **more: Any) -> None:
+    """Write ``value`` in this format, with ``more`` in the header."""
+    header, arrays = _module(format).parts(value)
+    archive.write(path, format, KINDS[format].version, header | more, arrays)
+
+
+def restore(path: Any, format: str, sim: Any = None, heads: Any = None) -> tuple[Any, dict]:
+    """``(value, header)`` of a file of this format."""
+    kind = KINDS[format]
+    header, arrays = archive.read(path, format, kind.version, kind.words)
+    return _whole(path, format, header, arrays, sim, heads), header
+
+
+def parts(value: Any) -> tuple[dict, dict[str, np.ndarray]]:
+    """Of a result that is a record: ``(header, arrays)``."""
+    arrays = {}
+
+    def special(part: Any) -> dict | None:
+        place = place_of(part)
+        if place in FUNCTIONS:
+            return {"left out": place}
+        if (format := FORMATS.get(place)) is None:
+            return None
+        name = f"part{len(arrays)}"
+        header, own = _module(format).parts(part)
+        arrays.update({f"{name}/{k}": a for k, a in own.items()})
+        return {"kind": [format, KINDS[format].version, name, sorted(own), header]}
+
+    return {"result": encode(value, arrays, special)}, arrays
+
+
+def _whole(path: Any, format: str, header: dict, arrays: dict, sim: Any, heads: Any) -> Any:
+    if format == "jast result":
+        return _result(path, header, arrays, sim, heads)
+    given = heads if format == "jast heads" else sim
+    return _module(format).whole(path, header, arrays, given)
+
+
+def _result(path: Any, header: dict, arrays: dict[str, np.ndarray], sim: Any, heads: Any) -> Any:
+    """The result of `parts`."""
+
+    def special(node: dict) -> Any:
+        ((what, about),) = node.items()
+        if what == "left out":
+            return None
+        if what != "kind":
+            raise ValueError(
+                f"load: {path} holds {what!r}, unknown here: use the jast that wrote it"
+            )
+        format, version, name, names, own = about
+        if format not in KINDS or version != KINDS[format].version:
+            raise ValueError(
+                f"load: {path} holds {format!r} of version {version}, unknown here: use the jast"
+                f" that wrote it, {header.get('package')}"
+            )
+        these = {k: arrays[f"{name}/{k}"] for k in names}
+        return _whole(path, format, own, these, sim, heads)
+
+    result = decode(header["result"], path, arrays, special, sim)
+    if sim is not None:
+        _check(path, result, sim)
+        if place_of(result) == "jast.estimate.multilevel:FailureProposal":
+            proposing = importlib.import_module("jast.estimate.multilevel").proposing
+            result = result._replace(policy=proposing(sim, result.start, result.steps))
+    return result
+
+
+def _check(path: Any, result: Any, sim: Any) -> None:
+    """ValueError unless the episodes of ``result`` are of ``sim``."""
+    from jast.episode import Episode
+    from jast.failures import fits
+
+    episodes = [result, *(result if isinstance(result, tuple) else ())]
+    for e in (e for e in episodes if isinstance(e, Episode)):
+        fits(path, sim, e.x0, e.disturbances, np.ndim(e.length))
+
+
+def _module(format: str) -> Any:
+    return importlib.import_module(KINDS[format].module)
