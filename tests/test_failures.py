@@ -15,6 +15,7 @@ from systems import PUBLISHED
 
 import jast
 from jast import failures as F
+from jast import files
 from jast.distributions import Independent, Joint, Normal
 
 FERRY = jast.simulators.ferry()
@@ -368,7 +369,8 @@ def test_load_refuses_other_files_and_versions(tmp_path, archive, monkeypatch):
         F.load(tmp_path / "b")
     for version in (0, 2):
         with monkeypatch.context() as patch:
-            patch.setattr(F, "VERSION", version)
+            kind = files.KINDS["jast failures"]._replace(version=version)
+            patch.setitem(files.KINDS, "jast failures", kind)
             F.save(path, archive)
         with pytest.raises(ValueError, match=f"has version {version}; this jast reads version 1"):
             F.load(path)

@@ -12,7 +12,8 @@ import pytest
 from jax.tree_util import Partial
 
 import jast
-from jast.heads import Head, Heads, Moments, make_head, networks, storage
+from jast import files
+from jast.heads import Head, Heads, Moments, make_head, networks
 from jast.heads.heads import histogram, value
 from jast.search.tree import run
 
@@ -382,7 +383,8 @@ def test_load_refuses_other_files_and_versions(tmp_path, monkeypatch):
         jast.heads.load(tmp_path / "none")
     for version in (0, 2):
         with monkeypatch.context() as patch:
-            patch.setattr(storage, "VERSION", version)
+            kind = files.KINDS["jast heads"]._replace(version=version)
+            patch.setitem(files.KINDS, "jast heads", kind)
             jast.heads.save(path, made())
         with pytest.raises(
             ValueError,
