@@ -73,8 +73,7 @@ class Nominal(NamedTuple):
             ("invalid", f"{self.invalid}"),
         ]
         if "interrupted" in self.settings:
-            done = f"after {self.episodes} of {self.settings['episodes']} episodes"
-            rows.append(("interrupted", done))
+            rows.append(("interrupted", self.settings["interrupted"]))
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
 
 
@@ -101,7 +100,7 @@ def nominal(key, sim, episodes=100_000):
     episodes, (failures, invalid, mean) = _played(key, sim, asked)
     settings = dict(method="nominal", episodes=asked)
     if episodes < asked:
-        settings["interrupted"] = True
+        settings["interrupted"] = f"after {episodes} of {asked} episodes"
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
             "the system fails undisturbed: its likeliest disturbances already lead to a failure, so"

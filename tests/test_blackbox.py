@@ -12,6 +12,7 @@ import pytest
 
 import jast
 from jast import blackbox
+from jast.blackbox import worker
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
 from jast.incidents import GROUPS, Log, incidents, since
 
@@ -432,3 +433,74 @@ def test_bad_programs_and_environments_are_named():
             blackbox.gymnasium_system(len, len, **settings)
     with pytest.raises(ValueError, match="calls: sim must be"):
         blackbox.calls(jast.simulators.walk1d())
+
+
+class Counted(blackboxes.Walk):
+    made = 0
+
+    def __init__(self):
+        type(self).made += 1
+
+
+def test_objects_serve_many_episodes(monkeypatch):
+    """One for each history that goes on, and those that ended are used again."""
+    for episodic, most in ((True, 1), (False, 4)):
+        Counted.made = 0
+        spec = worker.Spec(False, episodic, 3, (), False, None)
+        runner = worker.Runner(Counted, spec)
+        runner.configure(0, 0)
+        rows = np.random.default_rng(0).normal(size=(4, 3))
+        for _ in range(3):
+            for t in range(3 if episodic else 0, 4):
+                reply = runner(np.full(4, t), [], [rows])
+        assert Counted.made == most and reply.problems == [] and runner.kept == {}
+        np.testing.assert_allclose(reply.distance, 4 - rows.sum(1))
+    # no more are kept than there is room for: of the lost ones the histories are repeated
+    monkeypatch.setattr(worker, "KEPT", 2)
+    runner = worker.Runner(Counted, spec)
+    runner.configure(0, 0)
+    runner(np.full(4, 1), [], [rows])
+    assert (runner.count, len(runner.kept), len(runner.spare)) == (2, 2, 1)
+    reply = runner(np.full(4, 2), [], [rows])
+    assert (reply.episodes, reply.transitions) == (4, 8)  # 0 and 1 push out 2 and 3
+    np.testing.assert_allclose(reply.distance, np.maximum(4 - rows[:, :2].sum(1), 0))
+
+
+def test_an_example_ends_where_it_went_wrong(key):
+    sim = box(blackboxes.Fragile, 6)
+    jast.search.monte_carlo(key, sim, episodes=64, top=2)
+    (only,) = incidents(sim)
+    sums = np.cumsum(only.disturbances)
+    assert len(sums) < 6 and sums[-1] > 2 >= sums[:-1].max(initial=0)
+
+
+@pytest.mark.skipif(jax.config.jax_enable_x64, reason="the number is one in float64")
+def test_a_distance_beyond_the_precision_is_no_number():
+    class Far(blackboxes.Walk):
+        def is_event(self):
+            return self.s > 0
+
+        def miss_distance(self):
+            return 1e300 if self.s > 0 else 0.0
+
+    sim = box(Far, 3)
+    state = sim.step(sim.init(()), jnp.ones(()))
+    assert not state.event and state.terminal and np.isnan(state.distance)
+    (only,) = incidents(sim)
+    assert (only.kind, only.message) == ("NaN", "distance is 1e+300, beyond float32")
+    assert only.disturbances.tolist() == [1]
+
+
+def test_the_memory_of_outcomes_is_bounded(monkeypatch):
+    monkeypatch.setattr(blackbox.host, "REMEMBERED", 2)
+    outcome = [0.0]
+    sim = box(lambda x: (bool(x[0] > 5), outcome[0]))
+    ends(sim, [[1, 0], [2, 0], [3, 0], [9, 0]])  # the first is forgotten; failures have their own
+    host = sim.evaluate.func.host
+    assert (len(host.failing), len(host.others)) == (1, 2)
+    outcome[0] = 1.0
+    ends(sim, [[1, 0]])
+    assert incidents(sim) == ()
+    ends(sim, [[3, 0], [9, 0]])
+    (only,) = incidents(sim)
+    assert only.count == 2 and only.message.endswith("gave two distances")

@@ -407,7 +407,9 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
     monkeypatch.setattr(crude, "PIECE", 0.0)
     monkeypatch.setattr(crude, "apart", partial(apart, stop_at=3))
     part = jast.nominal(key, walk1d(), episodes=2100)
-    assert part.settings == dict(method="nominal", episodes=2100, interrupted=True)
+    assert part.settings == dict(
+        method="nominal", episodes=2100, interrupted="after 2048 of 2100 episodes"
+    )
     calls.clear()
     monkeypatch.setattr(crude, "apart", apart)
     equal(part[:-1], jast.nominal(key, walk1d(), episodes=2048)[:-1])

@@ -10,6 +10,8 @@ from jax.tree_util import Partial
 
 from jast import cross_entropy as ce
 from jast.cross_entropy import loop, refit, surrogates
+from jast.cross_entropy.gaussian import Gaussian
+from jast.cross_entropy.mixture import Mixture
 from jast.cross_entropy.settle import MODES, settled
 
 METHODS = {"ce_method": ce.ce_method, "ce_surrogate": ce.ce_surrogate, "ce_mixture": ce.ce_mixture}
@@ -753,3 +755,43 @@ def test_coordinates_of_very_different_size(key):
         ).best_value
     )
     assert median(jnp.array([1e6, 1.0])) < 10 * median(jnp.ones(2))
+
+
+def test_moments_of_a_mixture():
+    """Those of two points a side of 1 with shares 1 and 3, and their own spread."""
+    m = Mixture(
+        jnp.array([1.0, 3.0]),
+        jnp.array([[-1.0, 0.0], [1.0, 2.0]]),
+        jnp.stack([jnp.eye(2), 2 * jnp.eye(2)]),
+    )
+    g = refit.moments(m)
+    np.testing.assert_allclose(g.mean, [0.5, 1.5])
+    np.testing.assert_allclose(g.covariance, 1.75 * np.eye(2) + [[0.75, 0.75], [0.75, 0.75]])
+    assert refit.moments(g) is g
+
+
+def test_a_short_search_returns_the_best_that_it_drew(key):
+    drawn = []
+
+    def model(x):
+        value = jnp.sum((x - 3.0) ** 2, axis=-1)
+        jax.debug.callback(lambda x: drawn.append(np.asarray(x)), x)
+        return value
+
+    centres = jnp.array([[0.0, 0.0], [9.0, 9.0]])
+    sub = refit.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
+    jax.effects_barrier()
+    drawn = np.concatenate([d.reshape(-1, 2) for d in drawn])
+    assert len(drawn) == 2 * 6 * 40
+    for i in range(2):
+        np.testing.assert_allclose(sub.value[i], np.sum((np.asarray(sub.x[i]) - 3) ** 2), rtol=1e-5)
+    # the searches overlap, so the best of all is the best of one of them
+    np.testing.assert_allclose(np.min(sub.value), ((drawn - 3) ** 2).sum(-1).min(), rtol=1e-4)
+    away = lambda x: np.linalg.norm(np.asarray(x) - 3.0, axis=-1)
+    assert (away(sub.fitted.mean) < away(centres) - 1).all()  # it has moved there
+
+
+def test_the_frame_of_one_scale():
+    frame = refit._round(Gaussian(jnp.array([1.0, 2.0, 3.0]), jnp.diag(jnp.array([1.0, 4.0, 7.0]))))
+    np.testing.assert_allclose(frame[1], 2 * np.eye(3))
+    np.testing.assert_array_equal(frame[0], [1, 2, 3])

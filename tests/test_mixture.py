@@ -433,3 +433,20 @@ def test_shapes_that_do_not_fit():
                 ),
             ):
                 f(bad, jnp.zeros((5, 2)), jnp.ones(5))
+
+
+def test_a_soft_count_of_exactly_the_least_is_enough(dtype):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(6, 2)), dtype)
+    one = Mixture(jnp.ones(1, dtype), jnp.zeros((1, 2), dtype), 9 * jnp.eye(2, dtype=dtype)[None])
+    weights = jnp.ones(6, dtype)
+    moved, kept = (em(one, x, weights, 1, least=least) for least in (6.0, 6.01))
+    np.testing.assert_allclose(moved.covariances[0], np.cov(np.asarray(x).T, bias=True), rtol=1e-5)
+    np.testing.assert_array_equal(kept.covariances, one.covariances)
+    np.testing.assert_allclose(kept.means[0], np.mean(x, axis=0), rtol=1e-5, atol=1e-6)
+
+
+def test_weights_of_a_proposal_are_shares():
+    m = mixture.as_mixture(([1.0, 3.0], np.zeros((2, 1)), np.ones((2, 1, 1))))
+    assert m.weights.tolist() == [0.25, 0.75]
+    far = mixture.responsibilities(m._replace(weights=m.weights * 8), jnp.full((1,), 1e30))
+    assert far.tolist() == [0.25, 0.75]

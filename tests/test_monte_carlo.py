@@ -271,3 +271,22 @@ def test_best_distinct_episodes():
     number = jnp.array([0, 12, 11, 13, 14, 15, 16, 17], jnp.int32)
     places, counts = E.distinct(failure, reward, tag, number, jnp.ones(8, jnp.int32), 7)
     assert places.tolist() == [2, 5, 4, 0, 7, 8, 8] and counts.tolist() == [2, 1, 1, 1, 1, 0, 0]
+
+
+def test_the_best_is_a_failure_whatever_a_miss_is_worth(monkeypatch):
+    """Of any block of lanes, and of those of one worth the first."""
+    monkeypatch.setattr(module, "LANES", 128)
+    rare = walk(fails=lambda s: s > 7.5)
+    miss_first = lambda log_p, event, distance, terminal, approach: jnp.where(event, -5.0, 5.0)
+    r = monte_carlo(jax.random.key(0), rare, episodes=2000, reward=miss_first)
+    assert r.first_failure > 128 and r.failures.seen > 1  # not in the first block
+    assert r.best.failure
+    first = int(np.argmin(r.failures.simulation))
+    assert r.failures.simulation[first] == r.first_failure - 1
+    np.testing.assert_array_equal(r.best.disturbances, r.failures.episodes.disturbances[first])
+
+
+def test_too_many_steps_for_a_transformation(key):
+    count = lambda key: monte_carlo(key, walk(), episodes=2**31 // walk().horizon + 1).episodes
+    with pytest.raises(ValueError, match="episodes times the horizon must be below 2\\^31"):
+        jax.eval_shape(count, key)
