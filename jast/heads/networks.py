@@ -54,13 +54,13 @@ def make_head(
         raise ValueError(
             f"make_head: activation must be one of {sorted(ACTIVATIONS)}, received {activation!r}"
         )
-    init, apply = _network(tuple(hidden), tuple(outputs), activation, first_activation)
+    init, apply = dense(tuple(hidden), tuple(outputs), activation, first_activation)
     return Head(init(key, jnp.zeros((inputs,), jnp.float32)), apply)
 
 
 # one function for networks of one shape: a program that holds it is not compiled again for the next
 @functools.cache
-def _network(hidden, outputs, activation, first_activation):
+def dense(hidden, outputs, activation, first_activation):
     import flax.linen as nn  # here: it takes a while, and only searches with heads need it
 
     class Dense(nn.Module):

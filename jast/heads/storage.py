@@ -13,7 +13,7 @@ from jast import files
 from jast._jax import is_traced
 from jast.archive import arrays_of, check_array, check_structure, describe, named
 from jast.heads.heads import Heads, Moments
-from jast.heads.networks import ACTIVATIONS, Head, _network
+from jast.heads.networks import ACTIVATIONS, Head, dense
 
 __all__ = ["load", "save"]
 
@@ -124,7 +124,7 @@ def _specification(head):
     """
     module = getattr(getattr(head.apply, "func", None), "__self__", None)
     if (
-        type(module).__module__ != _network.__module__
+        type(module).__module__ != dense.__module__
         or head.apply.func != module.apply
         or head.apply.args
         or head.apply.keywords
@@ -150,7 +150,7 @@ def _specification(head):
 
 def _made(network):
     """The `Head` of a specification, with the shapes of its parameters in their place."""
-    init, apply = _network(
+    init, apply = dense(
         tuple(network["hidden"]),
         tuple(network["outputs"]),
         network["activation"],

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 
-from jast.heads.networks import _network
+from jast.heads.networks import dense
 from jast.policies.latent import LOG_2PI, log_normal
 
 __all__ = [
@@ -80,7 +80,7 @@ def networks(m, n, hidden, components):
     """The networks' ``(init, apply)``, the actor's and the critic's, for ``m`` numbers seen, time
     and distance beside them, and ``n`` latents.
     """
-    return _network(hidden, (components, 2 * n + 1), "relu", True), _network(
+    return dense(hidden, (components, 2 * n + 1), "relu", True), dense(
         hidden, (), "relu", True
     )
 
