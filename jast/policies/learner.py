@@ -80,9 +80,7 @@ def networks(m, n, hidden, components):
     """The networks' ``(init, apply)``, the actor's and the critic's, for ``m`` numbers seen, time
     and distance beside them, and ``n`` latents.
     """
-    return dense(hidden, (components, 2 * n + 1), "relu", True), dense(
-        hidden, (), "relu", True
-    )
+    return dense(hidden, (components, 2 * n + 1), "relu", True), dense(hidden, (), "relu", True)
 
 
 def learner(key, m, n, hidden, components, alpha):
