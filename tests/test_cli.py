@@ -75,6 +75,7 @@ def test_every_simulator(capsys, tmp_path, simulator):
         assert jast.replay(make(), held.best, reward=reward).reward == held.best.reward
 
 
+@pytest.mark.long
 def test_heads_of_a_forest(capsys, tmp_path):
     status, text, out = run(capsys, tmp_path, "--prunes", "2", "--heads", "both")
     assert status == 0 and "no interval: they share heads" in text

@@ -631,6 +631,7 @@ REACHED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method, mode", REACHED)
 def test_sierra(method, mode, x64):
     for (case, (mean, variance, samples, elites)), expected in zip(

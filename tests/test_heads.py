@@ -670,8 +670,8 @@ KINDS = [
     ("plane", "both", "samples"),
     ("plane", "value", "uniform"),
     ("walk1d", "rollout", "samples"),
-    ("landing", "both", "quantiles"),
-    ("ring", "both", "samples"),
+    pytest.param("landing", "both", "quantiles", marks=pytest.mark.long),
+    pytest.param("ring", "both", "samples", marks=pytest.mark.long),
 ]
 
 
@@ -985,6 +985,7 @@ def on_the_ferry(heads, **changed):
     )
 
 
+@pytest.mark.long
 def test_learned_heads_find_more_failures():
     """The first round is that of a search without heads; in the last half of the trees nearly all
     fail.
