@@ -2,21 +2,6 @@
 probability on them.
 """
 
-from jast import (
-    actions,
-    blackbox,
-    cross_entropy,
-    distributions,
-    estimate,
-    failures,
-    heads,
-    incidents,
-    policies,
-    rewards,
-    search,
-    simulators,
-    weakness,
-)
 from jast._doors import door, listed
 from jast.contract import check
 from jast.crude import nominal
@@ -53,5 +38,22 @@ __all__ = [
     "weakness",
 ]
 
-__getattr__ = door(__name__, lazy={"plot": "jast.plot"})
+# a room is loaded when it is first entered: importing jast costs little more than importing jax
+_ROOMS = (
+    "actions",
+    "blackbox",
+    "cross_entropy",
+    "distributions",
+    "estimate",
+    "failures",
+    "heads",
+    "incidents",
+    "plot",
+    "policies",
+    "rewards",
+    "search",
+    "simulators",
+    "weakness",
+)
+__getattr__ = door(__name__, lazy={room: f"jast.{room}" for room in _ROOMS})
 __dir__ = listed(__all__)

@@ -12,17 +12,16 @@ Nothing else in the package imports `jax.core`, `jax.extend`, `jax.interpreters`
 `jax.custom_batching`, `jax.experimental` or `jax._src`.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
-from jax.extend.core import Primitive
-from jax.extend.random import define_prng_impl
 from jax.interpreters import batching, mlir
 
 __all__ = [
@@ -77,7 +76,7 @@ def host_call(
         args: arrays or numbers.
     """
     return tuple(
-        _host_call.bind(
+        _host_call().bind(
             *map(jnp.asarray, args),
             callback=callback,
             shapes=tuple((s.shape, np.dtype(s.dtype)) for s in shapes),
@@ -85,16 +84,25 @@ def host_call(
     )
 
 
-_host_call = Primitive("jast_host_call")
-_host_call.multiple_results = True
+@functools.cache
+def _host_call() -> Any:
+    """The primitive, with what JAX asks of one."""
+    from jax.extend.core import Primitive  # here: jax.extend loads Pallas
+
+    primitive = Primitive("jast_host_call")
+    primitive.multiple_results = True
+    primitive.def_impl(_outside_of_programs)
+    primitive.def_abstract_eval(_shapes)
+    batching.primitive_batchers[primitive] = _batched
+    # each call of a program has its own number on the host
+    mlir.register_lowering(primitive, _lowered, cacheable=False)
+    return primitive
 
 
-@_host_call.def_impl
 def _outside_of_programs(*args, callback, shapes):
     return [jnp.asarray(a) for a in callback(*map(np.asarray, args))]
 
 
-@_host_call.def_abstract_eval
 def _shapes(*args, callback, shapes):
     return [ShapedArray(*s) for s in shapes]
 
@@ -103,7 +111,7 @@ def _batched(args, axes, *, callback, shapes):
     (n,) = {a.shape[i] for a, i in zip(args, axes) if i is not None}
     args = [a[None] if i is None else jnp.moveaxis(a, i, 0) for a, i in zip(args, axes)]
     shapes = tuple(((n, *shape), dtype) for shape, dtype in shapes)
-    return _host_call.bind(*args, callback=callback, shapes=shapes), [0] * len(shapes)
+    return _host_call().bind(*args, callback=callback, shapes=shapes), [0] * len(shapes)
 
 
 # an argument of JAX 0.8.2 and later; of effect on a TPU only
@@ -134,6 +142,13 @@ def _lowered(ctx, *args, callback, shapes):
     return out
 
 
-batching.primitive_batchers[_host_call] = _batched
-# each call of a program has its own number on the host
-mlir.register_lowering(_host_call, _lowered, cacheable=False)
+if TYPE_CHECKING:
+    from jax.extend.random import define_prng_impl
+
+
+def __getattr__(name: str) -> Any:
+    if name == "define_prng_impl":
+        from jax.extend.random import define_prng_impl
+
+        return define_prng_impl
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,7 +1,6 @@
 """Intervals for a probability. On the host, in double precision whatever the arrays' dtype."""
 
 import math
-from statistics import NormalDist
 
 from jast._checks import real
 
@@ -112,5 +111,7 @@ def log_normal(log_mean, relative_error, level=0.95):
     """(low, high) above 0, as skewed as a mean of weights is: exp(log_mean -+ z s), s^2 = log(1 +
     relative_error^2).
     """
+    from statistics import NormalDist  # here: slow to import
+
     half = NormalDist().inv_cdf((1 + level) / 2) * math.sqrt(math.log1p(relative_error**2))
     return tuple(math.exp(min(log_mean + sign * half, 0.0)) for sign in (-1, 1))
