@@ -143,7 +143,7 @@ def _accepted(d: Any) -> Any:
         return d
     if type(d).__module__.partition(".")[0] != "tensorflow_probability":
         raise ValueError(f"expected a distribution, received {d!r}")
-    import distrax
+    from jast.distributions.other import distrax
 
     return distrax.as_distribution(d)
 

@@ -20,7 +20,7 @@ class Laplace(Symmetric):
     """Density exp(-|x - loc| / scale) / (2 scale)."""
 
     def _sample_n(self, key, n):
-        return self._placed(jax.random.laplace(key, **self._like_n(n)))
+        return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
 
     def log_prob(self, value):
         return -jnp.abs(self._standardize(value)) - LOG_2 - jnp.log(self._scale)
@@ -159,6 +159,7 @@ class Beta(_Pair):
 
     def __init__(self, alpha, beta):
         super().__init__(alpha, beta)
+        self._norm = lgamma(self._a) + lgamma(self._b) - lgamma(self._a + self._b)
 
     alpha = property(lambda self: self._both[0])
     beta = property(lambda self: self._both[1])
@@ -169,10 +170,9 @@ class Beta(_Pair):
 
     def log_prob(self, value):
         a, b = self._a, self._b
-        norm = lgamma(a) + lgamma(b) - lgamma(a + b)
-        inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - norm
+        inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - self._norm
         flat = ((a == 1.0) & (value == 0.0)) | ((b == 1.0) & (value == 1.0))
-        return jnp.where(flat, -norm, inner)
+        return jnp.where(flat, -self._norm, inner)
 
     def mean(self):
         return self._a / (self._a + self._b)

@@ -1,0 +1,61 @@
+"""What is loaded when: heavy packages where they are used, rooms when they are entered."""
+
+import resource
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ["distrax", "tensorflow_probability", "flax", "optax", "chex", "matplotlib", "scipy"]
+HEAVY += ["sklearn", "tqdm", "loky"]
+LOADED = f"import sys; print([m for m in {HEAVY} if m in sys.modules])"
+
+
+def printed(code, *arguments):
+    command = [sys.executable, *arguments, *(["-c", code] if code else [])]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def test_jast_and_its_rooms_load_nothing_heavy():
+    assert printed(f"import jast; {LOADED}").strip() == "[]"
+    rooms = "import jast; [getattr(jast, name) for name in jast.__all__]"
+    assert printed(f"{rooms}; {LOADED}").strip() == "[]"
+
+
+def test_the_main_job_loads_neither_distrax_nor_what_is_below_it():
+    """A search and an estimate on a simulator of the package."""
+    job = (
+        "import jax, jast; sim = jast.simulators.walk1d();"
+        "jast.search.monte_carlo(jax.random.key(0), sim, episodes=100);"
+        "jast.estimate.monte_carlo(jax.random.key(0), sim, 100);"
+    )
+    assert printed(f"{job}{LOADED}").splitlines()[-1] == "[]"
+
+
+def test_the_command_line_loads_nothing_heavy():
+    code = "import runpy, sys; sys.argv = ['jast', '--help']\n"
+    code += "try: runpy.run_module('jast', run_name='__main__')\nexcept SystemExit: pass\n"
+    assert printed(code + LOADED).splitlines()[-1] == "[]"
+
+
+def test_distrax_is_reached_by_its_names():
+    code = "from jast import distributions as D; import sys; print('distrax' in sys.modules);"
+    code += (
+        "import jax; print(D.VonMises.__module__, D.VonMises is __import__('distrax').VonMises);"
+    )
+    assert printed(code).split() == ["False", "distrax._src.distributions.von_mises", "True"]
+
+
+@pytest.mark.long
+def test_import_takes_little_more_than_that_of_jax():
+    """CPU time, the least of seven runs each, which the machine's other work hardly moves."""
+
+    def cost(code):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        printed(code)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    pairs = [(cost("import jax"), cost("import jast")) for _ in range(7)]
+    jax, jast = map(min, zip(*pairs, strict=True))
+    assert jast < 1.3 * jax
