@@ -59,8 +59,8 @@ def test_draws_and_densities_agree_to_the_bit(name, dtype, equal, key):
 
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # of distrax's
         equal(all_of(own), all_of(other))
-    assert own.batch_shape == other.batch_shape and own.event_shape == other.event_shape
-    assert own.dtype == other.dtype
+        assert own.batch_shape == other.batch_shape and own.event_shape == other.event_shape
+        assert own.dtype == other.dtype
 
 
 @pytest.mark.parametrize("name", [n for n in pairs("float32") if n not in ("gamma", "beta")])
