@@ -284,6 +284,11 @@ def test_the_best_is_a_failure_whatever_a_miss_is_worth(monkeypatch):
     first = int(np.argmin(r.failures.simulation))
     assert r.failures.simulation[first] == r.first_failure - 1
     np.testing.assert_array_equal(r.best.disturbances, r.failures.episodes.disturbances[first])
+    assert r.best_reward_per_tree == r.best.reward
+    traced = jax.jit(lambda k: monte_carlo(k, rare, episodes=2000, reward=miss_first))
+    again = traced(jax.random.key(0))
+    assert again.best.failure and again.best_reward_per_tree == r.best.reward
+    np.testing.assert_array_equal(again.best.disturbances, r.best.disturbances)
 
 
 def test_too_many_steps_for_a_transformation(key):
