@@ -113,12 +113,13 @@ def test_check_says_where_failures_on_the_way_are_lost():
     lost = int(str(said[0].message).split()[2])
     before = blackbox.calls(sim)
     host = next(jast.incidents.sources(sim, "compare")).host
-    # the first comes back; the others stay near, or are away at their end
-    rows = np.zeros((5, 8))
-    rows[:, :3] = [[5, -5, 0], [1, 5, 1], [1, 1, 1], [5, -5, 5], [4, -8, 0]]
-    assert host.lost([], [rows]) == 1
+    # the first comes back, the last at the end; the others stay near, or are away at their end
+    rows = np.zeros((6, 8))
+    rows[5, -2:] = 5, -5
+    rows[:5, :3] = [[5, -5, 0], [1, 5, 1], [1, 1, 1], [5, -5, 5], [4, -8, 0]]
+    assert host.lost([], [rows]) == 2
     after = blackbox.calls(sim)
-    assert (after.episodes - before.episodes, after.transitions - before.transitions) == (5, 40)
+    assert (after.episodes - before.episodes, after.transitions - before.transitions) == (6, 48)
     assert 0 < lost <= 16
     # one that remembers loses nothing, one that cannot be asked before the end is not compared
     for system in (blackboxes.Left, blackboxes.Delivered):
