@@ -79,7 +79,6 @@ def learned():
     return sac(jax.random.key(1), TWO_SIDES, **SMALL)
 
 
-@pytest.mark.long
 def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probability(learned, key):
     """2 Phi(-5 / sqrt 3) = .0038924 within 4 SE of 4000 episodes, SE below 4 % (crude Monte Carlo:
     25 %), half of it on each side.
