@@ -165,7 +165,9 @@ def test_a_tree_is_the_same_alone_and_among_others():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", ["ferry", *(pytest.param(n, marks=pytest.mark.long) for n in ("landing", "ring"))]
+)
 def test_memoization_changes_the_steps_and_nothing_else(name):
     node, root, none = once(name), once(name, memoize="root"), once(name, memoize="none")
     same(node, root)
