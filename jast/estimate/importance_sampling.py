@@ -22,12 +22,12 @@ from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
 from jast.estimate.estimate import estimate
-from jast.estimate.limit_state import raw
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
 from jast.outline import outline
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
+from jast.rewards import log_likelihood
 from jast.watch import Watch
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
@@ -176,7 +176,7 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
         )
 
     x0 = D.sample(own.start(), for_start)
-    first = begin(sim, raw, x0)
+    first = begin(sim, log_likelihood, x0)
     none = jnp.zeros(proposal.log_weights.shape, dtype), jnp.zeros((), bool)
     ratio = weigh(none, sim.start(), lambda policy: policy.start(), x0)
 
@@ -189,7 +189,7 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
             lambda policy: policy.disturbance(progress.state, t),
             x,
         )
-        after = advance(sim, raw, progress, x, t + 1 >= sim.horizon)
+        after = advance(sim, log_likelihood, progress, x, t + 1 >= sim.horizon)
         if to_horizon:  # the state of an ended episode stays, while drawing and weighing go on
             after = jax.tree.map(lambda a, b: jnp.where(progress.done, a, b), progress, after)
         return after, ratio, t + 1, length + jnp.where(progress.done, 0, 1)
@@ -199,7 +199,7 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
     last, (ratios, impossible), _, length = lax.while_loop(
         goes_on, body, (first, ratio, zero, zero)
     )
-    last, prior = conclude(sim, raw, last), proposal.log_weights.astype(dtype)
+    last, prior = conclude(sim, log_likelihood, last), proposal.log_weights.astype(dtype)
     log_q = logsumexp(prior + ratios)
     return Traces(
         jnp.where(impossible, -jnp.inf, -log_q),
@@ -219,7 +219,9 @@ def played(key, sim, proposal, n):
     def one(key):
         for_component, for_episode = jax.random.split(key)
         k = jax.random.categorical(for_component, proposal.log_weights)
-        e = rollout(for_episode, sim, jax.tree.map(lambda a: a[k], proposal.policies), raw)
+        e = rollout(
+            for_episode, sim, jax.tree.map(lambda a: a[k], proposal.policies), log_likelihood
+        )
         t, states = (
             jnp.arange(sim.horizon, dtype=jnp.int32),
             jax.tree.map(lambda a: a[:-1], e.states),

@@ -23,6 +23,7 @@ from jast.outline import outline
 from jast.policy import Policy
 from jast.progress import advance, begin, conclude
 from jast.pytrees import count
+from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
 __all__ = [
@@ -104,19 +105,15 @@ def normal_numbers(sim: Simulator) -> Any:
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
     policy, last = _policy(sim, z), jnp.asarray(sim.horizon, jnp.int32)
-    first = begin(sim, raw, D.mode(policy.start()))
+    first = begin(sim, log_likelihood, D.mode(policy.start()))
 
     def body(carry):
         progress, t = carry
-        return (
-            advance(
-                sim, raw, progress, D.mode(policy.disturbance(progress.state, t)), t + 1 >= last
-            ),
-            t + 1,
-        )
+        x = D.mode(policy.disturbance(progress.state, t))
+        return advance(sim, log_likelihood, progress, x, t + 1 >= last), t + 1
 
     end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
-    end = conclude(sim, raw, end)
+    end = conclude(sim, log_likelihood, end)
     about = outline(sim)
     used = count(about.x0) + length * count(about.x)
     return Outcomes(end.failure, end.distance, used, length, end.invalid)
@@ -168,11 +165,6 @@ def log_ratios(q, z, used):
 def _live(q):
     """How many components are used: they come first."""
     return jnp.sum(jnp.isfinite(q.log_weights), dtype=jnp.int32)
-
-
-def raw(log_p, event, distance, terminal, approach=0.0):
-    """A reward that costs nothing: the log density."""
-    return log_p
 
 
 def _policy(sim: Simulator, z: jax.Array) -> Policy:

@@ -10,7 +10,7 @@ from jast.archive import arrays_of, check_array, check_structure, describe, name
 
 __all__ = ["keep", "resume"]
 
-FORMAT, VERSION, KIND = "jast sac checkpoint", 1, "a checkpoint of jast.policies.sac"
+FORMAT, VERSION, KIND = "jast sac checkpoint", 2, "a checkpoint of jast.policies.sac"
 
 
 def keep(path, sim, settings, training, rows):

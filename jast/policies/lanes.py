@@ -8,17 +8,21 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
+from jast import progress as P
 from jast.heads.heads import observed
 from jast.policies.latent import x_of
-from jast.pytrees import select, strong
+from jast.pytrees import select
+from jast.rewards import log_likelihood
+from jast.simulator import Simulator
 
 __all__ = ["Lane", "Rows", "at", "begin", "empty", "potential", "put", "step"]
 
 
 class Lane(NamedTuple):
-    """An episode at a state."""
+    """An episode at a state, and what a learner asks of it."""
 
-    state: Any
+    progress: P.Progress
+    """The episode so far: `jast.progress`."""
     t: Any
     """int32: steps taken."""
     seen: Any
@@ -27,12 +31,6 @@ class Lane(NamedTuple):
     """float32: the state's miss distance as it shapes the reward, 0 at a failure; also 0 before the
     end where only the last distance counts.
     """
-    nearest: Any
-    """float32: the episode's miss distance so far."""
-    over: Any
-    """bool: no step follows this state."""
-    failed: Any
-    """bool: ... as it is a failure."""
     drift: Any
     """[n] float32: what the latents of this episode have in common while the learner only looks
     around.
@@ -41,6 +39,21 @@ class Lane(NamedTuple):
     """float32: sum of -|z|^2 / 2 so far, x0's too."""
     gain: Any
     """float32: d(s0) - d(s)."""
+
+    @property
+    def over(self) -> jax.Array:
+        """bool: no step follows this state."""
+        return self.progress.done
+
+    @property
+    def failed(self) -> jax.Array:
+        """bool: ... as it is a failure."""
+        return self.progress.failure
+
+    @property
+    def nearest(self) -> jax.Array:
+        """float32: the miss distance so far; of an episodic system, inf before its end."""
+        return self.progress.distance.astype(jnp.float32)
 
 
 class Rows(NamedTuple):
@@ -58,26 +71,13 @@ class Rows(NamedTuple):
     next_seen: Any
 
 
-def at(sim, dense, x0, drift=()):
+def at(sim: Simulator, dense: bool, x0: Any, drift: Any = ()) -> Lane:
     """A `Lane` at the start ``x0``; ``dense``: the distance counts at every state."""
-    state = strong(sim.init(x0))
-    distance, failed, over = _judge(sim, state, jnp.zeros((), bool))
-    zero = jnp.zeros((), jnp.float32)
-    return Lane(
-        state,
-        jnp.int32(0),
-        observed(sim, state),
-        _potential(distance, failed, dense | over),
-        distance,
-        over,
-        failed,
-        drift,
-        zero,
-        zero,
-    )
+    first = P.begin(sim, log_likelihood, x0)
+    return _lane(sim, dense, first, jnp.int32(0), drift, jnp.zeros((), jnp.float32))
 
 
-def begin(sim, dense, key, z0, drift):
+def begin(sim: Simulator, dense: bool, key: jax.Array, z0: jax.Array, drift: jax.Array) -> Lane:
     """A `Lane` at the start with the latents ``z0`` [n0]; where there are none, at one drawn with
     ``key``.
     """
@@ -85,59 +85,74 @@ def begin(sim, dense, key, z0, drift):
     return at(sim, dense, x0, drift)._replace(log_p=-0.5 * jnp.sum(z0**2))
 
 
-def step(sim, dense, lane, z):
+def step(
+    sim: Simulator, dense: bool, lane: Lane, z: jax.Array
+) -> tuple[Lane, Rows, jax.Array, jax.Array]:
     """One step with the latents ``z`` [n]: ``(Lane, Rows of one transition, valid, invalid)``.
 
     ``valid``: it may be learned from. ``invalid``: a number was not finite, the episode ends there.
     A lane that was ``over`` stays as it is.
     """
-    x = x_of(sim.disturbance(lane.state), z)
-    state = strong(sim.step(lane.state, x))
-    distance, failed, done = _judge(sim, state, lane.t + 1 >= sim.horizon)
-    potential, seen = _potential(distance, failed, dense | done), observed(sim, state)
-    before = jnp.all(jnp.isfinite(lane.seen)) & jnp.isfinite(lane.potential)
-    after = jnp.stack([jnp.all(jnp.isfinite(a)) for a in (seen, potential, z, *jax.tree.leaves(x))])
-    invalid = ~(before & (lane.over | jnp.all(after)))
-    nearest = distance if sim.episodic else jnp.minimum(lane.nearest, distance)
-    approach = lane.potential - potential
+    x = x_of(sim.disturbance(lane.progress.state), z)
+    after = P.advance(sim, log_likelihood, lane.progress, x, lane.t + 1 >= sim.horizon)
     log_p = lane.log_p - 0.5 * jnp.sum(z**2)
-    moved = Lane(
-        state,
-        lane.t + 1,
-        seen,
-        potential,
-        nearest,
-        done | invalid,
-        failed & ~invalid,
-        lane.drift,
-        log_p,
-        lane.gain + approach,
-    )
-    stopped = lane._replace(failed=lane.failed & ~invalid)
+    drawn = _finite(z, *jax.tree.leaves(x))
+    moved = _lane(sim, dense, after, lane.t + 1, lane.drift, log_p, ~lane.over, drawn)
+    approach = lane.potential - moved.potential
+    moved = moved._replace(gain=lane.gain + approach)
     row = Rows(
-        lane.seen, lane.t.astype(jnp.float32), lane.potential, z, approach, failed, done, seen
+        lane.seen,
+        lane.t.astype(jnp.float32),
+        lane.potential,
+        z,
+        approach,
+        moved.failed,
+        moved.over,
+        moved.seen,
     )
-    return select(lane.over, stopped, moved), row, ~lane.over & ~invalid, invalid
+    kept = select(lane.over, lane, moved)
+    invalid = kept.progress.invalid
+    return kept, row, ~lane.over & ~invalid, invalid
 
 
-def _judge(sim, state, last):
-    """(miss distance float32, failed, over) of a state, in the order of `jast.Simulator`."""
-    event, distance = sim.evaluate(state)
-    ends = jnp.asarray(sim.is_terminal(state)) | last
-    failed, over = (event & ends, ends) if sim.episodic else (event, event | ends)
-    return jnp.asarray(distance).astype(jnp.float32), jnp.asarray(failed), jnp.asarray(over)
-
-
-def _potential(distance, failed, counts):
+def _lane(
+    sim: Simulator,
+    dense: bool,
+    episode: P.Progress,
+    t: jax.Array,
+    drift: Any,
+    log_p: jax.Array,
+    live: Any = True,
+    drawn: Any = True,
+) -> Lane:
+    """The `Lane` of an ``episode``, without a gain; invalid where ``drawn`` does not hold, or a
+    number that the learner would see is not finite.
+    """
+    episode = P.conclude(sim, log_likelihood, episode, live)
+    if sim.episodic and not dense:
+        distance = episode.distance  # evaluated at its end alone
+    else:
+        distance = jnp.asarray(sim.evaluate(episode.state)[1])
     # at a failure the distance counts 0, whatever a simulator gives there: failures are the nearest
     # of all, and none is nearer than another
-    return jnp.where(counts & ~failed, distance, 0)
+    counts = (dense | episode.done) & ~episode.failure
+    shaping = jnp.where(counts, distance.astype(jnp.float32), 0)
+    seen = observed(sim, episode.state)
+    invalid = episode.invalid | ~(drawn & _finite(seen, shaping))
+    episode = episode._replace(
+        invalid=invalid, done=episode.done | invalid, failure=episode.failure & ~invalid
+    )
+    return Lane(episode, t, seen, shaping, drift, log_p, jnp.zeros((), jnp.float32))
 
 
-def potential(sim, dense, state):
+def _finite(*arrays: jax.Array) -> jax.Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(a)) for a in arrays]))
+
+
+def potential(sim: Simulator, dense: Any, state: Any) -> jax.Array:
     """The `Lane`'s at a state that is not its last; 0 where the distance is not finite."""
-    distance, failed, _ = _judge(sim, state, jnp.zeros((), bool))
-    return jnp.where(jnp.isfinite(distance), _potential(distance, failed, dense), 0)
+    distance = jnp.asarray(sim.evaluate(state)[1]).astype(jnp.float32)
+    return jnp.where(dense & jnp.isfinite(distance), distance, 0)
 
 
 def empty(capacity, m, n):
