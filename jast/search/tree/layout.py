@@ -235,6 +235,8 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None, record=Fa
     ``axes`` says which parts of ``problem`` differ between trees (0) or not (None). ``record``:
     `Tree.trials` are wanted.
     """
+    # Why axes: in a batch of searches (`jax.vmap`) some parameters differ from tree to tree; the
+    # others, in most searches all, are held once and not once a tree.
     (lanes,) = keys.shape
     pages = pages_of(problem, simulations) if pages is None else pages
     if lanes > most_lanes(pages):

@@ -5,6 +5,7 @@ interrupted; or all in one traced program.
 import concurrent.futures
 import functools
 import threading
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -252,7 +253,14 @@ def grow_traced(problem, keys, plan):
     return _batchable(treedef, plan, (None,) * len(leaves))(keys, leaves)
 
 
-def _batchable(treedef, plan, axes):
+def _batchable(treedef: Any, plan: Plan, axes: tuple) -> Callable[..., Traced]:
+    """The traced search of a problem's leaves, with a rule of its own for `jax.vmap`; ``axes`` of
+    `jast.search.tree.layout.make`, a leaf each.
+    """
+    # Why custom_vmap: a plain vmap would make a select of the conditional that keeps XLA from
+    # copying all trees at each write (`simulate`). As trees stand side by side already, a batch of
+    # searches is one search of more trees.
+
     def whole(keys, leaves):
         return _traced(treedef.unflatten(leaves), treedef.unflatten(axes), keys, plan)
 
