@@ -17,10 +17,13 @@ from jast.distributions import rows as _rows
 from jast.distributions.base import Distribution, is_distribution
 from jast.distributions.containers import Independent, Joint
 from jast.distributions.continuous import Beta, Gamma, Laplace, Logistic, Uniform
+from jast.distributions.counts import Binomial, Geometric, Poisson, TiltedCounts
 from jast.distributions.discrete import Bernoulli, Categorical
 from jast.distributions.kinds import Deterministic, Fixed, Seeds, Tent, Where, seeds, tent, where
+from jast.distributions.lifetimes import Exponential, Gumbel, LogNormal, TruncatedNormal, Weibull
 from jast.distributions.normal import MultivariateNormalDiag, MultivariateNormalTri, Normal
 from jast.distributions.numerics import float_dtype, fraction, phi
+from jast.distributions.solved import MixtureSameFamily, StudentT
 from jast.distributions.table import register
 from jast.distributions.tilted import Tilted, tilted, untiltable
 from jast.distributions.verbs import (
@@ -43,23 +46,34 @@ from jast.distributions.verbs import (
 __all__ = [
     "Bernoulli",
     "Beta",
+    "Binomial",
     "Categorical",
     "Deterministic",
     "Distribution",
+    "Exponential",
     "Fixed",
     "Gamma",
+    "Geometric",
+    "Gumbel",
     "Independent",
     "Joint",
     "Laplace",
+    "LogNormal",
     "Logistic",
+    "MixtureSameFamily",
     "MultivariateNormalDiag",
     "MultivariateNormalTri",
     "Normal",
+    "Poisson",
     "Seeds",
+    "StudentT",
     "Tent",
     "Tilted",
+    "TiltedCounts",
     "Transformed",  # noqa: F822  (distrax's, by __getattr__)
+    "TruncatedNormal",
     "Uniform",
+    "Weibull",
     "Where",
     "cdf",
     "event_like",

@@ -13,6 +13,7 @@ __all__ = [
     "float_dtype",
     "fraction",
     "inside",
+    "log_one_less",
     "log_tails",
     "normal_of_log_tails",
     "normal_score",
@@ -88,8 +89,19 @@ def log_tails(z: jax.Array) -> tuple[jax.Array, jax.Array]:
     number is the log of a float below 1, of which in float32 an eighth is lost at z = 5.
     """
     small = log_ndtr(-jnp.abs(z))
-    large = jnp.log1p(-jnp.exp(small))
+    large = log_one_less(small)
     return jnp.where(z < 0, small, large), jnp.where(z < 0, large, small)
+
+
+def log_one_less(log_p: jax.Array) -> jax.Array:
+    """log(1 - p) of log p <= 0, precise for p near 0 and near 1."""
+    near_one = log_p > -math.log(2.0)
+    other = jnp.where(near_one, -1.0, log_p)
+    return jnp.where(
+        near_one,
+        jnp.log(-jnp.expm1(jnp.where(near_one, log_p, -1.0))),
+        jnp.log1p(-jnp.exp(other)),
+    )
 
 
 def normal_of_log_tails(log_below: jax.Array, log_above: jax.Array) -> jax.Array:

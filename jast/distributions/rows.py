@@ -180,4 +180,28 @@ def _cdf_transformed(d, x):
     return jnp.where(within, u, (x >= (x0 + x1) / 2).astype(u.dtype))
 
 
-register("distrax:Transformed", quantile=_transformed, cdf=_cdf_transformed)
+def _falls(d, like):
+    x0, x1 = _ends(d, like)
+    return x1 < x0
+
+
+def _transformed_of_normal(d, z):
+    """By the z of the base, which has the tails; a bijector that falls swaps them."""
+    _of_numbers(d, verbs.no_quantile(d))
+    return d.bijector.forward(verbs.from_normal(d.distribution, jnp.where(_falls(d, z), -z, z)))
+
+
+def _normal_of_transformed(d, x):
+    _of_numbers(d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert"))
+    z = verbs.to_normal(d.distribution, _inverse(d, x, "cdf"))
+    return jnp.where(_falls(d, x), -z, z)
+
+
+register(
+    "distrax:Transformed",
+    quantile=_transformed,
+    cdf=_cdf_transformed,
+    from_normal=_transformed_of_normal,
+    to_normal=_normal_of_transformed,
+    exact=lambda d: verbs.has_exact_tails(d.distribution),
+)

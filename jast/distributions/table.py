@@ -23,6 +23,8 @@ class Row(NamedTuple):
     """(d, z): the value that has the probability Phi(z) below it, exact in both tails."""
     to_normal: Callable[..., Any] | None = None
     """(d, x): the z of x."""
+    log_tails: Callable[..., Any] | None = None
+    """(d, x): (log P(X <= x), log P(X > x)), each to the precision of its own size."""
     mode: Callable[..., Any] | None = None
     """(d): the likeliest value."""
     log_mode: Callable[..., Any] | None = None

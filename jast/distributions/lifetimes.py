@@ -1,0 +1,238 @@
+"""Skewed families with closed quantiles, exact in both tails: each a class and one row, by the logs
+of the probabilities below and above a value.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import ndtr, ndtri
+
+from jast.distributions.base import Distribution, float_array
+from jast.distributions.normal import HALF_LOG_2PI, LocationScale
+from jast.distributions.numerics import inside, log_one_less, log_tails, normal_of_log_tails
+from jast.distributions.table import register
+from jast.distributions.tails import of_log_tails
+
+__all__ = ["Exponential", "Gumbel", "LogNormal", "TruncatedNormal", "Weibull"]
+
+
+class LogNormal(LocationScale):
+    """exp(e), e normal with mean ``loc`` and standard deviation ``scale``."""
+
+    def _sample_n(self, key, n):
+        return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
+
+    def log_prob(self, value):
+        log = jnp.log(value)
+        return -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale) - log
+
+    def mean(self):
+        return jnp.exp(self.loc + jnp.square(self.scale) / 2)
+
+    def median(self):
+        return jnp.exp(self.loc)
+
+    def mode(self):
+        return jnp.exp(self.loc - jnp.square(self.scale))
+
+
+register(
+    LogNormal,
+    quantile=lambda d, u: jnp.exp(d.loc + d.scale * ndtri(inside(u))),
+    cdf=lambda d, x: ndtr((jnp.log(x) - d.loc) / d.scale),
+    from_normal=lambda d, z: jnp.exp(d.loc + d.scale * z),
+    to_normal=lambda d, x: (jnp.log(x) - d.loc) / d.scale,
+    tilt=lambda d, m, s: LogNormal(d.loc + d.scale * m, d.scale * s),
+)
+
+
+class Exponential(Distribution):
+    """Density rate exp(-rate x), x >= 0."""
+
+    event_shape = ()
+
+    def __init__(self, rate):
+        self.rate = float_array(rate)
+
+    @property
+    def batch_shape(self):
+        return self.rate.shape
+
+    def _sample_n(self, key, n):
+        return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
+
+    def log_prob(self, value):
+        return jnp.where(value < 0, -jnp.inf, jnp.log(self.rate) - self.rate * value)
+
+    def mean(self):
+        return 1 / self.rate
+
+    def mode(self):
+        return jnp.zeros_like(self.rate)
+
+
+def _tails_exponential(d, x):
+    above = -d.rate * jnp.maximum(x, 0)
+    return log_one_less(above), above
+
+
+register(Exponential, **of_log_tails(lambda d, below, above: -above / d.rate, _tails_exponential))
+
+
+class Gumbel(LocationScale):
+    """Of the largest of many numbers: distribution function exp(-exp(-(x - loc) / scale))."""
+
+    def _sample_n(self, key, n):
+        return self._placed(jax.random.gumbel(key, **self._like_n(n)))
+
+    def log_prob(self, value):
+        v = self._standardize(value)
+        return -(v + jnp.exp(-v)) - jnp.log(self._scale)
+
+    def mean(self):
+        return self.loc + self.scale * jnp.euler_gamma
+
+    def mode(self):
+        return self.loc
+
+
+def _tails_gumbel(d, x):
+    below = -jnp.exp(-(x - d.loc) / d.scale)
+    return below, log_one_less(below)
+
+
+_gumbel = of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel)
+register(Gumbel, **_gumbel)
+register("distrax:Gumbel", **_gumbel)
+
+
+class Weibull(Distribution):
+    """Survival function exp(-(x / scale)^concentration), x >= 0."""
+
+    event_shape = ()
+
+    def __init__(self, concentration, scale):
+        self._shape, self._scale = float_array(concentration), float_array(scale)
+
+    @property
+    def batch_shape(self):
+        return jax.lax.broadcast_shapes(self._shape.shape, self._scale.shape)
+
+    @property
+    def concentration(self) -> jax.Array:
+        return jnp.broadcast_to(self._shape, self.batch_shape)
+
+    @property
+    def scale(self) -> jax.Array:
+        return jnp.broadcast_to(self._scale, self.batch_shape)
+
+    def _sample_n(self, key, n):
+        k, scale = self.concentration, self.scale
+        e = jax.random.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
+        return scale[None] * e ** (1 / k[None])
+
+    def log_prob(self, value):
+        k, v = self._shape, value / self._scale
+        inner = jnp.log(k / self._scale) + (k - 1) * jnp.log(jnp.abs(v)) - jnp.abs(v) ** k
+        return jnp.where(v < 0, -jnp.inf, inner)
+
+    def mode(self):
+        k = self.concentration
+        return self.scale * jnp.where(k > 1, jnp.maximum(1 - 1 / k, 0) ** (1 / k), 0.0)
+
+
+def _tails_weibull(d, x):
+    above = -((jnp.maximum(x, 0) / d.scale) ** d.concentration)
+    return log_one_less(above), above
+
+
+register(
+    Weibull,
+    **of_log_tails(
+        lambda d, below, above: d.scale * (-above) ** (1 / d.concentration), _tails_weibull
+    ),
+)
+
+
+class TruncatedNormal(LocationScale):
+    """Normal numbers (``loc``, ``scale`` before the cut) between ``low`` and ``high``, of which
+    either may be infinite.
+    """
+
+    def __init__(self, loc, scale, low, high):
+        super().__init__(loc, scale)
+        self._low, self._high = float_array(low), float_array(high)
+
+    @property
+    def batch_shape(self):
+        each = (self._loc, self._scale, self._low, self._high)
+        return jax.lax.broadcast_shapes(*(a.shape for a in each))
+
+    @property
+    def low(self) -> jax.Array:
+        return jnp.broadcast_to(self._low, self.batch_shape)
+
+    @property
+    def high(self) -> jax.Array:
+        return jnp.broadcast_to(self._high, self.batch_shape)
+
+    def ends(self) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """(low, high) in standard deviations from loc, and the log of the mass between them."""
+        a, b = ((v - self.loc) / self.scale for v in (self.low, self.high))
+        # where both are above loc by their upper tails, where the numbers are small
+        near, far = jnp.where(a > 0, -a, b), jnp.where(a > 0, -b, a)
+        below, above = log_tails(near)[0], log_tails(far)[0]
+        return a, b, below + log_one_less(jnp.minimum(above - below, 0))
+
+    def _sample_n(self, key, n):
+        z = jax.random.normal(key, **self._like_n(n))
+        return jax.vmap(lambda z: _cut(self, z))(z)
+
+    def log_prob(self, value):
+        exponent = -0.5 * jnp.square(self._standardize(value))
+        log_p = exponent - HALF_LOG_2PI - jnp.log(self._scale) - self.ends()[2]
+        return jnp.where((value < self._low) | (value > self._high), -jnp.inf, log_p)
+
+    def mode(self):
+        return jnp.clip(self.loc, self.low, self.high)
+
+
+def _cut(d, z, tails=None):
+    a, b, log_mass = d.ends()
+    below, above = log_tails(z) if tails is None else tails
+    e = normal_of_log_tails(
+        jnp.logaddexp(log_tails(a)[0], log_mass + below),
+        jnp.logaddexp(log_tails(b)[1], log_mass + above),
+    )
+    x = jnp.clip(d.loc + d.scale * e, d.low, d.high)
+
+    def from_end(end, log_part):
+        """The way from an end, |z| = ``end`` towards the mean, with a small part of the mass: what
+        the sum above rounds away. By the series of the inverse.
+        """
+        finite = jnp.isfinite(end)
+        end = jnp.where(finite, end, 0)
+        h = jnp.exp(jnp.minimum(log_mass + log_part + end**2 / 2 + HALF_LOG_2PI, 0))
+        small = finite & (h * (1 + jnp.abs(end)) < 1e-3)
+        h = jnp.where(small, h, 0)
+        return small, d.scale * h * (1 + end * h / 2 + (2 * end**2 + 1) * h**2 / 6)
+
+    at_low, step = from_end(a, below)
+    x = jnp.where(at_low, d.low + step, x)
+    at_high, step = from_end(-b, above)
+    return jnp.where(at_high, d.high - step, x)
+
+
+def _tails_cut(d, x):
+    a, b, log_mass = d.ends()
+    e = (jnp.clip(x, d.low, d.high) - d.loc) / d.scale
+    left, right = (
+        TruncatedNormal(0.0, 1.0, a, e).ends()[2],
+        TruncatedNormal(0.0, 1.0, e, b).ends()[2],
+    )
+    return left - log_mass, right - log_mass
+
+
+register(
+    TruncatedNormal,
+    **of_log_tails(lambda d, below, above: _cut(d, None, (below, above)), _tails_cut),
+)

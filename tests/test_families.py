@@ -1,0 +1,205 @@
+"""Families exact in both tails, with SciPy as the oracle: 1e-8 in float64 out to probabilities of
+1e-12, monotone in float32 out to |z| = 7; and a user's own, by one row.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats as st
+
+from jast import distributions as D
+from jast.distributions.numerics import log_tails, normal_of_log_tails
+
+Z = np.concatenate([-np.geomspace(7.1, 0.01, 60), np.geomspace(0.01, 7.1, 60)])
+
+
+class HalfNormal:
+    """SciPy's loses what is below 1e-16 of 1 / 2; its chi-square does not."""
+
+    def ppf(self, q):
+        return 1.3 * np.sqrt(st.chi2(1).ppf(q))
+
+    def isf(self, q):
+        return 1.3 * np.sqrt(st.chi2(1).isf(q))
+
+    def logpdf(self, x):
+        return st.halfnorm(scale=1.3).logpdf(x)
+
+
+def floats(dtype):
+    """name -> (distribution, SciPy's)."""
+    f = lambda v: jnp.asarray(v, dtype)
+    return {
+        "lognormal": (D.LogNormal(f(0.3), f(0.7)), st.lognorm(0.7, scale=np.exp(0.3))),
+        "exponential": (D.Exponential(f(1.7)), st.expon(scale=1 / 1.7)),
+        "gumbel": (D.Gumbel(f(0.3), f(0.7)), st.gumbel_r(0.3, 0.7)),
+        "weibull": (D.Weibull(f(1.7), f(0.6)), st.weibull_min(1.7, scale=0.6)),
+        "half": (D.TruncatedNormal(f(0), f(1.3), f(0), f(np.inf)), HalfNormal()),
+        "cut": (
+            D.TruncatedNormal(f(0.3), f(1.3), f(-1), f(2)),
+            st.truncnorm(-1, 1.7 / 1.3, 0.3, 1.3),
+        ),
+        "cauchy": (D.StudentT(f(1), f(0.3), f(0.7)), st.t(1, 0.3, 0.7)),
+        "t": (D.StudentT(f(4.5), f(0.3), f(0.7)), st.t(4.5, 0.3, 0.7)),
+        "of exp": (
+            D.Transformed(D.Normal(f(0.3), f(0.7)), jnp.exp),
+            st.lognorm(0.7, scale=np.exp(0.3)),
+        ),
+    }
+
+
+def counts(dtype):
+    f = lambda v: jnp.asarray(v, dtype)
+    return {
+        "geometric": (D.Geometric(f(0.03)), st.geom(0.03, loc=-1)),
+        "poisson": (D.Poisson(f(3.4)), st.poisson(3.4)),
+        "rare": (D.Poisson(f(1e-5)), st.poisson(1e-5)),
+        "binomial": (D.Binomial(20, f(0.3)), st.binom(20, 0.3)),
+    }
+
+
+def truth(scipys, z):
+    """By the tail in which z is."""
+    z = np.asarray(z, np.float64)
+    return np.where(z < 0, scipys.ppf(st.norm.cdf(z)), scipys.isf(st.norm.sf(z)))
+
+
+def mapped(function, values):
+    return np.asarray(jax.jit(jax.vmap(function))(values))
+
+
+@pytest.mark.parametrize("name", list(floats("float32")))
+def test_floats_are_scipys_in_both_tails(name, x64, key):
+    d, scipys = floats("float64")[name]
+    x = mapped(lambda z: D.from_normal(d, z), jnp.asarray(Z))
+    np.testing.assert_allclose(x, truth(scipys, Z), rtol=1e-8)
+    np.testing.assert_allclose(
+        mapped(d.log_prob, jnp.asarray(x)), scipys.logpdf(x), rtol=1e-8, atol=1e-8
+    )
+    if name != "cut":  # its ends are no zeros, and hide what is nearer than rounding
+        inner = np.abs(Z) < (6 if name == "half" else 7)
+        z = mapped(lambda x: D.to_normal(d, x), jnp.asarray(x))
+        np.testing.assert_allclose(z[inner], Z[inner], rtol=1e-3, atol=1e-6)
+    u = mapped(lambda u: D.cdf(d, D.quantile(d, u)), jnp.asarray([0.01, 0.3, 0.9]))
+    np.testing.assert_allclose(u, [0.01, 0.3, 0.9], rtol=1e-9)
+    draws = np.asarray(d.sample(seed=key, sample_shape=(4000,)))
+    below = np.mean(draws <= scipys.ppf(0.3))
+    assert abs(below - 0.3) < 4 * np.sqrt(0.21 / 4000) and D.has_exact_tails(d)
+
+
+@pytest.mark.parametrize("name", list(floats("float32")))
+def test_floats_rise_in_float32(name):
+    d, scipys = floats("float32")[name]
+    z = jnp.arange(-7, 7.005, 0.01, dtype=jnp.float32)
+    x = mapped(lambda z: D.from_normal(d, z), z)
+    assert x.dtype == np.float32 and np.isfinite(x).all()
+    steps = np.diff(x)
+    # at an end that is no zero neighbours are one float, as those of the uniform are
+    assert (steps >= 0).all() if name == "cut" else (steps > 0).all()
+    far = np.abs(np.asarray(z)) > 0.1
+    np.testing.assert_allclose(x[far], truth(scipys, z)[far], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", list(counts("float32")))
+def test_counts_are_scipys_in_both_tails(name, x64, key):
+    d, scipys = counts("float64")[name]
+    k = mapped(lambda z: D.from_normal(d, z), jnp.asarray(Z))
+    np.testing.assert_array_equal(k, truth(scipys, Z))
+    seen = np.unique(k)
+    np.testing.assert_allclose(
+        mapped(d.log_prob, jnp.asarray(seen)), scipys.logpmf(seen), rtol=1e-8
+    )
+    back = mapped(lambda k: D.from_normal(d, D.to_normal(d, k)), jnp.asarray(seen))
+    np.testing.assert_array_equal(back, seen)
+    again = mapped(lambda k: D.quantile(d, D.cdf(d, k)), jnp.asarray(seen[scipys.pmf(seen) > 1e-6]))
+    np.testing.assert_array_equal(again, seen[scipys.pmf(seen) > 1e-6])
+    draws = np.asarray(d.sample(seed=key, sample_shape=(4000,)))
+    assert np.issubdtype(draws.dtype, np.integer)
+    assert abs(draws.mean() - scipys.mean()) < 4 * scipys.std() / np.sqrt(4000) + 1e-3
+    assert D.mode(d) == seen[np.argmax(scipys.pmf(seen))]
+    # tilted: a proper distribution, and the model itself at N(0, 1)
+    tilt = lambda m, s: D.tilted(d, jnp.asarray(m), jnp.asarray(s)).log_prob
+    every = jnp.arange(1500)
+    assert np.exp(mapped(tilt(1.3, 0.7), every)).sum() == pytest.approx(1, abs=1e-9)
+    np.testing.assert_allclose(
+        mapped(tilt(0.0, 1.0), jnp.asarray(seen)), scipys.logpmf(seen), rtol=1e-8
+    )
+
+
+def test_a_mixture_is_exact_in_both_tails(dtype, key):
+    f = lambda *v: jnp.asarray(v, dtype)
+    d = D.MixtureSameFamily(D.Categorical(probs=f(0.99, 0.01)), D.Normal(f(0, 1), f(1, 6)))
+    x = mapped(lambda z: D.from_normal(d, z), jnp.asarray(Z, dtype))
+    wide = x.astype(np.float64)
+    below = 0.99 * st.norm.cdf(wide) + 0.01 * st.norm.cdf(wide, 1, 6)
+    above = 0.99 * st.norm.sf(wide) + 0.01 * st.norm.sf(wide, 1, 6)
+    ratio = np.where(Z < 0, below / st.norm.cdf(Z), above / st.norm.sf(Z))
+    np.testing.assert_allclose(ratio, 1, rtol=1e-4 if dtype == "float32" else 1e-8)
+    assert (np.diff(x) > 0).all() and x.dtype == dtype
+    density = 0.99 * st.norm.pdf(0.4) + 0.01 * st.norm.pdf(0.4, 1, 6)
+    assert float(d.log_prob(jnp.asarray(0.4, dtype))) == pytest.approx(np.log(density), rel=1e-5)
+    draws = np.asarray(d.sample(seed=key, sample_shape=(8000,)))
+    share, expected = np.mean(np.abs(draws) > 4), 0.01 * (st.norm.sf(0.5) + st.norm.cdf(-5 / 6))
+    assert abs(share - expected) < 4 * np.sqrt(expected / 8000)
+
+
+def test_derivatives_are_those_of_the_inverse(x64):
+    """By central differences: what is solved by steps has derivatives, too."""
+    pair = D.Normal(jnp.asarray([0.0, 3.0]), jnp.asarray([1.0, 0.5]))
+    mixture = D.MixtureSameFamily(D.Categorical(probs=jnp.asarray([0.7, 0.3])), pair)
+    cut = D.TruncatedNormal(
+        jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(-1.0), jnp.asarray(jnp.inf)
+    )
+    z = jnp.asarray([-3.0, 0.3, 2.0])
+    for d in (D.StudentT(jnp.asarray(3.0)), mixture, cut):
+        slope = mapped(jax.grad(lambda z, d=d: D.from_normal(d, z)), z)
+        ends = [mapped(lambda z, d=d: D.from_normal(d, z), z + h) for h in (1e-5, -1e-5)]
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-5, rtol=1e-5)
+
+
+def test_the_logs_of_the_tails_invert(dtype):
+    z = jnp.linspace(-12, 12, 241, dtype=dtype)
+    below, above = log_tails(z)
+    np.testing.assert_allclose(below, st.norm.logcdf(np.asarray(z, float)), rtol=2e-5)
+    np.testing.assert_allclose(above, st.norm.logsf(np.asarray(z, float)), rtol=2e-5)
+    np.testing.assert_allclose(normal_of_log_tails(below, above), z, rtol=1e-5, atol=1e-6)
+
+
+def test_a_family_of_the_users_own_is_one_row(dtype, key):
+    class Rayleigh(D.Distribution):
+        event_shape = ()
+
+        def __init__(self, scale):
+            self.scale = scale
+
+        def _sample_n(self, key, n):
+            u = jax.random.uniform(key, (n,), self.scale.dtype)
+            return self.scale * jnp.sqrt(-2 * jnp.log1p(-u))
+
+        def log_prob(self, x):
+            return jnp.log(x / self.scale**2) - (x / self.scale) ** 2 / 2
+
+    d = Rayleigh(jnp.asarray(2.0, dtype))
+    z = jnp.asarray(6.5, dtype)
+    assert not D.has_quantile(d) and not D.has_exact_tails(d)
+    tails = lambda d, x: (jnp.log(-jnp.expm1(-((x / d.scale) ** 2) / 2)), -((x / d.scale) ** 2) / 2)
+    D.register(
+        Rayleigh,
+        quantile=lambda d, u: d.scale * jnp.sqrt(-2 * jnp.log1p(-u)),
+        cdf=lambda d, x: -jnp.expm1(-((x / d.scale) ** 2) / 2),
+        from_normal=lambda d, z: d.scale * jnp.sqrt(-2 * log_tails(z)[1]),
+        to_normal=lambda d, x: normal_of_log_tails(*tails(d, x)),
+    )
+    assert D.has_quantile(d) and D.has_cdf(d) and D.has_exact_tails(d)
+    x = D.from_normal(d, z)
+    assert float(x) == pytest.approx(2 * np.sqrt(-2 * st.norm.logsf(6.5)), rel=1e-5)
+    assert float(D.to_normal(d, x)) == pytest.approx(6.5, rel=1e-5)
+    moved = D.tilted(D.Joint((d,)), (z,), (jnp.ones_like(z),))
+    assert float(moved.sample(seed=key)[0]) > float(D.from_normal(d, z - 5))
+    with pytest.raises(ValueError, match="register: 'ppf' is no function of a row"):
+        D.register(Rayleigh, ppf=lambda d, u: u)
+    with pytest.raises(ValueError, match="register: cdf: expected a function, received 3"):
+        D.register(Rayleigh, cdf=3)
+    with pytest.raises(ValueError, match='register: expected a class or "package:Class"'):
+        D.register("Rayleigh", cdf=lambda d, x: x)
