@@ -31,12 +31,12 @@ def found(runs):
         "random search": (
             lambda key: jast.search.monte_carlo(
                 key, sim, episodes=1000, reward=REWARD, actions=actions
-            ).failing[0]
+            ).failing_per_tree[0]
         ),
         "search.cem": (
             lambda key: jast.search.cem(
                 key, sim, samples=100, elites=10, iterations=10, reward=REWARD, actions=actions
-            ).failing[0]
+            ).failing_per_tree[0]
         ),
     }
     for name in ("ce_method", "ce_surrogate", "ce_mixture"):

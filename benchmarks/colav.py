@@ -79,7 +79,7 @@ def search(scenario, kind, trees, heads=None):
     result, seconds, _ = timed(grow)
     best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
     return (
-        share(result.failing)
+        share(result.failing_per_tree)
         | best
         | {
             "episodes": result.episodes,
@@ -94,7 +94,7 @@ def random_search(scenario, kind, runs):
     sim = colav(scenario, kind)
     one = lambda key: jast.search.monte_carlo(
         key, sim, episodes=PRUNES * SIMULATIONS, reward=REWARD
-    ).failing[0]
+    ).failing_per_tree[0]
     return share(
         jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
     )

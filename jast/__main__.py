@@ -207,7 +207,7 @@ def _shares(results):
         k, n, what = (
             (r.failures.seen, r.episodes, "episodes")
             if name == "monte-carlo"
-            else (int(r.failing.sum()), len(r.failing), "trees")
+            else (int(r.failing_per_tree.sum()), len(r.failing_per_tree), "trees")
         )
         low, high = clopper_pearson(k, n)
         interval = (

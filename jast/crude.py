@@ -40,12 +40,12 @@ class Nominal(NamedTuple):
     """The episode of every disturbance at its mode, else its median; None where a distribution has
     neither.
     """
-    failures: int
+    failing: int
     """Episodes that failed."""
     episodes: int
     """Episodes simulated."""
     rate: float
-    """failures / episodes."""
+    """failing / episodes."""
     interval: tuple[float, float]
     """95 % Clopper-Pearson interval of the failure probability."""
     mean_distance: float
@@ -57,6 +57,8 @@ class Nominal(NamedTuple):
     settings: Mapping = {}
     """``method``, the ``episodes`` asked for, and ``interrupted`` where not all were played."""
 
+    failures = results.former("failures", "failing")
+
     def __str__(self):
         quiet = "not defined: a disturbance has neither a mode nor a median"
         if self.undisturbed is not None:
@@ -67,7 +69,7 @@ class Nominal(NamedTuple):
         low, high = self.interval
         rows = [
             ("undisturbed", quiet),
-            ("failures", f"{self.failures} of {self.episodes} episodes"),
+            ("failures", f"{self.failing} of {self.episodes} episodes"),
             ("rate", f"{self.rate:.4g}   95 % [{low:.4g}, {high:.4g}]"),
             ("mean distance", f"{self.mean_distance:.4g}"),
             ("invalid", f"{self.invalid}"),

@@ -16,13 +16,16 @@ def honest(result, sim, reward):
     assert len({F.identity(archive.episode(i)) for i in range(archive.size)}) == archive.size
     assert (result.first_failure is None) == (archive.seen == 0)
     assert (
-        result.failing.any() == (archive.seen > 0) and result.failing_trees == result.failing.mean()
+        result.failing_per_tree.any() == (archive.seen > 0)
+        and result.failing_trees == result.failing_per_tree.mean()
     )
     assert np.isfinite(result.roots.visits).all() and np.isfinite(result.roots.q).all()
     if archive.size:
         assert float(result.best.reward) == archive.episodes.reward[0]
         np.testing.assert_allclose(
-            result.best_reward_per_tree[result.failing].max(), result.best.reward, rtol=1e-4
+            result.best_reward_per_tree[failing].max(),
+            result.best.reward,
+            rtol=1e-4,
         )
         assert 1 <= result.first_failure <= result.episodes
     if archive.seen == 0:

@@ -98,7 +98,7 @@ def test_an_object_is_judged_at_every_state_unless_said_otherwise(key):
         jast.nominal(key, s, episodes=500)
         for s in (sim, leaves, box(blackboxes.Leaves, 8, episodic=True))
     )
-    assert not sim.episodic and now.failures == theirs.failures > at_the_end.failures
+    assert not sim.episodic and now.failing == theirs.failing > at_the_end.failing
     np.testing.assert_allclose(now.mean_distance, theirs.mean_distance, rtol=1e-5)
     assert box(blackboxes.walk).episodic  # a function answers for a whole episode
     assert not box(lambda: blackboxes.Leaves()).episodic
@@ -266,9 +266,7 @@ def test_a_failure_probability():
 def test_the_nominal_system():
     found = jast.nominal(jax.random.key(0), sim := box(blackboxes.walk, 4), episodes=500)
     assert (
-        not found.undisturbed.failure
-        and found.undisturbed.distance == 4
-        and 0 < found.failures < 50
+        not found.undisturbed.failure and found.undisturbed.distance == 4 and 0 < found.failing < 50
     )
     assert blackbox.calls(sim).episodes in (501, 502)
 

@@ -38,10 +38,12 @@ def lock():
 def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     """Phi(-6) = 1e-9, and the likeliest failure is x = 3 everywhere."""
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
-    assert not monte_carlo(key, sim, episodes=4000, reward=reward).failing.any()
+    assert not monte_carlo(key, sim, episodes=4000, reward=reward).failing_per_tree.any()
     r = cem(key, sim, reward=reward, samples=200, elites=20, iterations=20)
     assert (
-        r.failing.all() and r.failures.size == 64 and r.settings["actions"] == "actions.quantiles"
+        r.failing_per_tree.all()
+        and r.failures.size == 64
+        and r.settings["actions"] == "actions.quantiles"
     )
     assert archive_replays(sim, r, reward, equal)
     np.testing.assert_allclose(r.best.disturbances[0], 3, atol=0.3)
@@ -58,10 +60,12 @@ def test_ferry(key, equal, choice):
     """Random search finds no collision in two million episodes."""
     sim = jast.simulators.ferry()
     r = cem(key, sim, trees=4, actions=choice, reward=S0["reward"])
-    assert r.failing.all() and (r.best_reward_per_tree > 29).all() and r.best.reward < 29.65
+    assert (
+        r.failing_per_tree.all() and (r.best_reward_per_tree > 29).all() and r.best.reward < 29.65
+    )
     assert (
         r.episodes == 36_000
-        and r.simulator_steps <= 36_000 * 21
+        and r.steps <= 36_000 * 21
         and r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
     )
     assert archive_replays(sim, r, S0["reward"], equal)
@@ -82,7 +86,7 @@ def test_structured_disturbances_and_a_random_start(key, equal, choice):
     r = cem(key, sim, actions=choice, trees=4)
     assert archive_replays(sim, r, reward, equal)
     assert (
-        r.failing.all()
+        r.failing_per_tree.all()
         and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
     )
 
@@ -103,9 +107,9 @@ def _far_from_the_line(log_p, event, distance, terminal, approach):
 
 def test_seeds_of_unknown_density(key, equal):
     sim = lock()
-    assert not monte_carlo(key, sim, episodes=9000).failing.any()
+    assert not monte_carlo(key, sim, episodes=9000).failing_per_tree.any()
     r = cem(key, sim, trees=3)
-    assert r.failing.all() and r.settings["actions"] == "actions.samples"
+    assert r.failing_per_tree.all() and r.settings["actions"] == "actions.samples"
     assert archive_replays(sim, r, rewards.standard(), equal)
 
 
@@ -143,7 +147,7 @@ def test_invalid_episodes_are_counted_and_never_elite(key):
     )
     r = cem(key, walk(step=lambda s, x: s + jnp.nan), trees=2, **SMALL)
     assert (
-        r.invalid == r.episodes == r.simulator_steps == 2000
+        r.invalid == r.episodes == r.steps == 2000
         and r.best.reward == -np.inf
         and not r.best.failure
     )
@@ -156,14 +160,14 @@ def test_invalid_episodes_are_counted_and_never_elite(key):
 
 def test_systems_that_never_or_always_fail(key):
     r = cem(key, walk(fails=lambda s: s > 1e9), **SMALL)
-    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (
+    assert (r.failing_share, r.first_failure, r.failures.size, r.steps) == (
         0,
         None,
         0,
         6000,
     )
     r = cem(key, walk(fails=lambda s: s < 1e9), trees=2, **SMALL)  # at the start
-    assert (r.failing_share, r.first_failure, r.simulator_steps, r.best.length) == (1, 1, 0, 0)
+    assert (r.failing_share, r.first_failure, r.steps, r.best.length) == (1, 1, 0, 0)
     assert r.failures.size == 1 and r.failures.counts.tolist() == [r.failures.seen] == [2000]
 
 
@@ -179,9 +183,9 @@ def test_under_jit_and_vmap(key):
         np.testing.assert_allclose(
             traced.best_reward_per_tree[i], r.best_reward_per_tree, rtol=2e-2
         )
-        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (
+        assert (traced.episodes[i], traced.steps[i], traced.invalid[i]) == (
             r.episodes,
-            r.simulator_steps,
+            r.steps,
             r.invalid,
         )
         assert float(traced.best.reward[i]) == pytest.approx(
@@ -191,7 +195,7 @@ def test_under_jit_and_vmap(key):
         traced.failures is None
         and traced.history is None
         and traced.settings is None
-        and traced.failing.shape == (2, 2)
+        and traced.failing_per_tree.shape == (2, 2)
     )
 
 

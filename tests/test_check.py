@@ -375,14 +375,12 @@ def test_nominal_is_a_loop_of_rollouts(key):
     n = 1100  # more than one chunk, and not a multiple of it
     found = jast.nominal(key, walk1d(), episodes=n)
     episodes = jax.vmap(lambda i: jast.rollout(jax.random.fold_in(key, i), walk1d()))(jnp.arange(n))
-    assert (found.failures, found.episodes, found.invalid) == (int(episodes.failure.sum()), n, 0)
+    assert (found.failing, found.episodes, found.invalid) == (int(episodes.failure.sum()), n, 0)
     assert found.mean_distance == pytest.approx(float(episodes.distance.mean()), rel=1e-4)
-    assert found.interval == clopper_pearson(found.failures, n) and found.rate == found.failures / n
+    assert found.interval == clopper_pearson(found.failing, n) and found.rate == found.failing / n
     assert float(found.undisturbed.distance) == 10 and int(found.undisturbed.length) == 30
     text = str(found)
-    assert (
-        "no failure" in text and f"{found.failures} of {n}" in text and len(text.splitlines()) < 8
-    )
+    assert "no failure" in text and f"{found.failing} of {n}" in text and len(text.splitlines()) < 8
 
 
 def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeypatch):
@@ -423,7 +421,7 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
 def test_nominal_says_when_the_system_fails_undisturbed(key):
     with pytest.warns(UserWarning, match="fails undisturbed"):
         found = jast.nominal(key, line(step=lambda s, x: s + 1), episodes=10)
-    assert found.failures == 10 and found.interval[1] == 1 and "FAILS" in str(found)
+    assert found.failing == 10 and found.interval[1] == 1 and "FAILS" in str(found)
 
 
 def test_nominal_counts_invalid_episodes(key):
@@ -434,7 +432,7 @@ def test_nominal_counts_invalid_episodes(key):
     assert (
         abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000)
         and found.mean_distance == pytest.approx(5)
-        and found.failures == 0
+        and found.failing == 0
     )
     with pytest.warns(UserWarning, match="of 5 nominal"):
         assert np.isnan(

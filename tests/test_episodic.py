@@ -131,7 +131,7 @@ def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
     )
     r = jast.search.monte_carlo(key, sim, episodes=200, top=4, record=True)
     assert since(host) == 200 + r.failures.size + 1
-    assert set(r.failures.episodes.length) <= {3, 4} and 200 * 3 < r.simulator_steps < 200 * 4
+    assert set(r.failures.episodes.length) <= {3, 4} and 200 * 3 < r.steps < 200 * 4
     r = forest(key, sim, trees=4, prunes=2, simulations=50, top=4, record=True)
     # a few more candidates are replayed
     assert 0 <= since(host) - r.trials.ran.sum() - r.failures.size - 1 <= 8
@@ -165,8 +165,7 @@ def test_one_start_and_an_end(key, search, limit):
     r = getattr(jast.search, search)(key, sim, record=True, **sizes)
     ended = limit < 0
     assert (
-        r.episodes == (2 if ended and search != "monte_carlo" else 60)
-        and (r.simulator_steps == 0) == ended
+        r.episodes == (2 if ended and search != "monte_carlo" else 60) and (r.steps == 0) == ended
     )
     assert r.trials.failure.any() == (not ended)
     distance = 1 - r.best.disturbances[: r.best.length].sum()

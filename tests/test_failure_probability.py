@@ -186,7 +186,7 @@ def test_no_failure(key):
     assert (
         np.isnan(found.mean)
         and not found.reliable
-        and found.failures_seen == 0
+        and found.failing == 0
         and found.proposal is None
         and found.evaluations <= BUDGET
     )
@@ -251,7 +251,7 @@ def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
     [why] = [w for w in found.warnings if "interrupted" in w]
     assert why.startswith(f"interrupted after {fits[1]} of {BUDGET} evaluations")
     assert not found.reliable and found.evaluations == fits[1] < BUDGET / 2
-    assert found.samples == 2 * (BUDGET // 25) >= found.failures_seen > 100
+    assert found.samples == 2 * (BUDGET // 25) >= found.failing > 100
     truth = norm.sf(4) + norm.sf(4.5)
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error < 1
 
@@ -286,7 +286,7 @@ def test_subset_simulation(key):
         and found.reliable
     )
     assert "k-hat" not in str(found) and "ESS" in str(found)  # its weights have no tail to fit
-    assert found.samples == found.failures_seen == 5000 and found.evaluations == sum(
+    assert found.samples == found.failing == 5000 and found.evaluations == sum(
         int(h.split()[-2]) for h in found.history
     )
     assert found.interval[0] < found.mean < found.interval[1]

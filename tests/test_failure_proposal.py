@@ -100,7 +100,7 @@ def test_known_probabilities(key, name, precision):
         )
         assert (abs(mean - truth) < 4 * error).all(), (mean / truth, error / truth)
         assert (error / truth < bound).all() and bound < 1 / np.sqrt(20_000 * truth) / 4
-        assert (found.levels[:, 0] > 0).all() and (found.failures[:, -1] > 200).all()
+        assert (found.levels[:, 0] > 0).all() and (found.failing[:, -1] > 200).all()
 
 
 def test_unequal_sides(key):
@@ -279,7 +279,7 @@ def test_failures_with_a_distance(key):
         6,
     )
     found = failure_proposal(key, sim)
-    assert found.reached and found.levels[-1] == 0 and found.failures[-1] > 100
+    assert found.reached and found.levels[-1] == 0 and found.failing[-1] > 100
 
 
 def test_jit_vmap_and_text(key):

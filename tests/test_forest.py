@@ -62,9 +62,9 @@ def test_fields_are_as_documented(name):
         0
     ].shape == (horizon + 1,)
     assert (result.best_reward_per_tree.shape, result.best_reward_per_tree.dtype) == ((6,), real)
-    assert (result.failing.shape, result.failing.dtype) == ((6,), np.dtype(bool))
+    assert (result.failing_per_tree.shape, result.failing_per_tree.dtype) == ((6,), np.dtype(bool))
     assert (
-        all(type(v) is int for v in (result.episodes, result.simulator_steps, result.invalid))
+        all(type(v) is int for v in (result.episodes, result.steps, result.invalid))
         and type(result.failing_share) is float
     )
     assert result.first_failure is None if name == "ferry" else type(result.first_failure) is int
@@ -266,7 +266,7 @@ def test_a_system_that_fails_at_its_start_takes_one_episode_a_tree():
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
     assert (
         result.episodes,
-        result.simulator_steps,
+        result.steps,
         result.first_failure,
         result.failing_share,
     ) == (6, 0, 1, 1.0)
@@ -284,7 +284,7 @@ def test_a_system_that_always_fails_at_its_first_step():
     # the next root would be an episode's end
     assert result.episodes == 6 * 60 and result.failing_share == 1.0 and result.first_failure == 1
     # an end that is visited again is not simulated again
-    assert result.simulator_steps < result.episodes
+    assert result.steps < result.episodes
     assert (result.failures.episodes.length == 1).all()
     honest(result, sim, BONUS)
 
@@ -446,13 +446,13 @@ def test_a_traced_result_counts_as_an_eager_one():
     eager = once("landing")
     traced = jax.jit(lambda key: forest(key, LANDING, **SIZE, reward=BONUS))(jax.random.key(3))
     assert traced.failures is None and traced.history is None
-    assert (traced.episodes, traced.simulator_steps, traced.first_failure) == (
+    assert (traced.episodes, traced.steps, traced.first_failure) == (
         eager.episodes,
-        eager.simulator_steps,
+        eager.steps,
         eager.first_failure,
     )
     np.testing.assert_allclose(traced.failing_share, eager.failing_share, rtol=1e-6)
-    np.testing.assert_array_equal(traced.failing, eager.failing)
+    np.testing.assert_array_equal(traced.failing_per_tree, eager.failing_per_tree)
     np.testing.assert_allclose(traced.best.reward, eager.best.reward, rtol=1e-4)
     none = jax.jit(lambda key: forest(key, FERRY, **SIZE, **S0).first_failure)(jax.random.key(3))
     assert none == -1

@@ -886,7 +886,7 @@ def test_an_observe_that_turns_nan_loses_samples_and_nothing_else(sight):
 
 def test_a_system_that_fails_at_its_start():
     result = searched(sim=plane(-1.0))
-    assert result.episodes == 8 and result.failing_share == 1 and result.simulator_steps == 0
+    assert result.episodes == 8 and result.failing_share == 1 and result.steps == 0
     assert (
         all(of.samples == of.steps == 0 for lesson in result.lessons for of in lesson.values())
         and result.heads.levels == 0
@@ -994,7 +994,7 @@ def test_learned_heads_find_more_failures():
     np.testing.assert_array_equal(
         without.best_reward_per_tree[:20], learned.best_reward_per_tree[:20]
     )
-    a, b = without.failing[50:].mean(), learned.failing[50:].mean()
+    a, b = without.failing_per_tree[50:].mean(), learned.failing_per_tree[50:].mean()
     assert b - a > 4 * np.sqrt((a * (1 - a) + b * (1 - b)) / 50)
     assert learned.best.reward > without.best.reward
 
@@ -1011,7 +1011,7 @@ def test_learned_heads_guide_another_search_from_its_first_tree():
         simulations=50,
         **S0,
     )
-    assert warm.failing.mean() > again.failing.mean() + 0.3
+    assert warm.failing_per_tree.mean() > again.failing_per_tree.mean() + 0.3
 
 
 # --- bad input

@@ -531,10 +531,7 @@ def test_the_same_key_gives_the_same_result():
 def test_threads_change_nothing(name, candidates):
     """Groups of three, the last one filled up, in one thread or two."""
     same(once(name, candidates), searched(name, candidates, threads=2))
-    assert (
-        once(name, candidates).simulator_steps
-        == searched(name, candidates, threads=2).simulator_steps
-    )
+    assert once(name, candidates).steps == searched(name, candidates, threads=2).steps
 
 
 @pytest.mark.compiled

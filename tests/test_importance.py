@@ -186,7 +186,7 @@ def test_to_the_end_and_to_the_horizon(key):
         and within(paper, truth)
     )
     assert max(end.relative_error, paper.relative_error) < 0.08
-    assert end.failures_seen == paper.failures_seen and end.steps == paper.steps < 10 * MORE
+    assert end.failing == paper.failing and end.steps == paper.steps < 10 * MORE
     t, p = log_weights(key, WALK, q, LANES), log_weights(key, WALK, q, LANES, mode="paper")
     same = np.asarray(t.length) == 10
     assert (
@@ -292,7 +292,7 @@ def test_algorithm_2_verbatim_is_unreliable():
         assert (
             not found.reliable and found.ess < 100 and (found.k_hat > 0.7 or found.max_share > 0.05)
         )
-        assert str(found).startswith("UNRELIABLE: ") and found.failures_seen > 100
+        assert str(found).startswith("UNRELIABLE: ") and found.failing > 100
 
 
 # Disturbances of other kinds
@@ -391,7 +391,7 @@ def test_all_of_the_model_is_plain(key):
     t = log_weights(key, SIM, trace_proposal(SIM, BOTH, 1), LANES)
     np.testing.assert_allclose(t.log_weight, 0, atol=1e-5)
     found = importance(key, WALK, odd(), 10 * MORE)
-    k, n = found.failures_seen, found.samples
+    k, n = found.failing, found.samples
     assert (
         found.mean == pytest.approx(k / n)
         and found.ess == pytest.approx(k)
@@ -411,7 +411,7 @@ def test_a_proposal_that_does_not_cover(key):
         not found.reliable
         and "density 0 on" in found.warnings[0]
         and "of the model's own episodes" in found.warnings[0]
-        and found.failures_seen > 100
+        and found.failing > 100
     )
 
 
@@ -440,7 +440,7 @@ def test_invalid_episodes(key):
     first = np.where(above.any(axis=1), above.argmax(axis=1), 6)
     truth = (above.any(axis=1) & ~(bad & (np.arange(6) <= first[:, None])).any(axis=1)).mean()
     assert abs(found.mean - truth) < 4 * np.hypot(np.sqrt(truth / 400_000), found.standard_error)
-    assert 0 < found.invalid < MORE - found.failures_seen and any(
+    assert 0 < found.invalid < MORE - found.failing and any(
         "are invalid" in w for w in found.warnings
     )
 
@@ -453,7 +453,7 @@ def test_no_failure(key):
     ).all() and found.interval == (0.0, 1.0)
     assert (
         not found.reliable
-        and found.failures_seen == 0
+        and found.failing == 0
         and found.warnings == ("no failure was seen",)
         and found.ess == 0
         and found.modes is None
@@ -490,7 +490,7 @@ def test_chunks_are_those_of_log_weights(key):
     assert found.ess == pytest.approx(
         w.sum() ** 2 / (w**2).sum()
     ) and found.max_share == pytest.approx(w.max() / w.sum())
-    assert found.failures_seen == failure.sum()
+    assert found.failing == failure.sum()
     np.testing.assert_allclose(
         np.sort(found.modes), np.sort((w @ np.exp(shares.astype(float))) / w.sum()), rtol=1e-6
     )
@@ -639,7 +639,7 @@ def test_a_start_of_one_value(key):
 def test_monte_carlo(key):
     """Counts, an exact interval, and the bounds of the paper also where nothing was seen."""
     found = monte_carlo(key, WALK, 10 * MORE)
-    k, n = found.failures_seen, 10 * MORE
+    k, n = found.failing, 10 * MORE
     assert (
         found.reliable
         and found.mean == k / n

@@ -52,7 +52,11 @@ def test_rate_of_a_known_system(key, equal):
         r = monte_carlo(key, sim, episodes=n, actions=choice)
         assert abs(r.failing_share - p) < 4 * np.sqrt(p * (1 - p) / n)
         archive_replays(sim, r, rewards.standard(), equal)
-    assert (r.episodes, r.invalid, r.failures.size) == (n, 0, 64) and r.failing.tolist() == [True]
+    assert (r.episodes, r.invalid, r.failures.size) == (
+        n,
+        0,
+        64,
+    ) and r.failing_per_tree.tolist() == [True]
     assert r.best_reward_per_tree.shape == (1,) and r.history.best_reward.shape[1] == 1
     assert r.history.simulations[-1] == n and r.history.failures[-1] == r.failures.seen
     assert (np.diff(r.history.best_reward[:, 0]) >= 0).all()
@@ -85,7 +89,7 @@ def test_counts_are_those_of_the_episodes(key):
     played = [jax.tree.map(lambda a: a[0], one(jnp.int32(i))) for i in range(n)]
     failing = [i for i, e in enumerate(played) if e.failure]
     assert r.episodes == n and r.failures.seen == len(failing) and r.first_failure == failing[0] + 1
-    assert r.simulator_steps == sum(int(e.length) for e in played)
+    assert r.steps == sum(int(e.length) for e in played)
     assert sorted(r.failures.simulation) == failing and (r.failures.counts == 1).all()
     for i, number in enumerate(r.failures.simulation):
         np.testing.assert_allclose(r.failures.episodes.reward[i], played[number].reward, rtol=1e-5)
@@ -113,10 +117,10 @@ def test_kinds_of_disturbances(key, equal, make):
     sim = make()
     r = monte_carlo(key, sim, episodes=3000)
     archive_replays(sim, r, rewards.standard(), equal)
-    assert r.failing.any() == (make is not jast.simulators.landing)
+    assert r.failing_per_tree.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
         assert (
-            r.simulator_steps == 30_000
+            r.steps == 30_000
             and not r.best.failure
             and r.failures.size == 0
             and r.first_failure is None
@@ -133,8 +137,8 @@ def test_uniform_actions(key, equal):
     sim = jast.simulators.ferry()
     r = monte_carlo(key, sim, episodes=20_000, **S0)
     assert (
-        not r.failing.any()
-        and 20.9 < r.simulator_steps / r.episodes <= 21
+        not r.failing_per_tree.any()
+        and 20.9 < r.steps / r.episodes <= 21
         and -20 < r.best.reward < -13
     )
     near = jast.Simulator(
@@ -150,14 +154,14 @@ def test_uniform_actions(key, equal):
 def test_invalid_episodes_are_counted_and_never_best(key):
     sim = walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x))
     r = monte_carlo(key, sim, episodes=2000)
-    assert 0.2 < r.invalid / 2000 < 0.5 and np.isfinite(r.best.reward) and r.failing.any()
+    assert 0.2 < r.invalid / 2000 < 0.5 and np.isfinite(r.best.reward) and r.failing_per_tree.any()
     assert np.isfinite(r.failures.episodes.reward).all() and "invalid" in str(r)
     r = monte_carlo(key, walk(step=lambda s, x: s + jnp.nan), episodes=200)
     assert (
         r.invalid == 200
-        and r.simulator_steps == 200
+        and r.steps == 200
         and r.best.reward == -np.inf
-        and not r.failing.any()
+        and not r.failing_per_tree.any()
         and r.failures.size == 0
     )
     assert r.best_reward_per_tree == -np.inf
@@ -165,14 +169,14 @@ def test_invalid_episodes_are_counted_and_never_best(key):
 
 def test_systems_that_never_or_always_fail(key):
     r = monte_carlo(key, walk(fails=lambda s: s > 1e9), episodes=300)
-    assert (r.failing_share, r.first_failure, r.failures.size, r.simulator_steps) == (
+    assert (r.failing_share, r.first_failure, r.failures.size, r.steps) == (
         0,
         None,
         0,
         1800,
     )
     r = monte_carlo(key, walk(fails=lambda s: s < 1e9), episodes=300)  # at the start
-    assert (r.failing_share, r.first_failure, r.simulator_steps, r.best.length) == (1, 1, 0, 0)
+    assert (r.failing_share, r.first_failure, r.steps, r.best.length) == (1, 1, 0, 0)
     assert (r.failures.size, r.failures.counts.tolist(), r.failures.seen) == (1, [300], 300)
 
 
@@ -196,15 +200,15 @@ def test_under_jit_and_vmap(key):
         np.testing.assert_allclose(
             traced.best.disturbances[i], r.best.disturbances, rtol=1e-4, atol=1e-5
         )
-        assert (traced.episodes[i], traced.simulator_steps[i], traced.invalid[i]) == (
+        assert (traced.episodes[i], traced.steps[i], traced.invalid[i]) == (
             r.episodes,
-            r.simulator_steps,
+            r.steps,
             r.invalid,
         )
         assert traced.first_failure[i] == (-1 if r.first_failure is None else r.first_failure)
-        assert traced.failing[i] == r.failing and traced.failing_share[i] == pytest.approx(
-            r.failing_share
-        )
+        assert traced.failing_per_tree[i] == r.failing_per_tree and traced.failing_share[
+            i
+        ] == pytest.approx(r.failing_share)
     assert traced.failures is None and traced.history is None and traced.settings is None
 
 

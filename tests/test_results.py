@@ -99,8 +99,29 @@ def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
 @pytest.mark.parametrize("name", MAKERS)
 def test_every_result_has_the_whole_vocabulary(name):
     value = made(name)
-    for word in results.VOCABULARY:
-        getattr(value, word)
+    whole = {word: getattr(value, word) for word in results.VOCABULARY if word != "failures"}
+    assert np.ndim(whole["episodes"]) == 0 or name == "failure_samples"
+    assert whole["episodes"] is not None and whole["failing"] is not NotImplemented
+    assert whole["settings"] is None or isinstance(whole["settings"], dict)
+    if name in ("monte_carlo", "forest", "cem"):
+        assert whole["failing"] == value.failures.seen == value.failing_share * value.episodes
+        assert whole["steps"] == value.simulator_steps and whole["invalid"] == 0
+        np.testing.assert_array_equal(value.history.failures, value.history.failing)
+    if name in ("crude", "importance"):
+        assert (whole["failing"], whole["episodes"]) == (value.failures_seen, value.evaluations)
+        assert value.failures is None and whole["incidents"] is None
+    if name == "validation":
+        assert (whole["episodes"], whole["failing"]) == (value.calls, len(value.failures))
+        assert whole["settings"] == {"selector": value.state.selector}
+    if name == "ce":
+        assert whole["episodes"] == 40 and whole["steps"] is None
+
+
+@pytest.mark.parametrize("name", ["nominal", "failure_proposal"])
+def test_a_former_name_warns(name):
+    value = made(name)
+    with pytest.warns(DeprecationWarning, match=r"\.failures is failing now; the old name goes"):
+        assert value.failures is value.failing
 
 
 def test_a_batched_and_a_traced_result_print_and_say_so():

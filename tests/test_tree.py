@@ -153,7 +153,7 @@ def test_threads_and_lanes_change_nothing(name):
     """Groups of three, the last one filled up, in one thread or two; and all trees in one group."""
     for other in (searched(name, threads=2), searched(name, lanes=None)):
         same(once(name), other)
-        assert once(name).simulator_steps == other.simulator_steps
+        assert once(name).steps == other.steps
 
 
 @pytest.mark.compiled
@@ -172,7 +172,7 @@ def test_memoization_changes_the_steps_and_nothing_else(name):
     node, root, none = once(name), once(name, memoize="root"), once(name, memoize="none")
     same(node, root)
     same(node, none)
-    assert node.simulator_steps < root.simulator_steps < none.simulator_steps
+    assert node.steps < root.steps < none.steps
 
 
 def test_the_steps_of_replays_add_up():
@@ -184,8 +184,8 @@ def test_the_steps_of_replays_add_up():
         forest(jax.random.key(7), sim, **SIZE | choices, memoize=memoize)
         for memoize in ("root", "none")
     )
-    assert none.simulator_steps == 5 * 360 * 21
-    assert root.simulator_steps == none.simulator_steps - 5 * 120 * (0 + 1 + 2)
+    assert none.steps == 5 * 360 * 21
+    assert root.steps == none.steps - 5 * 120 * (0 + 1 + 2)
 
 
 # --- widths

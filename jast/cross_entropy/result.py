@@ -46,6 +46,11 @@ class CEResult(NamedTuple):
     invalid: Any
     """int: evaluations that gave NaN or infinity; none of them was an elite"""
 
+    @property
+    def episodes(self) -> int:
+        """Evaluations of the objective, of one run."""
+        return np.shape(self.history.value)[-1]
+
     def __str__(self):
         value = np.asarray(self.best_value)
         n = np.asarray(self.history.value).shape[-1]

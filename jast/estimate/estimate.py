@@ -45,12 +45,14 @@ class Estimate(NamedTuple):
     """Pareto shape of the greatest weights: `jast.estimate.pareto_k`"""
     max_share: float
     """Greatest weight over the sum of all"""
-    failures_seen: int
-    """Failing episodes among ``samples``"""
+    failing: int
+    """Failing episodes among ``samples``; ``failures_seen`` is another name"""
     samples: int
     """Episodes that the estimate is the mean of"""
-    evaluations: int
-    """Episodes simulated in all, the search for a proposal included"""
+    episodes: int
+    """Episodes simulated in all, the search for a proposal included; ``evaluations`` is another
+    name
+    """
     steps: int
     """Simulator steps of ``samples``"""
     invalid: int
@@ -71,6 +73,11 @@ class Estimate(NamedTuple):
     """What it was drawn from, where the method found it: for `jast.estimate.failure_samples`"""
     history: Any = None
     """How that was found, a text a line"""
+    settings: dict | None = None
+    """What was asked for: ``method`` and numbers"""
+
+    failures_seen = results.alias("failing")
+    evaluations = results.alias("episodes")
 
     @property
     def log10_mean(self):
@@ -103,10 +110,10 @@ class Estimate(NamedTuple):
         rows.append(
             (
                 "failures",
-                f"{self.failures_seen} of {self.samples} episodes   {self.evaluations} evaluations",
+                f"{self.failing} of {self.samples} episodes   {self.episodes} evaluations",
             )
         )
-        if self.chernoff is None and self.failures_seen:
+        if self.chernoff is None and self.failing:
             rows.append(
                 (
                     "weights",
@@ -116,7 +123,7 @@ class Estimate(NamedTuple):
                     ),
                 )
             )
-        if self.modes is not None and len(self.modes) > 1 and self.failures_seen:
+        if self.modes is not None and len(self.modes) > 1 and self.failing:
             rows.append(
                 (
                     "modes",
@@ -193,9 +200,9 @@ def estimate(
         ess=ess,
         k_hat=k_hat,
         max_share=share,
-        failures_seen=sums.failures,
+        failing=sums.failures,
         samples=n,
-        evaluations=n if evaluations is None else evaluations,
+        episodes=n if evaluations is None else evaluations,
         steps=sums.steps,
         invalid=sums.invalid,
         modes=modes,
@@ -230,9 +237,9 @@ def of_counts(
         ess=float(k),
         k_hat=math.nan,
         max_share=1 / k if k else math.nan,
-        failures_seen=k,
+        failing=k,
         samples=n,
-        evaluations=n if evaluations is None else evaluations,
+        episodes=n if evaluations is None else evaluations,
         steps=sums.steps,
         invalid=sums.invalid,
         modes=np.ones(1) if k else None,

@@ -27,7 +27,7 @@ from jast.simulator import Simulator
 __all__ = ["FailureProposal", "failure_proposal"]
 
 
-@results.result("evaluations", batches=True)
+@results.result("episodes", batches=True)
 class FailureProposal(NamedTuple):
     """A proposal and how it was found. K iterations; with a leading axis everywhere after
     `jax.vmap`.
@@ -43,12 +43,12 @@ class FailureProposal(NamedTuple):
     """[K]: the miss distance gamma_k that the elites of an iteration reached, 0 where they failed;
     inf where no episode counted
     """
-    failures: Any
+    failing: Any
     """[K] int32: failing episodes of an iteration"""
     ess: Any
     """[K]: effective number of the elites, (sum w)^2 / sum w^2"""
-    evaluations: Any
-    """int: episodes simulated in all"""
+    episodes: Any
+    """int: episodes simulated in all; ``evaluations`` is another name"""
     invalid: Any
     """int: those in which the simulator returned a number that is not finite"""
     reached: Any
@@ -56,16 +56,19 @@ class FailureProposal(NamedTuple):
     is fitted to near misses as well
     """
 
+    failures = results.former("failures", "failing")
+    evaluations = results.alias("episodes")
+
     def __str__(self):
         reached, levels = np.asarray(self.reached), np.asarray(self.levels)
         if reached.ndim:
             return (
-                f"{reached.size} runs of {np.ravel(self.evaluations)[0]} evaluations:"
+                f"{reached.size} runs of {np.ravel(self.episodes)[0]} evaluations:"
                 f" {int(reached.sum())} reached failures"
             )
         rows = "\n".join(
             f"{i:9d} {g:11.6g} {n:9d} {e:10.1f}"
-            for i, (g, n, e) in enumerate(zip(levels, self.failures, self.ess, strict=True), 1)
+            for i, (g, n, e) in enumerate(zip(levels, self.failing, self.ess, strict=True), 1)
         )
         note = "" if reached else "\nthe last elites do not fail: more iterations, or more samples"
         return f"{'iteration':>9} {'level':>11} {'failures':>9} {'ess':>10}\n{rows}{note}"

@@ -21,8 +21,10 @@ class History(NamedTuple):
     """[C] int: episodes simulated by each tree so far."""
     best_reward: Any
     """[C, trees] float: reward of each tree's best episode so far (failures before all others)."""
-    failures: Any
+    failing: Any
     """[C] int: failing episodes so far, over all trees."""
+
+    failures = results.alias("failing")
 
 
 @results.shown()
@@ -63,7 +65,7 @@ class SearchResult(NamedTuple):
     """The archive: the best distinct failures, replayed (`jast.failures`)."""
     episodes: Any
     """int: episodes simulated."""
-    simulator_steps: Any
+    steps: Any
     """int: calls of ``step``; an episode that starts from a kept state costs only its new steps."""
     first_failure: Any
     """int: how many episodes were simulated up to and including the first that failed, or None (-1
@@ -73,7 +75,7 @@ class SearchResult(NamedTuple):
     """float: share of the simulated episodes that failed. The share of the trees is
     ``failing_trees``.
     """
-    failing: Any
+    failing_per_tree: Any
     """[trees] bool: whether the tree found a failure."""
     history: History | None
     invalid: Any
@@ -94,11 +96,15 @@ class SearchResult(NamedTuple):
     """
     lessons: tuple = ()
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
+    failing: Any = None
+    """int: how many of the episodes failed."""
+
+    simulator_steps = results.alias("steps")
 
     @property
-    def failing_trees(self):
+    def failing_trees(self) -> Any:
         """Share of the trees that found a failure: the rate of Table 1 of the MCFS-AP paper."""
-        return self.failing.mean()
+        return self.failing_per_tree.mean()
 
     def __str__(self):
         return table({(self.settings or {}).get("method", "search"): self}) + "\n" + _words(self)
@@ -114,7 +120,7 @@ def table(results):
         first = "-" if r.first_failure is None else str(r.first_failure)
         best = np.asarray(r.best_reward_per_tree)
         lines.append(
-            f"{name:14} {r.episodes:10d} {r.simulator_steps:12d} {100 * r.failing_share:8.3f}%"
+            f"{name:14} {r.episodes:10d} {r.steps:12d} {100 * r.failing_share:8.3f}%"
             f" {100 * r.failing_trees:6.1f}% {first:>9} {float(r.best.reward):12.4f}"
             f" {best[np.isfinite(best)].mean() if np.isfinite(best).any() else -np.inf:10.4f}"
         )

@@ -88,6 +88,18 @@ class Result(NamedTuple):
     state: State
     """Give it to `validate` again to go on"""
 
+    episodes = results.alias("calls")
+
+    @property
+    def failing(self) -> int:
+        """How many of the inputs that were run the system gets wrong."""
+        return len(self.failures)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The ``selector`` with its settings, as text."""
+        return {"selector": self.state.selector}
+
     def __str__(self):
         h, n = self.history, len(self.scores)
         rows = zip(h.calls, h.found, h.precision, h.recall, h.auc, h.expected, strict=True)
