@@ -115,7 +115,11 @@ def former(
         warnings.warn(text + later, DeprecationWarning, stacklevel=2)
         return getattr(self, new) if value is None else value(self)
 
-    return property(get, doc=f"Deprecated: {new}.")
+    return _Former(get, doc=f"Deprecated: {new}.")
+
+
+class _Former(property):
+    """A former name, which tables leave out."""
 
 
 def batch_shape(value: Any) -> tuple[int, ...] | None:
@@ -209,7 +213,9 @@ def _html(self: Any) -> str:
     """A table of the fields; the names of `VOCABULARY` that are no fields of it come after them."""
     rows = dict(_fields(self))
     for name in VOCABULARY:
-        if name not in rows and (value := getattr(self, name, None)) is not None:
+        if name in rows or isinstance(getattr(type(self), name, None), _Former):
+            continue
+        if (value := getattr(self, name, None)) is not None:
             rows[name] = value
     return html_table(type(self).__name__, {k: _words(v) for k, v in rows.items()})
 

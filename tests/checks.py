@@ -15,10 +15,9 @@ def honest(result, sim, reward):
     assert (np.diff(archive.episodes.reward) <= 0).all()
     assert len({F.identity(archive.episode(i)) for i in range(archive.size)}) == archive.size
     assert (result.first_failure is None) == (archive.seen == 0)
-    assert (
-        result.failing_per_tree.any() == (archive.seen > 0)
-        and result.failing_trees == result.failing_per_tree.mean()
-    )
+    failing = result.failing_per_tree
+    assert failing.any() == (archive.seen > 0) and result.failing_trees == failing.mean()
+    assert result.failing == archive.seen
     assert np.isfinite(result.roots.visits).all() and np.isfinite(result.roots.q).all()
     if archive.size:
         assert float(result.best.reward) == archive.episodes.reward[0]
