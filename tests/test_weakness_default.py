@@ -477,6 +477,7 @@ def test_one_value_far_out_does_not_hide_a_column(far):
     )
 
 
+@pytest.mark.long
 def test_what_failures_teach(digits):
     """A weakness that no label shows: every bright 3 and 7, well-written ones among them."""
     inputs, labels, predicted = digits(1.0)
@@ -502,6 +503,7 @@ def test_what_failures_teach(digits):
     )
 
 
+@pytest.mark.long
 def test_a_table_whose_columns_have_units_of_their_own():
     inputs, labels = table(600)
     wrong = inputs[:, 2] > 1.2  # a weakness in a column that tells nothing of the label
