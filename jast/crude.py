@@ -80,8 +80,12 @@ class Nominal(NamedTuple):
 
 
 def nominal(key, sim, episodes=100_000):
-    """Simulate the system under its own disturbance model: `Nominal`, the undisturbed outcome and
-    the failure rate with its exact interval.
+    """How does the system do when nobody searches? Simulate it under its own disturbance model:
+    `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
+
+    Of the three that draw from the model alone, this one keeps no episode and asks nothing of a
+    reward; `jast.search.monte_carlo` keeps the best failures, and `jast.estimate.monte_carlo` gives
+    an `Estimate`, to be compared with those of other estimators.
 
     The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not
     grow with ``episodes``. Warns (UserWarning) where the system fails undisturbed and where

@@ -125,8 +125,10 @@ def _of_the_search(s, level):
 
 
 def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callback=None):
-    """Crude Monte Carlo, the baseline: `Estimate` with an exact interval, and Chernoff's and
-    Jeffreys' upper bounds also where no failure was seen.
+    """How probable is a failure, by counting alone? Crude Monte Carlo, the baseline of estimators:
+    `Estimate` with an exact interval, and Chernoff's and Jeffreys' upper bounds also where no
+    failure was seen. `jast.nominal` is for a first look at a system, and
+    `jast.search.monte_carlo` keeps the failures.
 
     Any simulator. In float32 the normal numbers of a step end at 5.42 standard deviations.
     Arguments and errors as in `importance`.

@@ -54,8 +54,10 @@ def monte_carlo(
     progress=False,
     callback=None,
 ):
-    """Simulate ``episodes`` independent episodes with disturbances of ``actions``, and keep the
-    best: `SearchResult` of one tree. Maximises ``reward``.
+    """What are the likeliest failures that chance alone finds? Simulate ``episodes`` independent
+    episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree.
+    Maximises ``reward``. The baseline of searches; `jast.nominal` only counts, and
+    `jast.estimate.monte_carlo` is the baseline of estimators.
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up
     to chance. A random start is drawn likewise (from its own distribution where actions are a box).
