@@ -24,6 +24,7 @@ import jast
 from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
 from jast.distributions import Normal
+from jast.distributions.mixtures import blend
 from jast.estimate import (
     clopper_pearson,
     failure_probability,
@@ -31,7 +32,6 @@ from jast.estimate import (
     policy_proposal,
     trace_proposal,
 )
-from jast.estimate.blend import blend
 from jast.policy import Policy
 
 LANDING = 4.0236721906842e-13

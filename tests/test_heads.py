@@ -18,8 +18,9 @@ from systems import S0, dice, plane, ring
 import jast
 from jast import heads as H
 from jast.actions import quantiles, samples, uniform
+from jast.distributions.numbers import flat, unflat
 from jast.heads import Heads, Lesson, Moments, make_head
-from jast.heads.heads import flat, in_bins, moments, unflat
+from jast.heads.heads import in_bins, moments
 from jast.heads.rounds import best_trees, enrol
 from jast.heads.samples import Samples, _rows, _steps, of_edges, of_episodes, of_roots
 from jast.heads.training import _fit, learn, learner

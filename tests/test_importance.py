@@ -16,6 +16,7 @@ from systems import walk
 import jast
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
+from jast.distributions.mixtures import blend
 from jast.estimate import (
     chernoff,
     clopper_pearson,
@@ -26,7 +27,6 @@ from jast.estimate import (
     policy_proposal,
     trace_proposal,
 )
-from jast.estimate.blend import blend
 from jast.estimate.importance_sampling import LANES, chunks, even, played
 from jast.policy import Policy, recorded
 from jast.simulators import landing, landing_probability, walk1d

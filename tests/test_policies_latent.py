@@ -11,8 +11,9 @@ from systems import ring, walk
 
 import jast
 from jast import distributions as D
+from jast.distributions.mixtures import Blended, Moved, x_of
 from jast.policies import lanes as L
-from jast.policies.latent import Blended, Moved, log_normal, sizes, x_of
+from jast.policies.latent import log_normal, sizes
 from jast.policies.learner import entropy_term, learner, networks
 from jast.policies.start import Tilt, fit, log_density
 

@@ -17,8 +17,8 @@ from jast import actions as choices
 from jast import distributions as D
 from jast.contract import contract
 from jast.cross_entropy.sequences import player
+from jast.distributions.numbers import unflat
 from jast.episode import rollout
-from jast.heads.heads import unflat
 from jast.outline import outline
 from jast.policy import Policy
 from jast.progress import advance, begin, conclude

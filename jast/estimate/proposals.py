@@ -19,8 +19,8 @@ from jast import results
 from jast._checks import real
 from jast._jax import is_traced
 from jast.contract import contract
+from jast.distributions.mixtures import blend
 from jast.episode import Episode, replay
-from jast.estimate.blend import blend
 from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.pytrees import fitted

@@ -2,7 +2,6 @@
 to come after one.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,19 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jast import distributions as D
 from jast import results
 from jast.heads.networks import Head
 
 __all__ = [
     "Heads",
     "Moments",
-    "flat",
     "histogram",
     "in_bins",
     "moments",
     "observed",
-    "unflat",
     "value",
 ]
 
@@ -110,24 +106,6 @@ class Heads:
 def observed(sim, state):
     """[n] float32: what networks see of a state."""
     return jnp.ravel(jnp.asarray(sim.observe(state))).astype(jnp.float32)
-
-
-def flat(x):
-    """[d] float32: a disturbance, or a point of its unit cube, as one row of numbers."""
-    return jnp.concatenate([jnp.ravel(a).astype(jnp.float32) for a in jax.tree.leaves(x)])
-
-
-def unflat(u, event):
-    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as
-    floats.
-    """
-    leaves, treedef = jax.tree.flatten(event)
-    out, at = [], 0
-    for s in leaves:
-        n = math.prod(s.shape)
-        out.append(u[at : at + n].reshape(s.shape).astype(D.float_dtype(s.dtype)))
-        at += n
-    return treedef.unflatten(out)
 
 
 def histogram(heads, seen):

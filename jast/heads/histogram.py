@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast.heads.heads import Heads, flat, histogram, in_bins, observed, unflat
+from jast.distributions.numbers import flat, unflat
+from jast.heads.heads import Heads, histogram, in_bins, observed
 from jast.outline import outline
 from jast.policy import Policy
 from jast.simulator import Simulator

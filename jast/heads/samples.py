@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import rewards
+from jast.distributions.numbers import flat
 from jast.episode import play_back
-from jast.heads.heads import flat, observed
+from jast.heads.heads import observed
 
 __all__ = ["Samples", "joined", "of_edges", "of_episodes", "of_roots"]
 

@@ -11,9 +11,9 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import results
+from jast.distributions.mixtures import Blended
 from jast.heads.heads import observed
 from jast.policies.lanes import potential
-from jast.policies.latent import Blended
 from jast.policies.learner import act, see
 from jast.policy import Policy
 

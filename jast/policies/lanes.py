@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast import progress as P
+from jast.distributions.mixtures import x_of
 from jast.heads.heads import observed
-from jast.policies.latent import x_of
 from jast.pytrees import select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jast.distributions.mixtures import x_of
 from jast.heads.heads import Moments
 from jast.policies import lanes as L
 from jast.policies import start as starts
-from jast.policies.latent import x_of
 from jast.policies.learner import Learner, Net, act, draw, learner, see, soft_value, update
 from jast.pytrees import select
 

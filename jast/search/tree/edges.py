@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jast.heads.heads import flat, observed
+from jast.distributions.numbers import flat
+from jast.heads.heads import observed
 from jast.outline import outline
 from jast.search.tree.layout import (
     FRESH,

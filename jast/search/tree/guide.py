@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast.heads.heads import flat, histogram, in_bins, observed, unflat, value
+from jast.distributions.numbers import flat, unflat
+from jast.heads.heads import histogram, in_bins, observed, value
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
