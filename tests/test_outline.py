@@ -167,10 +167,10 @@ def test_of_a_traced_simulator(transform):
 def test_another_value_is_no_other_outline_but_another_shape_is():
     calls = Counter()
     kind = jax.tree.structure(of(jnp.ones(()), jnp.ones(()), calls))
-    at = lambda *leaves: outline(jax.tree.unflatten(kind, [jnp.float32(0.1), *leaves]))
-    one, two = (at(jnp.full((), v, jnp.float32), jnp.ones(())) for v in (1.0, 2.0))
+    at = lambda *leaves: outline(jax.tree.unflatten(kind, [jnp.full((), 0.1), *leaves]))
+    one, two = (at(jnp.full((), v), jnp.ones(())) for v in (1.0, 2.0))
     assert one == two and calls["init"] == 1
-    assert at(jnp.ones((2,), jnp.float32), jnp.ones(())).x.shape == (2,) and calls["init"] == 2
+    assert at(jnp.ones((2,)), jnp.ones(())).x.shape == (2,) and calls["init"] == 2
 
 
 def test_precision():
