@@ -27,7 +27,9 @@ QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     " --xla_cpu_parallel_codegen_split_count=1"
 )
-"""Compiles small programs in a seventh of the time; they run slower and round otherwise."""
+"""Compiles small programs in a seventh of the time; they run slower and round otherwise. A test
+that needs the optimised compiler is marked long (soft actor-critic learns NaN without it).
+"""
 
 
 def pytest_configure(config):

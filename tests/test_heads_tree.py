@@ -75,7 +75,8 @@ def v_of(heads, seen, x):
 def shares_of(heads, seen, power):
     """[d, bins] probabilities of the histogram at one observation, by NumPy."""
     p = jax.device_get(heads.policy.params)
-    mass = np.exp(power * (p["tilt"] @ normalised(heads, seen) + p["base"]).astype(np.float64))
+    logits = np.einsum("dbn,n->db", p["tilt"], normalised(heads, seen)) + p["base"]
+    mass = np.exp(power * logits.astype(np.float64))
     return mass / mass.sum(axis=1, keepdims=True)
 
 

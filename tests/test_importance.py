@@ -173,6 +173,7 @@ def test_one_step_exactly(key):
     )
 
 
+@pytest.mark.long  # of rounding, which is the compiler's
 def test_to_the_end_and_to_the_horizon(key):
     """A walk that fails early: both weights are unbiased (4 standard errors), of the same episodes;
     those of Algorithm 1 in NumPy to the horizon are distributed as the paper's (Kolmogorov and

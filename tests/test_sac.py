@@ -79,6 +79,7 @@ def learned():
     return sac(jax.random.key(1), TWO_SIDES, **SMALL)
 
 
+@pytest.mark.long
 def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probability(learned, key):
     """2 Phi(-5 / sqrt 3) = .0038924 within 4 SE of 4000 episodes, SE below 4 % (crude Monte Carlo:
     25 %), half of it on each side.
@@ -92,6 +93,7 @@ def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probabili
     assert np.mean(w > 0) > 0.4
 
 
+@pytest.mark.long
 def test_the_start_is_what_the_critics_say_of_the_true_value(learned):
     """p(x0) exp(V_true) given failure, by quadrature: at +-1.74 on average (V not freed of lambda
     d(s0) would draw it to 0), deviation about .8.
@@ -112,6 +114,7 @@ def test_the_start_is_what_the_critics_say_of_the_true_value(learned):
     assert abs(integrate.simpson(own * (x > 0), x=x) - 0.5) < 0.1
 
 
+@pytest.mark.long
 def test_two_ways_out_of_one_state_are_both_taken(key):
     """From a fixed start: the probability within 4 SE, SE below 4 %, half of it on each side; a
     policy of one component leaves a side out.
@@ -123,6 +126,7 @@ def test_two_ways_out_of_one_state_are_both_taken(key):
     assert 0.4 < w[np.asarray(sides) > 0].sum() / w.sum() < 0.6
 
 
+@pytest.mark.long
 def test_the_mode_is_a_deterministic_policy_that_pushes_outwards(learned):
     for side in (-1.0, 1.0):
         state = jnp.asarray(side * 3.0)
@@ -131,6 +135,7 @@ def test_the_mode_is_a_deterministic_policy_that_pushes_outwards(learned):
         np.testing.assert_allclose(D.mode(dist), dist.means[jnp.argmax(dist.weights), 0], rtol=1e-5)
 
 
+@pytest.mark.long
 def test_the_curve_tells_what_was_learned(learned):
     h = learned.history
     assert (
@@ -143,6 +148,7 @@ def test_the_curve_tells_what_was_learned(learned):
     assert "lambda" in text and "start" in text and len(text.splitlines()) < 14
 
 
+@pytest.mark.long
 def test_a_policy_goes_through_jit_and_vmap(learned, key):
     keys = jax.random.split(key, 3)
     play = jax.jit(
@@ -256,6 +262,7 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
         save(path, jast.Policy(_start, lambda s, t: _disturbance(s)))
 
 
+@pytest.mark.long
 def test_what_is_not_finite_is_counted_and_never_learned_from():
     """A tenth of the episodes and more come to a state that is NaN: every parameter stays finite,
     and failures are still found.
@@ -268,6 +275,7 @@ def test_what_is_not_finite_is_counted_and_never_learned_from():
     assert "not finite" in str(policy)
 
 
+@pytest.mark.long
 def test_lambda_is_raised_while_too_few_fail():
     """A system that no episode of so few makes fail, with a distance that tells the model nothing
     new: lambda rises, at most to where three quarters are.
@@ -282,6 +290,7 @@ def test_lambda_is_raised_while_too_few_fail():
     np.testing.assert_allclose(fixed.alpha, 0.5, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_temperature_follows_the_entropy():
     """A wanted entropy that no policy of deviations up to e^2 has draws alpha up, one far below
     draws it down.
