@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.episode import rollout
-from jast.estimate.limit_state import _policy, dimension, normal_numbers, outcome
+from jast.estimate.limit_state import dimension, normal_numbers, outcome, policy_of
 from jast.rewards import log_likelihood
 
 __all__ = ["DesignPoints", "design_points", "distinct"]
@@ -67,7 +67,7 @@ def _one(sim, z):
     def step(carry, _):
         z, best, found = carry
         g, slope = jax.value_and_grad(
-            lambda z: rollout(jax.random.key(0), sim, _policy(sim, z), log_likelihood).distance
+            lambda z: rollout(jax.random.key(0), sim, policy_of(sim, z), log_likelihood).distance
         )(z)
         square = jnp.sum(slope**2)
         usable = jnp.isfinite(g) & jnp.isfinite(square) & (square > 0)

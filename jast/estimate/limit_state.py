@@ -38,6 +38,7 @@ __all__ = [
     "outcome",
     "outcomes",
     "place",
+    "policy_of",
 ]
 
 
@@ -104,7 +105,7 @@ def normal_numbers(sim: Simulator) -> Any:
 
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
-    policy, last = _policy(sim, z), jnp.asarray(sim.horizon, jnp.int32)
+    policy, last = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32)
     first = begin(sim, log_likelihood, D.mode(policy.start()))
 
     def body(carry):
@@ -129,7 +130,7 @@ def outcomes(sim, z):
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
     return jax.vmap(
-        lambda z: rollout(jax.random.key(0), sim, _policy(sim, z))._replace(states=None)
+        lambda z: rollout(jax.random.key(0), sim, policy_of(sim, z))._replace(states=None)
     )(z)
 
 
@@ -167,7 +168,7 @@ def _live(q):
     return jnp.sum(jnp.isfinite(q.log_weights), dtype=jnp.int32)
 
 
-def _policy(sim: Simulator, z: jax.Array) -> Policy:
+def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     like = outline(sim)
     size0 = count(like.x0)
     return player(
