@@ -5,7 +5,7 @@ is compared with.
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from jast.intervals import clopper_pearson
 from jast.outline import outline
 from jast.policy import undisturbed
 from jast.progress import advance, begin, conclude
+from jast.watch import Watch, in_pieces
 
 __all__ = ["Nominal", "nominal"]
 
@@ -79,7 +80,7 @@ class Nominal(NamedTuple):
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
 
 
-def nominal(key, sim, episodes=100_000):
+def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
     """How does the system do when nobody searches? Simulate it under its own disturbance model:
     `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
 
@@ -88,7 +89,8 @@ def nominal(key, sim, episodes=100_000):
     an `Estimate`, to be compared with those of other estimators.
 
     The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not
-    grow with ``episodes``. Warns (UserWarning) where the system fails undisturbed and where
+    grow with ``episodes``. ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
+    now and then. Warns (UserWarning) where the system fails undisturbed and where
     episodes are invalid. A KeyboardInterrupt ends it with the result of the episodes played by
     then, and is raised where there are none. Raises ValueError for ``episodes`` below 1 and where
     the simulator's functions do not fit together.
@@ -103,7 +105,9 @@ def nominal(key, sim, episodes=100_000):
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
-    episodes, (failures, invalid, mean) = _played(key, sim, asked)
+    episodes, (failures, invalid, mean) = _played(
+        key, sim, asked, Watch("nominal", asked, "episode", progress, callback)
+    )
     settings = dict(method="nominal", episodes=asked)
     if episodes < asked:
         settings["interrupted"] = f"after {episodes} of {asked} episodes"
@@ -131,26 +135,32 @@ def nominal(key, sim, episodes=100_000):
     )
 
 
-def _played(key, sim, episodes):
+def _played(key, sim, episodes, watch):
     """How many episodes were played, all unless interrupted, and of these: failures, invalid ones,
     and the mean distance of the valid ones.
     """
     zero = jnp.zeros((), jnp.int32)
     counts = zero, zero, jnp.zeros((), outline(sim).dtype)
-    chunks, done, more = -(-episodes // LANES), 0, 1
-    try:
-        while done < chunks:
-            begin, end = time.perf_counter(), min(done + more, chunks)
-            bounds = (jnp.asarray(n, jnp.int32) for n in (episodes, done, end))
-            piece = partial(_count, key, sim, *bounds, counts, LANES)
-            counts, done = apart(lambda piece=piece: jax.block_until_ready(piece())), end
-            if time.perf_counter() - begin < PIECE:
-                more *= 2
-    except KeyboardInterrupt:
-        if not done:
-            raise
+
+    played = lambda chunks: min(chunks * LANES, episodes)
+
+    def work(counts, begin, end):
+        bounds = (jnp.asarray(n, jnp.int32) for n in (episodes, begin, end))
+        return apart(lambda: jax.block_until_ready(_count(key, sim, *bounds, counts, LANES)))
+
+    counts, done = in_pieces(work, counts, _ends(-(-episodes // LANES)), watch, played)
     failures, invalid, mean = jax.device_get(counts)
-    return min(done * LANES, episodes), (int(failures), int(invalid), float(mean))
+    return played(done), (int(failures), int(invalid), float(mean))
+
+
+def _ends(chunks: int) -> Iterator[int]:
+    """Ends of pieces that take about `PIECE`: more chunks at a time while they are quick."""
+    done, more = 0, 1
+    while done < chunks:
+        begin, done = time.perf_counter(), min(done + more, chunks)
+        yield done
+        if time.perf_counter() - begin < PIECE:
+            more *= 2
 
 
 @partial(jax.jit, static_argnums=6)

@@ -1,13 +1,16 @@
-"""Long work that is watched: one bar, one callback, one signature of it."""
+"""Long work: piece by piece, so that it can be watched and interrupted; one bar, one callback, one
+signature of it.
+"""
 
 import inspect
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
-__all__ = ["Watch"]
+__all__ = ["Watch", "in_pieces"]
 
 Callback = Callable[[int, int, Any], Any]
+State = TypeVar("State")
 
 
 class Watch:
@@ -79,6 +82,45 @@ class Watch:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def in_pieces(
+    work: Callable[[State, int, int], State],
+    state: State,
+    ends: Iterable[int],
+    watch: Watch,
+    units: Callable[[int], int] = lambda end: end,
+    words: Callable[[State], dict[str, Any]] = lambda state: {},
+) -> tuple[State, int]:
+    """Do ``state = work(state, begin, end)`` for each stretch up to the next of ``ends``. This is the
+    one driver of all that draws episodes chunk by chunk.
+
+    Args:
+        work: returns the next state. It changes nothing else, as it may be interrupted.
+        state: the first one.
+        ends: rising; a generator may look at the clock between two of them.
+        watch: is told after each piece, and closed.
+        units: of ``watch``, that are done at an end.
+        words: of a state, for the bar.
+
+    Returns:
+        The last state and its end. A KeyboardInterrupt ends the work after the last whole piece,
+        and is raised again where there is none.
+    """
+    kept = state, 0
+    try:
+        for end in ends:
+            state, done = kept
+            # at once: an interruption finds all of a piece or nothing
+            kept = work(state, done, end), end
+            watch.reach(units(end), **words(kept[0]))
+            watch.tell()
+    except KeyboardInterrupt:
+        if not kept[1]:
+            raise
+    finally:
+        watch.close()
+    return kept
 
 
 def _of_three(name: str, callback: Any, former: Callable[..., tuple] | None) -> Callback:

@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 
-from jast.watch import Watch
+from jast.watch import Watch, in_pieces
 
 
 def watched(callback, **named):
@@ -64,3 +64,34 @@ def test_the_result_so_far_is_made_for_a_callback_only():
     watch.tell(lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         Watch("search", 10, "sim", False, print).tell(lambda: 1 / 0)
+
+
+def interrupted(at, callback=None):
+    """Sums 1 .. 5 in pieces that end at 2, 4, 5; the one that begins at ``at`` is interrupted."""
+
+    def work(total, begin, end):
+        if begin == at:
+            raise KeyboardInterrupt
+        return total + sum(range(begin + 1, end + 1))
+
+    watch = Watch("sum", 50, "number", False, callback)
+    return in_pieces(work, 0, [2, 4, 5], watch, units=lambda end: 10 * end)
+
+
+def test_pieces_are_done_in_order_and_told():
+    seen = []
+    assert interrupted(None, lambda *three: seen.append(three)) == (15, 5)
+    assert seen == [(20, 50, None), (40, 50, None), (50, 50, None)]
+
+
+def test_an_interruption_leaves_whole_pieces():
+    assert interrupted(4) == (10, 4) and interrupted(2) == (3, 2)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(0)
+
+
+def test_an_interruption_by_the_callback_comes_after_its_piece():
+    def stop(done, total, result):
+        raise KeyboardInterrupt
+
+    assert interrupted(None, stop) == (3, 2)

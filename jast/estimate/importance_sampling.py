@@ -28,7 +28,7 @@ from jast.outline import outline
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
 from jast.rewards import log_likelihood
-from jast.watch import Watch
+from jast.watch import Watch, in_pieces
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
 
@@ -124,24 +124,21 @@ def chunks(simulate, lanes, samples, progress=False, callback=None, name="import
     """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces``
     [lanes]; of the last chunk the first ones count.
     """
-    total, done, notes = sums.nothing(samples), 0, ()
+
+    def work(kept, done, end):
+        total, now = kept
+        now = simulate(0) if now is None else now
+        # the device goes on while the host sums
+        ahead = simulate(end // lanes) if end < samples else None
+        rows = jax.tree.map(lambda a: a[: end - done], jax.device_get(now))
+        return sums.add(total, rows), ahead
+
     watch = Watch(name, samples, "episode", progress, callback)
-    try:
-        ahead = simulate(0)
-        while done < samples:
-            n, now = min(lanes, samples - done), ahead
-            if done + n < samples:
-                ahead = simulate(done // lanes + 1)  # the device goes on while the host sums
-            total = sums.add(total, jax.tree.map(lambda a, n=n: a[:n], jax.device_get(now)))
-            done += n
-            watch.more(n)
-    except KeyboardInterrupt:
-        if not done:
-            raise
-        notes = (f"interrupted after {done} of {samples} episodes",)
-    finally:
-        watch.close()
-    return total, notes
+    ends = [*range(lanes, samples, lanes), samples]
+    (total, _), done = in_pieces(work, (sums.nothing(samples), None), ends, watch)
+    if done < samples:
+        return total, (f"interrupted after {done} of {samples} episodes",)
+    return total, ()
 
 
 @partial(jax.jit, static_argnames=("n", "to_horizon"))

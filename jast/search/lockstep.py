@@ -25,7 +25,7 @@ from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
 from jast.search.tree.packing import pack
-from jast.watch import Watch
+from jast.watch import Watch, in_pieces
 
 __all__ = [
     "Played",
@@ -287,31 +287,27 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
     episodes of all trees. A KeyboardInterrupt ends the search after the last whole chunk, and is
     raised again where there is none.
     """
-    whole, kept = ends[-1] * trees, (carry, 0, None, [])
+
+    def work(kept, done, end):
+        carry, total, moments = kept
+        run = lambda: jax.block_until_ready(chunk(carry, done, end))
+        carry, counted, best, record = apart(run) if host else run()
+        counted, best, record = jax.device_get((counted, best, record))
+        # Python's ints do not overflow
+        counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
+        if total is not None:
+            sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
+            counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
+        return carry, counted, [*moments, (end, best, counted.failures, record)]
+
+    def words(kept):
+        _, total, moments = kept
+        return dict(failures=total.failures, best=f"{moments[-1][1].max():.4g}")
+
+    whole = ends[-1] * trees
     watch = Watch(name, whole, "sim", progress, callback)
-    try:
-        for end in ends:
-            carry, done, total, moments = kept
-            run = lambda: jax.block_until_ready(chunk(carry, done, end))  # noqa: B023
-            carry, counted, best, record = apart(run) if host else run()
-            counted, best, record = jax.device_get((counted, best, record))
-            # Python's ints do not overflow
-            counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
-            if total is not None:
-                sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
-                counted = Tally(
-                    *sums, min(total.first, counted.first), total.failing | counted.failing
-                )
-            # at once: an interruption finds all of a chunk or nothing
-            kept = carry, end, counted, [*moments, (end, best, counted.failures, record)]
-            watch.reach(end * trees, failures=counted.failures, best=f"{best.max():.4g}")
-            watch.tell()
-    except KeyboardInterrupt:
-        if kept[2] is None:
-            raise
-    finally:
-        watch.close()
-    carry, done, total, moments = kept
+    kept, done = in_pieces(work, (carry, None, []), ends, watch, lambda end: end * trees, words)
+    carry, total, moments = kept
     *moments, records = zip(*moments, strict=True)
     record = None if records[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *records)
     interrupted = f"after {done * trees} of {whole} episodes" if done < ends[-1] else None
