@@ -92,8 +92,8 @@ def in_pieces(
     units: Callable[[int], int] = lambda end: end,
     words: Callable[[State], dict[str, Any]] = lambda state: {},
 ) -> tuple[State, int]:
-    """Do ``state = work(state, begin, end)`` for each stretch up to the next of ``ends``. This is the
-    one driver of all that draws episodes chunk by chunk.
+    """Do ``state = work(state, begin, end)`` for each stretch up to the next of ``ends``: the one
+    driver of all that draws episodes chunk by chunk.
 
     Args:
         work: returns the next state. It changes nothing else, as it may be interrupted.
