@@ -83,7 +83,7 @@ def search(scenario, kind, trees, heads=None):
         | best
         | {
             "episodes": result.episodes,
-            "steps": result.simulator_steps,
+            "steps": result.steps,
             "cpu_s": seconds,
         }
     )

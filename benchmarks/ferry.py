@@ -87,7 +87,7 @@ def row(search, seed):
         "best_of_200": [min(runs), float(np.median(runs)), max(runs)] if runs else None,
         "failing_episodes": result.failing_share,
         "episodes": result.episodes,
-        "steps": result.simulator_steps,
+        "steps": result.steps,
         "cpu_s": cpu,
         "wall_s": wall,
         "failing_trees_per_cpu_s": int(np.sum(best > 0)) / cpu,

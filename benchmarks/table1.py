@@ -169,7 +169,7 @@ def measure(searches, seeds, published=None):
         "bests": [b.max() for b in bests],
         "tests": compare(np.concatenate(bests), published),
         "episodes": episodes,
-        "steps": sum(r.simulator_steps for r in results),
+        "steps": sum(r.steps for r in results),
         "cpu_s": list(cpu),
         "wall_s": list(wall),
         "warm_up_cpu_s": warm,

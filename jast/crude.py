@@ -56,7 +56,9 @@ class Nominal(NamedTuple):
     failing.
     """
     settings: Mapping = {}
-    """``method``, the ``episodes`` asked for, and ``interrupted`` where not all were played."""
+    """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
+    played.
+    """
 
     failures = results.former("failures", "failing")
 
@@ -108,7 +110,7 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
     episodes, (failures, invalid, mean) = _played(
         key, sim, asked, Watch("nominal", asked, "episode", progress, callback)
     )
-    settings = dict(method="nominal", episodes=asked)
+    settings = results.asked("nominal", key, episodes=asked)
     if episodes < asked:
         settings["interrupted"] = f"after {episodes} of {asked} episodes"
     if quiet is not None and bool(quiet.failure):

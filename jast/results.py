@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 
 from jast._jax import is_traced
 
-__all__ = ["VOCABULARY", "alias", "batch_shape", "former", "html_table", "result", "shown"]
+__all__ = ["VOCABULARY", "alias", "asked", "batch_shape", "former", "html_table", "result", "shown"]
 
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",
@@ -92,6 +92,23 @@ def result(scalar: str, batches: bool = False) -> Callable[[C], C]:
         return shown(scalar, batches)(cls)
 
     return decorate
+
+
+def asked(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
+    """The ``settings`` of a result, as JSON can hold them.
+
+    Args:
+        method: the call's name.
+        key: the one that it was given.
+        **given: numbers and texts that it was asked for.
+
+    Returns:
+        ``method``, these, and ``seed``, the words of the key.
+    """
+    plain = lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist()
+    typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+    words = jax.random.key_data(key) if typed else key
+    return dict(method=method, **jax.tree.map(plain, given), seed=np.asarray(words).tolist())
 
 
 def alias(name: str) -> property:

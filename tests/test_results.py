@@ -1,6 +1,7 @@
 """What all results have in common: one vocabulary, how they print, and their files."""
 
 import functools
+import json
 from typing import NamedTuple
 
 import jax
@@ -107,6 +108,10 @@ def test_every_result_has_the_whole_vocabulary(name):
         assert whole["failing"] == value.failures.seen == value.failing_share * value.episodes
         assert whole["steps"] == value.simulator_steps and whole["invalid"] == 0
         np.testing.assert_array_equal(value.history.failures, value.history.failing)
+    if name in ("monte_carlo", "forest", "cem", "crude", "importance", "nominal"):
+        assert whole["settings"]["seed"] == jax.random.key_data(KEY).tolist()
+        assert whole["settings"]["method"] == {"crude": "monte_carlo"}.get(name, name)
+        json.dumps(whole["settings"])
     if name in ("crude", "importance"):
         assert (whole["failing"], whole["episodes"]) == (value.failures_seen, value.evaluations)
         assert value.failures is None and whole["incidents"] is None

@@ -23,6 +23,7 @@ from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import Seeker, seek
 from jast.intervals import checked_level, log_normal
 from jast.policy import nominal_policy
+from jast.results import asked
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
 
@@ -62,17 +63,19 @@ def failure_probability(
     budget = whole(name, "budget", budget, LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
+    settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     for_search, key = jax.random.split(key)
     s = Seeker(for_search, sim, budget)
     try:
         seek(s, gradients)
-        return _with_the_rest(key, s, level, progress, callback)
+        found = _with_the_rest(key, s, level, progress, callback)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
             raise
         if not s.batches:
             raise KeyboardInterrupt from error
-        return _of_the_search(s, level)
+        found = _of_the_search(s, level)
+    return found._replace(settings=settings)
 
 
 def _with_the_rest(key, s, level, progress, callback):
@@ -141,7 +144,8 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), even(samples)
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes)
     total, notes = chunks(simulate, lanes, samples, progress=progress, callback=callback, name=name)
-    return of_counts(name, total, level=level, notes=notes)
+    settings = asked(name, key, samples=samples, level=level)
+    return of_counts(name, total, level=level, notes=notes)._replace(settings=settings)
 
 
 def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
@@ -208,6 +212,7 @@ def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
         reliable=not found,
         warnings=tuple(found),
         history=history,
+        settings=asked(name, key, samples=samples, replicates=replicates, level=level),
     )
 
 
@@ -224,13 +229,15 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     random_key(name, key)
     budget = whole(name, "budget", budget, LEAST)
     level = checked_level(name, level)
+    settings = asked(name, key, budget=budget, level=level)
     for_search, key = jax.random.split(key)
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
-    result = importance(key, sim, found.policy, budget - int(found.evaluations), level=level)
+    result = importance(key, sim, found.policy, budget - int(found.episodes), level=level)
     against = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
     return result._replace(
         method=name,
-        evaluations=budget,
+        episodes=budget,
+        settings=settings,
         reliable=result.reliable and not against,
         warnings=(*against, *result.warnings),
         history=tuple(str(found).splitlines()),

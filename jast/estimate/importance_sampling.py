@@ -27,6 +27,7 @@ from jast.intervals import checked_level
 from jast.outline import outline
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
+from jast.results import asked
 from jast.rewards import log_likelihood
 from jast.watch import Watch, in_pieces
 
@@ -107,12 +108,14 @@ def importance(
     level = checked_level("importance", level)
     contract(sim, observed=False)
     proposal = as_proposal("importance", sim, proposal)
+    settings = asked("importance", key, samples=samples, mode=mode, level=level)
     key, for_probes = jax.random.split(key)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = even(samples)
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
     total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
-    return estimate("importance", total, level=level, reasons=reasons, notes=stopped)
+    found = estimate("importance", total, level=level, reasons=reasons, notes=stopped)
+    return found._replace(settings=settings)
 
 
 def even(samples):

@@ -23,6 +23,7 @@ from jast.contract import ACTIONS, contract
 from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
+from jast.results import asked
 from jast.search.result import History, SearchResult, Trials
 from jast.search.tree.packing import pack
 from jast.watch import Watch, in_pieces
@@ -232,16 +233,9 @@ def prepare(function, key, sim, reward, actions, **settings):
     reward = rewards.as_pytree(reward)
     if is_traced(key, sim, reward, actions, settings) or is_tracing():
         return reward, None
-    seed = key if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else jax.random.key_data(key)
     func = getattr(reward, "func", reward)
     name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
-    settings = jax.tree.map(
-        lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist(), settings
-    )
-    return reward, dict(
-        method=function,
-        **settings,
-        seed=np.asarray(seed).tolist(),
+    return reward, asked(function, key, **settings) | dict(
         reward=name,
         reward_settings=_settings(reward),
         actions=ACTIONS.get(type(actions), type(actions).__name__),
