@@ -46,6 +46,14 @@ def test_distrax_is_reached_by_its_names():
     assert printed(code).split() == ["False", "distrax._src.distributions.von_mises", "True"]
 
 
+def test_a_user_of_distrax_may_put_distributions_of_jast_into_its_containers():
+    printed(
+        "import jax, jax.numpy as jnp; from jast.distributions import Normal; import distrax;"
+        "d = distrax.Independent(Normal(jnp.zeros(2), 1.0), 1);"
+        "assert d.sample(seed=jax.random.key(0)).shape == (2,)"
+    )
+
+
 @pytest.mark.long
 def test_import_takes_little_more_than_that_of_jax():
     """CPU time, the least of seven runs each, which the machine's other work hardly moves."""

@@ -1,5 +1,6 @@
 """What every distribution of jast is: a pytree with samples and log densities."""
 
+import sys
 from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
@@ -36,6 +37,10 @@ class Distribution(metaclass=_Kind):
     """
 
     event_shape: Any
+
+    def __new__(cls, *args: Any, **settings: Any) -> "Distribution":
+        _introduce()
+        return super().__new__(cls)
 
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
@@ -85,6 +90,18 @@ class Distribution(metaclass=_Kind):
     @property
     def name(self) -> str:
         return type(self).__name__
+
+
+def _introduce() -> None:
+    """Let distrax's containers take jast's distributions as parts, once somebody imported it."""
+    global _introduced
+    theirs = None if _introduced else getattr(sys.modules.get("distrax"), "Distribution", None)
+    if theirs is not None:
+        theirs.register(Distribution)
+        _introduced = True
+
+
+_introduced = False
 
 
 def is_distribution(d: Any) -> bool:
