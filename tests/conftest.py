@@ -3,6 +3,7 @@ of compiled programs for workers, kernels of notebooks and other processes. ``JA
 the whole suite in float64.
 """
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -18,6 +19,9 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
+# tracing makes many objects that live long: collecting them less often saves a twentieth
+gc.set_threshold(200_000, 50, 100)
+jax.config.update("jax_traceback_in_locations_limit", 0)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import pytest
 from jax.tree_util import Partial
 
 import jast
@@ -181,3 +182,10 @@ def line(**changes):
         horizon=10,
     )
     return jast.Simulator(**(fields | changes))
+
+
+def ferry_now(cases):
+    """Parameters of a test: those of the ferry at once, of other systems with the long tests."""
+    of = lambda case: case if isinstance(case, tuple) else (case,)
+    marks = lambda case: () if of(case)[0] == "ferry" else pytest.mark.long
+    return [pytest.param(*of(case), marks=marks(case)) for case in cases]

@@ -127,6 +127,7 @@ def test_check_looks_on_the_way_in_a_worker():
     assert host.lost([], [np.ones((2, 8))]) == 0
 
 
+@pytest.mark.long
 def test_a_search_with_workers_is_that_without(key, equal):
     sims = [
         box(blackboxes.Walk, episodic=False, horizon=8, workers=n, time_limit=None) for n in (0, 2)

@@ -35,6 +35,7 @@ def lock():
     )
 
 
+@pytest.mark.long
 def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     """Phi(-6) = 1e-9, and the likeliest failure is x = 3 everywhere."""
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)

@@ -51,6 +51,7 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "simulator",
     [
@@ -83,6 +84,7 @@ def test_heads_of_a_forest(capsys, tmp_path):
     assert settings["heads"] == "both" and settings["head_settings"]["round"] == 1
 
 
+@pytest.mark.long
 def test_a_seed_gives_the_same_report(capsys, tmp_path):
     one, two, other = (
         run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2", "--seed", seed)[1]

@@ -353,6 +353,7 @@ def test_units_do_not_matter(key, x64):
     np.testing.assert_allclose(other.value, np.log(8 * one.value), rtol=1e-9)
 
 
+@pytest.mark.long
 def test_mixtures_stay_proper(key):
     result = ce.ce_mixture(
         key, ce.sierra(), (np.zeros(2), 200.0), samples=10, elites=5, iterations=6
@@ -678,6 +679,7 @@ def test_the_plain_method_is_the_published_one(x64):
         assert abs(s.best_value[-1] - published) < slack + 3 * s.standard_error[-1]
 
 
+@pytest.mark.long
 def test_the_default_is_not_for_the_plane_alone(key):
     """In ten dimensions, a rotated ellipsoid of condition 100: far below the plain method, for each
     of 8 seeds (the means differ by more than ten times).
@@ -740,6 +742,7 @@ def test_proposals_move_in_many_dimensions(d, key):
     assert (steps > 0).all() and result.best_value < result.history.best_value[0]
 
 
+@pytest.mark.long
 def test_coordinates_of_very_different_size(key):
     """In float32, the units of one coordinate a million times those of the other: as good as with
     equal ones.

@@ -248,6 +248,7 @@ def needle(half=0.05):
     )
 
 
+@pytest.mark.long
 def test_following_finds_many_failures_where_nothing_points_to_the_first():
     """Against the same search that does not follow: more trees that make much of what they
     found.

@@ -100,6 +100,7 @@ def two():
     return sim, norm.sf(4) + norm.sf(4.5), failure_probability(jax.random.key(5), sim, BUDGET)
 
 
+@pytest.mark.long
 def test_two_modes(two):
     sim, truth, found = two
     assert good(found, truth), str(found)
@@ -633,6 +634,7 @@ def test_samples_of_an_estimate(key, two):
     ) and "500 failures from" in str(found)
 
 
+@pytest.mark.long
 def test_samples_without_a_failure(key, proposal):
     with pytest.raises(
         ValueError, match="failure_samples: source gave no failure in 5000 episodes"

@@ -236,6 +236,7 @@ def test_an_arc_leads_nearly_all_the_way_round():
 # measured rates: within 4.5 standard errors of those of 400,000 routes
 
 
+@pytest.mark.long
 def test_rate_and_miss_distances():
     n, few = 16 * CHUNK, 3 * CHUNK
     x = routes(n)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import honest, replays
-from systems import S0, dice, ring, walk
+from systems import S0, dice, ferry_now, ring, walk
 
 import jast
 from jast import failures as F
@@ -53,7 +53,7 @@ once = functools.cache(searched)
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["ferry", "landing"])
+@pytest.mark.parametrize("name", ferry_now(["ferry", "landing"]))
 def test_fields_are_as_documented(name):
     result, real = once(name), np.dtype(jnp.zeros(()).dtype)
     horizon = SYSTEMS[name].horizon
@@ -91,7 +91,7 @@ def test_fields_are_as_documented(name):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["ferry", "landing", "ring"])
+@pytest.mark.parametrize("name", ferry_now(["ferry", "landing", "ring"]))
 def test_results_are_honest(name):
     honest(once(name), SYSTEMS[name], (S0 if name == "ferry" else dict(reward=BONUS))["reward"])
 
@@ -198,6 +198,7 @@ KINDS = dict(
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("actions", "name"), [(actions, name) for actions, names in KINDS.items() for name in names]
 )
@@ -429,6 +430,7 @@ def test_vmap_over_simulators_is_a_loop():
     assert (together[2] != together[0]).all()
 
 
+@pytest.mark.long
 def test_vmap_over_a_setting_is_a_loop():
     weights = jnp.array([0.5, 10.0, 40.0])
     together = jax.vmap(best_of, in_axes=(None, None, 0))(
@@ -441,6 +443,7 @@ def test_vmap_over_a_setting_is_a_loop():
     assert (together[0] != together[1]).any()
 
 
+@pytest.mark.long
 def test_a_traced_result_counts_as_an_eager_one():
     """Also where trees fail; without an archive, and with -1 in place of None."""
     eager = once("landing")
@@ -479,6 +482,7 @@ def test_float64_within_a_block(x64):
 # ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_forest_beats_random_search():
     """At equal budget, on a walk that fails about once in 8000 episodes, a forest sees far more
     failures, and a likelier one.

@@ -118,6 +118,7 @@ def test_equal_points_and_equal_values_are_finite():
         np.testing.assert_allclose(gp.predict(fitted, x[:1]), y.mean(), rtol=0.02, atol=1e-6)
 
 
+@pytest.mark.long
 def test_it_vmaps():
     x, y = data(12, 2, np.float32)
     xs, ys = jnp.stack([x, 2 * x]), jnp.stack([y, -y])
@@ -191,6 +192,7 @@ def test_a_polynomial_finds_a_paraboloid(x64):
 FINITE = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=30)
 @given(
     st.lists(FINITE | st.sampled_from([np.nan, np.inf, -np.inf]), min_size=1, max_size=12),

@@ -660,6 +660,7 @@ def compiled():
     return before, first, programs()
 
 
+@pytest.mark.long
 def test_rounds_and_searches_share_their_programs():
     """One of each function, but two to train: policy and value."""
     before, first, second = compiled()
@@ -676,6 +677,7 @@ KINDS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "heads", "actions"), KINDS)
 def test_forests_of_all_kinds_learn(name, heads, actions):
     result, (n, d) = (
@@ -771,6 +773,7 @@ def test_a_round_is_a_fifth_of_the_trees_unless_it_is_said():
     )
 
 
+@pytest.mark.long
 def test_threads_and_lanes_change_nothing():
     """Nor do they when heads learn between the rounds."""
     for other in (searched(threads=2), searched(lanes=4)):
@@ -849,6 +852,7 @@ def broken(params, x):
     return jnp.sum(params * x) * jnp.nan
 
 
+@pytest.mark.long
 def test_heads_of_any_framework_and_one_that_only_says_nan(equal):
     """What is not finite is no value: the tree goes on by Q, and the head learns nothing."""
     own = Heads(
@@ -938,6 +942,7 @@ def test_a_search_interrupted_in_a_lesson_says_so(monkeypatch, equal):
 PUBLISHED = dict(trees=4, prunes=2, simulations=30, reward=BONUS, lanes=1, threads=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("round", [1, 2])
 def test_the_published_heads(round, equal):
     """One pass over the round's own edges, one by one; the networks guide from the first tree
@@ -961,6 +966,7 @@ def test_the_published_heads(round, equal):
     )
 
 
+@pytest.mark.long
 def test_a_published_value_head_alone_is_not_trained(equal):
     result = forest(jax.random.key(5), PLANE, mode="paper", heads="value", **PUBLISHED)
     assert result.lessons == ({},) * 4
@@ -1000,6 +1006,7 @@ def test_learned_heads_find_more_failures():
     assert learned.best.reward > without.best.reward
 
 
+@pytest.mark.long
 def test_learned_heads_guide_another_search_from_its_first_tree():
     again = on_the_ferry(None, trees=20)
     warm = forest(

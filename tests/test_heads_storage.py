@@ -220,6 +220,7 @@ def test_loaded_heads_say_the_same_without_compiling(tmp_path, equal, policy, va
     equal(outputs(back, seen, x), outputs(heads, seen, x))
 
 
+@pytest.mark.long
 def test_a_search_goes_on_with_loaded_heads(tmp_path, equal):
     heads = made()
     first = searched(heads)
@@ -236,6 +237,7 @@ def test_a_search_goes_on_with_loaded_heads(tmp_path, equal):
     equal(saved(tmp_path / "h", again.heads), first.heads)
 
 
+@pytest.mark.long
 def test_what_a_search_trained_can_be_saved(tmp_path, equal):
     settings = jast.heads.settings(hidden=(4,), bins=4, steps=(2, 2), round=2)
     found = jast.search.forest(

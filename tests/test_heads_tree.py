@@ -15,7 +15,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from jax.tree_util import Partial
 from plain_tree import drawn_as_published, drawn_by_default, plain_search
-from systems import walk
+from systems import ferry_now, walk
 from trees import SYSTEMS, counts_add_up, grown, large_copies, nbytes, problem, slots_of
 
 import jast
@@ -250,7 +250,7 @@ def test_rolls_out_as_an_independent_search_at_the_first_levels_of_the_share_of_
 # --- what holds in every tree
 # ----------------------------------------------------------------------------
 
-EACH = list(itertools.product(SYSTEMS, CANDIDATES))
+EACH = ferry_now(itertools.product(SYSTEMS, CANDIDATES))
 
 
 def searching(name, candidates):
@@ -440,7 +440,8 @@ def test_children_that_wait_need_more_pages():
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ("name", "candidates", "memoize"), [(*each, "node") for each in EACH] + KEPT
+    ("name", "candidates", "memoize"),
+    ferry_now([(*each, "node") for each in itertools.product(SYSTEMS, CANDIDATES)] + KEPT),
 )
 def test_no_array_of_the_tree_is_copied_in_a_loop(name, candidates, memoize):
     p = searching(name, candidates)
@@ -467,7 +468,7 @@ def test_bytes_per_tree_are_those_of_its_arrays(name, candidates):
 
 
 @pytest.mark.parametrize(
-    ("name", "candidates"), [("ferry", "all"), ("landing", "one"), ("ring", "all")]
+    ("name", "candidates"), ferry_now([("ferry", "all"), ("landing", "one"), ("ring", "all")])
 )
 def test_edges_are_those_of_the_tree(name, candidates):
     p, (tree, *_) = searching(name, candidates), built(name, candidates)
@@ -528,7 +529,7 @@ def test_the_same_key_gives_the_same_result():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize(("name", "candidates"), [("ferry", "one"), ("landing", "all")])
+@pytest.mark.parametrize(("name", "candidates"), ferry_now([("ferry", "one"), ("landing", "all")]))
 def test_threads_change_nothing(name, candidates):
     """Groups of three, the last one filled up, in one thread or two."""
     same(once(name, candidates), searched(name, candidates, threads=2))
@@ -536,7 +537,7 @@ def test_threads_change_nothing(name, candidates):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize(("name", "candidates"), [("ferry", "one"), ("landing", "all")])
+@pytest.mark.parametrize(("name", "candidates"), ferry_now([("ferry", "one"), ("landing", "all")]))
 def test_results_are_honest_and_failures_replay_to_the_bit(name, candidates):
     (sim, choices), result = SYSTEMS[name], once(name, candidates)
     honest(result, sim, choices["reward"])
@@ -545,6 +546,7 @@ def test_results_are_honest_and_failures_replay_to_the_bit(name, candidates):
         replays(result.failures.episode(i), sim, choices["reward"])
 
 
+@pytest.mark.long
 def test_heads_guide():
     """Both heads, each of the two, and each of the two ways with candidates, come to other
     trees.
@@ -597,6 +599,7 @@ def test_a_traced_search_is_the_same_search():
     )
 
 
+@pytest.mark.long
 def test_vmap_over_simulators_is_a_loop():
     adversaries = jnp.array([[16.0, 0.0], [17.0, 0.0], [30.0, 10.0]])
     together = jax.vmap(best_of, in_axes=(0, None, None))(adversaries, KNOWN["ferry"], "one")
@@ -605,6 +608,7 @@ def test_vmap_over_simulators_is_a_loop():
     assert (together[2] != together[0]).all()
 
 
+@pytest.mark.long
 def test_vmap_over_heads_is_a_loop():
     several = [KNOWN["ferry"], known(5, 1, 21, seed=1), without(KNOWN["ferry"])]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)

@@ -283,6 +283,7 @@ def test_policy_with_a_tilted_start(key):
     )
 
 
+@pytest.mark.long
 def test_algorithm_2_verbatim_is_unreliable():
     """The best of policies with the start of the model: of 20 seeds all are flagged, and say why
     before any number.
@@ -330,6 +331,7 @@ def boxes_probability(h=2e-4):
     return sum(scipy.stats.binom.pmf(k, 2, 0.1) * tail(5.2 - k) for k in range(3))
 
 
+@pytest.mark.long
 def test_bounded_disturbances(key):
     """Tent, uniform and whole numbers in one disturbance, moved within their bounds: within 4
     standard errors of a convolution.

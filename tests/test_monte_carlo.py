@@ -46,6 +46,7 @@ def coins():
     )
 
 
+@pytest.mark.long
 def test_rate_of_a_known_system(key, equal):
     sim, n, p = jast.simulators.walk1d(), 40_000, 0.1087363323
     for choice in (actions.samples(), actions.quantiles()):

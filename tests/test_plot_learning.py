@@ -32,6 +32,7 @@ def test_the_levels_of_a_proposal_fall_to_failures():
     assert [text.get_text() for text in both.get_legend().texts] == ["a", "b"]
 
 
+@pytest.mark.long
 def test_the_training_of_a_policy():
     policy = jast.policies.sac(KEY, WALK, episodes=400, lanes=16, hidden=(8,))
     share, log_p = plot.training(policy)

@@ -104,6 +104,7 @@ def in_numpy(rng, episodes):
     return failed
 
 
+@pytest.mark.long
 def test_pendulum_truth(key):
     n, truth = 100_000, 8.169e-3
     error = np.sqrt(truth / n)

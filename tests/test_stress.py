@@ -157,6 +157,7 @@ def test_what_is_not_finite_is_nan_and_counted(key):
     assert np.isnan(outside.objective(jnp.zeros(21)))
 
 
+@pytest.mark.long
 def test_surrogate_beats_random_search_on_the_ferry(key, equal):
     """Of four seeds with 1000 evaluations each, all come closer than random search and three or
     more find a collision; that has none in two million.

@@ -14,7 +14,7 @@ from checks import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain_tree import drawn_as_published, drawn_by_default, plain_search
-from systems import S0
+from systems import S0, ferry_now
 from trees import (
     FERRY,
     LANDING,
@@ -107,7 +107,7 @@ def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", ferry_now(SYSTEMS))
 def test_counts_of_every_node_add_up(name, key):
     sim, choices = SYSTEMS[name]
     tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(4.0, 0.5), **choices)
@@ -142,13 +142,13 @@ once = functools.cache(searched)
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", ferry_now(SYSTEMS))
 def test_the_same_key_gives_the_same_result(name):
     same(once(name), searched(name))
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["ferry", "ring"])
+@pytest.mark.parametrize("name", ferry_now(["ferry", "ring"]))
 def test_threads_and_lanes_change_nothing(name):
     """Groups of three, the last one filled up, in one thread or two; and all trees in one group."""
     for other in (searched(name, threads=2), searched(name, lanes=None)):
@@ -329,7 +329,7 @@ def test_no_array_of_the_tree_is_copied_in_a_loop(memoize):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["landing", "ring"])
+@pytest.mark.parametrize("name", ferry_now(["landing", "ring"]))
 def test_nor_with_other_states(name):
     sim, choices = SYSTEMS[name]
     assert not large_copies(compiled_text(sim, 307, "node", **choices), 307)

@@ -398,6 +398,7 @@ def lookup(inputs, predicted):
     return lambda batch: np.array([at[x.tobytes()] for x in batch])
 
 
+@pytest.mark.long
 def test_failures_are_found_early(digits):
     inputs, labels, predicted = digits(0.02)
     failed = predicted != labels
@@ -538,6 +539,7 @@ def test_influence_names_the_column():
     )
 
 
+@pytest.mark.long
 def test_an_interruption_changes_nothing(brief, digits):
     inputs, labels, predicted = digits(0.02)
     system, asked = lookup(inputs, predicted), []

@@ -196,6 +196,7 @@ def test_other_sizes_in_the_same_room_compile_nothing(key):
     assert _fit._cache_size() == programs
 
 
+@pytest.mark.long
 def test_training_lowers_the_losses(key):
     inputs, _ = digits()
     rows = inputs[:600].reshape(600, -1)
@@ -404,6 +405,7 @@ def test_an_interrupted_validation_goes_on_as_if_it_was_not(key, equal, tmp_path
         equal(result.state.memory, whole.state.memory)
 
 
+@pytest.mark.long
 def test_it_learns_where_the_system_fails(key):
     inputs, labels, answers = problem()
     result = validate(

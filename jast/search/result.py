@@ -138,7 +138,7 @@ def _words(result):
         text = (
             "no failure was found; the nearest episode came to distance"
             f" {float(result.best.distance):.4f}\nto find one: more episodes; a reward in which the"
-            " miss distance outweighs log p, as reward=jast.rewards.shaped(100.0);"
+            " miss distance outweighs log p, as\n  reward=jast.rewards.shaped(100.0);"
             " jast.estimate.failure_probability, which looks for failures alone"
         )
     if result.invalid:
