@@ -36,6 +36,9 @@ that needs the optimised compiler is marked long (soft actor-critic learns NaN w
 """
 
 
+LATER = set((Path(__file__).parent / "later.txt").read_text().splitlines())
+
+
 def pytest_configure(config):
     """The short tests are compiled quickly, the long ones as a user's programs are."""
     if config.option.markexpr == "not long":
@@ -44,7 +47,12 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """What depends on the compiler runs twice: with the long ones, compiled as users have it."""
+    """The cases of later.txt are long. What depends on the compiler runs twice: with the long ones,
+    compiled as users have it.
+    """
+    for item in items:
+        if f"{item.path.name}::{item.name}" in LATER:
+            item.add_marker("long")
     if config.option.markexpr == "long":
         for item in items:
             if "equal" in item.fixturenames or item.get_closest_marker("compiled"):
