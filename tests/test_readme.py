@@ -29,7 +29,7 @@ def test_the_example_runs_and_finds_a_failure(tmp_path):
         timeout=600,
     )
     assert done.returncode == 0, done.stderr
-    shown = TEXT.split("This prints:\n```\n")[1]
+    shown = TEXT.split("This prints")[1]
     for words in ("undisturbed    no failure", "likeliest failure: reward"):
         assert words in done.stdout and words in shown
 
