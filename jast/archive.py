@@ -19,6 +19,7 @@ import numpy as np
 __all__ = [
     "arrays_of",
     "check_array",
+    "check_part",
     "check_structure",
     "describe",
     "format_of",
@@ -197,6 +198,23 @@ def check_array(path, other, name, a, like, axes=0):
             f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected"
             f" {like.dtype.name}{list(like.shape)}"
         )
+
+
+def check_part(
+    path: str | os.PathLike,
+    name: str,
+    structure: Any,
+    arrays: list[np.ndarray],
+    like: Any,
+    rows: tuple[int, ...],
+    axes: int = 1,
+) -> None:
+    """ValueError unless ``arrays``, the leaves of a part of this ``structure``, are those of the
+    simulator's value ``like``: after the first ``axes``, ``rows`` and then the shape of a value.
+    """
+    check_structure(path, "sim", name, structure, like)
+    for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
+        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)
 
 
 def _checksum(header, arrays):

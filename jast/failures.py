@@ -18,7 +18,7 @@ import numpy as np
 
 from jast import files, results
 from jast._doors import listed
-from jast.archive import arrays_of, check_array, check_structure, describe, named
+from jast.archive import arrays_of, check_part, describe, named
 from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.simulator import Simulator
@@ -245,8 +245,8 @@ def whole(
     structure = header["structure"]
     if sim is not None:
         like = outline(sim)
-        _fits(path, "x0", structure["x0"], x0, like.x0, ())
-        _fits(path, "disturbances", structure["disturbances"], x, like.x, (sim.horizon,))
+        check_part(path, "x0", structure["x0"], x0, like.x0, ())
+        check_part(path, "disturbances", structure["disturbances"], x, like.x, (sim.horizon,))
         x0, x = jax.tree.structure(like.x0).unflatten(x0), jax.tree.structure(like.x).unflatten(x)
     else:
         x0, x = (
@@ -258,16 +258,6 @@ def whole(
         for names in (SCALARS, ("counts", "tree", "simulation"))
     )
     return Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"])
-
-
-def fits(path: str | os.PathLike, sim: Simulator, x0: Any, x: Any, axes: int) -> None:
-    """ValueError unless x0 and x of episodes with so many leading axes are those of ``sim``."""
-    like = outline(sim)
-    for name, value, own, rows in (
-        ("x0", x0, like.x0, ()),
-        ("disturbances", x, like.x, (sim.horizon,)),
-    ):
-        _fits(path, name, describe(value), jax.tree.leaves(value), own, rows, axes)
 
 
 def _take(episodes, i):
@@ -344,9 +334,3 @@ def _rebuild(path, structure, leaves):
         "list": lambda: below,
         "dict": lambda: dict(zip(names, below, strict=True)),
     }[kind]()
-
-
-def _fits(path, name, structure, arrays, like, rows, axes=1):
-    check_structure(path, "sim", name, structure, like)
-    for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
-        check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)

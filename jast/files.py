@@ -10,9 +10,11 @@ import importlib
 import os
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jast import archive
+from jast.outline import outline
 from jast.records import decode, encode, place_of
 
 __all__ = ["load", "save"]
@@ -159,11 +161,15 @@ def _result(path: Any, header: dict, arrays: dict[str, np.ndarray], sim: Any, he
 def _check(path: Any, result: Any, sim: Any) -> None:
     """ValueError unless the episodes of ``result`` are of ``sim``."""
     from jast.episode import Episode
-    from jast.failures import fits
 
+    like = outline(sim)
+    parts = ("x0", like.x0, ()), ("disturbances", like.x, (sim.horizon,))
     episodes = [result, *(result if isinstance(result, tuple) else ())]
     for e in (e for e in episodes if isinstance(e, Episode)):
-        fits(path, sim, e.x0, e.disturbances, np.ndim(e.length))
+        for name, own, rows in parts:
+            value = getattr(e, name)
+            leaves, axes = jax.tree.leaves(value), np.ndim(e.length)
+            archive.check_part(path, name, archive.describe(value), leaves, own, rows, axes)
 
 
 def _module(format: str) -> Any:
