@@ -640,3 +640,13 @@ def test_samples_without_a_failure(key, proposal):
         ValueError, match="failure_samples: source gave no failure in 5000 episodes"
     ):
         failure_samples(key, landing(50.0), proposal, 500)
+
+
+@pytest.mark.parametrize("rare", [True, False])
+@pytest.mark.parametrize("values", [(1.5, 2.0), (0.5, 2.0)], ids=["wide", "narrow"])
+def test_the_shares_of_a_defended_proposal_are_those_of_a_mixture(rare, values):
+    """Its wide copies and, unless failures are rare, a share of the model, which sum to 1."""
+    g = Gaussians(np.ones(1), np.zeros((1, 2)), np.array([values]), np.eye(2)[None])
+    parts = seek._defended(g, 0.0, rare)
+    assert np.isclose(sum(share for share, _ in parts), 1.0)
+    assert len(parts) == 1 + (min(values) < 1) + (not rare)
