@@ -152,9 +152,8 @@ def _run(options):
         with contextlib.suppress(KeyboardInterrupt):
             results["monte-carlo"] = monte_carlo(keys[2], sim, episodes=found.episodes, **common)
         stopped = "monte-carlo" not in results or "interrupted" in results["monte-carlo"].settings
-    print(
-        f"{table(results)}\n{_shares(results)}{_drawn_from(chosen)}\n\n{_episode(found.best)}\n\n{found.failures}\n"
-    )
+    print(f"{table(results)}\n{_shares(results)}{_drawn_from(chosen)}\n")
+    print(f"{_episode(found.best)}\n\n{found.failures}\n")
 
     archive = options.output / "failures.npz"
     failures.save(archive, found.failures, found.settings | dict(simulator=options.simulator))
