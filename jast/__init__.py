@@ -39,21 +39,6 @@ __all__ = [
 ]
 
 # a room is loaded when it is first entered: importing jast costs little more than importing jax
-_ROOMS = (
-    "actions",
-    "blackbox",
-    "cross_entropy",
-    "distributions",
-    "estimate",
-    "failures",
-    "heads",
-    "incidents",
-    "plot",
-    "policies",
-    "rewards",
-    "search",
-    "simulators",
-    "weakness",
-)
+_ROOMS = [name for name in __all__ if name not in globals()]
 __getattr__ = door(__name__, lazy={room: f"jast.{room}" for room in _ROOMS})
 __dir__ = listed(__all__)
