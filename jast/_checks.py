@@ -11,8 +11,6 @@ import numpy as np
 
 from jast._jax import is_traced
 
-__all__ = ["number", "random_key", "real", "whole"]
-
 
 def random_key(function: str, key: Any) -> None:
     """ValueError unless ``key`` is one key of `jax.random`."""

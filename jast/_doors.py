@@ -10,8 +10,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-__all__ = ["door", "listed"]
-
 
 def door(
     package: str,

@@ -7,8 +7,6 @@ import contextlib
 
 import jax
 
-__all__ = ["apart", "handed_on"]
-
 
 def handed_on():
     """A context manager's maker: in another thread it sets what ``with`` statements have set in

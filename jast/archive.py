@@ -16,17 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = [
-    "arrays_of",
-    "check_array",
-    "check_part",
-    "check_structure",
-    "describe",
-    "format_of",
-    "named",
-    "read",
-    "write",
-]
+__all__ = ["write"]
 
 
 def write(path, format, version, header, arrays):

@@ -18,7 +18,7 @@ from jast.incidents import incidents, since, sources
 from jast.outline import outline
 from jast.simulator import Simulator
 
-__all__ = ["OBSERVED", "check", "contract"]
+__all__ = ["check", "contract"]
 
 OBSERVED = 64
 """The most numbers that ``observe`` may return."""

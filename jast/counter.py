@@ -14,7 +14,7 @@ from jax import lax
 
 from jast._jax import define_prng_impl
 
-__all__ = ["COUNTER", "coin", "generator", "tree_keys"]
+__all__ = ["COUNTER", "generator", "tree_keys"]
 
 
 def _mix(h):

@@ -26,7 +26,7 @@ from jast.policy import undisturbed
 from jast.progress import advance, begin, conclude
 from jast.watch import Watch, in_pieces
 
-__all__ = ["Nominal", "nominal"]
+__all__ = ["nominal"]
 
 LANES = 1024
 PIECE = 0.2

@@ -4,7 +4,7 @@ import math
 
 from jast._checks import real
 
-__all__ = ["checked_level", "chernoff", "clopper_pearson", "jeffreys", "log_normal"]
+__all__ = ["chernoff", "clopper_pearson", "jeffreys", "log_normal"]
 
 
 def clopper_pearson(k, n, level=0.95):

@@ -14,7 +14,7 @@ from jast import distributions as D
 from jast.pytrees import strong
 from jast.simulator import Simulator
 
-__all__ = ["Offer", "Outline", "ask", "outline"]
+__all__ = ["Offer", "ask", "outline"]
 
 _static = dict(metadata=dict(static=True))
 

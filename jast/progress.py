@@ -14,7 +14,7 @@ from jast.outline import outline
 from jast.pytrees import strong
 from jast.simulator import Simulator
 
-__all__ = ["Progress", "advance", "begin", "blank", "conclude"]
+__all__ = ["Progress", "begin"]
 
 
 class Progress(NamedTuple):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-__all__ = ["clear", "count", "fitted", "padded", "select", "strong"]
+__all__ = ["count"]
 
 
 def strong(tree: Any) -> Any:

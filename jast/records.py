@@ -14,8 +14,6 @@ import numpy as np
 
 from jast._jax import is_traced
 
-__all__ = ["decode", "encode"]
-
 RECORDS = {
     "Episode": "jast.episode:Episode",
     "Incident": "jast.incidents:Incident",

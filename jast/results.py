@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 
 from jast._jax import is_traced
 
-__all__ = ["VOCABULARY", "alias", "asked", "batch_shape", "former", "html_table", "result", "shown"]
+__all__ = ["VOCABULARY", "html_table"]
 
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",

@@ -11,7 +11,7 @@ from jax.tree_util import Partial
 from jast import results
 from jast.distributions import Fixed
 
-__all__ = ["Simulator", "fixed", "never", "ravel"]
+__all__ = ["Simulator"]
 
 
 def fixed():

@@ -12,7 +12,7 @@ import numpy as np
 from jast.blackbox.worker import fill
 from jast.incidents import Log
 
-__all__ = ["Calls", "Host"]
+__all__ = ["Calls"]
 
 REMEMBERED = 1 << 16
 """Outcomes that are kept to be compared with, of failures and of the others each."""

@@ -12,8 +12,6 @@ from jast import distributions as D
 from jast.blackbox.host import Host
 from jast.simulator import Simulator
 
-__all__ = ["compare"]
-
 EPISODES = 16
 """Half of them drawn from the model, half from its tails, where failures are."""
 TAIL = 0.02

@@ -14,7 +14,7 @@ import numpy as np
 
 from jast.blackbox import environment, programs, worker
 
-__all__ = ["Pool", "packed"]
+__all__ = ["Pool"]
 
 GRACE = 1.0
 """Seconds that a worker has beyond the time limits of its rows before it is killed."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from jast.blackbox.worker import WrongAnswer
 
-__all__ = ["Program", "program"]
+__all__ = ["program"]
 
 
 class Program(NamedTuple):

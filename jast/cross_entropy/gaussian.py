@@ -14,19 +14,7 @@ from jax.scipy.linalg import solve_triangular
 from jast import results
 from jast._jax import is_traced
 
-__all__ = [
-    "Gaussian",
-    "as_gaussian",
-    "check_covariance",
-    "fit",
-    "float_of",
-    "is_definite",
-    "log_prob",
-    "moments",
-    "normal",
-    "numbers",
-    "sample",
-]
+__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "normal", "sample"]
 
 
 @results.shown()

@@ -15,17 +15,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.tree_util import register_dataclass
 
-__all__ = [
-    "JITTER",
-    "KERNELS",
-    "LENGTHSCALES",
-    "NOISES",
-    "GaussianProcess",
-    "fit",
-    "log_likelihood",
-    "predict",
-    "squared_distances",
-]
+__all__ = ["JITTER", "KERNELS", "LENGTHSCALES", "fit", "predict"]
 
 LENGTHSCALES = tuple(10 ** (-1.7 + 2.1 * i / 11) for i in range(12))
 """The grid, as multiples of a scale: 0.02 to 2.5."""

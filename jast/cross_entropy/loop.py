@@ -18,7 +18,7 @@ from jast.cross_entropy import refit
 from jast.cross_entropy.refit import Points
 from jast.cross_entropy.result import CEResult, History
 
-__all__ = ["Plan", "Settings", "State", "ask", "begin", "finish", "run", "tell"]
+__all__ = ["begin", "run"]
 
 
 class Plan(NamedTuple):

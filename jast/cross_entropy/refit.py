@@ -13,7 +13,7 @@ from jast.cross_entropy import gaussian, mixture, surrogates
 from jast.cross_entropy.gaussian import Gaussian
 from jast.cross_entropy.mixture import Mixture
 
-__all__ = ["Points", "draw", "moments", "search_around", "to_elites", "to_model"]
+__all__ = ["draw", "moments", "search_around"]
 
 
 class Points(NamedTuple):

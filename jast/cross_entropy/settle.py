@@ -16,7 +16,7 @@ from jast.cross_entropy.schedules import counts
 from jast.cross_entropy.surrogates import SURROGATES, WARPS
 from jast.rewards import as_pytree
 
-__all__ = ["MODES", "checked", "settled"]
+__all__ = ["MODES", "settled"]
 
 _MODEL = dict(surrogate="gaussian process", kernel="squared exponential", alpha=1.0)
 _THESIS = dict(

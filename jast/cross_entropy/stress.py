@@ -23,7 +23,7 @@ from jast.outline import outline
 from jast.rewards import as_pytree
 from jast.simulator import Simulator
 
-__all__ = ["LogLikelihood", "Stress", "over"]
+__all__ = ["Stress", "over"]
 
 
 @jax.tree_util.register_dataclass

@@ -14,7 +14,7 @@ from jax.scipy.special import ndtri
 
 from jast.cross_entropy import gaussian_process
 
-__all__ = ["SURROGATES", "WARPS", "Surrogate", "frame", "fit", "lower_bound", "predict", "warped"]
+__all__ = ["SURROGATES", "WARPS", "frame", "fit", "predict", "warped"]
 
 
 class Frame(NamedTuple):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["Distribution", "float_array", "is_distribution", "tree_map"]
+__all__ = ["Distribution", "is_distribution"]
 
 
 class _Kind(type):

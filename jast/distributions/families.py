@@ -15,8 +15,6 @@ from jast.distributions.numerics import inside, standard
 from jast.distributions.table import register
 from jast.distributions.tilted import tilted
 
-__all__ = ["both"]
-
 
 def both(kind: type, **functions: Callable[..., Any]) -> None:
     """One row for jast's class ``kind`` and for distrax's of the same name."""

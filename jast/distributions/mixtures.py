@@ -10,7 +10,7 @@ from jast.distributions.numbers import unflat
 from jast.distributions.tilted import tilted
 from jast.distributions.verbs import event_like, from_normal, mode, sample
 
-__all__ = ["Blend", "Blended", "Moved", "blend", "x_of"]
+__all__ = ["Blended", "Moved", "blend", "x_of"]
 
 COIN = 0x5EED
 

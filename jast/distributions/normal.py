@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, float_array
 
-__all__ = ["LocationScale", "MultivariateNormalDiag", "MultivariateNormalTri", "Normal"]
+__all__ = ["MultivariateNormalDiag", "MultivariateNormalTri", "Normal"]
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 

@@ -7,19 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, ndtr, ndtri
 
-__all__ = [
-    "cell",
-    "cells",
-    "float_dtype",
-    "fraction",
-    "inside",
-    "log_one_less",
-    "log_tails",
-    "normal_of_log_tails",
-    "normal_score",
-    "phi",
-    "standard",
-]
+__all__ = ["float_dtype", "fraction", "log_tails", "normal_of_log_tails", "normal_score", "phi"]
 
 
 def float_dtype(dtype: Any) -> Any:

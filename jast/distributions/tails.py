@@ -12,8 +12,6 @@ from jast.distributions.numerics import inside, log_tails, normal_of_log_tails
 from jast.distributions.table import row
 from jast.distributions.verbs import to_normal
 
-__all__ = ["of_log_tails", "tails"]
-
 
 def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
     """The functions of a row.

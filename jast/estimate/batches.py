@@ -11,7 +11,7 @@ from jax.scipy.special import logsumexp
 
 from jast.estimate import limit_state as latent
 
-__all__ = ["Batch", "balanced", "drawn", "log_ratio", "numbers", "over_batches"]
+__all__ = ["numbers"]
 
 
 class Batch(NamedTuple):

@@ -17,7 +17,7 @@ from jast.episode import rollout
 from jast.estimate.limit_state import dimension, normal_numbers, outcome, policy_of
 from jast.rewards import log_likelihood
 
-__all__ = ["DesignPoints", "design_points", "distinct"]
+__all__ = ["design_points", "distinct"]
 
 STEPS, HALVINGS = 12, 5
 APART = 0.5

@@ -4,7 +4,7 @@ greatest weights, and the rules made of them.
 
 import numpy as np
 
-__all__ = ["by_mode", "pareto_k", "reasons", "thin_modes"]
+__all__ = ["pareto_k", "reasons"]
 
 K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 

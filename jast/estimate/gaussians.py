@@ -13,7 +13,7 @@ import numpy as np
 
 from jast.estimate.limit_state import Latent
 
-__all__ = ["Gaussians", "as_latent", "effective", "fit", "shrunk", "together", "unit"]
+__all__ = ["Gaussians", "as_latent", "fit", "shrunk", "together", "unit"]
 
 COMPONENTS = (1, 2, 4, 8, 16)
 ITERATIONS = 10

@@ -11,8 +11,6 @@ from jast.estimate.batches import balanced, log_ratio
 from jast.estimate.gaussians import as_latent, unit
 from jast.estimate.populations import LAST, QUANTILE, Chain, explore
 
-__all__ = ["guarded"]
-
 LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches
 see there.

@@ -31,7 +31,7 @@ from jast.results import asked
 from jast.rewards import log_likelihood
 from jast.watch import Watch, in_pieces
 
-__all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played", "traces"]
+__all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played"]
 
 LANES = 16384
 PROBES = 256

@@ -26,20 +26,7 @@ from jast.pytrees import count
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = [
-    "Latent",
-    "Outcomes",
-    "check",
-    "dimension",
-    "episodes",
-    "flat",
-    "log_ratios",
-    "normal_numbers",
-    "outcome",
-    "outcomes",
-    "place",
-    "policy_of",
-]
+__all__ = ["log_ratios", "outcomes", "place"]
 
 
 class Outcomes(NamedTuple):

@@ -18,7 +18,7 @@ from jax.scipy.special import logsumexp
 from jast.counter import generator
 from jast.estimate.limit_state import dimension, log_ratios, normal_numbers, outcomes
 
-__all__ = ["Chain", "Explored", "Population", "cool", "explore"]
+__all__ = ["cool", "explore"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 WIDTHS, FAILING, COLD, COOLING, DRAWS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60, 4

@@ -25,7 +25,7 @@ from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.pytrees import fitted
 
-__all__ = ["Proposal", "as_proposal", "latents", "policy_proposal", "trace_proposal"]
+__all__ = ["Proposal", "policy_proposal", "trace_proposal"]
 
 MIXING = ("step", "trace")
 

@@ -21,8 +21,6 @@ from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore
 from jast.incidents import hosted
 
-__all__ = ["Seeker", "seek"]
-
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
 no weight is without variance; where failures are not rare the model itself.

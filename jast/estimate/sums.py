@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Sums", "add", "nothing"]
+__all__ = ["add", "nothing"]
 
 
 class Sums(NamedTuple):

@@ -15,7 +15,7 @@ from jast.outline import outline
 from jast.policy import Policy
 from jast.simulator import Simulator
 
-__all__ = ["Histogram", "as_policy"]
+__all__ = ["as_policy"]
 
 
 class Histogram(D.Distribution):

@@ -20,7 +20,7 @@ from jast.outline import ask, outline
 from jast.pytrees import count
 from jast.simulator import Simulator
 
-__all__ = ["School", "enrol", "teach"]
+__all__ = ["enrol"]
 
 
 class School(NamedTuple):

@@ -12,7 +12,7 @@ from jast.distributions.numbers import flat
 from jast.episode import play_back
 from jast.heads.heads import observed
 
-__all__ = ["Samples", "joined", "of_edges", "of_episodes", "of_roots"]
+__all__ = ["Samples", "of_edges", "of_episodes", "of_roots"]
 
 
 class Samples(NamedTuple):

@@ -12,7 +12,7 @@ from jax import lax
 
 from jast.heads.samples import Samples
 
-__all__ = ["Learner", "Lesson", "learn", "learner"]
+__all__ = ["Lesson", "learn", "learner"]
 
 
 class Learner(NamedTuple):

@@ -14,31 +14,7 @@ import numpy as np
 from jast.episode import Episode
 from jast.simulator import Simulator
 
-__all__ = [
-    "BLUE",
-    "COLOURS",
-    "GREEN",
-    "GREY",
-    "INK",
-    "MARKERS",
-    "ORANGE",
-    "PURPLE",
-    "SKY",
-    "STYLE",
-    "VERMILION",
-    "WRITERS",
-    "axes",
-    "frugal",
-    "halo",
-    "headline",
-    "iteration",
-    "one",
-    "panels",
-    "result_first",
-    "shade",
-    "styled",
-    "writable",
-]
+__all__ = ["BLUE", "COLOURS", "GREY", "INK", "STYLE", "VERMILION", "axes", "result_first", "styled"]
 
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
     "#0072B2",

@@ -6,7 +6,7 @@ from jast.plot import style
 from jast.weakness import measures
 from jast.weakness.result import Result
 
-__all__ = ["checked_result", "failures_found", "roc"]
+__all__ = ["failures_found", "roc"]
 
 LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 

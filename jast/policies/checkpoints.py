@@ -8,8 +8,6 @@ import numpy as np
 
 from jast.archive import arrays_of, check_array, check_structure, describe, named, read, write
 
-__all__ = ["keep", "resume"]
-
 FORMAT, VERSION, KIND = "jast sac checkpoint", 2, "a checkpoint of jast.policies.sac"
 
 

@@ -17,7 +17,7 @@ from jast.policies.lanes import potential
 from jast.policies.learner import act, see
 from jast.policy import Policy
 
-__all__ = ["FAILING_SHARE", "FailurePolicy", "History", "Learned", "assemble", "history", "row"]
+__all__ = ["FailurePolicy", "History"]
 
 
 @results.shown()

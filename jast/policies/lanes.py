@@ -15,7 +15,7 @@ from jast.pytrees import select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = ["Lane", "Rows", "at", "begin", "empty", "potential", "put", "step"]
+__all__ = ["at", "empty", "put", "step"]
 
 
 class Lane(NamedTuple):

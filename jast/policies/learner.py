@@ -18,19 +18,7 @@ from jax.scipy.special import ndtr
 from jast.heads.networks import dense
 from jast.policies.latent import LOG_2PI, log_normal
 
-__all__ = [
-    "Learner",
-    "Net",
-    "Rates",
-    "act",
-    "draw",
-    "entropy_term",
-    "learner",
-    "networks",
-    "see",
-    "soft_value",
-    "update",
-]
+__all__ = ["entropy_term", "learner", "networks"]
 
 
 EVEN = 0.2

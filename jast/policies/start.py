@@ -10,7 +10,7 @@ from jax import lax
 
 from jast.policies.latent import log_normal
 
-__all__ = ["Tilt", "fit", "log_density", "nominal"]
+__all__ = ["Tilt", "fit", "log_density"]
 
 
 class Tilt(NamedTuple):

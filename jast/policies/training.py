@@ -16,7 +16,7 @@ from jast.policies import start as starts
 from jast.policies.learner import Learner, Net, act, draw, learner, see, soft_value, update
 from jast.pytrees import select
 
-__all__ = ["Count", "Phase", "Shape", "Training", "first", "settle", "stretch", "tilt"]
+__all__ = ["stretch"]
 
 VALUE_DRAWS = 16
 

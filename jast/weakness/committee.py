@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["Committee", "folds", "fit", "gradient", "held_out"]
+__all__ = ["folds", "fit", "gradient", "held_out"]
 
 HIDDEN, BATCH, ROWS, RATE = 32, 256, 1024, 3e-3
 STEPS = (300, 1500)  # least and most

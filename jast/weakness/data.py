@@ -13,7 +13,7 @@ import numpy as np
 
 from jast._checks import whole
 
-__all__ = ["Data", "arrays", "digits", "fingerprint", "from_idx", "idx", "within"]
+__all__ = ["Data", "arrays", "digits", "from_idx", "idx"]
 
 # of IDX files, which are big-endian
 TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}

@@ -13,15 +13,7 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-__all__ = [
-    "Network",
-    "adversary",
-    "autoencoder",
-    "fit_adversary",
-    "fit_autoencoder",
-    "logits",
-    "sizes",
-]
+__all__ = ["adversary", "autoencoder", "fit_adversary", "fit_autoencoder", "logits", "sizes"]
 
 ADVERSARY = (128, 64)
 LEAK = 0.01  # of the autoencoder's leaky ReLU; Flux's default, which the published code takes

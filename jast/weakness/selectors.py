@@ -8,7 +8,7 @@ from jast.weakness.contract import Selector, Step
 from jast.weakness.default import default
 from jast.weakness.thesis import thesis
 
-__all__ = ["NAMES", "default", "random", "thesis"]
+__all__ = ["default", "random", "thesis"]
 
 
 def random(*, batch=None):

@@ -5,8 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 __all__ = [
-    "Views",
-    "centred",
     "components",
     "difficulty_of_neighbours",
     "reduce",

@@ -14,18 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = [
-    "DESIRED",
-    "FIRST",
-    "SPEEDS",
-    "STILL",
-    "ZONES",
-    "Zone",
-    "costs",
-    "inside",
-    "plan",
-    "speed_of",
-]
+__all__ = ["DESIRED", "FIRST", "SPEEDS", "ZONES", "costs", "inside", "plan"]
 
 
 class Zone(NamedTuple):

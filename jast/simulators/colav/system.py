@@ -27,7 +27,7 @@ from jast.simulators.colav.vessels import (
     world_velocity,
 )
 
-__all__ = ["COLLISION", "ColavState", "colav"]
+__all__ = ["ColavState", "colav"]
 
 KINDS = ("delay", "steering", "noise")
 COLLISION = 1.0  # m between the centres: published

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from jast.simulators.fms.geodesic import Earth, direct, inverse, wrap
 
-__all__ = ["GRAVITY", "KNOT", "NMI", "Build", "Path", "lateral"]
+__all__ = ["Path"]
 
 NMI = 1852.0  # m
 KNOT = NMI / 3600  # m/s
