@@ -118,7 +118,7 @@ def policies(seeds):
         clocks.append((time.perf_counter() - wall, time.process_time() - cpu))
         samples = jast.estimate.failure_samples(
             jax.random.key(200 + seed), sim, policy_proposal(sim, policy), 500, moves=0
-        ).episodes
+        ).failures
         upper = float(np.mean(samples.x0 + samples.disturbances.sum(axis=1) > 0))
         runs.append((r, LANDING, upper))
     good = sum(

@@ -37,6 +37,8 @@ RECORDS = {
     "ValidationHistory": "jast.weakness.result:History",
 }
 """Records by their names in files, which stay when a class moves."""
+FORMER = {"FailureSamples": {"episodes": "failures"}}
+"""Record -> fields by their names in files of an earlier version -> their names now."""
 NAMES = {place: name for name, place in RECORDS.items()}
 
 Special = Callable[[Any], Any]
@@ -102,7 +104,8 @@ def decode(node: Any, path: str, arrays: dict[str, np.ndarray], special: Special
         return {k: below(v) for k, v in about.items()}
     if kind == "record":
         name, fields = about
-        return _record(path, name)(**{k: below(v) for k, v in fields.items()})
+        now = FORMER.get(name, {})
+        return _record(path, name)(**{now.get(k, k): below(v) for k, v in fields.items()})
     if kind == "class":
         name, names, children = about
         return _own(path, sim, name, names).unflatten(map(below, children))

@@ -24,7 +24,7 @@ __all__ = ["VOCABULARY", "html_table"]
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",
     "steps": "calls of the simulator's step",
-    "failures": "the failures themselves: an archive, or their numbers in a data set",
+    "failures": "the failures themselves: an archive, a batch, or their numbers in a data set",
     "failing": "how many of the episodes failed",
     "invalid": "how many episodes gave a number that is not finite; they count as not failing",
     "incidents": "what went wrong on the host of a black box, or ended the work early",

@@ -593,7 +593,7 @@ def test_samples_of_landing(key, proposal, moves):
     one of them replays to a failure.
     """
     found = failure_samples(key, LANDING, proposal, 500, moves=moves)
-    e = found.episodes
+    e = found.failures
     n = len(e.length)
     assert (
         480 < n <= 500
@@ -624,7 +624,7 @@ def test_samples_of_an_estimate(key, two):
     """Both modes by their shares; on the failing side of the planes; nearest ones likeliest."""
     sim, truth, estimate = two
     found = failure_samples(key, sim, estimate, 500)
-    along = found.episodes.disturbances.sum(axis=1) / 2
+    along = found.failures.disturbances.sum(axis=1) / 2
     assert ((along > 4) | (along < -4.5)).all() and abs(
         (along < 0).mean() - norm.sf(4.5) / truth
     ) < 4 * np.sqrt(0.1 / min(found.ess, 500))

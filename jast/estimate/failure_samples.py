@@ -30,8 +30,8 @@ PER_SAMPLE = 10
 class FailureSamples(NamedTuple):
     """Failures drawn from p(x | failure)."""
 
-    episodes: Episode
-    """Leading axis [n]; without states (`jast.replay` gives them)"""
+    failures: Episode
+    """A batch, leading axis [n]; without states (`jast.replay` gives them)"""
     ess: float
     """Effective number of the weighted failures that they were resampled from"""
     distinct: int
@@ -39,9 +39,12 @@ class FailureSamples(NamedTuple):
     accepted: float
     """Share of the last Markov moves that was accepted"""
     evaluations: int
+    """Episodes simulated in all"""
+
+    episodes = results.former("episodes", "failures")
 
     def __str__(self):
-        n, e = len(self.episodes.length), self.episodes
+        n, e = len(self.failures.length), self.failures
         steps = (
             f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to"
             f" {np.max(e.log_prob):.4g}"

@@ -121,8 +121,8 @@ def failure_fan(
             1.
     """
     caller = "failure_fan"
-    samples = samples.failures if isinstance(samples, SearchResult) else samples
-    samples = samples.episodes if isinstance(samples, FailureSamples | Failures) else samples
+    samples = samples.failures if isinstance(samples, SearchResult | FailureSamples) else samples
+    samples = samples.episodes if isinstance(samples, Failures) else samples
     lines = _lines(caller, "samples", sim, samples, value, most)
     behind = [] if nominal is None else _lines(caller, "nominal", sim, nominal, value, most)
     with style.axes(ax, (6.8, 3.8)) as ax:
