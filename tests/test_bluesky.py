@@ -11,7 +11,7 @@ import pytest
 import jast
 from jast import blackbox
 from jast.incidents import incidents
-from jast.simulators.bluesky import Route, bluesky, bluesky_flight, nearest
+from jast.simulators.bluesky import Route, bluesky, bluesky_flight, judged, nearest
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,32 @@ def test_a_flight_is_the_same_after_others_and_prints_nothing(installed, capfd):
 def test_the_nearest_point_lies_on_a_segment():
     track = np.array([[0.0, 0.0], [0.0, 4.0], [0.0, 4.0]])
     np.testing.assert_allclose(nearest(np.array([[1.0, 2.0], [3.0, 8.0]]), track), [1.0, 5.0])
+
+
+R = 1.953093
+"""nmi: the radius of a turn at 250 kt and 25 degrees of bank, v^2 / (g tan(bank))."""
+
+
+@pytest.mark.parametrize(
+    "courses, lengths, turns, allowed",
+    [
+        # right, then left by 90 degrees: corners are cut by R (sqrt(2) - 1), the end by nothing
+        ([0, 90, 0], [6, 6, 6], [90, -90], [0.414214 * R, 0.414214 * R]),
+        # the turns lead by R each: of the leg between them 2 R - 3 is missing, at both its ends
+        ([0, 90, 0], [6, 3, 6], [90, -90], [1.414214 * R + R - 3] * 2),
+        # from north west to north east by the north; then one counted as of 120 degrees
+        ([-45, 45, 195], [9, 9, 9], [90, 150], [0.414214 * R, R]),
+    ],
+)
+def test_what_is_asked_of_a_flight_depends_on_its_turns(courses, lengths, turns, allowed):
+    """By hand: how much a fly-by turn cuts its corner, and what does not fit on a leg."""
+    course = np.radians(courses)
+    legs = np.array(lengths)[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
+    route = np.concatenate([np.zeros((1, 2)), np.cumsum(legs, axis=0)])
+    flight = judged(route, route, 250.0, True)
+    np.testing.assert_allclose(flight.turns, [*turns, 0], atol=1e-9)
+    np.testing.assert_allclose(flight.allowed, [*allowed, 0], rtol=1e-4)
+    np.testing.assert_allclose(flight.nearest, 0, atol=1e-9)  # it flew over all of them
 
 
 def test_bad_input_and_a_missing_extra_are_named(monkeypatch):

@@ -276,6 +276,30 @@ def test_shares_beyond_the_whole_are_in_words():
     assert said == ["3% of", "30% of", "1 times", "14 times", "far more than"]
 
 
+def test_the_guard_looks_for_failures_away_from_the_known_modes(key, monkeypatch):
+    """Its first population may go a part of the way to a known mode: to where the log density ratio
+    of a unit Gaussian there is .3 of its log probability; with |mean|^2 / 2 for that, to .65.
+    """
+
+    class Seen(Exception):
+        pass
+
+    def explore(key, sim, size, covered, least, most):
+        raise Seen(covered)
+
+    monkeypatch.setattr(guard, "explore", explore)
+    s = seek.Seeker(key, planes(4.0), BUDGET)
+    mean = np.full(4, 2.0)
+    s.add(unit(mean[None]))
+    s.log_mean = -mean @ mean / 2
+    with pytest.raises(Seen) as seen:
+        guard.guarded(s, 0, 1)
+    q, threshold = seen.value.args[0]
+    way = jnp.asarray(np.array([0.0, 0.6, 0.7, 1.0])[:, None] * mean, s.dtype)
+    ratios = logsumexp(L.log_ratios(q, way, jnp.full(4, 4)) + q.log_weights[None], axis=1)
+    assert (ratios > threshold).tolist() == [False, False, True, True]
+
+
 def test_subset_simulation(key):
     """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30
     %; each population is counted.

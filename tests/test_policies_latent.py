@@ -15,7 +15,7 @@ from jast.distributions.mixtures import Blended, Moved, x_of
 from jast.policies import lanes as L
 from jast.policies.latent import log_normal, sizes
 from jast.policies.learner import entropy_term, learner, networks
-from jast.policies.start import Tilt, fit, log_density
+from jast.policies.start import Tilt, _first, fit, log_density
 
 DISTRIBUTIONS = dict(
     normal=lambda: D.Normal(jnp.float32(1.0), jnp.float32(2.0)),
@@ -205,6 +205,16 @@ def test_the_fit_of_a_start_finds_unequal_modes(key):
     assert abs(w[right].sum() - 0.8) < 0.06
     np.testing.assert_allclose((w[right] @ m[right]) / w[right].sum(), [4, 0], atol=0.15)
     np.testing.assert_allclose((w[~right] @ m[~right]) / w[~right].sum(), [-5, 1], atol=0.3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_first_components_are_far_apart_in_deviations(seed):
+    """A few points are 4 deviations off in a narrow direction, the others 2 apart in a wide one:
+    those few are among the first two components.
+    """
+    z = jnp.array([[-5.0, 0.0]] * 15 + [[5.0, 0.0]] * 15 + [[0.0, 2.0]] * 2, jnp.float32)
+    tilt = _first(jax.random.key(seed), z, jnp.ones(32, jnp.float32), 2)
+    assert sorted(tilt.means[:, 1].tolist()) == [0, 2]
 
 
 @pytest.mark.parametrize("value", [-jnp.inf, jnp.nan])
