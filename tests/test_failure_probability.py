@@ -26,7 +26,7 @@ from jast.estimate import (
 )
 from jast.estimate import limit_state as L
 from jast.estimate.adaptive import LEAST
-from jast.estimate.batches import numbers
+from jast.estimate.batches import Batch, drawn, numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, fit, shrunk, together, unit
 from jast.estimate.populations import cool, explore
@@ -298,6 +298,43 @@ def test_the_guard_looks_for_failures_away_from_the_known_modes(key, monkeypatch
     way = jnp.asarray(np.array([0.0, 0.6, 0.7, 1.0])[:, None] * mean, s.dtype)
     ratios = logsumexp(L.log_ratios(q, way, jnp.full(4, 4)) + q.log_weights[None], axis=1)
     assert (ratios > threshold).tolist() == [False, False, True, True]
+
+
+def at_the_guard(key, sim, *shares):
+    """A `Seeker` with a batch of a proposal: unit Gaussians at the nearest failures of `planes` up
+    and down, by these shares.
+    """
+    s = seek.Seeker(key, sim, BUDGET)
+    s.q = as_latent([(w, unit(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))], s.dtype)
+    z, o, log_w, _ = jax.device_get(drawn(sim, s.q, *numbers(key, 20_000, 4, s.dtype)))
+    s.batches = [Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))]
+    w = np.exp(s.batches[0].log_weight[o.failure])
+    s.log_mean = float(np.log(w.sum() / 20_000))
+    return s
+
+
+def test_the_guard_takes_a_lost_mode_into_the_proposal(key):
+    """In its last round, after which nothing can be mended, it is a reason against the estimate."""
+    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
+    down = np.full((1, 4), -2.0), np.array([4], np.int32)
+    assert guard._bare(s, *down).all()
+    assert not guard.guarded(s, 1, 2) and not s.reasons
+    assert not guard._bare(s, *down).any()
+    # it is as likely as what is known: each of two populations gives it half of the proposal
+    of_down = np.asarray(s.q.means).sum(axis=1) < 0
+    assert 0.5 < np.exp(np.asarray(s.q.log_weights, float))[of_down].sum() < 0.9
+    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
+    assert guard.guarded(s, 2, 2)
+    assert len(s.reasons) == 1 and "failures that the proposal hardly draws" in s.reasons[0]
+
+
+@pytest.mark.parametrize("down, shares", [(FAR, (1.0,)), (4.0, (0.5, 0.5)), (4.0, (0.995, 0.005))])
+def test_the_guard_is_content_where_nothing_was_lost(down, shares, key):
+    """One mode; two; and a second one that the proposal draws seldom, but often enough for its
+    batch to know what is there.
+    """
+    s = at_the_guard(key, planes(4.0, down), *shares)
+    assert guard.guarded(s, 1, 2) and not s.reasons
 
 
 def test_subset_simulation(key):

@@ -12,9 +12,10 @@ from systems import ring, walk
 import jast
 from jast import distributions as D
 from jast.distributions.mixtures import Blended, Moved, x_of
+from jast.heads.heads import Moments
 from jast.policies import lanes as L
 from jast.policies.latent import log_normal, sizes
-from jast.policies.learner import entropy_term, learner, networks
+from jast.policies.learner import Net, Rates, entropy_term, learner, networks, update
 from jast.policies.start import Tilt, _first, fit, log_density
 
 DISTRIBUTIONS = dict(
@@ -254,3 +255,34 @@ def test_networks_start_as_those_of_heads(key):
     assert jax.tree.structure(new.actor) == jax.tree.structure(
         jax.eval_shape(networks(2, 1, (64, 32), 2)[0][0], key, jnp.zeros(4, jnp.float32))
     )
+
+
+@pytest.mark.long  # the quick compiler makes NaN of the actor's gradient
+@pytest.mark.parametrize("acting", [0.0, 1.0])
+def test_an_update_moves_all_by_the_learning_rate(acting, key):
+    """Adam's first step is the rate in the sign of each gradient: the critics take it, and where
+    they do not learn alone the actor and the temperature too, which rises while more entropy is
+    wanted; averages follow by ``polyak`` of it.
+    """
+    rates = Rates(*(jnp.float32(v) for v in (0.01, 0.25, 1.0, 10.0, 0.0, 1.0)))
+    applies = tuple(apply for _, apply in networks(2, 1, (8,), 2))
+    old = learner(key, 2, 1, (8,), 2, rates.alpha)
+    net = Net(Moments(*(jnp.asarray(a) for a in Moments.empty(2))), jnp.float32(1.0))
+    columns = jax.random.normal(key, (8, 4), jnp.float32)
+    no = jnp.zeros(4, bool)
+    rows = L.Rows(
+        columns[:2].T, jnp.zeros(4), columns[2], columns[3:4].T, columns[4], no, no, columns[5:7].T
+    )
+    noise = jnp.broadcast_to(columns[7][:, None], (2, 4, 1))
+    one = jnp.float32(1.0)
+    step = jax.jit(update, static_argnums=(2, 8))
+    new, loss = step(noise, old, applies, net, rates, jnp.float32(acting), one, rows, 5)
+    assert loss > 0
+    moved = jax.tree.map(lambda a, b: a - b, new, old)
+    most = lambda tree: max(float(jnp.abs(a).max()) for a in jax.tree.leaves(tree))
+    rate = dict(rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(most(moved.critic), 0.01, **rate)
+    np.testing.assert_allclose(most(moved.target), 0.25 * 0.01, **rate)
+    np.testing.assert_allclose(most(moved.actor), acting * 0.01, **rate)
+    np.testing.assert_allclose(most(moved.average), acting * 0.25 * 0.01, **rate)
+    np.testing.assert_allclose(moved.log_alpha, acting * 0.01, **rate)
