@@ -146,11 +146,12 @@ def test_a_batched_and_a_traced_result_print_and_say_so():
         return found
 
     batch = jax.jit(jax.vmap(search))(jax.random.split(KEY, 3))
-    assert seen[0].startswith("SearchResult (traced): ") and "traced float32[]" in seen[2]
+    dtype = jnp.zeros(()).dtype
+    assert seen[0].startswith("SearchResult (traced): ") and f"traced {dtype}[]" in seen[2]
     for text in (repr(batch), str(batch)):
         assert text.startswith("SearchResult (a batch of shape (3,)): ")
     assert len(repr(batch).splitlines()) <= 10
-    assert "best_reward_per_tree=float32[3, 1]" in repr(batch)
+    assert f"best_reward_per_tree={dtype}[3, 1]" in repr(batch)
 
 
 def test_a_repr_does_not_raise_whatever_the_leaves_are():
