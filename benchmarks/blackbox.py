@@ -1,5 +1,5 @@
 """What a black box costs beside its own time, and what workers gain: ``python -m
-benchmarks.blackbox [--json] [--quick]``.
+benchmarks.blackbox [--json] [--quick | --smoke]``.
 
 ``overhead``: milliseconds of wall time an evaluation of a function that does nothing, in a compiled
 loop of batches. ``speedup``: wall time with one worker to that with two, for a system that waits
@@ -21,6 +21,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from jax import lax  # noqa: E402
 
+from benchmarks.sizes import options, size  # noqa: E402
 from jast import blackbox  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
 
@@ -81,11 +82,12 @@ def middle(values):
     return {"median": median, "quartiles": [low, high]}
 
 
-def overhead(repeats):
+def overhead(repeats, batches=((1, 200), (64, 50), (1024, 5))):
+    """``batches``: (lanes, calls a repetition)."""
     out = {}
     for workers in (0, 1):
         sim = box(trivial, workers)
-        for lanes, calls in ((1, 200), (64, 50), (1024, 5)):
+        for lanes, calls in batches:
             run = loop(sim, lanes)
             run(0, 1)
             out[f"{workers} workers, batch {lanes}"] = middle(
@@ -111,10 +113,10 @@ def speedup(repeats, lanes=64):
     return out
 
 
-def bare(repeats):
+def bare(repeats, pieces=100):
     """Of 2 n pieces of computing in one process, to n in each of two."""
     code = (
-        f"import time\nfor _ in range(100):\n end = time.perf_counter() + {SECONDS}\n while"
+        f"import time\nfor _ in range({pieces}):\n end = time.perf_counter() + {SECONDS}\n while"
         " time.perf_counter() < end: pass"
     )
 
@@ -132,17 +134,16 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.blackbox", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--quick", action="store_true", help="fewer repetitions")
-    args = parser.parse_args(argv)
-    repeats = 3 if args.quick else 15
+    args = options(parser, "fewer repetitions").parse_args(argv)
+    repeats = size(args, 15, 3, 1)
     processors = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     )
     report = {
         "processors": processors,
-        "overhead_ms": overhead(repeats),
-        "speedup": speedup(repeats) | {"bare": bare(repeats)},
+        "overhead_ms": overhead(repeats, **({"batches": [(2, 2)]} if args.smoke else {})),
+        "speedup": speedup(repeats, 4 if args.smoke else 64)
+        | {"bare": bare(repeats, 2 if args.smoke else 100)},
     }
     if args.json:
         print(json.dumps(report, indent=1))

@@ -1,5 +1,5 @@
 """Cross-entropy methods over a simulator's disturbances, and their proposals for rare events:
-``python -m benchmarks.bridge [--json] [--quick]``.
+``python -m benchmarks.bridge [--json] [--quick | --smoke]``.
 
 First, how many runs of 1000 episodes find a collision on the ferry, with quantiles for actions.
 Then the failure probability that `failure_proposal` leads to: by importance sampling with 10,000
@@ -16,32 +16,39 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.ferry import REWARD
+from benchmarks.sizes import options, size
 from jast import cross_entropy as ce
 from jast.estimate import clopper_pearson, importance
 
-SIZE = dict(samples=100, elites=30, iterations=10)
 FRESH = 10_000
 
 
-def found(runs):
+def found(runs, samples=100, iterations=10, methods=("ce_method", "ce_surrogate", "ce_mixture")):
     """Runs of each method that find a collision, of 1000 episodes each."""
+    sizes = dict(samples=samples, elites=3 * samples // 10, iterations=iterations)
     sim, actions = jast.simulators.ferry(), jast.actions.quantiles()
     stress = ce.over(sim, actions=actions)
     searches = {
         "random search": (
             lambda key: jast.search.monte_carlo(
-                key, sim, episodes=1000, reward=REWARD, actions=actions
+                key, sim, episodes=samples * iterations, reward=REWARD, actions=actions
             ).failing_per_tree[0]
         ),
         "search.cem": (
             lambda key: jast.search.cem(
-                key, sim, samples=100, elites=10, iterations=10, reward=REWARD, actions=actions
+                key,
+                sim,
+                samples=samples,
+                elites=samples // 10,
+                iterations=iterations,
+                reward=REWARD,
+                actions=actions,
             ).failing_per_tree[0]
         ),
     }
-    for name in ("ce_method", "ce_surrogate", "ce_mixture"):
+    for name in methods:
         searches[name] = lambda key, name=name: (
-            getattr(ce, name)(key, stress.objective, stress.proposal, **SIZE).best_value < 0
+            getattr(ce, name)(key, stress.objective, stress.proposal, **sizes).best_value < 0
         )
     out = {}
     for name, search in searches.items():
@@ -69,12 +76,12 @@ SYSTEMS = {  # name -> simulator, truth
 }
 
 
-def proposals(name, seeds):
+def proposals(name, seeds, iterations=20):
     """Estimate over truth, and its relative standard error, of each seed."""
     make, truth = SYSTEMS[name]
     sim, rows = make(), []
     for seed in range(seeds):
-        proposal = jast.estimate.failure_proposal(jax.random.key(seed), sim, iterations=20)
+        proposal = jast.estimate.failure_proposal(jax.random.key(seed), sim, iterations=iterations)
         r = importance(jax.random.key(1000 + seed), sim, proposal.policy, FRESH)
         rows.append((r.mean / truth, r.relative_error, bool(proposal.reached)))
     ratio, error, reached = map(list, zip(*rows, strict=True))
@@ -91,13 +98,9 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.bridge", description=__doc__.splitlines()[0]
     )
-    parser.add_argument(
-        "--json", action="store_true", help="print the report as JSON, and nothing else"
-    )
-    parser.add_argument("--quick", action="store_true", help="under two minutes: fewer runs")
-    args = parser.parse_args(argv)
+    args = options(parser, "under two minutes: fewer runs").parse_args(argv)
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    report = {"found": found(5 if args.quick else 20), "proposals": {}}
+    report = {"found": found(*size(args, (20,), (5,), (1, 10, 2, ["ce_method"]))), "proposals": {}}
     say("runs of 1000 episodes that find a collision on the ferry")
     for name, r in report["found"].items():
         say(
@@ -108,8 +111,9 @@ def main(argv=None):
         "importance sampling under failure_proposal: estimate / truth by seed; relative standard"
         " error, and that of crude Monte Carlo with all 30,000 episodes"
     )
-    for name in SYSTEMS:
-        report["proposals"][name] = r = proposals(name, 3 if args.quick else 10)
+    for name in list(SYSTEMS)[: 1 if args.smoke else None]:
+        r = proposals(name, *size(args, (10,), (3,), (1, 1)))
+        report["proposals"][name] = r
         ratios = " ".join(f"{v:.3f}" for v in r["ratio"])
         say(
             f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to"

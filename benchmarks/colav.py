@@ -1,14 +1,16 @@
 """The ferry with collision avoidance: how often it fails by itself, what the searches find, and
 what keeping its states is worth.
 
-``python -m benchmarks.colav [--json] [--quick]``. The searches have 22 roots of 50 simulations, as
-published for S1. Rates have 95 % Clopper-Pearson intervals. The CPU time of a search is that of its
-one call, compilation included. Those of memoization are of one core, compilation excluded, the best
-of alternated runs (of one with ``--quick``), in a process whose XLA has one thread.
+``python -m benchmarks.colav [--json] [--quick | --smoke]``. The searches have 22 roots of 50
+simulations, as published for S1. Rates have 95 % Clopper-Pearson intervals. The CPU time of a
+search is that of its one call, compilation included. Those of memoization are of one core,
+compilation excluded, the best of alternated runs (of one with ``--quick``), in a process whose XLA
+has one thread.
 """
 
 import argparse
 import functools
+import itertools
 import json
 
 import jax
@@ -16,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.engine import alone, cpu, problem, whole
+from benchmarks.engine import alone, cpu, here, problem, whole
 from benchmarks.ferry import timed
+from benchmarks.sizes import options, size
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
@@ -46,7 +49,7 @@ def nominal(scenario, kind, episodes):
         "undisturbed_distance_m": float(quiet.distance),
         "undisturbed_fails": bool(quiet.failure),
         "episodes": found.episodes,
-        "failures": found.failures,
+        "failures": found.failing,
         "rate": found.rate,
         "rate_95": list(found.interval),
         "mean_distance_m": found.mean_distance,
@@ -64,14 +67,14 @@ def share(failing):
     }
 
 
-def search(scenario, kind, trees, heads=None):
+def search(scenario, kind, trees, heads=None, prunes=PRUNES):
     """Trees of the default search that find a collision."""
     sim = colav(scenario, kind)
     grow = lambda: jast.search.forest(
         jax.random.key(0),
         sim,
         trees=trees,
-        prunes=PRUNES,
+        prunes=prunes,
         simulations=SIMULATIONS,
         reward=REWARD,
         heads=heads,
@@ -89,22 +92,24 @@ def search(scenario, kind, trees, heads=None):
     )
 
 
-def random_search(scenario, kind, runs):
+def random_search(scenario, kind, runs, episodes=PRUNES * SIMULATIONS):
     """Random searches of as many episodes as a tree has simulations that find a collision."""
     sim = colav(scenario, kind)
     one = lambda key: jast.search.monte_carlo(
-        key, sim, episodes=PRUNES * SIMULATIONS, reward=REWARD
+        key, sim, episodes=episodes, reward=REWARD
     ).failing_per_tree[0]
     return share(
         jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
     )
 
 
-def memoization(substeps, mode, simulations, trees, repeats):
+def memoization(
+    substeps, mode, simulations, trees, repeats, prunes=PRUNES, memoize=("node", "root", "none")
+):
     """CPU microseconds and simulator steps of a simulation, by where states are kept; and of
     MCTS-SA, one root, whose simulations all begin at the start.
     """
-    total = PRUNES * simulations
+    total = prunes * simulations
     sim, reward = colav("sharp turn", substeps=substeps), published if mode == "paper" else REWARD
     p, keys = (
         problem(total, mode, sim, reward, jast.actions.samples()),
@@ -112,8 +117,8 @@ def memoization(substeps, mode, simulations, trees, repeats):
     )
     children = int(p.settings.widths.max())
     runs = {
-        name: functools.partial(whole, p, keys, PRUNES, simulations, children, name)
-        for name in ("node", "root", "none")
+        name: functools.partial(whole, p, keys, prunes, simulations, children, name)
+        for name in memoize
     }
     runs["MCTS-SA"] = functools.partial(whole, p, keys, 1, total, children, "none")
     steps = {
@@ -126,8 +131,7 @@ def memoization(substeps, mode, simulations, trees, repeats):
             seconds[name] = min(seconds[name], cpu(function)[0])
     us = {name: s / total / trees * 1e6 for name, s in seconds.items()}
     ratios = {
-        f"{a}/{b}": us[a] / us[b]
-        for a, b in (("node", "none"), ("root", "none"), ("node", "MCTS-SA"), ("root", "MCTS-SA"))
+        f"{a}/{b}": us[a] / us[b] for a, b in itertools.product(memoize[:-1], ("none", "MCTS-SA"))
     }
     return {
         "mode": mode,
@@ -170,10 +174,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.colav", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--quick", action="store_true", help="fewer episodes, trees and rows: under two minutes"
-    )
+    options(parser, "fewer episodes, trees and rows: under two minutes")
     parser.add_argument(
         "--memoization", action="store_true", help="only what keeping states is worth"
     )
@@ -184,15 +185,18 @@ def main(argv=None):
         f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
     )
     report = {"nominal": {}, "searches": {}, "memoization": []}
+    measure = here if args.smoke else alone
 
     say(
         "nominal: least distance undisturbed, and failures when disturbances are drawn from their"
         " densities"
     )
-    for scenario in () if args.memoization else SCENARIOS:
-        for kind in ("delay", "steering") if args.quick else (*ALL, ALL):
+    few = [*SCENARIOS][:1] if args.smoke else SCENARIOS
+    for scenario in () if args.memoization else few:
+        for kind in size(args, (*ALL, ALL), ("delay", "steering"), ("delay",)):
             name = f"{scenario}, {kind if isinstance(kind, str) else 'all three'}"
-            r = report["nominal"][name] = nominal(scenario, kind, 20_000 if args.quick else 300_000)
+            episodes = size(args, 300_000, 20_000, 100)
+            r = report["nominal"][name] = nominal(scenario, kind, episodes)
             low, high = r["rate_95"]
             say(
                 f"  {name:26} {r['undisturbed_distance_m']:6.2f} m   {r['failures']:6d} of"
@@ -204,15 +208,14 @@ def main(argv=None):
         " episodes"
     )
     rows = [(s, k) for k in ("delay", "steering") for s in SCENARIOS]
-    if args.quick:
-        rows = [("sharp turn", "delay"), ("head-on", "steering")]
-    for scenario, kind in () if args.memoization else rows:
-        trees = 64 if args.quick else 200
+    two = [("sharp turn", "delay"), ("head-on", "steering")]
+    for scenario, kind in () if args.memoization else size(args, rows, two, two[:1]):
+        trees, prunes = size(args, 200, 64, 4), 2 if args.smoke else PRUNES
         r = {
-            "random": random_search(scenario, kind, trees),
-            "forest": search(scenario, kind, trees),
+            "random": random_search(scenario, kind, trees, prunes * SIMULATIONS),
+            "forest": search(scenario, kind, trees, prunes=prunes),
         }
-        if not args.quick:
+        if not (args.quick or args.smoke):
             r["forest, heads"] = search(scenario, kind, trees, heads="both")
         report["searches"][f"{scenario}, {kind}"] = r
         for name, row in r.items():
@@ -224,14 +227,18 @@ def main(argv=None):
             say(f"  {scenario + ', ' + kind:26} {name:14} {percent(row, 'share'):24} {more}")
 
     say("\nCPU time of a simulation (us) and its steps, by where states are kept")
-    if args.quick:
+    if args.smoke:
+        calls = [
+            (1, "default", SIMULATIONS, 4, 1, 2, ["node", "none"])
+        ]  # the program of the search
+    elif args.quick:
         calls = [(30, "paper", 20, 64, 1)]
     else:
         calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [
             (n, "paper", 20, 64, 2) for n in SUBSTEPS
         ]
     for call in calls:
-        report["memoization"].append(r := alone("memoization", *call, module="colav"))
+        report["memoization"].append(r := measure("memoization", *call, module="colav"))
         cells = ", ".join(
             f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"]
         )

@@ -1,5 +1,5 @@
 """The cross-entropy methods on sierra and on other objectives, beside their peers: ``python -m
-benchmarks.cross_entropy [--json] [--quick] [--seeds N]``.
+benchmarks.cross_entropy [--json] [--quick | --smoke] [--seeds N]``.
 
 All in float64, but for the rows that say so. b_v: mean best value of the runs +- its standard
 error; d: mean distance to the optimum; F: sqrt(50) times the root of its mean square, which the
@@ -23,6 +23,7 @@ from benchmarks import peers  # noqa: E402
 from benchmarks.cases import CASES  # noqa: E402
 from benchmarks.engine import cpu  # noqa: E402
 from benchmarks.ferry import timed  # noqa: E402
+from benchmarks.sizes import options, size  # noqa: E402
 from jast import cross_entropy as ce  # noqa: E402
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
@@ -107,10 +108,10 @@ def compiled_for(run, *arguments):
     return run.lower(*arguments).compile()
 
 
-def speed(seeds):
+def speed(seeds, methods=METHODS):
     """CPU time to compile each method on sierra, and of a seed of 1A; 1B has the same program."""
     out = {}
-    for method in METHODS:
+    for method in methods:
         run = program(method, ce.sierra(), 10, 10, ())
         c = {case: (CASES[case].mean, np.diag(CASES[case].sd ** 2)) for case in SIERRA[:2]}
         keys = jax.random.split(jax.random.key(1), seeds)
@@ -130,23 +131,23 @@ def speed(seeds):
     return out
 
 
-def schedules(seeds):
+def schedules(seeds, rates=(0.1, 0.2, 0.3), forms=("before", "after"), modes=("thesis", "default")):
     """Experiment 2: 1B with uneven schedules, in both forms of the normaliser, with and without the
     ratchet of the elites.
     """
     out = {}
     uneven = [
         (f"Geo({p}), {form}", ce.schedules.geometric(p, form)(100, 10))
-        for form in ("before", "after")
-        for p in (0.1, 0.2, 0.3)
+        for form in forms
+        for p in rates
     ]
-    for mode in ("thesis", "default"):
+    for mode in modes:
         out[f"uniform, {mode}"] = ours("ce_surrogate", "sierra 1B", seeds, mode=mode)
         for name, counts in uneven:
             out[f"{name}, {mode}"] = ours(
                 "ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts
             )
-    for name, counts in uneven[:3]:
+    for name, counts in uneven[: len(rates)]:
         out[f"{name}, thesis with ratchet"] = ours(
             "ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True
         )
@@ -167,12 +168,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.cross_entropy", description=__doc__.splitlines()[0]
     )
-    parser.add_argument(
-        "--json", action="store_true", help="print the report as JSON, and nothing else"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="under two minutes: 64 seeds, fewer cases and peers"
-    )
+    options(parser, "under two minutes: 64 seeds, fewer cases and peers")
     parser.add_argument("--seeds", type=int, help="runs of each row; 256, or 64 with --quick")
     parser.add_argument(
         "--slow-seeds",
@@ -183,10 +179,19 @@ def main(argv=None):
     parser.add_argument("--picture", metavar="PATH", help="draw the mean best value by evaluations")
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    seeds = args.seeds or (64 if args.quick else 256)
+    seeds = args.seeds or size(args, 256, 64, 2)
+    methods, modes = METHODS, ("thesis", "default")
+    if args.smoke:  # the others differ in their names alone
+        methods, modes = ("ce_surrogate",), ("default",)
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
     show = (lambda *a: None) if args.json else say_row
-    report = {"seeds": seeds, "speed": speed(seeds), "sierra": {}, "peers": {}, "others": {}}
+    report = {
+        "seeds": seeds,
+        "speed": speed(seeds, methods),
+        "sierra": {},
+        "peers": {},
+        "others": {},
+    }
     say("speed: CPU seconds to compile, CPU ms of a run")
     for method, s in report["speed"].items():
         each = s["cpu_ms_a_seed"]
@@ -195,18 +200,19 @@ def main(argv=None):
             f" by the same program {each['sierra 1B']:.2f} ms"
         )
 
-    for i, case in enumerate(SIERRA):
+    cheap = ("random_search", "cma_es", "differential_evolution", "direct")
+    cheap = size(args, cheap, cheap, cheap[2:])  # of SciPy
+    for i, case in enumerate(SIERRA[: 1 if args.smoke else None]):
         say(f"\n{case}")
-        for mode in ("thesis", "default"):
-            for method in METHODS:
+        for mode in modes:
+            for method in methods:
                 if args.quick and (method, mode) == ("ce_mixture", "thesis"):
                     continue
                 report["sierra"][f"{case}, {method}, {mode}"] = r = ours(
                     method, case, seeds, mode=mode
                 )
                 show(f"{method}, {mode}", r, TABLE[method][i] if mode == "thesis" else None)
-        cheap = ("random_search", "cma_es", "differential_evolution", "direct")
-        for peer in (*cheap, *(() if args.quick else ("expected_improvement",))):
+        for peer in (*cheap, *size(args, ("expected_improvement",), (), ())):
             n = args.slow_seeds if peer == "expected_improvement" else seeds
             report["peers"][f"{case}, {peer}"] = r = theirs(peer, case, n)
             show(peer, r)
@@ -217,7 +223,7 @@ def main(argv=None):
             " -exp(-log))"
         )
         jax.config.update("jax_enable_x64", False)
-        for case in SIERRA[:2]:
+        for case in SIERRA[: 1 if args.smoke else 2]:
             report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours(
                 "ce_surrogate", case, seeds, dtype=np.float32
             )
@@ -236,17 +242,18 @@ def main(argv=None):
             show(f"{case}, float32, log=True", r)
         jax.config.update("jax_enable_x64", True)
         say("\nexperiment 2: schedules, CE-surrogate from 1B")
-        report["schedules"] = schedules(seeds)
+        report["schedules"] = schedules(
+            seeds, *((0.1,), ("before",), ("default",)) if args.smoke else ()
+        )
         for name, r in report["schedules"].items():
             show(name, r, SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None)
 
     say("\nother objectives: median best value (mean)")
     others = [case for case in CASES if case not in SIERRA]
-    for case in ("branin", "ackley 5", "levy 5") if args.quick else others:
+    for case in size(args, others, ("branin", "ackley 5", "levy 5"), ("paraboloid 2",)):
         rows = {
             method: ours(method, case, seeds)
-            for method in METHODS
-            if not args.quick or method != "ce_mixture"
+            for method in size(args, METHODS, METHODS[:2], METHODS[:1])
         }
         rows |= (
             {"ce_surrogate, thesis": ours("ce_surrogate", case, seeds, mode="thesis")}

@@ -1,5 +1,5 @@
 """Speed of the tree search, in CPU time of this process and as ratios within one run: ``python -m
-benchmarks.engine [--json] [--quick]``.
+benchmarks.engine [--json] [--quick | --smoke]``.
 
 Rates are simulations (episodes) per CPU second, compilation excluded; each figure is the best of
 several alternated repetitions, which on a shared machine is the least disturbed one. The rates are
@@ -10,6 +10,7 @@ own threads, which use all cores, are measured in ``cores``.
 
 import argparse
 import functools
+import importlib
 import json
 import os
 import subprocess
@@ -24,6 +25,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks import reference
+from benchmarks.sizes import options, size
 from jast.counter import tree_keys
 from jast.progress import Progress, begin
 from jast.rewards import as_pytree
@@ -87,18 +89,18 @@ def whole(problem, keys, prunes, simulations, children, memoize="node"):
     return tree
 
 
-def first_turn(problem, keys, capacity, simulations=500):
+def first_turn(problem, keys, capacity, simulations):
     """The first simulations of trees with this much room; making the trees is not counted."""
     tree = jax.block_until_ready(run._make(problem, keys, capacity, "node"))
     return cpu(lambda: run._grow(problem, tree, 0, simulations, "node").log)
 
 
-def rates(repeats, lanes=200, prunes=18, simulations=500):
+def rates(repeats, lanes=200, prunes=18, simulations=500, plain_trees=3):
     keys, total = tree_keys(jax.random.key(0), lanes), prunes * simulations
     problems = {mode: problem(total, mode) for mode in MODES}
     children = {mode: int(p.settings.widths.max()) for mode, p in problems.items()}
     runs = {
-        "rollouts": lambda: rollouts(problems["paper"], keys, 1000),
+        "rollouts": lambda: rollouts(problems["paper"], keys, 2 * simulations),
         "forest, paper": lambda: whole(
             problems["paper"], keys, prunes, simulations, children["paper"]
         ),
@@ -107,7 +109,7 @@ def rates(repeats, lanes=200, prunes=18, simulations=500):
         ),
     }
     episodes = {
-        "rollouts": 1000 * lanes,
+        "rollouts": 2 * simulations * lanes,
         "forest, paper": total * lanes,
         "forest, default": total * lanes,
     }
@@ -119,7 +121,7 @@ def rates(repeats, lanes=200, prunes=18, simulations=500):
     for seed in range(repeats):
         now = {name: episodes[name] / cpu(function)[0] for name, function in runs.items()}
         start = time.process_time()
-        done = sum(reference.forest(10 * seed + k)[1] for k in range(3))
+        done = sum(reference.forest(10 * seed + k)[1] for k in range(plain_trees))
         plain = max(plain, done / (time.process_time() - start))
         for name, rate in now.items():
             best[name] = min(best[name], 1 / rate)
@@ -132,29 +134,30 @@ def rates(repeats, lanes=200, prunes=18, simulations=500):
     }
 
 
-def capacity(repeats, lanes=200):
+def capacity(repeats, lanes=200, few=500, many=10_000):
     """Cost of the first 500 simulations in trees with room for 10,000, to that in trees with room
     for 500: 1 where nothing copies the tree.
     """
     keys = tree_keys(jax.random.key(0), lanes)
-    small, large = problem(500), problem(10_000)
+    small, large = problem(few), problem(many)
     pairs = [
-        (first_turn(large, keys, 10_000)[0], first_turn(small, keys, 500)[0])
+        (first_turn(large, keys, many, few)[0], first_turn(small, keys, few, few)[0])
         for _ in range(repeats + 1)
     ][1:]
     return {
-        "ratio_10000_to_500": min(a for a, _ in pairs) / min(b for _, b in pairs),
-        "us_per_lockstep_500": min(b for _, b in pairs) / 500 * 1e6,
+        f"ratio_{many}_to_{few}": min(a for a, _ in pairs) / min(b for _, b in pairs),
+        f"us_per_lockstep_{few}": min(b for _, b in pairs) / few * 1e6,
     }
 
 
-def cores(repeats, trees=200):
+def cores(repeats, trees=200, prunes=6, simulations=500):
     """How many times faster two threads, of half of the trees each, are than one, in wall time."""
     search = lambda threads: jast.search.forest(
         jax.random.key(0),
         jast.simulators.ferry(),
         trees=trees,
-        prunes=6,
+        prunes=prunes,
+        simulations=simulations,
         reward=REWARD,
         actions=BOX,
         mode="paper",
@@ -191,10 +194,15 @@ def alone(name, *arguments, module="engine", settings=ONE_THREAD):
     )
 
 
+def here(name, *arguments, module="engine", **_):
+    """The same measurement in this process: compiled programs are shared, figures mean less."""
+    return getattr(importlib.import_module(f"benchmarks.{module}"), name)(*arguments)
+
+
 def compile_time(total=9000, lanes=100):
     """Seconds to trace and compile what a forest on S0 runs."""
     p, keys, out = problem(total, "default"), tree_keys(jax.random.key(0), lanes), {}
-    jax.block_until_ready(p.settings.widths)
+    children = int(p.settings.widths.max())
     start = time.perf_counter()
 
     def lap(name):
@@ -207,7 +215,7 @@ def compile_time(total=9000, lanes=100):
     lap("grow")
     run._make.lower(p, keys, total, "node").compile()
     lap("make")
-    run._prune.lower(p, tree, 191, "node").compile()
+    run._prune.lower(p, tree, children, "node").compile()
     lap("prune")
     return out
 
@@ -237,17 +245,21 @@ def _slow_step(step, substeps, state, a):
     return after._replace(heading=lax.fori_loop(0, substeps, burn, after.heading))
 
 
-def memoization(lanes, prunes, simulations):
+SLOWED = ((None, "S0"), (200, "200 substeps"))
+
+
+def memoization(lanes, prunes, simulations, systems=SLOWED, memoize=("node", "root", "none")):
     """CPU time of the memoization modes, to that with states at every node, on the cheap S0 and one
     of 200 substeps.
     """
     keys, out = tree_keys(jax.random.key(0), lanes), {}
-    for name, sim in (("S0", None), ("200 substeps", slow_ferry(200))):
+    for substeps, name in systems:
+        sim = None if substeps is None else slow_ferry(substeps)
         p = problem(prunes * simulations, sim=sim)
         children = int(p.settings.widths.max())
         runs = {
             mode: functools.partial(whole, p, keys, prunes, simulations, children, mode)
-            for mode in ("node", "root", "none")
+            for mode in memoize
         }
         for function in runs.values():
             cpu(function)
@@ -327,12 +339,9 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.engine", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--quick", action="store_true", help="fewer repetitions, smaller memoization runs"
-    )
-    args = parser.parse_args(argv)
-    repeats = 2 if args.quick else 5
+    args = options(parser, "fewer repetitions, smaller memoization runs").parse_args(argv)
+    repeats, measure = size(args, 5, 2, 1), here if args.smoke else alone
+    least = lambda *arguments: arguments if args.smoke else ()
     p = problem(9000)
     one = run.bytes_per_tree(p, run.Plan(18, 500, 1, "node"))
     report = {
@@ -341,12 +350,17 @@ def main(argv=None):
         ),
         "bytes_per_tree_of_9000": one,
         "bytes_per_node": one / 9000,
-        **alone("rates", repeats),
-        "capacity": alone("capacity", repeats),
-        "cores": cores(repeats),
-        "peer_at_200_x_500": alone("peer", repeats),
-        "compile_s": alone("compile_time", settings=NO_CACHE),
-        "memoization": alone("memoization", *((32, 4, 100) if args.quick else (100, 18, 100))),
+        **measure("rates", repeats, *least(2, 2, 45, 1)),
+        "capacity": measure("capacity", repeats, *least(2, 90, 180)),
+        "cores": cores(repeats, *least(2, 2, 45)),
+        "peer_at_200_x_500": measure("peer", repeats, *least(2, 20)),
+        "compile_s": measure("compile_time", *least(90, 2), settings=NO_CACHE),
+        "memoization": measure(
+            "memoization",
+            *size(
+                args, (100, 18, 100), (32, 4, 100), (2, 2, 45, [(1, "1 substep")], ["node", "none"])
+            ),
+        ),
     }
     if args.json:
         print(json.dumps(report, indent=1))

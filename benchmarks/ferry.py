@@ -1,10 +1,10 @@
 """The ferry S0: golden episodes, the paper's Table 1 without networks, and what the default search
 makes of it.
 
-``python -m benchmarks.ferry [--json] [--quick] [--trees N]``. Every tree has 9000 simulations.
-Rates have 95 % Clopper-Pearson intervals, means 1.96 standard errors. Published rows: Lytskjold and
-Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--picture PATH]``: all of that table,
-networks included, and where they pay (`benchmarks.table1`).
+``python -m benchmarks.ferry [--json] [--quick | --smoke] [--trees N]``. Every tree has 9000
+simulations. Rates have 95 % Clopper-Pearson intervals, means 1.96 standard errors. Published rows:
+Lytskjold and Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--picture PATH]``: all of
+that table, networks included, and where they pay (`benchmarks.table1`).
 """
 
 import argparse
@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 import jast
+from benchmarks.sizes import options, size
 from jast.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
@@ -94,51 +95,60 @@ def row(search, seed):
     }
 
 
-def rows(trees, quick):
+def rows(trees, prunes=18, simulations=500):
     """Name -> search of S0 (and S0b)."""
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
 
     def forest(sim=s0, **settings):
         return lambda key: jast.search.forest(
-            key, sim, trees=trees, reward=REWARD, actions=BOX, **settings
+            key,
+            sim,
+            trees=trees,
+            prunes=prunes,
+            simulations=simulations,
+            reward=REWARD,
+            **dict(actions=BOX) | settings,
         )
 
     def mcts(**settings):
         return lambda key: jast.search.mcts(
-            key, s0, trees=trees, reward=REWARD, actions=BOX, **settings
+            key,
+            s0,
+            trees=trees,
+            simulations=prunes * simulations,
+            reward=REWARD,
+            actions=BOX,
+            **settings,
         )
 
-    table = {
+    return {
         "forest, paper": forest(mode="paper"),
         "mcts, paper": mcts(mode="paper"),
         "forest, default": forest(),
-        "forest as typed, no actions": lambda key: jast.search.forest(
-            key, s0, trees=trees, reward=REWARD
-        ),
+        "forest as typed, no actions": forest(actions=None),
         "mcts, default": mcts(),
         "forest, S0b, paper": forest(s0b, mode="paper"),
         "forest, S0b, default": forest(s0b),
         "monte carlo": lambda key: jast.search.monte_carlo(
-            key, s0, episodes=9000 * trees, reward=REWARD, actions=BOX
+            key, s0, episodes=prunes * simulations * trees, reward=REWARD, actions=BOX
         ),
+        "forest, widening (2, 0.5) alone": forest(spread=False, focus=1.0),
+        "forest, and spread": forest(focus=1.0),
+        "cem": lambda key: jast.search.cem(key, s0, trees=trees, reward=REWARD, actions=BOX),
     }
-    if not quick:
-        table |= {
-            "forest, widening (2, 0.5) alone": forest(spread=False, focus=1.0),
-            "forest, and spread": forest(focus=1.0),
-            "cem": lambda key: jast.search.cem(key, s0, trees=trees, reward=REWARD, actions=BOX),
-        }
-    return table
+
+
+QUICK = ("forest, widening (2, 0.5) alone", "forest, and spread", "cem")
+"""Rows that ``--quick`` leaves out."""
+SMOKE = ("forest, paper", "mcts, paper", "monte carlo", "cem")
+"""Rows of ``--smoke``, one of each search."""
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--quick", action="store_true", help="100 trees a row; of --table1 also fewer rows"
-    )
+    options(parser, "100 trees a row; of --table1 also fewer rows")
     parser.add_argument("--trees", type=int, help="trees a row (default 1000; of --table1 200)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -157,7 +167,7 @@ def main(argv=None):
         from benchmarks import table1
 
         return table1.report(args)
-    trees = args.trees or (100 if args.quick else 1000)
+    trees = args.trees or size(args, 1000, 100, 2)
     report = {"golden": golden(), "seed": args.seed, "rows": {}}
     if not args.json:
         print("golden episodes:", report["golden"] or "data not found")
@@ -165,7 +175,10 @@ def main(argv=None):
             f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
             f" {'of 200: least, median':>21} {'CPU s':>7}"
         )
-    for name, search in rows(trees, args.quick).items():
+    table = rows(trees, *((2, 45) if args.smoke else ()))
+    shown = size(args, [*table], [name for name in table if name not in QUICK], SMOKE)
+    for name in shown:
+        search = table[name]
         report["rows"][name] = r = row(search, args.seed)
         if not args.json:
             low, high = (100 * v for v in r["rate_95"])

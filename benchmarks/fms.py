@@ -1,11 +1,11 @@
 """The flight management system's trajectory predictor: what each search finds in 5000 evaluations
 (Table 3.3 of Moss's thesis, on an open stand-in).
 
-``python -m benchmarks.fms [--json] [--quick] [--seeds N]``. Every method has the same number of
-evaluations and independent seeds (trees). Failures are counted once each: a tree that comes to the
-end of an episode again has evaluated nothing. Means are over seeds, +- is one standard error of
-that mean. The control is the same search on the predictor without its defect. CPU time is that of
-the one call for all seeds, compilation included.
+``python -m benchmarks.fms [--json] [--quick | --smoke] [--seeds N]``. Every method has the same
+number of evaluations and independent seeds (trees). Failures are counted once each: a tree that
+comes to the end of an episode again has evaluated nothing. Means are over seeds, +- is one standard
+error of that mean. The control is the same search on the predictor without its defect. CPU time is
+that of the one call for all seeds, compilation included.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import numpy as np
 
 import jast
 from benchmarks.ferry import timed
+from benchmarks.sizes import options, size
 from jast.distributions import Independent, Normal
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
@@ -29,6 +30,9 @@ PUBLISHED = {
     "cross-entropy": (24, 249, 625.65, 97.80, -1077.3),
     "mcts, thesis": (4394, 61, -923.49, 497.4, -1147.9),
 }
+
+SMOKE = ("monte carlo", "cross-entropy", "mcts", "forest")
+"""Searches of ``--smoke``: one of each."""
 
 
 def searches(evaluations, seeds):
@@ -126,12 +130,14 @@ def summary(result, seeds, baseline=None):
     }
 
 
-def run(evaluations, seeds, control_seeds, key=0):
-    """The whole table."""
+def run(evaluations, seeds, control_seeds, key=0, names=None):
+    """The table; ``names``: of these searches alone."""
     keys, out, baseline = jax.random.split(jax.random.key(key), 7), {}, None
     for k, (name, (search, settings)) in zip(
         keys, searches(evaluations, seeds).items(), strict=True
     ):
+        if names and name not in names:
+            continue
         result, seconds, _ = timed(
             lambda search=search, k=k, settings=settings: search(k, fms(**settings))
         )
@@ -144,7 +150,9 @@ def run(evaluations, seeds, control_seeds, key=0):
     for k, (name, (search, settings)) in zip(
         keys, searches(evaluations, control_seeds).items(), strict=True
     ):
-        out[name]["control_failures"] = int(search(k, fms(fixed=True, **settings)).failures.seen)
+        if name in out:
+            control = search(k, fms(fixed=True, **settings))
+            out[name]["control_failures"] = int(control.failures.seen)
     return out
 
 
@@ -174,29 +182,28 @@ def line(name, row):
 def main(argv=None):
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="the figures as JSON, after the table")
-    parser.add_argument("--quick", action="store_true", help="10 seeds, in under two minutes")
+    options(parser, "10 seeds, in under two minutes")
     parser.add_argument(
         "--seeds",
         type=int,
         default=None,
         help="independent searches of each method (default 100, with --quick 10)",
     )
-    options = parser.parse_args(argv)
-    seeds = options.seeds or (10 if options.quick else 100)
-    print(f"{EVALUATIONS} evaluations, {seeds} seeds\n{HEADER}")
+    args = parser.parse_args(argv)
+    seeds, evaluations = args.seeds or size(args, 100, 10, 2), 100 if args.smoke else EVALUATIONS
+    print(f"{evaluations} evaluations, {seeds} seeds\n{HEADER}")
     with jax.enable_x64(True):
-        table = run(EVALUATIONS, seeds, min(seeds, 10))
+        table = run(evaluations, seeds, min(seeds, 10), names=SMOKE if args.smoke else None)
     print(
         "on the predictor without its defect: "
         + ", ".join(f"{name} {row['control_failures']}" for name, row in table.items())
         + " failures"
     )
-    if options.json:
+    if args.json:
         print(
             json.dumps(
                 {
-                    "evaluations": EVALUATIONS,
+                    "evaluations": evaluations,
                     "seeds": seeds,
                     "published": PUBLISHED,
                     "methods": table,

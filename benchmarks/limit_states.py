@@ -1,5 +1,5 @@
 """Rare events of known probability, fixed and drawn by seed, for studies of error and coverage:
-``python -m benchmarks.limit_states [--json] [--quick]`` checks the truths.
+``python -m benchmarks.limit_states [--json] [--quick | --smoke]`` checks the truths.
 
 ``cases()`` lists the fixed ones, ``draw(family, seed)`` gives one of a family of ``FAMILIES``:
 `Case`, (name, simulator, truth). Truths are closed forms or quadratures in float64 (SciPy), with P
@@ -23,6 +23,7 @@ from jax.tree_util import Partial
 from scipy import integrate, optimize, stats
 
 import jast
+from benchmarks.sizes import options, size
 from jast.simulators import autoregression, landing, limit_state, pendulum, ruin, walk1d
 
 __all__ = ["FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
@@ -463,12 +464,10 @@ def main(argv=None):
         description="Check the truths of the families by sampling.",
     )
     parser.add_argument("--seeds", type=int, help="problems of a family (default 8)")
-    parser.add_argument("--quick", action="store_true", help="2 problems of a family")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args(argv)
-    seeds, report = args.seeds or (2 if args.quick else 8), {}
+    args = options(parser, "2 problems of a family").parse_args(argv)
+    seeds, n, report = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000), {}
     for family in FAMILIES:
-        scores = [check(family, seed) for seed in range(seeds)]
+        scores = [check(family, seed, n) for seed in range(seeds)]
         easy, rare = (
             np.array([s[0] for s in scores]),
             np.array([s[1] for s in scores if len(s) > 1]),

@@ -1,5 +1,5 @@
 """Failure probabilities: error, coverage and cost of jast's estimators, ``python -m
-benchmarks.probability [--json] [--quick] [--only PART ...]``.
+benchmarks.probability [--json] [--quick | --smoke] [--only PART ...]``.
 
 ``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the
 published Algorithm 2, traces a second; ``range``: log P to 1e-100 in float32; ``policy``: learned
@@ -23,6 +23,7 @@ from scipy import stats
 import jast
 from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
+from benchmarks.sizes import options, size
 from jast.distributions import Normal
 from jast.distributions.mixtures import blend
 from jast.estimate import (
@@ -64,7 +65,7 @@ def _two_starts(s0):
     return blend(jnp.array([0.5, 0.5]), Normal(s0, 0.1), Normal(-s0, 0.1))
 
 
-def landing(seeds, samples=100_000):
+def landing(seeds, samples=100_000, timed=2_000_000):
     sim, traces = both_traces()
     policy = Policy(Partial(_two_starts, jnp.float32(0.526)), _to_the_edge)
     proposals = {
@@ -76,11 +77,11 @@ def landing(seeds, samples=100_000):
     for name, proposal in proposals.items():
         runs = [importance(jax.random.key(seed), sim, proposal, samples) for seed in range(seeds)]
         cpu, wall = time.process_time(), time.perf_counter()
-        importance(jax.random.key(seeds), sim, proposal, 2_000_000)
+        importance(jax.random.key(seeds), sim, proposal, timed)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
         out[name] = summary([(r, LANDING) for r in runs]) | {
-            "traces_per_cpu_s": 2e6 / cpu,
-            "traces_per_s": 2e6 / wall,
+            "traces_per_cpu_s": timed / cpu,
+            "traces_per_s": timed / wall,
         }
     return out
 
@@ -201,14 +202,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.probability", description=__doc__.splitlines()[0]
     )
-    parser.add_argument(
-        "--json", action="store_true", help="print the report as JSON, and nothing else"
-    )
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="under two minutes: few seeds, no learned policies, two families",
-    )
+    options(parser, "under two minutes: few seeds, no learned policies, two families")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="parts to run; default: all")
     parser.add_argument(
         "--seeds", type=int, help="seeds of each family in coverage (20), and of default (50)"
@@ -221,16 +215,20 @@ def main(argv=None):
         metavar="FAMILY",
         help=", ".join(FAMILIES),
     )
-    parser.add_argument("--budget", type=int, default=100_000)
+    parser.add_argument("--budget", type=int, help="default 100,000")
     args = parser.parse_args(argv)
     parts = args.only or [
         part for part in PARTS if not (args.quick and part in ("policy", "cases"))
     ]
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    report, quick = {"budget": args.budget}, args.quick
+    if args.smoke:  # policies need minutes
+        parts = [part for part in parts if part != "policy" or args.only]
+    budget = args.budget or size(args, 100_000, 100_000, 5000)
+    report, quick = {"budget": budget}, args.quick
+    seeds = lambda *n: args.seeds or size(args, *n)
 
     if "landing" in parts:
-        report["landing"] = landing(5 if quick else 200)
+        report["landing"] = landing(*size(args, (200,), (5,), (1, 1000, 1000)))
         say("importance resampling on the landing, 1e5 traces")
         for name, r in report["landing"].items():
             say(
@@ -238,7 +236,7 @@ def main(argv=None):
                 f" {r['traces_per_s'] / 1e6:.2f} M a s"
             )
     if "range" in parts:
-        report["range"] = to_small()
+        report["range"] = to_small(1000 if args.smoke else 262_144)
         for r in report["range"]:
             say(
                 f"  log10 P {r['log10_P']:8.2f}  error {100 * r['error']:6.2f} %  SE"
@@ -253,9 +251,9 @@ def main(argv=None):
             sep="\n",
         )
     if "default" in parts:
-        say(f"failure_probability, budget {args.budget}")
-        peers = [] if quick else ["subset", "nais", "form_16", "form_by_hand"]
-        report["default"] = default(args.seeds or (3 if quick else 50), peers, args.budget)
+        say(f"failure_probability, budget {budget}")
+        peers = [] if quick or args.smoke else ["subset", "nais", "form_16", "form_by_hand"]
+        report["default"] = default(seeds(50, 3, 1), peers, budget)
         for name, r in report["default"].items():
             if "covers" in r:
                 say(line(name, r))
@@ -266,17 +264,14 @@ def main(argv=None):
                 )
     if "cases" in parts:
         report["cases"] = {}
-        for c in cases():
-            report["cases"][c.name] = r = ours([c[1:]] * (args.seeds or 10), args.budget)
+        for c in cases(["four-branch"] if args.smoke else None):
+            report["cases"][c.name] = r = ours([c[1:]] * seeds(10, 10, 1), budget)
             say(line(c.name, r))
     if "coverage" in parts:
         report["coverage"], total = {}, []
-        for family in ("two_sided", "branches") if quick else args.families:
-            problems = [
-                draw(family, 50_000 + seed)[1:]
-                for seed in range(args.seeds or (3 if quick else 20))
-            ]
-            report["coverage"][family] = r = ours(problems, args.budget)
+        for family in size(args, args.families, ("two_sided", "branches"), ("branches",)):
+            problems = [draw(family, 50_000 + seed)[1:] for seed in range(seeds(20, 3, 1))]
+            report["coverage"][family] = r = ours(problems, budget)
             total.append(r)
             say(line(family, r))
         n, flagged, covers, missed = (

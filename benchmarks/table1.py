@@ -16,6 +16,7 @@ import numpy as np
 import jast
 from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
+from benchmarks.sizes import size
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.search.tree.memory import LANES
@@ -47,9 +48,23 @@ class Sizes(NamedTuple):
     warm_trees: int = 40
     substeps: tuple = (0, 3, 10, 30, 100, 300)
     """Of the slowed simulators."""
+    modes: tuple = ("paper", "default")
+    """Of the paper's table."""
+    variants: tuple = tuple(VARIANTS)
+    published: int = 500
+    """Simulations a root, of the paper's table."""
+    small: int = 50
+    """Simulations a root, where that is few."""
 
 
 QUICK = Sizes(100, 24, 1, 8, ("none", "both"), 50, (), 100, (15.0,), 100, (0, 30, 300))
+SMOKE = Sizes(
+    *(2, 2, 1, 1, ("both",), 5, (), 2, (15.0,), 2, (0,)),
+    modes=("paper",),
+    variants=("MCTS-SA",),
+    published=5,
+    small=5,
+)
 
 COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "B": (3, lambda r: r["B"] or "-"),
@@ -114,12 +129,18 @@ def variant(name, mode, sizes):
     s0, heads = jast.simulators.ferry(), VARIANTS[name]
     if name == "MCTS-SA":
         return functools.partial(
-            jast.search.mcts, sim=s0, trees=sizes.trees, mode=mode, reward=REWARD, actions=BOX
+            jast.search.mcts,
+            sim=s0,
+            trees=sizes.trees,
+            simulations=18 * sizes.published,
+            mode=mode,
+            reward=REWARD,
+            actions=BOX,
         )
     # alone, the paper's value network is not trained
     published = dict(train=False) if heads == "value" else dict(round=sizes.round)
     trees = sizes.taught_trees if mode == "paper" and name.startswith("RP") else sizes.trees
-    return forest(s0, heads, mode, trees, **(published if mode == "paper" else {}))
+    return forest(s0, heads, mode, trees, sizes.published, **(published if mode == "paper" else {}))
 
 
 def warm_up(search):
@@ -261,7 +282,7 @@ def warm_start(sizes, seeds, say):
             forest,
             jast.simulators.ferry(adversary=(x, 0.0)),
             trees=sizes.warm_trees,
-            simulations=50,
+            simulations=sizes.small,
         )
         rows = {
             "none": search(),
@@ -270,8 +291,8 @@ def warm_start(sizes, seeds, say):
             "frozen": [search(h, train=False) for h in heads],
         }
         title = (
-            f"start at ({x:g}, 0), 18 x 50: heads that start cold, or warm from {taught} (not"
-            " counted), or stay as those are (frozen)"
+            f"start at ({x:g}, 0), 18 x {sizes.small}: heads that start cold, or warm from"
+            f" {taught} (not counted), or stay as those are (frozen)"
         )
         out[f"({x:g}, 0)"] = block(title, rows, later, say)
     return out
@@ -294,8 +315,8 @@ def slowed(sizes, seeds, say):
         sim = engine.slow_ferry(n)
         cost = episode_cost(sim, max(4, 1000 // (3 + n)))
         rows = block(
-            f"{n} substeps, 18 x 50: {cost:.2f} us an episode",
-            kinds(("none", "rollout", "both"), sim, trees=sizes.trees, simulations=50),
+            f"{n} substeps, 18 x {sizes.small}: {cost:.2f} us an episode",
+            kinds(("none", "rollout", "both"), sim, trees=sizes.trees, simulations=sizes.small),
             seeds,
             say,
         )
@@ -370,7 +391,7 @@ def bars(ax, points, style):
 
 def report(args):
     """Measure, print and draw what the arguments of `benchmarks.ferry` ask for."""
-    sizes = QUICK if args.quick else Sizes()
+    sizes = size(args, Sizes(), QUICK, SMOKE)
     if args.trees:
         sizes = sizes._replace(
             trees=args.trees,
@@ -397,10 +418,10 @@ def report(args):
     )
     for name, row in rows.items():
         say(line(name, row))
-    for mode in ("paper", "default"):
+    for mode in sizes.modes:
         out[mode] = block(
             f"S0, {mode} mode",
-            {name: variant(name, mode, sizes) for name in VARIANTS},
+            {name: variant(name, mode, sizes) for name in sizes.variants},
             seeds,
             say,
             bests,
@@ -413,8 +434,8 @@ def report(args):
         say,
     )
     out["small"] = block(
-        "S0, default mode, 18 x 50",
-        kinds(sizes.heads, s0, trees=sizes.trees, simulations=50),
+        f"S0, default mode, 18 x {sizes.small}",
+        kinds(sizes.heads, s0, trees=sizes.trees, simulations=sizes.small),
         seeds,
         say,
     )

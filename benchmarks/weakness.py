@@ -1,13 +1,14 @@
 """Weakness recognition: how many of a classifier's failures are found in so many calls (chapter 4
 of Moss's thesis, and reference figures on the same images).
 
-``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick] [--seeds N] [--picture FILE]``.
-With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the published classifier in
-it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random forest that
-were trained on the first half of the images and are validated on the other. Without: scikit-learn's
-digits, a third to train on and the rest to validate, and three classifiers. Means over seeds, +-
-one standard error of that mean. "difficulty" is the committee's word before any call; "pixels" the
-cross-validated logistic regression on 64 principal components that needs no call either. Failures
+``python -m benchmarks.weakness [--data FOLDER] [--json] [--quick | --smoke] [--seeds N] [--picture
+FILE]``. With ``--data``: the 10,000 MNIST test images of FOLDER (IDX files) and the published
+classifier in it (``sut_784x32x10.npz``: W1, b1, W2, b2), then three nearest neighbours and a random
+forest that were trained on the first half of the images and are validated on the other. Without:
+scikit-learn's digits, a third to train on and the rest to validate, and three classifiers. Means
+over seeds, +- one standard error of that mean. "difficulty" is the committee's word before any
+call; "pixels" the cross-validated logistic regression on 64 principal components that needs no call
+either. Failures
 found are shares of all of them, at budgets of 5, 10 and 25 % of the inputs; AUC and precision are
 those of the final scores on all inputs, where those that were run are judged by models that have
 not seen their outcome; candidates: as many as 627 of 10,000. Seconds are of one validation, the
@@ -29,6 +30,7 @@ from sklearn.neural_network import MLPClassifier
 
 from benchmarks.ferry import timed
 from benchmarks.fms import mean
+from benchmarks.sizes import options, size
 from jast import plot, weakness
 
 SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
@@ -254,24 +256,24 @@ def study(images, labels, predicted, seeds, quick, picture):
     return rows | {"inputs": len(labels), "failures": int(failed.sum())}
 
 
-def main():
+def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--data", help="folder with the MNIST test images and the published classifier"
     )
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON at the end")
-    parser.add_argument(
-        "--quick", action="store_true", help="one system, 2 seeds, without the thesis's mode"
-    )
+    options(parser, "one system, 2 seeds, without the thesis's mode")
     parser.add_argument("--seeds", type=int, default=None, help="default 10")
     parser.add_argument(
         "--picture", help="draw the first system's failures found against calls into this file"
     )
-    given = parser.parse_args()
-    seeds = given.seeds or (2 if given.quick else 10)
-    systems = mnist(given.data, given.quick) if given.data else digits(given.quick)
+    given = parser.parse_args(argv)
+    seeds = given.seeds or size(given, 10, 2, 1)
+    one = given.quick or given.smoke
+    systems = mnist(given.data, one) if given.data else digits(one)
     out = {}
     for name, images, labels, predicted in systems:
+        if given.smoke:
+            images, labels, predicted = images[:80], labels[:80], predicted[:80]
         print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
         out[name] = study(
             images, labels, predicted, seeds, given.quick, None if out else given.picture

@@ -1,5 +1,8 @@
-"""Every benchmark runs and reports numbers, at its smallest sizes."""
+"""Every benchmark runs and reports numbers: at its smallest size in the suite, and as its users run
+it with the long tests.
+"""
 
+import importlib
 import importlib.util
 import json
 import os
@@ -7,15 +10,27 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SHORT = {  # of the suite: seconds each
+SMALLEST = {  # beside each other what shares compiled programs
+    "ferry": ["--smoke"],
+    "table1": ["--table1", "--smoke"],
+    "engine": ["--smoke"],
+    "blackbox": ["--smoke"],
+    "bridge": ["--smoke"],
+    "colav": ["--smoke"],
+    "cross_entropy": ["--smoke"],
+    "fms": ["--smoke"],
+    "limit_states": ["--smoke"],
     "peers": "--seeds 1 --cases branin --peers random_search differential_evolution".split(),
+    "probability": ["--smoke"],
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
+    "weakness": ["--smoke"],
 }
-LONG = {
+QUICK = {
     "blackbox": ["--quick"],
     "bridge": ["--quick"],
     "colav": ["--quick"],
@@ -28,36 +43,19 @@ LONG = {
     "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }
-NEEDS = {  # of the extra `benchmark`, which the tests do not install
-    "cross_entropy": ["cma"],
-    "engine": ["mctx"],
-    "reliability": ["openturns"],
-}
+# of the extra `benchmark`, which the tests do not install
+NEEDS_SMALLEST = {"reliability": ["openturns"]}
+NEEDS_QUICK = {"cross_entropy": ["cma"], "engine": ["mctx"]}
 
 
-def test_no_benchmark_is_left_out():
-    programs = {
-        path.stem for path in (ROOT / "benchmarks").glob("*.py") if "argparse" in path.read_text()
-    }
-    assert programs | {"table1"} == SHORT.keys() | LONG.keys()
+def module(name):
+    return "benchmarks.ferry" if name == "table1" else f"benchmarks.{name}"
 
 
-@pytest.mark.parametrize("name", [*SHORT, *(pytest.param(n, marks=pytest.mark.long) for n in LONG)])
-def test_a_benchmark_reports(name, tmp_path):
-    for package in NEEDS.get(name, []):
+def skip_without(packages):
+    for package in packages:
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is not installed")
-    module = "ferry" if name == "table1" else name
-    done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{module}", "--json", *(SHORT | LONG)[name]],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr
-    assert len(numbers(json.loads(done.stdout[done.stdout.index("{") :]))) > 5
 
 
 def numbers(report):
@@ -66,3 +64,65 @@ def numbers(report):
     if isinstance(report, list):
         return [number for part in report for number in numbers(part)]
     return [report] if isinstance(report, int | float) else []
+
+
+def check(printed):
+    assert len(numbers(json.loads(printed[printed.index("{") :]))) > 5
+
+
+def test_no_benchmark_is_left_out():
+    programs = {
+        path.stem
+        for path in (ROOT / "benchmarks").glob("*.py")
+        if "ArgumentParser(" in path.read_text()
+    }
+    assert programs | {"table1"} == SMALLEST.keys()
+
+
+@pytest.fixture
+def as_users_have_it():
+    """JAX's own precision and promotion, which a benchmark may also change for itself."""
+    kept = {name: getattr(jax.config, name) for name in SETTINGS}
+    for name, value in SETTINGS.items():
+        jax.config.update(name, value)
+    yield
+    for name, value in kept.items():
+        jax.config.update(name, value)
+
+
+SETTINGS = {
+    "jax_enable_x64": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+}
+
+
+@pytest.mark.parametrize("name", SMALLEST)
+def test_a_benchmark_runs(name, as_users_have_it, monkeypatch, capsys):
+    skip_without(NEEDS_SMALLEST.get(name, []))
+    monkeypatch.syspath_prepend(str(ROOT))
+    importlib.import_module(module(name)).main([*SMALLEST[name], "--json"])
+    check(capsys.readouterr().out)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", QUICK)
+def test_a_benchmark_reports(name):
+    skip_without(NEEDS_QUICK.get(name, []))
+    done = subprocess.run(
+        [sys.executable, "-m", module(name), "--json", *QUICK[name]],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+    check(done.stdout)
+
+
+def test_a_measurement_in_a_process_of_its_own_is_the_same(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    engine = importlib.import_module("benchmarks.engine")
+    alone, here = (f("interval", 3, 10, module="reference") for f in (engine.alone, engine.here))
+    assert tuple(alone) == here
