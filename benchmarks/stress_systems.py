@@ -38,7 +38,7 @@ def linear(steps, beta=4.55, sides=1, decay=0.95):
         return out >= limit, jnp.maximum(limit - out, 0.0)
 
     return jast.Simulator(
-        init=lambda x0: jnp.float32(0),
+        init=lambda x0: jnp.zeros(()),
         step=lambda y, x: decay * y + x,
         disturbance=lambda y: Normal(0.0, 1.0),
         evaluate=evaluate,
@@ -141,7 +141,7 @@ def slips():
         init=lambda x0: jnp.zeros(2, jnp.int32),
         step=step,
         disturbance=lambda s: Categorical(probs=jnp.array([0.9, 0.04, 0.06])),
-        evaluate=lambda s: (s[1] >= 3, (3 - s[1]).astype(jnp.float32)),
+        evaluate=lambda s: (s[1] >= 3, (3 - s[1]).astype(float)),
         is_terminal=lambda s: s[0] >= 12,
         horizon=40,
     )

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import limit_state as latent
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
-from jast.estimate import limit_state as latent
 from jast.estimate import sums
 from jast.estimate.batches import balanced, drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.scipy.special import logsumexp
 
-from jast.estimate import limit_state as latent
+from jast import limit_state as latent
 
 __all__ = ["numbers"]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.episode import rollout
-from jast.estimate.limit_state import dimension, normal_numbers, outcome, policy_of
+from jast.limit_state import dimension, normal_numbers, outcome, policy_of
 from jast.rewards import log_likelihood
 
 __all__ = ["design_points", "distinct"]

@@ -9,17 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import limit_state as latent
 from jast import results
 from jast._checks import random_key, whole
 from jast.episode import Episode
-from jast.estimate import limit_state as latent
 from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.populations import Chain
-from jast.estimate.proposals import as_proposal, latents
-from jast.outline import outline
+from jast.estimate.proposals import as_proposal
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -89,9 +88,8 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
-        recorded = e.x0, e.disturbances, e.length
-        z = latent.flat(sim, *latents(sim, recorded, outline(sim).random_start))
-        z, failure, log_w = jax.device_get((z, e.failure, log_w))
+        z = latent.normal_of(sim, e)
+        failure, log_w = jax.device_get((e.failure, log_w))
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
         raise ValueError(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jast.estimate.limit_state import Latent
+from jast.limit_state import Latent
 
 __all__ = ["Gaussians", "as_latent", "fit", "shrunk", "together", "unit"]
 

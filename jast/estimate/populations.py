@@ -16,7 +16,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 
 from jast.counter import generator
-from jast.estimate.limit_state import dimension, log_ratios, normal_numbers, outcomes
+from jast.limit_state import dimension, log_ratios, normal_numbers, outcomes
 
 __all__ = ["cool", "explore"]
 

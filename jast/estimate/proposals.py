@@ -6,7 +6,6 @@ RL-Informed Sampling ("the paper").
 """
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import jax
@@ -20,7 +19,8 @@ from jast._checks import real
 from jast._jax import is_traced
 from jast.contract import contract
 from jast.distributions.mixtures import blend
-from jast.episode import Episode, replay
+from jast.episode import Episode
+from jast.limit_state import latents
 from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.pytrees import fitted
@@ -213,25 +213,6 @@ def _stacked(sim, episodes):
                 f"trace_proposal: episodes do not fit the simulator: {error}"
             ) from None
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
-
-
-@partial(jax.jit, static_argnums=2)
-def latents(sim, recorded, of_start):
-    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end
-    of each.
-    """
-
-    def one(x0, x, length):
-        e = replay(
-            sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(()))
-        )
-        states = jax.tree.map(lambda a: a[:-1], e.states)
-        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
-        live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
-        z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
-        return D.to_normal(sim.start(), x0) if of_start else (), z
-
-    return jax.vmap(one)(*recorded)
 
 
 def _stack(many, one, k):

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast import limit_state as latent
 from jast.counter import generator
-from jast.estimate import limit_state as latent
 from jast.estimate.batches import Batch, balanced, drawn, over_batches
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, effective, fit, together, unit

@@ -2,11 +2,26 @@
 
 from jast._doors import listed
 from jast.search.cem import cem
+from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.forest import forest
 from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
+from jast.search.refinement import Refined, refine
 from jast.search.result import History, SearchResult, table
 
-__all__ = ["History", "SearchResult", "cem", "forest", "mcts", "monte_carlo", "table"]
+__all__ = [
+    "History",
+    "Mode",
+    "Modes",
+    "Refined",
+    "SearchResult",
+    "cem",
+    "forest",
+    "mcts",
+    "modes",
+    "monte_carlo",
+    "refine",
+    "table",
+]
 
 __dir__ = listed(__all__)

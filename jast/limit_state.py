@@ -7,10 +7,13 @@ nothing, so densities are taken over the used ones. With Cholesky factors, lower
 are a cumulative sum.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast import actions as choices
@@ -18,10 +21,10 @@ from jast import distributions as D
 from jast.contract import contract
 from jast.cross_entropy.sequences import player
 from jast.distributions.numbers import unflat
-from jast.episode import rollout
+from jast.episode import Episode, replay, rollout
 from jast.outline import outline
 from jast.policy import Policy
-from jast.progress import advance, begin, conclude
+from jast.progress import Progress, advance, begin, conclude
 from jast.pytrees import count
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
@@ -90,18 +93,25 @@ def normal_numbers(sim: Simulator) -> Any:
     return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
 
 
-def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
-    """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
+def ended(sim: Simulator, z: jax.Array, reward: Callable) -> tuple[Progress, jax.Array]:
+    """The `Progress` at the end of the one episode of ``z`` [D], and its steps; differentiable in
+    forward mode.
+    """
     policy, last = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32)
-    first = begin(sim, log_likelihood, D.mode(policy.start()))
+    first = begin(sim, reward, D.mode(policy.start()))
 
     def body(carry):
         progress, t = carry
         x = D.mode(policy.disturbance(progress.state, t))
-        return advance(sim, log_likelihood, progress, x, t + 1 >= last), t + 1
+        return advance(sim, reward, progress, x, t + 1 >= last), t + 1
 
     end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
-    end = conclude(sim, log_likelihood, end)
+    return conclude(sim, reward, end), length
+
+
+def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
+    """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
+    end, length = ended(sim, z, log_likelihood)
     about = outline(sim)
     used = count(about.x0) + length * count(about.x)
     return Outcomes(end.failure, end.distance, used, length, end.invalid)
@@ -178,3 +188,30 @@ def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
         ],
         axis=1,
     )
+
+
+@partial(jax.jit, static_argnums=2)
+def latents(sim, recorded, of_start):
+    """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end
+    of each.
+    """
+
+    def one(x0, x, length):
+        e = replay(
+            sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(()))
+        )
+        states = jax.tree.map(lambda a: a[:-1], e.states)
+        z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
+        live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
+        z = jax.tree.map(lambda a: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, 0), z)
+        return D.to_normal(sim.start(), x0) if of_start else (), z
+
+    return jax.vmap(one)(*recorded)
+
+
+def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
+    """The points [n, D] of the episodes ``given`` [n]; numbers that decided nothing are 0."""
+    if not len(given.length):
+        return np.zeros((0, dimension(sim)), normal_numbers(sim))
+    recorded = given.x0, given.disturbances, jnp.asarray(given.length)
+    return np.asarray(flat(sim, *latents(sim, recorded, outline(sim).random_start)))

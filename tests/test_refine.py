@@ -1,0 +1,168 @@
+"""refine and modes, against closed forms."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from benchmarks.stress_systems import CASES, linear
+from jast import limit_state as latent
+from jast.distributions import Exponential, MultivariateNormalDiag, Normal
+from jast.failures import collect
+from jast.search import moves as M
+from jast.search import refine
+from jast.search.failure_modes import modes
+
+
+def draws(sim, scale, n=300, seed=0):
+    """Failures of wider noise: an archive, ranked by log p relative to the mode."""
+    z = scale * np.random.default_rng(seed).standard_normal((n, latent.dimension(sim)))
+    e = jax.device_get(latent.episodes(sim, jnp.asarray(z, latent.normal_numbers(sim))))
+    return collect(sim, M.likelihood(sim), e, top=200)
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_a_linear_system_ends_at_the_closed_form(gradients, key):
+    sim = linear(10)
+    found = draws(sim, 4.0)
+    result = refine(key, sim, found, budget=12_000, gradients=gradients)
+    best = result.failures.best
+    assert float(best.reward) == pytest.approx(-(4.55**2) / 2, abs=0.01 if gradients else 0.1)
+    # the disturbances of the optimum are those of the filter's impulse response
+    weights = 0.95 ** np.arange(9, -1, -1)
+    np.testing.assert_allclose(
+        best.disturbances, 4.55 * weights / np.linalg.norm(weights), atol=0.05 if gradients else 0.3
+    )
+    assert result.episodes <= 12_000
+    if gradients:
+        assert result.residual[0] < 0.02
+
+
+def test_what_comes_back_replays_and_is_sorted(key):
+    sim = CASES["relay"].make()
+    found = draws(sim, 3.0)
+    result = refine(key, sim, found, budget=2000)
+    rewards = result.failures.episodes.reward
+    assert len(rewards) and (np.diff(rewards) <= 0).all()
+    for e, origin, gain in zip(result.failures, result.origin, result.gain, strict=True):
+        assert bool(jast.replay(sim, e).failure)
+        assert gain >= 0
+        before = float(found[int(origin)].reward)
+        assert float(e.reward) >= before - 1e-3 * abs(before)
+
+
+def test_slips_of_whole_numbers_are_taken_out(key):
+    """No slope leads anywhere: removals alone."""
+    sim = CASES["slips"].make()
+    result = refine(key, sim, draws(sim, 2.0, n=3000), budget=6000)
+    assert float(result.failures.best.reward) == pytest.approx(3 * math.log(0.04 / 0.9), abs=1e-4)
+
+
+def test_disturbances_of_other_families(key):
+    """An exponential one, whose mode is at the edge: -x is log p less that of the mode."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Exponential(1.0),
+        evaluate=lambda s: (s >= 12, jnp.maximum(12 - s, 0.0)),
+        horizon=4,
+    )
+    result = refine(key, sim, draws(sim, 2.0), budget=3000)
+    assert float(result.failures.best.reward) == pytest.approx(-12, abs=0.01)
+
+
+def test_a_random_start_is_refined_too(key):
+    sim = jast.Simulator(
+        init=lambda x0: x0,
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= 6, jnp.maximum(6 - s, 0.0)),
+        horizon=3,
+        start=lambda: Normal(0.0, 1.0),
+    )
+    best = refine(key, sim, draws(sim, 3.0), budget=4000).failures.best
+    assert float(best.reward) == pytest.approx(-(6**2) / 2 / 4, abs=0.01)
+    np.testing.assert_allclose([best.x0, *best.disturbances], 1.5, atol=0.05)
+
+
+def test_gradients_that_are_nan_do_no_harm(key):
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(2),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)),
+        # the slope of sqrt is NaN at 0 when masked by where
+        evaluate=lambda s: (
+            s[0] >= 4,
+            jnp.where(s[0] < 4, jnp.maximum(4 - s[0], 0) + 0 * jnp.sqrt(s[1] * 0), 0.0),
+        ),
+        horizon=2,
+    )
+    result = refine(key, sim, draws(sim, 3.0), budget=4000)
+    assert float(result.failures.best.reward) == pytest.approx(-4.0, abs=0.02)
+    assert np.isnan(result.residual).all()
+
+
+def test_nothing_in_nothing_out(key):
+    sim = linear(10)
+    result = refine(key, sim, draws(sim, 1.0, n=10), budget=100)
+    assert len(result.failures) == 0 and "no failure" in str(result)
+    assert modes(sim, result.failures) == ()
+
+
+def test_bad_input_is_named(key):
+    sim = linear(10)
+    found = draws(sim, 4.0, n=50)
+    with pytest.raises(ValueError, match="refine: budget"):
+        refine(key, sim, found, budget=10)
+    seeds = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s,
+        disturbance=lambda s: jast.distributions.seeds(),
+        evaluate=lambda s: (s > 1, s),
+        horizon=2,
+    )
+    with pytest.raises(ValueError, match="refine: disturbance: Seeds has no quantile function"):
+        refine(key, seeds, found)
+
+
+@pytest.mark.parametrize("name", ["pedestrians", "branches"])
+def test_planted_modes_are_recovered(name, key):
+    case = CASES[name]
+    sim = case.make()
+    found = draws(sim, 4.0, n=400)
+    result = refine(key, sim, found, budget=10_000)
+    kinds = modes(sim, result.failures, found)
+    assert len(kinds) == case.modes
+    assert sum(m.members for m in kinds) == len(result.failures) + len(found)
+    assert sum(m.share for m in kinds) == pytest.approx(1)
+    assert float(kinds[0].failure.reward) == pytest.approx(case.optimum, abs=0.01)
+    assert len(str(kinds).splitlines()) == case.modes + 1
+
+
+def test_a_failure_at_another_time_is_of_the_same_mode(key):
+    """Four disturbances in a row above a threshold, at any time."""
+    sim = CASES["latch"].make()
+    archive = []
+    for at in (3, 20, 41):
+        x = np.zeros(50, jnp.zeros(()).dtype)
+        x[at : at + 4] = 2.0
+        archive.append(jax.device_get(jast.replay(sim, x)._replace(states=None)))
+    found = collect(sim, M.likelihood(sim), jax.tree.map(lambda *a: np.stack(a), *archive))
+    assert len(found) == 3
+    assert len(modes(sim, found)) == 1
+
+
+def test_results_print_and_save(key, tmp_path):
+    sim = linear(10, sides=2)
+    found = draws(sim, 4.0)
+    result = refine(key, sim, found, budget=1000)
+    assert "log p rel." in str(result)
+    jast.save(tmp_path / "refined", result)
+    again = jast.load(tmp_path / "refined", sim)
+    np.testing.assert_array_equal(again.gain, result.gain)
+    kinds = modes(sim, result.failures, found)
+    jast.save(tmp_path / "modes", kinds)
+    assert str(jast.load(tmp_path / "modes")) == str(kinds)
