@@ -14,8 +14,9 @@ from jast import distributions as D
 from jast.distributions.mixtures import Blended, Moved, x_of
 from jast.heads.heads import Moments
 from jast.policies import lanes as L
+from jast.policies.actor import Net, entropy_term
 from jast.policies.latent import log_normal, sizes
-from jast.policies.learner import Net, Rates, entropy_term, learner, networks, update
+from jast.policies.learner import Rates, learner, networks, update
 from jast.policies.start import Tilt, _first, fit, log_density
 
 DISTRIBUTIONS = dict(
@@ -65,16 +66,20 @@ def test_a_joint_disturbance_is_moved_number_by_number(key):
 
 def test_sizes_count_floats_and_name_what_cannot_be_tilted():
     start = lambda: D.Normal(jnp.zeros(3), 1.0)
-    assert sizes(walk()) == (1, 0)
-    assert sizes(walk(lambda x0: x0.sum(), start=lambda: D.Independent(start(), 1))) == (1, 3)
+    assert sizes(walk(), "sac") == (1, 0)
+    assert sizes(walk(lambda x0: x0.sum(), start=lambda: D.Independent(start(), 1)), "sac") == (
+        1,
+        3,
+    )
     assert sizes(
         walk(
             lambda x0: x0.astype(jnp.zeros(()).dtype),
             start=lambda: D.Categorical(probs=jnp.array([0.5, 0.5])),
-        )
+        ),
+        "sac",
     ) == (1, 0)
     with pytest.raises(ValueError, match="sac: disturbance: expected floats, received float.*int"):
-        sizes(ring())
+        sizes(ring(), "sac")
     beta = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x,
@@ -83,7 +88,7 @@ def test_sizes_count_floats_and_name_what_cannot_be_tilted():
         4,
     )
     with pytest.raises(ValueError, match="sac: disturbance: Beta cannot be tilted"):
-        sizes(beta)
+        sizes(beta, "sac")
 
 
 def play(sim, x0, zs, dense=True):

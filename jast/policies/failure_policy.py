@@ -13,8 +13,8 @@ from jax.tree_util import Partial
 from jast import results
 from jast.distributions.mixtures import Blended
 from jast.heads.heads import observed
+from jast.policies.actor import act, see
 from jast.policies.lanes import potential
-from jast.policies.learner import act, see
 from jast.policy import Policy
 
 __all__ = ["FailurePolicy", "History"]

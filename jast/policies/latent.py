@@ -24,19 +24,19 @@ def log_normal(z, mean=None, deviation=None):
     return -0.5 * jnp.sum(((z - mean) / deviation) ** 2 + LOG_2PI) - jnp.sum(jnp.log(deviation))
 
 
-def sizes(sim: Simulator) -> tuple[int, int]:
+def sizes(sim: Simulator, function: str) -> tuple[int, int]:
     """``(n, n0)``: how many numbers x and x0 are made of; n0 is 0 where the start is fixed, or not
     of floats with quantiles, and then drawn as it is.
 
-    ValueError naming ``disturbance`` where x is not of floats, or has no quantile function with an
-    inverse.
+    ValueError of ``function``, naming ``disturbance``, where x is not of floats or has no quantile
+    function with an inverse.
     """
     like = outline(sim)
     if not _floats(like.x):
-        raise ValueError(f"sac: disturbance: expected floats, received {_kinds(like.x)}")
+        raise ValueError(f"{function}: disturbance: expected floats, received {_kinds(like.x)}")
     start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
-        raise ValueError(f"sac: disturbance: {step}")
+        raise ValueError(f"{function}: disturbance: {step}")
     return count(like.x), count(like.x0) if _floats(like.x0) and start is None else 0
 
 

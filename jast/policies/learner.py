@@ -6,23 +6,15 @@ is V(s) = log E_p[exp(lambda (d(s) - d(s_T)))], which is, less lambda d(s) and f
 the log of the probability of failure from s; the best pi is the disturbances given failure.
 """
 
-import itertools
-import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.scipy.special import ndtr
 
 from jast.heads.networks import dense
-from jast.policies.latent import LOG_2PI, log_normal
+from jast.policies.actor import act, adam, descend, drawn, entropy_term, network, see
 
-__all__ = ["entropy_term", "learner", "networks"]
-
-
-EVEN = 0.2
-"""Share of the policy's mixture that all components have alike."""
+__all__ = ["learner", "networks"]
 
 
 class Rates(NamedTuple):
@@ -36,17 +28,6 @@ class Rates(NamedTuple):
     bonus: Any
     adapt: Any
     """1 where alpha follows ``entropy``, else 0."""
-
-
-class Net(NamedTuple):
-    """What goes in and out of the networks."""
-
-    inputs: Any
-    """`jast.heads.Moments` of the observation."""
-    unit: Any
-    """float32: the distance that an episode comes nearer by, about; times lambda what the critics
-    answer in.
-    """
 
 
 class Learner(NamedTuple):
@@ -68,7 +49,7 @@ def networks(m, n, hidden, components):
     """The networks' ``(init, apply)``, the actor's and the critic's, for ``m`` numbers seen, time
     and distance beside them, and ``n`` latents.
     """
-    return dense(hidden, (components, 2 * n + 1), "relu", True), dense(hidden, (), "relu", True)
+    return network(n, hidden, components), dense(hidden, (), "relu", True)
 
 
 def learner(key, m, n, hidden, components, alpha):
@@ -78,79 +59,10 @@ def learner(key, m, n, hidden, components, alpha):
         jax.eval_shape(init, jax.random.key(0), jnp.zeros((size,), jnp.float32))
         for init, size in zip(inits, (m + 2, m + 2 + n), strict=True)
     ]
-    actor, one, other = _drawn(key, (shapes[0], shapes[1], shapes[1]))
+    actor, one, other = drawn(key, (shapes[0], shapes[1], shapes[1]))
     critic = jax.tree.map(lambda a, b: jnp.stack([a, b]), one, other)
     parts = actor, critic, jnp.log(alpha)
-    return Learner(actor, critic, critic, actor, parts[2], tuple(_adam().init(p) for p in parts))
-
-
-def _drawn(key, shapes):
-    """Networks' parameters, uniform in +-1/sqrt(fan-in) as `make_head` has them, in one draw: one
-    for each array is much to compile.
-    """
-    leaves, structure = jax.tree.flatten([params["params"] for params in shapes])
-    fan_in = lambda layer: dict.fromkeys(layer, layer["kernel"].shape[0])
-    fans = jax.tree.leaves(
-        [{name: fan_in(layer) for name, layer in params["params"].items()} for params in shapes]
-    )
-    ends = list(itertools.accumulate(math.prod(s.shape) for s in leaves))
-    flat = jax.random.uniform(key, (ends[-1],), jnp.float32, -1, 1)
-    drawn = [
-        flat[b - math.prod(s.shape) : b].reshape(s.shape) / math.sqrt(fan)
-        for s, fan, b in zip(leaves, fans, ends, strict=True)
-    ]
-    return [{"params": params} for params in structure.unflatten(drawn)]
-
-
-def see(net, horizon, seen, t, potential):
-    """[m + 2]: the actor's inputs, the observation in its moments, the share of the horizon that is
-    gone (the best policy depends on the time left), and the miss distance as it shapes the reward:
-    the value of a state has its kinks.
-    """
-    gone = jnp.asarray(t).astype(jnp.float32) / horizon
-    return jnp.concatenate(
-        [net.inputs.normalise(seen), jnp.stack([gone - 0.5, potential / net.unit])]
-    )
-
-
-def act(apply, actor, inputs):
-    """The policy: a mixture of the latents, its log weights [K], means and deviations [K, n]; a
-    deviation is from e^-2 to e^2.
-    """
-    out = apply(actor, inputs)
-    n = (out.shape[1] - 1) // 2
-    # no component may die out: it would learn no more, and never come to see its own way
-    weights = (1 - EVEN) * jax.nn.softmax(out[:, 0]) + EVEN / out.shape[0]
-    return (
-        jnp.log(weights),
-        out[:, 1 : n + 1] + _apart(out.shape[0], n),
-        jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2)),
-    )
-
-
-def _apart(k, n):
-    """[k, n]: where the components are before anything was learned, on opposite sides, so that each
-    goes its own way.
-    """
-    side = np.random.default_rng(0).choice([-1.0, 1.0], size=(1, n))
-    if k == 1:
-        return jnp.zeros((1, n), jnp.float32)
-    return jnp.asarray(np.linspace(-1, 1, k)[:, None] * side, jnp.float32)
-
-
-def draw(mixture, noise):
-    """Latents [n] of a mixture of `act`, by n + 1 standard normal numbers."""
-    log_w, mean, deviation = mixture
-    k = jnp.sum(ndtr(noise[-1]) > jnp.cumsum(jnp.exp(log_w))[:-1], dtype=jnp.int32)
-    return mean[k] + deviation[k] * noise[:-1]
-
-
-def entropy_term(z, log_w, mean, deviation):
-    """log pi(z | s) less the log density of N(0, I) at its mode: so measured, an episode that ends
-    early neither gains nor loses.
-    """
-    log_pi = jax.nn.logsumexp(log_w + jax.vmap(log_normal, (None, 0, 0))(z, mean, deviation))
-    return log_pi + 0.5 * z.shape[0] * LOG_2PI
+    return Learner(actor, critic, critic, actor, parts[2], tuple(adam().init(p) for p in parts))
 
 
 def _values(apply, unit, critic, inputs, z):
@@ -224,7 +136,7 @@ def update(noise, learner, applies, net, rates, acting, scale, rows, horizon):
     )
     steps = acting * rates.learning_rate, rates.learning_rate, acting * rates.learning_rate
     moved = [
-        _descend(*each) for each in zip(gradients, learner.optimiser, parts, steps, strict=True)
+        descend(*each) for each in zip(gradients, learner.optimiser, parts, steps, strict=True)
     ]
     (actor, critic, log_alpha), optimiser = zip(*moved, strict=True)
     follow = lambda old, new: jax.tree.map(lambda a, b: a + rates.polyak * (b - a), old, new)
@@ -239,15 +151,3 @@ def update(noise, learner, applies, net, rates, acting, scale, rows, horizon):
         ),
         loss,
     )
-
-
-def _adam():
-    import optax  # here: it takes a while, and only learning needs it
-
-    return optax.scale_by_adam()
-
-
-def _descend(gradient, optimiser, params, rate):
-    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-        step, optimiser = _adam().update(gradient, optimiser)
-    return jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, step), optimiser

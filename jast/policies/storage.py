@@ -13,9 +13,10 @@ from jast.archive import arrays_of, check_array, named
 from jast.contract import contract
 from jast.heads.heads import Moments
 from jast.outline import outline
+from jast.policies.actor import Net
 from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
 from jast.policies.latent import sizes
-from jast.policies.learner import Net, learner, networks
+from jast.policies.learner import learner, networks
 from jast.policies.start import Tilt
 from jast.simulator import Simulator
 
@@ -46,7 +47,7 @@ def parts(policy: FailurePolicy) -> tuple[dict, dict[str, np.ndarray]]:
     layers = learned.actor["params"]
     widths = [int(layers[f"Dense_{i}"]["bias"].shape[0]) for i in range(len(layers))]
     sim, _, dense = policy.disturbance.args[:3]
-    n, _ = sizes(sim)
+    n, _ = sizes(sim, "load")
     components = widths[-1] // (2 * n + 1)
     header = dict(
         hidden=widths[:-1],
@@ -75,7 +76,7 @@ def whole(
             f"load: {path} does not fit sim: its horizon is {header['horizon']}, expected"
             f" {sim.horizon}"
         )
-    n, n0 = sizes(sim)
+    n, n0 = sizes(sim, "load")
     if header["tilted"] != bool(n0):
         raise ValueError(
             f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} start,"
