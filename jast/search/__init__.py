@@ -4,6 +4,7 @@ from jast._doors import listed
 from jast.search.cem import cem
 from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.forest import forest
+from jast.search.go_explore import go_explore
 from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
 from jast.search.refinement import Refined, refine
@@ -17,6 +18,7 @@ __all__ = [
     "SearchResult",
     "cem",
     "forest",
+    "go_explore",
     "mcts",
     "modes",
     "monte_carlo",

@@ -36,6 +36,7 @@ __all__ = [
     "drive",
     "finish",
     "finish_traced",
+    "fold",
     "nothing",
     "play",
     "prepare",
@@ -76,6 +77,8 @@ class Tally(NamedTuple):
 
 
 NEVER = np.int32(2**31 - 1)
+FIRST = np.uint32(0x9E3779B9)
+"""The hash of no disturbance."""
 
 
 def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, judge=True):
@@ -99,11 +102,11 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
     def first(key, row):
         x0 = draw_start(key, row, sim.start()) if start else ()
         progress = begin(sim, reward, x0)
-        return x0, progress, _fold(jnp.uint32(0x9E3779B9), x0)
+        return x0, progress, fold(FIRST, x0)
 
     def move(key, row, progress, tag, last):
         x = draw(key, row, sim.disturbance(progress.state))
-        return x, advance(sim, reward, progress, x, last), _fold(tag, x)
+        return x, advance(sim, reward, progress, x, last), fold(tag, x)
 
     move = jax.vmap(move, (0, 0, 0, 0, None))
     x0, progress, tag = jax.vmap(first)(*at(0, rows[0], 0))
@@ -364,7 +367,7 @@ def finish_traced(sim, reward, n, best, best_reward):
     )
 
 
-def _fold(tag, x):
+def fold(tag, x):
     """The hash with the bits of one more disturbance: a multiply and a shift a word, as it is paid
     at every step.
     """

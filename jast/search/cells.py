@@ -1,0 +1,181 @@
+"""An archive of states to go on from, the likeliest known way to each cell of them.
+
+The cells of Go-Explore (Ecoffet et al. 2021) without any knowledge of the system: by the step, by
+the rank of the miss distance among the states kept (the nearest half of them, the nearest quarter,
+and so on), and by two random projections of what is observed. A slot holds a state and the
+disturbances that lead there; a cell's place is told anew at every merge, as ranks change.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast.outline import outline
+from jast.rewards import log_likelihood
+from jast.search import lockstep as E
+from jast.search import restarts as R
+from jast.simulator import Simulator, ravel
+
+__all__ = ["Cells", "chosen", "empty", "features", "merged"]
+
+PHASES, HALVES, SIDES = 16, 12, 3
+"""Cells: stretches of the horizon, halvings of the rank, cells to each side of a projection."""
+
+
+class Cells(NamedTuple):
+    """S slots."""
+
+    points: R.Point
+    x0: Any
+    rows: Any
+    """[S, horizon, ...]: the disturbances up to the point count."""
+    near: Any
+    """[S] the state's own miss distance; inf where there is none."""
+    seen: Any
+    """[S] int32: how many runs went on from the cell."""
+    live: Any
+    """[S] bool: the slot holds a state."""
+
+
+def empty(sim: Simulator, slots: int) -> Cells:
+    """No state yet."""
+    about = outline(sim)
+    zero = lambda s: jnp.zeros((slots, *s.shape), s.dtype)
+    long = lambda s: jnp.zeros((slots, sim.horizon, *s.shape), s.dtype)
+    point = jax.eval_shape(lambda: R.started(sim, log_likelihood, jax.tree.map(_blank, about.x0)))
+    return Cells(
+        jax.tree.map(zero, point),
+        jax.tree.map(zero, about.x0),
+        jax.tree.map(long, about.x),
+        jnp.full(slots, jnp.inf, about.dtype),
+        jnp.zeros(slots, jnp.int32),
+        jnp.zeros(slots, bool),
+    )
+
+
+def _blank(s):
+    return jnp.zeros(s.shape, s.dtype)
+
+
+def features(sim: Simulator, state: Any) -> jax.Array:
+    """[F] the numbers of a state that cells are told by: what it shows, finite."""
+    seen = sim.observe if outline(sim).observation is not None else ravel
+    row = jnp.ravel(jnp.asarray(seen(state)))
+    row = row if jnp.issubdtype(row.dtype, jnp.floating) else row.astype(outline(sim).dtype)
+    return jnp.clip(jnp.nan_to_num(row, nan=0.0), -1e6, 1e6)
+
+
+def chosen(cells: Cells, coin: jax.Array, u: jax.Array, nearest: Any) -> jax.Array:
+    """The slot [N] of each lane by uniform numbers ``coin`` and ``u`` [N]: with probability
+    ``nearest`` those that are nearest to failure first, else those least gone on from.
+    """
+    live = cells.live.astype(u.dtype)
+    near = jnp.where(cells.live & jnp.isfinite(cells.near), cells.near, jnp.inf)
+    rank = jnp.searchsorted(jnp.sort(near), near, side="right").astype(u.dtype)
+    seen = 1 / (1 + cells.seen.astype(u.dtype))
+    by = lambda weight, u: jnp.searchsorted(s := jnp.cumsum(weight), u * s[-1], side="right")
+    pick = jnp.where(
+        coin < nearest, by(live * jnp.sqrt(seen) / jnp.maximum(rank, 1), u), by(live * seen, u)
+    )
+    return jnp.minimum(pick, live.shape[0] - 1).astype(jnp.int32)
+
+
+def merged(
+    sim: Simulator,
+    cell: Callable | None,
+    key: jax.Array,
+    cells: Cells,
+    points: R.Point,
+    good: Any,
+    lane: Any,
+    ways: tuple[Any, Any],
+    most: int,
+) -> Cells:
+    """The archive with the best of the points.
+
+    Args:
+        sim: the simulator.
+        cell: the user's own cells, of a state, or None.
+        key: of the projections.
+        cells: the archive.
+        points: [M], new ones.
+        good: [M] bool: those that may go on.
+        lane: [M] int32: the row of ``ways`` that leads there.
+        ways: x0 and the disturbances, [N, ...] each.
+        most: of the points that enter; static.
+    """
+    slots = cells.live.shape[0]
+    real = cells.near.dtype
+    if sim.episodic:
+        near = jnp.full(good.shape, jnp.inf, real)
+    else:
+        near = jax.vmap(lambda s: jnp.asarray(sim.evaluate(s)[1]).astype(real))(
+            points.progress.state
+        )
+    both = lambda a, b: jnp.concatenate([a, b])
+    value = both(cells.points.progress.reward, points.progress.reward)
+    live = both(cells.live, good) & jnp.isfinite(value)
+    parts = cells.points.progress.state, points.progress.state
+    if cell is None:
+        told = both(*(jax.vmap(partial(features, sim))(s) for s in parts))
+        t = both(cells.points.t, points.t)
+        name = _by_default(sim, key, told, t, both(cells.near, near), live, cells)
+    else:
+        name = both(*(jax.vmap(lambda s: E.fold(jnp.uint32(E.FIRST), cell(s)))(s) for s in parts))
+    # the likeliest way to each cell
+    out = jnp.where(live, 0, 1)
+    index = jnp.arange(live.shape[0], dtype=jnp.int32)
+    out, name, _, order = lax.sort((out, name, -value, index), num_keys=4)
+    first = (out == 0) & jnp.concatenate(
+        [jnp.ones(1, bool), (name[1:] != name[:-1]) | (out[1:] != out[:-1])]
+    )
+    group = jnp.cumsum(first, dtype=jnp.int32) - 1
+    seen = both(cells.seen, jnp.zeros_like(points.t))[order]
+    seen = jnp.zeros_like(seen).at[group].max(jnp.where(out == 0, seen, 0))[group]
+    wins = jnp.zeros_like(first).at[order].set(first)
+    seen = jnp.zeros_like(seen).at[order].set(seen)
+
+    # the nearest of the new ones take the slots of those that lost, then of the most seen
+    old, new = wins[:slots], wins[slots:]
+    index = jnp.arange(new.shape[0], dtype=jnp.int32)
+    _, _, places = lax.sort((jnp.where(new, 0, 1), near, index), num_keys=2)
+    index = jnp.arange(slots, dtype=jnp.int32)
+    _, _, free = lax.sort((jnp.where(old, 1, 0), -seen[:slots], index), num_keys=2)
+    most = min(most, slots, len(places))
+    places, free = places[:most], free[:most]
+    enters = new[places] & (~old[free] | (seen[:slots][free] > 0))
+    to = jnp.where(enters, free, slots)
+    put = lambda into, a, at: jax.tree.map(lambda s, v: s.at[to].set(v[at], mode="drop"), into, a)
+    return Cells(
+        put(cells.points, points, places),
+        put(cells.x0, ways[0], lane[places]),
+        put(cells.rows, ways[1], lane[places]),
+        put(cells.near, near, places),
+        put(seen[:slots], seen[slots:], places),
+        put(old, new, places),
+    )
+
+
+def _by_default(sim, key, f, t, distance, live, cells):
+    """The cell of each of n states as a number, by their features ``f`` [n, F]."""
+    weight = live.astype(f.dtype)[:, None]
+    total = jnp.maximum(jnp.sum(weight), 1)
+    mean = jnp.sum(f * weight, axis=0) / total
+    spread = jnp.sqrt(jnp.sum(weight * (f - mean[None]) ** 2, axis=0) / total)
+    unit = (f - mean[None]) / jnp.where(spread > 0, spread, 1)[None]
+    ways = jax.random.normal(key, (f.shape[1], 2), f.dtype) / np.sqrt(f.shape[1])
+    side = jnp.clip(jnp.round(2 * (unit @ ways)), -SIDES, SIDES).astype(jnp.int32) + SIDES
+    known = jnp.sort(jnp.where(cells.live, cells.near, jnp.inf))
+    n = jnp.sum(cells.live, dtype=jnp.int32)
+    below = jnp.minimum(jnp.searchsorted(known, distance, side="right"), n)
+    share = (below + 1).astype(f.dtype) / (n + 1).astype(f.dtype)
+    half = jnp.clip(jnp.floor(-jnp.log2(share)), 0, HALVES).astype(jnp.int32)
+    phase = t * PHASES // max(sim.horizon, PHASES)
+    wide = 2 * SIDES + 1
+    name = ((phase * (HALVES + 1) + half) * wide + side[:, 0]) * wide + side[:, 1]
+    return name.astype(jnp.uint32)

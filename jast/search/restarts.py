@@ -1,0 +1,234 @@
+"""Episodes that go on from a kept state: a state is a pytree, so that the way there need not be
+simulated again.
+
+Runs go on in lanes in lockstep. What a lane draws is either new, also of wider noise and of noise
+that persists, or follows a known failing episode and changes it here and there.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import actions as choices
+from jast import distributions as D
+from jast.distributions.numbers import unflat
+from jast.episode import Episode
+from jast.outline import ask, outline
+from jast.progress import Progress, advance, begin, conclude
+from jast.search import lockstep as E
+from jast.simulator import Simulator
+
+__all__ = ["Follow", "Noise", "Point", "explore", "follow", "onward", "played", "started"]
+
+PERSISTING = np.uint32(1 << 31)
+"""Address of what persists in the noise of a run, apart from those of its steps."""
+
+
+class Point(NamedTuple):
+    """An episode on its way."""
+
+    progress: Progress
+    t: Any
+    """int32: steps so far."""
+    tag: Any
+    """uint32: a hash of the disturbances so far."""
+
+
+class Noise(NamedTuple):
+    """How a run draws anew, one a lane."""
+
+    width: Any
+    """Of the normal numbers; 1 is the model's."""
+    persisting: Any
+    """From 0 to below 1: the share of the normal numbers that is the same at every step."""
+
+
+class Follow(NamedTuple):
+    """How a run follows a known episode, one a lane."""
+
+    noise: Noise
+    rows: Any
+    """[horizon, ...]: the disturbances of that episode, and"""
+    x0: Any
+    length: Any
+    """int32: how many they are; beyond them it draws anew."""
+    rate: Any
+    """Share of the steps that it changes, by"""
+    change: Any
+    """int32, one of `CHANGES`."""
+    size: Any
+    """Of the changes, from 0 to 1."""
+
+
+CHANGES = "anew", "to the mode", "towards the mode", "a step aside"
+
+
+def onward(
+    sim: Simulator,
+    reward: Any,
+    keys: jax.Array,
+    points: Point,
+    until: jax.Array,
+    draw: Callable,
+    own: Any,
+    most: int,
+    keep: bool = False,
+) -> tuple[Point, jax.Array, Any, Any]:
+    """Let every lane go on from its point.
+
+    Args:
+        sim: the simulator.
+        reward: of whole episodes.
+        keys: [N], of the runs.
+        points: [N], where each goes on.
+        until: [N] int32: the step at which it stops, if not before.
+        draw: ``(key, t, own, distribution) -> disturbance``, t an int32 from 0 on.
+        own: [N, ...]: what ``draw`` knows of the lane.
+        most: of the new steps of any lane; static.
+        keep: also return the points on the way; static.
+
+    Returns:
+        The `Point` [N] of each end, how many steps are new [N], the new disturbances [most, N, ...]
+        and the points after each of them [most, N], or ``()``.
+    """
+    like = outline(sim)
+    (n,) = until.shape
+    space = lambda s: jnp.zeros((most, n, *s.shape), s.dtype)
+    xs = jax.tree.map(space, like.x)
+    way = jax.tree.map(lambda a: jnp.zeros((most, *a.shape), a.dtype), points) if keep else ()
+    until = jnp.minimum(until, sim.horizon)
+    on = lambda p: ~p.progress.done & (p.t < until)
+
+    def move(key, p, own, on):
+        x = draw(key, p.t, own, sim.disturbance(p.progress.state))
+        new = Point(
+            advance(sim, reward, p.progress, x, p.t + 1 >= sim.horizon), p.t + 1, E.fold(p.tag, x)
+        )
+        return x, jax.tree.map(lambda a, b: jnp.where(on, a, b), new, p)
+
+    def step(carry):
+        i, p, new, xs, way = carry
+        live = on(p)
+        x, p = jax.vmap(move)(keys, p, own, live)
+        put = lambda to, a: jax.tree.map(lambda s, v: s.at[i].set(v), to, a)
+        return i + 1, p, new + live.astype(jnp.int32), put(xs, x), put(way, p) if keep else ()
+
+    first = jnp.zeros((), jnp.int32), points, jnp.zeros(n, jnp.int32), xs, way
+    _, end, new, xs, way = lax.while_loop(lambda c: jnp.any(on(c[1])) & (c[0] < most), step, first)
+    return end, new, xs, way
+
+
+def started(sim: Simulator, reward: Any, x0: Any) -> Point:
+    """The `Point` that x0 leads to, before any step."""
+    return Point(begin(sim, reward, x0), jnp.zeros((), jnp.int32), E.fold(jnp.uint32(E.FIRST), x0))
+
+
+def played(
+    sim: Simulator, reward: Any, x0: Any, rows: Any, points: Point, end: Point, new: Any, xs: Any
+) -> E.Played:
+    """What runs [N] came to: whole episodes, of x0 and the disturbances ``rows`` [N, horizon, ...]
+    up to ``points`` and the new ones after them.
+    """
+    ended = jax.vmap(lambda p: conclude(sim, reward, p, p.done))(end.progress)
+    most = jax.tree.leaves(xs)[0].shape[0]
+    i = jnp.arange(most, dtype=jnp.int32)[:, None]
+    at = jnp.where(i < new[None], points.t[None] + i, sim.horizon)
+    lane = jnp.broadcast_to(jnp.arange(new.shape[0], dtype=jnp.int32)[None], at.shape)
+    rows = jax.tree.map(lambda a, b: a.at[lane, at].set(b, mode="drop"), rows, xs)
+    # the distance of an episodic system is known at its end alone
+    known = ended.done | ~jnp.asarray(sim.episodic)
+    finite = jnp.isfinite(ended.reward) & ~ended.invalid
+    value = jnp.where(finite, ended.reward, -jnp.inf)
+    distance = jnp.where(known, ended.distance, jnp.inf)
+    episode = Episode(x0, rows, ended.log_prob, distance, ended.failure & finite, end.t, value)
+    return E.Played(episode, ~finite, end.tag)
+
+
+def explore(sim: Simulator) -> tuple[Callable, Callable]:
+    """``draw`` of `onward` with a `Noise`, and likewise ``draw_start(key, noise, p(x0))``: draws of
+    the model, of wider noise where it has quantile functions.
+    """
+    about = outline(sim)
+    return (
+        _fresh if about.disturbance.quantile else lambda key, t, own, dist: _sampled(key, t, dist),
+        (lambda key, own, dist: _start(key, own, dist))
+        if about.start.quantile
+        else (lambda key, own, dist: D.sample(dist, jax.random.fold_in(key, 0))),
+    )
+
+
+def _sampled(key, t, dist):
+    return D.sample(dist, jax.random.fold_in(key, t + 1))
+
+
+def _start(key, own, dist):
+    z = own.width * _normal(jax.random.fold_in(key, 0), dist, own.width.dtype)
+    return D.from_normal(dist, unflat(z, D.event_like(dist)))
+
+
+def _fresh(key, t, own, dist):
+    dtype = own.width.dtype
+    same = _normal(jax.random.fold_in(key, PERSISTING), dist, dtype)
+    new = _normal(jax.random.fold_in(key, t + 1), dist, dtype)
+    z = own.width * (own.persisting * same + jnp.sqrt(1 - own.persisting**2) * new)
+    return D.from_normal(dist, unflat(z, D.event_like(dist)))
+
+
+def _normal(key, dist, dtype):
+    numbers = sum(int(np.prod(s.shape)) for s in jax.tree.leaves(D.event_like(dist)))
+    return jax.random.normal(key, (numbers,), dtype)
+
+
+def follow(sim: Simulator) -> tuple[Callable, Callable]:
+    """The same two with a `Follow`."""
+    about = outline(sim)
+    fresh, fresh_start = explore(sim)
+    of_step, of_start = ask(sim, lambda start, state, dist: (_aside(dist), _aside(start)))
+    step = _changer(about.disturbance.mode, of_step)
+    start = _changer(about.start.mode, of_start)
+
+    def draw(key, t, own, dist):
+        x = jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], own.rows)
+        anew = fresh(key, t, own.noise, dist)
+        changed = step(jax.random.fold_in(key, t + 1), own, x, anew, dist)
+        return jax.tree.map(lambda a, b: jnp.where(t < own.length, a, b), changed, anew)
+
+    def draw_start(key, own, dist):
+        anew = fresh_start(key, own.noise, dist)
+        return start(jax.random.fold_in(key, 0), own, own.x0, anew, dist)
+
+    return draw, draw_start
+
+
+def _aside(dist):
+    return D.has_quantile(dist) and D.has_cdf(dist)
+
+
+def _changer(has_mode: bool, aside: bool) -> Callable:
+    """``(key, own, x, anew, distribution) -> disturbance``: ``x``, or changed."""
+
+    def change(key, own, x, anew, dist):
+        coin, noise = jax.random.split(key)
+        dtype = own.size.dtype
+        ways = [anew] * len(CHANGES)
+        if has_mode:
+            ways[1] = D.mode(dist)
+            ways[2] = choices.samples().near(x, dist, 1 - own.size)
+        if aside:
+            z = D.to_normal(dist, x)
+            e = unflat(_normal(noise, dist, dtype), D.event_like(dist))
+            mix = lambda z, e: (
+                jnp.sqrt(1 - own.size**2).astype(z.dtype) * z + own.size.astype(z.dtype) * e
+            )
+            ways[3] = D.from_normal(dist, jax.tree.map(mix, z, e))
+        changed = jax.tree.map(
+            lambda *each: jnp.stack([a.astype(each[0].dtype) for a in each])[own.change], *ways
+        )
+        hit = jax.random.uniform(coin, (), dtype) < own.rate
+        return jax.tree.map(lambda a, b: jnp.where(hit, a, b), changed, x)
+
+    return change
