@@ -20,6 +20,7 @@ CALLS = {
     "ce_surrogate": lambda key: C.ce_surrogate(key, jnp.sum, (jnp.zeros(1), jnp.eye(1))),
     "ce_mixture": lambda key: C.ce_mixture(key, jnp.sum, (jnp.zeros(1), jnp.eye(1))),
     "start": lambda key: C.start(key, (jnp.zeros(1), jnp.eye(1))),
+    "ppo": lambda key: jast.policies.ppo(key, walk1d()),
     "sac": lambda key: jast.policies.sac(key, walk1d()),
     "importance": lambda key: E.importance(key, walk1d(), None),
     "log_weights": lambda key: E.log_weights(key, walk1d(), None, 2),

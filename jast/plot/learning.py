@@ -16,7 +16,7 @@ def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = Non
     log p of those in the latent numbers, relative to the mode, a panel each.
 
     Args:
-        policies: of `jast.policies.sac`, or a dict of name -> policy.
+        policies: of `jast.policies.sac` or `ppo`, or a dict of name -> policy.
         axes: two, to draw into.
 
     Returns:

@@ -81,7 +81,7 @@ class Learned(NamedTuple):
     actor: Any
     """Parameters: the latents' mixture from what is seen."""
     critic: Any
-    """Parameters of the two, stacked in front."""
+    """Parameters: of `sac` those of two, stacked in front."""
     net: Any
     """`Net`: moments of the observation, unit of the critics."""
     tilt: Any

@@ -13,10 +13,11 @@ from jast.archive import arrays_of, check_array, named
 from jast.contract import contract
 from jast.heads.heads import Moments
 from jast.outline import outline
-from jast.policies.actor import Net
+from jast.policies import proximal
+from jast.policies.actor import Net, network
 from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
 from jast.policies.latent import sizes
-from jast.policies.learner import learner, networks
+from jast.policies.learner import learner
 from jast.policies.start import Tilt
 from jast.simulator import Simulator
 
@@ -55,6 +56,8 @@ def parts(policy: FailurePolicy) -> tuple[dict, dict[str, np.ndarray]]:
         horizon=sim.horizon,
         tilted=learned.tilt != (),
         dense=bool(dense),
+        # two critics of state and action, stacked in front, or one of the state
+        critics=2 if learned.critic["params"]["Dense_0"]["bias"].ndim == 2 else 1,
     )
     return header, named(learned._asdict() | dict(history=policy.history))
 
@@ -84,9 +87,8 @@ def whole(
         )
     (m,) = outline(sim).observation
     hidden, components = tuple(header["hidden"]), header["components"]
-    new = jax.eval_shape(
-        lambda: learner(jax.random.key(0), m, n, hidden, components, jnp.float32(1))
-    )
+    teach = proximal.learner if header.get("critics") == 1 else learner
+    new = jax.eval_shape(lambda: teach(jax.random.key(0), m, n, hidden, components, jnp.float32(1)))
     number, vector = (jax.ShapeDtypeStruct(s, jnp.float32) for s in ((), (m,)))
     k = len(arrays["tilt.0"]) if n0 else 0
     tilt = (
@@ -95,10 +97,10 @@ def whole(
         else ()
     )
     like = Learned(
-        new.average, new.target, Net(Moments(number, vector, vector), number), tilt, number, number
+        new.actor, new.critic, Net(Moments(number, vector, vector), number), tilt, number, number
     )
     learned = Learned(*(_part(path, name, arrays, part) for name, part in like._asdict().items()))
-    (_, act), _ = networks(m, n, hidden, components)
+    _, act = network(n, hidden, components)
     return assemble(
         sim,
         act,

@@ -1,0 +1,169 @@
+"""ppo: a failure policy by proximal policy optimisation (Schulman et al., arXiv:1707.06347)."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jast._checks import random_key, whole
+from jast.contract import contract
+from jast.outline import outline
+from jast.policies import course, settings
+from jast.policies import proximal as X
+from jast.policies.checkpoints import Book
+from jast.policies.exploring import Shape
+from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
+from jast.policies.latent import sizes
+from jast.simulator import Simulator
+
+__all__ = ["ppo"]
+
+LONGEST = 128
+"""Steps of a lane between updates, at most, where nobody says."""
+LOOKED_AT = 100_000
+"""Transitions of the look around whose moments are taken."""
+
+
+def ppo(
+    key: jax.Array,
+    sim: Simulator,
+    *,
+    episodes: int = 12_000,
+    scale: float | str = "auto",
+    bonus: float = 0.0,
+    alpha: float = 1.0,
+    shaping: str = "auto",
+    widen: float | str = "auto",
+    components: int = 2,
+    lanes: int = 64,
+    hidden: Sequence[int] = (100, 100),
+    learning_rate: float = 1e-3,
+    steps: int | str = "auto",
+    epochs: int = 10,
+    batch: int = 256,
+    clip: float = 0.2,
+    trace: float = 0.95,
+    progress: bool = False,
+    callback: Callable[..., Any] | None = None,
+    checkpoint: str | os.PathLike | None = None,
+) -> FailurePolicy:
+    """Teach a policy to make ``sim`` fail in the likeliest ways: the `FailurePolicy` that
+    `jast.policies.sac` hands out, by clipped proximal policy optimisation with generalised
+    advantages.
+
+    It learns only from the episodes of the policy as it is, and keeps none of them. The latents,
+    the reward of a step (Lipkis and Agogino eq. 21, less ``alpha`` times the log density of what
+    was drawn), the look around before the learning, and what becomes of numbers that are not finite
+    are those of `sac`. So are random starts: drawn ``widen`` times as wide as p(x0), and handed out
+    as a mixture fitted to p(x0) exp(V(s0) - lambda d(s0)).
+
+    Args:
+        key: of `jax.random`; consumed.
+        sim: with a disturbance of floats that has a quantile function and its inverse. One that is
+            ``episodic`` may end its episodes at any step.
+        episodes: in all, of full length; where they end early there are more of them. At least 4 a
+            lane.
+        scale, bonus, shaping, widen, components, hidden: as for `sac`.
+        alpha: temperature, above 0; 1 for importance sampling. It stays as it is.
+        lanes: episodes side by side.
+        steps: of each lane between updates, at least 1; "auto": the horizon, at most 128. An
+            episode that is not over then is judged by V, and goes on.
+        epochs: times that all steps since the last updates are learned from, in another order each
+            time.
+        batch: steps of one update; what is left over of an epoch waits for the next.
+        learning_rate: of Adam, above 0; falls to a twentieth.
+        clip: epsilon, above 0 and below 1: how far the density of a latent gains from an update.
+        trace: lambda of the advantages, from 0 (the next step and V) to 1 (the whole return).
+        progress: whether there is a bar.
+        callback: called some twenty times as ``callback(done, total, history)``, with the steps of
+            all lanes and the `History` so far.
+        checkpoint: a file to which the training is saved as often, and from which a call with the
+            same arguments goes on to the same bits.
+
+    Returns:
+        `FailurePolicy`; its ``history.alpha`` is ``alpha`` and ``critic_loss`` that of V. A
+        KeyboardInterrupt ends the training after its last whole stretch and gives what was learned
+        by then (it is raised again where there is none).
+
+    Raises:
+        ValueError: for settings out of range, a simulator that breaks its contract, a disturbance
+            that is not of floats or cannot be tilted (named), a checkpoint of another training.
+    """
+    random_key("ppo", key)
+    contract(sim)
+    counts = dict(episodes=episodes, lanes=lanes, batch=batch, epochs=epochs, components=components)
+    episodes, lanes, batch, epochs, components = (
+        whole("ppo", name, value) for name, value in counts.items()
+    )
+    steps = min(sim.horizon, LONGEST) if settings.auto(steps) else whole("ppo", "steps", steps)
+    plan = settings.plan("ppo", episodes, sim.horizon, lanes, steps)
+    hidden = settings.widths("ppo", hidden)
+    dense = settings.shaped("ppo", shaping, sim)
+    auto_scale = settings.auto(scale)
+    scale = None if auto_scale else settings.positive("ppo", "scale", scale)
+    number = lambda name, value, holds, expected: settings.number(
+        "ppo", name, value, holds, expected
+    )
+    rates = X.Rates(
+        learning_rate=settings.positive("ppo", "learning_rate", learning_rate),
+        clip=number("clip", clip, lambda v: 0 < v < 1, "above 0 and below 1"),
+        trace=number("trace", trace, lambda v: 0 <= v <= 1, "of 0 to 1"),
+        alpha=settings.positive("ppo", "alpha", alpha),
+        bonus=number("bonus", bonus, math.isfinite, "that is finite"),
+        total=float(plan.total),
+    )
+    widen = settings.widening("ppo", widen)
+    n, n0 = sizes(sim, "ppo")
+    (m,) = outline(sim).observation
+    looked_at = max(min(LOOKED_AT, lanes * (plan.nominal + plan.around)), lanes)
+    shape, pace = (
+        Shape(m, n, n0, hidden, components, dense, lanes, batch, looked_at),
+        (steps, epochs),
+    )
+    known = dict(
+        shape=list(shape),
+        pace=list(pace),
+        plan=list(plan),
+        rates=list(rates),
+        scale=scale,
+        widen=widen,
+        seed=settings.seed(key),
+        x64=jax.config.jax_enable_x64,
+    )
+
+    for_first, for_steps, for_start = jax.random.split(key, 3)
+    applies = tuple(apply for _, apply in X.networks(n, hidden, components))
+    rates = jax.tree.map(jnp.float32, rates)
+    begin = lambda: X.first(for_first, sim, shape, rates.alpha)
+    look = lambda training, steps: X.look(for_steps, sim, shape, applies[0], training, steps)
+    run = lambda training, n: jax.block_until_ready(
+        X.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
+    )
+    book = Book("ppo", checkpoint, sim, known)
+    training, rows = book.resume(jax.eval_shape(begin)._replace(buffer=())) or course.look(
+        begin(), look, plan, sim.horizon, scale, widen
+    )
+    training, rows = course.learn(
+        "ppo",
+        training._replace(buffer=()),
+        rows,
+        run,
+        plan,
+        auto_scale=auto_scale,
+        progress=progress,
+        callback=callback,
+        keep=book.keep,
+    )
+    tilt = X.tilt(for_start, sim, shape, applies[1], training, rates.bonus) if n0 else ()
+    learned = Learned(
+        training.learner.actor,
+        training.learner.critic,
+        training.net,
+        tilt,
+        rates.alpha,
+        training.scale,
+    )
+    return assemble(sim, applies[0], dense, learned, history(rows[1:]))
