@@ -13,7 +13,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast._jax import is_traced, is_tracing
-from jast.actions import Quantiles, Samples, UniformBox
+from jast.actions import Quantiles, Samples, UniformBox, Wide
 from jast.incidents import incidents, since, sources
 from jast.outline import outline
 from jast.simulator import Simulator
@@ -28,6 +28,7 @@ ACTIONS = {
     Samples: "actions.samples",
     Quantiles: "actions.quantiles",
     UniformBox: "actions.uniform",
+    Wide: "actions.wide",
 }
 
 

@@ -27,13 +27,17 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jast._jax import is_traced
+
 __all__ = [
     "Episodic",
+    "Lexicographic",
     "Shaped",
     "Standard",
     "as_pytree",
     "density_of",
     "episodic",
+    "lexicographic",
     "log_likelihood",
     "once",
     "shaped",
@@ -95,6 +99,39 @@ class Shaped:
         )
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lexicographic:
+    """See `lexicographic`."""
+
+    near: Any = None
+    rare: Any = None
+    likely: Any = 0.0
+    density: str | None = field(default=None, metadata=dict(static=True))
+
+    once = True
+
+    @property
+    def scaled(self) -> bool:
+        """Whether it has its scales; else a search sets them."""
+        return self.near is not None and self.rare is not None
+
+    def __call__(
+        self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
+    ) -> jax.Array:
+        if not self.scaled:
+            raise ValueError(
+                "rewards.lexicographic: near and rare are set by a search; here it needs both, as"
+                " lexicographic(near=1.0, rare=10.0)"
+            )
+        near, rare, likely = (_like(v, log_p) for v in (self.near, self.rare, self.likely))
+        cost, miss = (likely - log_p) / rare, jnp.maximum(distance, 0)
+        below = jnp.reciprocal(1 + jnp.maximum(cost, 0))
+        above = 2 - jnp.reciprocal(1 + jnp.maximum(-cost, 0))  # likelier than ``likely``
+        value = jnp.where(event, jnp.where(cost < 0, above, below), -miss / (near + miss))
+        return jnp.where(log_p == -jnp.inf, -jnp.inf, value)  # the model never does that
+
+
 def standard(event_bonus=0.0, density="raw"):
     """Sum of every step's log p, plus ``event_bonus`` at a failure or less the miss distance at
     another end.
@@ -136,6 +173,44 @@ def shaped(scale, event_bonus=0.0, density="raw"):
     end, to -scale d(sT).
     """
     return Shaped(scale, event_bonus, _checked("shaped", density))
+
+
+def lexicographic(
+    near: Any = None, rare: Any = None, likely: Any = 0.0, density: str | None = None
+) -> Lexicographic:
+    """Any failure above all episodes that do not fail; failures by log p, the others by nearness.
+
+    The default of every search. A failure earns 1 / (1 + u) with u = (likely - log p) / rare, which
+    is in (0, 1]; another episode -d / (near + d), its miss distance d at least 0, which is in
+    (-1, 0]. So it is bounded, as trees need it, and no weight of log p against distance is to be
+    chosen. The order of episodes is that of (failure, log p, -distance) whatever the scales; these
+    only say which differences a mean over many episodes sees.
+
+    Args:
+        near: a miss distance that is neither near nor far, above 0. None: a search sets it to the
+            median miss distance of plain episodes of the model, those that miss.
+        rare: nats, above 0: how far log p of an episode usually is below ``likely``. None: a search
+            sets it to the median of that over the same episodes. Medians, as they have the unit of
+            what they divide and heed no outlier: a system written in other units has the same
+            rewards.
+        likely: log p of an episode from which rarity is counted: 0 with ``density="mode"``. Where a
+            search sets the scales of raw densities, the highest of the plain episodes; an episode
+            above it earns up to 2.
+        density: "mode" counts log p less its value at the mode, "raw" the log density itself. None:
+            "mode", and in a search "raw" where a distribution has no finite mode.
+
+    Raises:
+        ValueError: for a scale that is not above 0, an unknown density; when called without its
+            scales.
+    """
+    for name, value in (("near", near), ("rare", rare)):
+        if value is not None and not is_traced(value) and not value > 0:
+            raise ValueError(f"rewards.lexicographic: {name} must be above 0, received {value!r}")
+    if density is None:
+        density = "mode" if near is not None and rare is not None else None
+    else:
+        _checked("lexicographic", density)
+    return Lexicographic(near, rare, likely, density)
 
 
 def log_likelihood(

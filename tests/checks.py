@@ -50,6 +50,12 @@ def archive_replays(sim, result, reward, equal):
     return f.size
 
 
+def reward_of(result):
+    """The lexicographic reward of a search, of the scales that its result states."""
+    assert result.settings["reward"] == "rewards.lexicographic"
+    return jast.rewards.lexicographic(**result.settings["reward_settings"])
+
+
 def replays(episode, sim, reward):
     again = jax.device_get(jast.replay(sim, episode, reward=reward))
     for name in ("log_prob", "distance", "failure", "length", "reward"):

@@ -33,6 +33,9 @@ PUBLISHED = [
     0.454360642513824,
 ]
 """The best failure published for the ferry: reward 29.092054904933118, collision at step 20."""
+TOLD = dict(reward=jast.rewards.STANDARD, actions=jast.actions.samples())
+"""What a search needs no episodes before it for, so that its counts are exact."""
+
 S0 = dict(
     reward=jast.rewards.standard(event_bonus=30.0, density="mode"),
     actions=jast.actions.uniform(0.0, 1.0),

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checks import archive_replays
-from systems import S0, hyperplane, ring, two_densities, walk
+from checks import archive_replays, reward_of
+from systems import S0, TOLD, hyperplane, ring, two_densities, walk
 
 import jast
 from jast import actions, rewards
@@ -15,7 +15,7 @@ from jast.distributions import seeds
 from jast.search.cem import cem
 from jast.search.monte_carlo import monte_carlo
 
-SMALL = dict(samples=100, elites=10, iterations=10)
+SMALL = dict(samples=100, elites=10, iterations=10) | TOLD | dict(actions=actions.quantiles())
 WEIGHED = rewards.shaped(20.0, event_bonus=30.0, density="mode")
 
 
@@ -40,7 +40,7 @@ def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     """Phi(-6) = 1e-9, and the likeliest failure is x = 3 everywhere."""
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
     assert not monte_carlo(key, sim, episodes=4000, reward=reward).failing_per_tree.any()
-    r = cem(key, sim, reward=reward, samples=200, elites=20, iterations=20)
+    r = cem(key, sim, **SMALL | dict(reward=reward, samples=200, elites=20, iterations=20))
     assert (
         r.failing_per_tree.all()
         and r.failures.size == 64
@@ -83,9 +83,9 @@ def test_ferry(key, equal, choice):
 
 @pytest.mark.parametrize("choice", [None, actions.samples(), actions.uniform(0.0, 1.0)])
 def test_structured_disturbances_and_a_random_start(key, equal, choice):
-    sim, reward = ring(), rewards.standard()
+    sim = ring()
     r = cem(key, sim, actions=choice, trees=4)
-    assert archive_replays(sim, r, reward, equal)
+    assert archive_replays(sim, r, reward_of(r), equal)
     assert (
         r.failing_per_tree.all()
         and r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000).best.reward
@@ -111,7 +111,7 @@ def test_seeds_of_unknown_density(key, equal):
     assert not monte_carlo(key, sim, episodes=9000).failing_per_tree.any()
     r = cem(key, sim, trees=3)
     assert r.failing_per_tree.all() and r.settings["actions"] == "actions.samples"
-    assert archive_replays(sim, r, rewards.standard(), equal)
+    assert archive_replays(sim, r, reward_of(r), equal)
 
 
 def test_trees_are_independent_of_their_number(key, equal):
@@ -133,7 +133,7 @@ def test_counts_of_repetitions(key):
         lambda s: (s == 1, (1 - s).astype(float)),
         1,
     )
-    r = cem(key, sim, trees=2, actions=actions.samples(), samples=50, elites=5, iterations=4)
+    r = cem(key, sim, trees=2, **TOLD, samples=50, elites=5, iterations=4)
     assert r.failures.size == 1 and r.failures.counts.sum() == r.failures.seen == round(
         r.failing_share * 400
     )
@@ -175,7 +175,7 @@ def test_systems_that_never_or_always_fail(key):
 def test_under_jit_and_vmap(key):
     betas = jnp.array([3.0, 4.0])
     search = lambda sim, smoothing=0.3: cem(
-        key, sim, reward=WEIGHED, trees=2, smoothing=smoothing, **SMALL
+        key, sim, trees=2, smoothing=smoothing, **SMALL | dict(reward=WEIGHED)
     )
     traced = jax.jit(jax.vmap(lambda b, s: search(hyperplane(b), s)))(betas, jnp.array([0.3, 0.3]))
     for i, b in enumerate(betas):
@@ -212,7 +212,7 @@ def test_interruption(key, equal):
         and r.settings["interrupted"] == "after 600 of 2000 episodes"
         and len(r.history.failures) == 3
     )
-    equal(r.failures, cem(key, walk(), trees=2, samples=100, elites=10, iterations=3).failures)
+    equal(r.failures, cem(key, walk(), trees=2, **SMALL | dict(iterations=3)).failures)
 
 
 @pytest.mark.parametrize(

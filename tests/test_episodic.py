@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import TOLD
 from trees import FERRY, grown, problem
 
 import jast
@@ -88,11 +89,11 @@ def test_an_episode_is_evaluated_once_at_its_end(key):
 def test_searches_evaluate_each_episode_once_and_replay_what_they_keep(key, record):
     sim, host = counted()
     replays = lambda r: r.failures.size + 1
-    r = jast.search.monte_carlo(key, sim, episodes=500, top=8, record=record)
+    r = jast.search.monte_carlo(key, sim, episodes=500, top=8, record=record, **TOLD)
     assert r.episodes == 500 and since(host) == 500 + replays(r)
-    r = jast.search.cem(key, sim, samples=40, elites=8, iterations=3, top=8, record=record)
+    r = jast.search.cem(key, sim, samples=40, elites=8, iterations=3, top=8, record=record, **TOLD)
     assert r.episodes == 120 and since(host) == 120 + replays(r)
-    r = mcts(key, sim, trees=3, simulations=60, top=8, record=record, lanes=2, threads=1)
+    r = mcts(key, sim, trees=3, simulations=60, top=8, record=record, lanes=2, threads=1, **TOLD)
     fresh = r.episodes if r.trials is None else r.trials.ran.sum()
     # the last group is filled up with a fourth tree
     assert r.episodes == 180 and fresh + replays(r) <= since(host) <= 4 * 60 + replays(r) + 9
@@ -129,10 +130,10 @@ def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
         episodic=True,
         observe=lambda s: s[2],
     )
-    r = jast.search.monte_carlo(key, sim, episodes=200, top=4, record=True)
+    r = jast.search.monte_carlo(key, sim, episodes=200, top=4, record=True, **TOLD)
     assert since(host) == 200 + r.failures.size + 1
     assert set(r.failures.episodes.length) <= {3, 4} and 200 * 3 < r.steps < 200 * 4
-    r = forest(key, sim, trees=4, prunes=2, simulations=50, top=4, record=True)
+    r = forest(key, sim, trees=4, prunes=2, simulations=50, top=4, record=True, **TOLD)
     # a few more candidates are replayed
     assert 0 <= since(host) - r.trials.ran.sum() - r.failures.size - 1 <= 8
     for e in map(r.failures.episode, range(r.failures.size)):
@@ -162,7 +163,7 @@ def test_one_start_and_an_end(key, search, limit):
         mcts=dict(trees=2, simulations=30),
         forest=dict(trees=2, prunes=1, simulations=30),
     )[search]
-    r = getattr(jast.search, search)(key, sim, record=True, **sizes)
+    r = getattr(jast.search, search)(key, sim, record=True, **TOLD, **sizes)
     ended = limit < 0
     assert (
         r.episodes == (2 if ended and search != "monte_carlo" else 60) and (r.steps == 0) == ended

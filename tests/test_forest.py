@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import honest, replays
-from systems import S0, dice, ferry_now, ring, walk
+from systems import S0, TOLD, dice, ferry_now, ring, walk
 
 import jast
 from jast import failures as F
@@ -42,7 +42,7 @@ ACTIONS = dict(
 
 
 def searched(name, **changed):
-    choices = S0 if name == "ferry" else dict(reward=BONUS)
+    choices = S0 if name == "ferry" else dict(reward=BONUS, actions=ACTIONS["samples"])
     return forest(jax.random.key(3), SYSTEMS[name], **SIZE | choices | changed)
 
 
@@ -230,7 +230,7 @@ def _breaking(s, x):
 
 def test_a_simulator_that_returns_nan_is_counted_and_never_best():
     sim = walk(step=_breaking)
-    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
+    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     assert 0 < result.invalid < result.episodes
     assert np.isfinite(result.best_reward_per_tree).all() and np.isfinite(result.best.reward)
     assert f"{result.invalid} episodes were invalid" in str(result)
@@ -239,7 +239,7 @@ def test_a_simulator_that_returns_nan_is_counted_and_never_best():
 
 def test_a_simulator_that_returns_only_nan():
     sim = walk(step=lambda s, x: s * jnp.nan)
-    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
+    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     assert (
         result.invalid == result.episodes > 0
         and result.failures.size == 0
@@ -252,7 +252,7 @@ def test_a_simulator_that_returns_only_nan():
 
 def test_a_system_that_never_fails():
     sim = walk(fails=lambda s: s > 1e6)
-    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
+    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     assert (
         result.failures.size == result.failures.seen == 0
         and result.first_failure is None
@@ -264,7 +264,7 @@ def test_a_system_that_never_fails():
 
 def test_a_system_that_fails_at_its_start_takes_one_episode_a_tree():
     sim = walk(fails=lambda s: s > -1.0)
-    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
+    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     assert (
         result.episodes,
         result.steps,
@@ -281,7 +281,7 @@ def test_a_system_that_fails_at_its_start_takes_one_episode_a_tree():
 
 def test_a_system_that_always_fails_at_its_first_step():
     sim = walk(step=lambda s, x: jnp.full_like(s, 4.0))
-    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS)
+    result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     # the next root would be an episode's end
     assert result.episodes == 6 * 60 and result.failing_share == 1.0 and result.first_failure == 1
     # an end that is visited again is not simulated again
@@ -294,7 +294,13 @@ def test_trees_that_end_early_end_apart():
     """A tree whose root is an episode's end stops; the others go on, also those of other groups."""
     sim = walk(fails=lambda s: s > 2.0)
     result = forest(
-        jax.random.key(0), sim, trees=6, prunes=6, simulations=60, reward=BONUS, lanes=2
+        jax.random.key(0),
+        sim,
+        trees=6,
+        prunes=6,
+        simulations=60,
+        lanes=2,
+        **TOLD | dict(reward=BONUS),
     )
     turns = result.roots.valid.sum(0)
     assert turns.min() < turns.max()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checks import archive_replays
+from checks import archive_replays, reward_of
 from systems import S0, ring, two_densities, walk
 
 import jast
@@ -52,7 +52,7 @@ def test_rate_of_a_known_system(key, equal):
     for choice in (actions.samples(), actions.quantiles()):
         r = monte_carlo(key, sim, episodes=n, actions=choice)
         assert abs(r.failing_share - p) < 4 * np.sqrt(p * (1 - p) / n)
-        archive_replays(sim, r, rewards.standard(), equal)
+        archive_replays(sim, r, reward_of(r), equal)
     assert (r.episodes, r.invalid, r.failures.size) == (
         n,
         0,
@@ -72,7 +72,7 @@ def test_rate_of_a_known_system(key, equal):
 def test_counts_are_those_of_the_episodes(key):
     """Steps, failures and the first one, against every episode played by itself."""
     sim, n = walk(), 301  # no multiple of any number of lanes
-    r = monte_carlo(key, sim, episodes=n, top=1000)
+    r = monte_carlo(key, sim, episodes=n, top=1000, reward=rewards.STANDARD)
     tree = module.tree_keys(key, 1)[0]
     one = jax.jit(
         lambda i: (
@@ -117,7 +117,7 @@ def test_kinds_of_disturbances(key, equal, make):
     """Joint and integer disturbances, seeds of unknown density, random starts."""
     sim = make()
     r = monte_carlo(key, sim, episodes=3000)
-    archive_replays(sim, r, rewards.standard(), equal)
+    archive_replays(sim, r, reward_of(r), equal)
     assert r.failing_per_tree.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
         assert (

@@ -14,7 +14,7 @@ from checks import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain_tree import drawn_as_published, drawn_by_default, plain_search
-from systems import S0, ferry_now
+from systems import S0, TOLD, ferry_now
 from trees import (
     FERRY,
     LANDING,
@@ -438,7 +438,7 @@ def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
     )
     assert node > 5 * root
     with pytest.warns(UserWarning, match='kept at roots: memoize="root"'):
-        result = forest(jax.random.key(0), sim, **size, available=2 * 2 * root)
+        result = forest(jax.random.key(0), sim, **size, **TOLD, available=2 * 2 * root)
     assert result.settings["memoize"] == "root" and result.episodes == 720
-    result = forest(jax.random.key(0), sim, **size, available=2 * 2 * node)
+    result = forest(jax.random.key(0), sim, **size, **TOLD, available=2 * 2 * node)
     assert result.settings["memoize"] == "node"

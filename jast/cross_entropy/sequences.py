@@ -35,14 +35,14 @@ class Steps(NamedTuple):
     deviation: Any
 
 
-def standard(like, steps):
-    """The `Steps` N(0, 1) over ``steps`` disturbances of these shapes and dtypes: u = Phi(z) is
-    uniform.
+def standard(like, steps, deviation=1):
+    """The `Steps` N(0, deviation^2) over ``steps`` disturbances of these shapes and dtypes; by
+    default u = Phi(z) is uniform.
     """
     full = lambda value: jax.tree.map(
         lambda s: jnp.full((steps, *s.shape), value, D.float_dtype(s.dtype)), like
     )
-    return Steps(full(0), full(1))
+    return Steps(full(0), full(deviation))
 
 
 def noise(key, steps, offset):

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast import _checks, rewards
+from jast import _checks
 from jast import actions as choices
-from jast.contract import contract
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode
@@ -24,7 +23,8 @@ from jast.incidents import hosted, incidents, since
 from jast.outline import outline
 from jast.search import lockstep as E
 from jast.search import proposals as P
-from jast.simulator import Simulator
+from jast.search.pilot import joined
+from jast.search.prepare import default_actions, prepare
 
 __all__ = ["cem"]
 
@@ -65,7 +65,7 @@ def cem(
     samples=300,
     elites=30,
     iterations=30,
-    reward=rewards.STANDARD,
+    reward=None,
     actions=None,
     smoothing=0.3,
     floor=0.05,
@@ -80,13 +80,17 @@ def cem(
     ``elites`` best distinct ones so far; maximises ``reward``.
 
     Failures rank before other episodes, each by reward; one whose reward is not finite is never an
-    elite. With ``actions.quantiles()`` and ``uniform(low, high)`` x_t is the quantile, or the point
-    of the box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the
-    share ``smoothing`` of the last fit is kept, and s_t >= ``floor``. With ``samples()``, for any
-    disturbance (integers, seeds of unknown density), x_t is that of a random elite, each step with
-    another, or with probability ``fresh`` a draw from p(x | s). A random start is treated likewise,
-    but never by the box. Default ``actions``: quantiles where all disturbances have them, else
-    samples.
+    elite. Default ``reward``: `jast.rewards.lexicographic`, with its scales from 128 plain episodes
+    of the system (10 of a black box), which count among the episodes, as tree -1.
+
+    With ``actions.quantiles()`` and ``uniform(low, high)`` x_t is the quantile, or the point of the
+    box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the share
+    ``smoothing`` of the last fit is kept, and s_t >= ``floor``. ``wide()`` begins at N(0, width^2);
+    where no width is given, it widens only where all plain episodes have the same miss distance, so
+    that nothing else points to failures. With ``samples()``, for any disturbance (integers, seeds
+    of unknown density), x_t is that of a random elite, each step with another, or with probability
+    ``fresh`` a draw from p(x | s). A random start is treated likewise, but never by the box.
+    Default ``actions``: wide where disturbances have a quantile function, else samples.
 
     ``trees``: independent searches, side by side; tree k is the same whatever their number.
     Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
@@ -97,10 +101,10 @@ def cem(
     result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and
     `jax.vmap`, without archive, history and callbacks.
 
-    A reward whose log p outweighs the distance has its best non-failing episode far from any
-    failure, and the elites gather there: weigh the distance (`jast.rewards.shaped`) where no
-    failure is found. Raises ValueError for a count below 1, more elites than samples, a setting
-    outside its range, and where the simulator's functions or the actions do not fit together.
+    A reward whose log p outweighs the distance, as `jast.rewards.standard` of many steps, has its
+    best non-failing episode far from any failure, and the elites gather there. Raises ValueError
+    for a count below 1, more elites than samples, a setting outside its range, and where the
+    simulator's functions or the actions do not fit together.
     """
     samples, elites, iterations, trees, top = E.whole(
         "cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top
@@ -116,12 +120,16 @@ def cem(
         "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
     )
     real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
-    actions = _chosen(contract(sim, observed=False)) if actions is None else actions
+    actions = default_actions(sim) if actions is None else actions
+    before = incidents(sim)
     counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
-    reward, settings = E.prepare("cem", key, sim, reward, actions, **counts, **real._asdict())
+    reward, actions, settings, pilot = prepare(
+        "cem", key, sim, reward, actions, widen="blind", **counts, **real._asdict()
+    )
     plan = Plan(samples, elites, P.kinds(sim, actions))
     search = partial(_iteration, tree_keys(key, trees), sim, reward, actions, real, plan)
-    carry = _nothing(sim, plan, trees, max(elites, top))
+    width = actions.width if isinstance(actions, choices.Wide) else 1.0
+    carry = _nothing(sim, plan, trees, max(elites, top), width)
     if settings is None:
 
         def body(i, carry):
@@ -130,9 +138,9 @@ def cem(
             return inner, E.add(counted, more)
 
         (pool, _), counted = lax.fori_loop(0, iterations, body, (carry, E.nothing(trees)))
-        return E.finish_traced(sim, reward, counted, _best(pool), pool.episode.reward[:, 0])
-
-    before = incidents(sim)
+        best = pool.episode.reward[:, 0]
+        found = E.finish_traced(sim, reward, counted, _best(pool), best)
+        return joined(sim, reward, pilot, found, top)
 
     def chunk(carry, begin, end):
         carry, counted, best, rows = search(carry, begin)
@@ -163,6 +171,7 @@ def cem(
         settings,
         top,
     )
+    found = joined(sim, reward, pilot, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 
@@ -272,7 +281,7 @@ def _merge(pool, new):
     )
 
 
-def _nothing(sim, plan, trees, k):
+def _nothing(sim, plan, trees, k, width):
     """An empty `Pool` and the first proposals, of every tree."""
     about = outline(sim)
     likes = about.x0, about.x
@@ -281,19 +290,15 @@ def _nothing(sim, plan, trees, k):
         for kind, like in zip(plan.kinds, likes, strict=True)
     ]
     proposals = tuple(
-        sequences.standard(like, steps) if use else ()
+        sequences.standard(like, steps, width) if use else ()
         for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True)
     )
-    zero = lambda dtype: jnp.zeros((k,), dtype)
-    x0 = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), likes[0])
-    x = jax.tree.map(lambda s: jnp.zeros((k, sim.horizon, *s.shape), s.dtype), likes[1])
-    real = zero(about.dtype)
-    episode = Episode(x0, x, real, real, zero(bool), zero(jnp.int32), real - jnp.inf)
     z = tuple(
         jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
         for g in proposals
     )
-    one = Pool(episode, z, zero(jnp.uint32), zero(jnp.int32), zero(jnp.int32)), proposals
+    zero = lambda dtype: jnp.zeros((k,), dtype)
+    one = Pool(E.blank(sim, k), z, zero(jnp.uint32), zero(jnp.int32), zero(jnp.int32)), proposals
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (trees, *a.shape)), one)
 
 
@@ -325,10 +330,3 @@ def _archive(pool, top):
 
 def _take(tree, places):
     return jax.tree.map(lambda a: a.at[places].get(mode="fill", fill_value=0), tree)
-
-
-def _chosen(sim: Simulator) -> choices.Quantiles | choices.Samples:
-    """Quantiles where x0 and x have a quantile function, else samples."""
-    about = outline(sim)
-    both = about.start.quantile and about.disturbance.quantile
-    return choices.quantiles() if both else choices.samples()

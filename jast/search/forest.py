@@ -2,14 +2,11 @@
 1.
 """
 
-from jast import actions as A
-from jast import rewards
 from jast.search.tree.grow import grow_trees
 from jast.search.tree.settings import PLAIN, settled
 
 __all__ = ["MODES", "forest"]
 
-SAMPLES = A.samples()
 MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
@@ -28,9 +25,9 @@ def forest(
     prunes=18,
     simulations=500,
     heads=None,
-    reward=rewards.STANDARD,
-    actions=SAMPLES,
-    exploration=10.0,
+    reward=None,
+    actions=None,
+    exploration=None,
     mode="default",
     widening=None,
     spread=None,
@@ -63,8 +60,15 @@ def forest(
     second rollout step, is drawn closer to the mode of the disturbance by this factor: 0.2 for a
     uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches into
     the tails, for failures too rare for the model's own draws; where failures lie at the edge of a
-    tight box, 1 finds more. Each may be given on its own. ``actions`` and ``reward``:
-    `jast.actions`, `jast.rewards`.
+    tight box, 1 finds more. Each may be given on its own.
+
+    Default ``reward``: `jast.rewards.lexicographic`, any failure above all misses, then the
+    likeliest failure, the nearest miss. Default ``actions``: `jast.actions.wide` where disturbances
+    have a quantile function, else draws of the model. Their scales come from up to 768 episodes of
+    the system (60 of a black box) before the first tree, the same for every key; these count among
+    the episodes, and their failures are tree -1's. ``exploration``: default 1 with the
+    lexicographic reward, else the published 10. Modes "paper" and "thesis" have the published
+    `jast.rewards.standard` and draws of the model.
 
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none":
     the same trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``:
@@ -75,10 +79,10 @@ def forest(
     systems that are judged at their end only: ``urgent`` and ``follow``. ``urgent``: a child that
     was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of
     its tree, the next simulations grow its path into the tree, an action each, so that every step
-    of it can be varied; not with a value head. ``exploration`` is in the units of the reward: there
-    a hundredth of what a failure earns. ``mode="thesis"`` is Moss's: ``widening`` (10, 0.3),
-    ``urgent``, and ``feed``: with half of its steps to go, a rollout takes the action that the
-    tree's best episode took there (Algorithm 9).
+    of it can be varied; not with a value head. ``exploration`` is in the units of the reward: of
+    one of your own give here a hundredth of what a failure earns. ``mode="thesis"`` is Moss's:
+    ``widening`` (10, 0.3), ``urgent``, and ``feed``: with half of its steps to go, a rollout takes
+    the action that the tree's best episode took there (Algorithm 9).
 
     Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither
     changes a result. ``available``: bytes that the trees in flight may take (default: what is

@@ -6,7 +6,6 @@ the start, where it is random, is level 0. So an episode is known by its number,
 it was simulated in.
 """
 
-from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -15,15 +14,10 @@ import numpy as np
 from jax import lax
 
 from jast import failures as archive
-from jast import rewards
-from jast._checks import random_key
-from jast._jax import is_traced, is_tracing
 from jast._threads import apart
-from jast.contract import ACTIONS, contract
 from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
-from jast.results import asked
 from jast.search.result import History, SearchResult, Trials
 from jast.search.tree.packing import pack
 from jast.watch import Watch, in_pieces
@@ -32,6 +26,7 @@ __all__ = [
     "Played",
     "Tally",
     "add",
+    "blank",
     "distinct",
     "drive",
     "finish",
@@ -39,7 +34,6 @@ __all__ = [
     "fold",
     "nothing",
     "play",
-    "prepare",
     "tally",
     "trials",
     "whole",
@@ -155,6 +149,18 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
     )
 
 
+def blank(sim, n):
+    """n episodes that were not played: reward -inf, distance inf, an `Episode` with its
+    disturbances.
+    """
+    like = outline(sim)
+    zero = lambda dtype: jnp.zeros((n,), dtype)
+    x0 = jax.tree.map(lambda s: jnp.zeros((n, *s.shape), s.dtype), like.x0)
+    x = jax.tree.map(lambda s: jnp.zeros((n, sim.horizon, *s.shape), s.dtype), like.x)
+    real = zero(like.dtype)
+    return Episode(x0, x, real, real + jnp.inf, zero(bool), zero(jnp.int32), real - jnp.inf)
+
+
 def tally(played, live, order, tree=None, trees=1):
     """The `Tally` of the ``live`` lanes of ``played``; ``order`` [lanes]: each one's place in the
     search, from 0; ``tree`` [lanes] of ``trees``, default 0.
@@ -225,45 +231,6 @@ def whole(function, **values):
                 f"{function}: {name} must be a whole number from 1 to 2^31 - 1, received {value!r}"
             )
     return [int(v) for v in values.values()]
-
-
-def prepare(function, key, sim, reward, actions, **settings):
-    """``(reward, settings)`` as the search takes them, once `contract` holds: the reward as a
-    pytree, the settings with names and seed (None if traced).
-    """
-    random_key(function, key)
-    contract(sim, actions, observed=False)
-    reward = rewards.as_pytree(reward)
-    if is_traced(key, sim, reward, actions, settings) or is_tracing():
-        return reward, None
-    func = getattr(reward, "func", reward)
-    name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
-    return reward, asked(function, key, **settings) | dict(
-        reward=name,
-        reward_settings=_settings(reward),
-        actions=ACTIONS.get(type(actions), type(actions).__name__),
-        action_settings=_settings(actions),
-    )
-
-
-def _settings(part: Any) -> dict[str, Any]:
-    """The numbers and texts of a reward or of actions, as JSON can hold them."""
-    if is_dataclass(part):
-        given = {f.name: getattr(part, f.name) for f in fields(part)}
-    else:
-        args = getattr(part, "args", ())
-        given = dict(getattr(part, "keywords", {})) | ({"args": args} if args else {})
-    return {name: _plain(value) for name, value in given.items()}
-
-
-def _plain(value: Any) -> Any:
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    return value.tolist() if hasattr(value, "tolist") else repr(value)
 
 
 class Log(NamedTuple):

@@ -2,8 +2,6 @@
 classic of adaptive stress testing.
 """
 
-from jast import rewards
-from jast.search.forest import SAMPLES
 from jast.search.tree.grow import grow_trees
 from jast.search.tree.settings import PLAIN, settled
 
@@ -25,9 +23,9 @@ def mcts(
     *,
     trees=1,
     simulations=9000,
-    reward=rewards.STANDARD,
-    actions=SAMPLES,
-    exploration=10.0,
+    reward=None,
+    actions=None,
+    exploration=None,
     mode="default",
     widening=None,
     spread=None,

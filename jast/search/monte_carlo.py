@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast import actions as choices
-from jast import rewards
 from jast.counter import tree_keys
 from jast.incidents import hosted, incidents, since
 from jast.outline import outline
 from jast.search import lockstep as E
+from jast.search.prepare import prepare
 
 __all__ = ["monte_carlo"]
 
@@ -47,7 +47,7 @@ def monte_carlo(
     sim,
     *,
     episodes=100_000,
-    reward=rewards.STANDARD,
+    reward=None,
     actions=SAMPLES,
     top=64,
     record=False,
@@ -61,6 +61,9 @@ def monte_carlo(
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up
     to chance. A random start is drawn likewise (from its own distribution where actions are a box).
+    Default ``reward``: `jast.rewards.lexicographic`; its scales come from 128 plain episodes (10 of
+    a black box), the same for every key, which are not among those of the result.
+
     The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``:
     distinct failures kept, static like ``episodes``. ``record=True`` keeps the numbers of every
     episode (``result.trials``); without it memory does not grow with ``episodes``.
@@ -72,7 +75,11 @@ def monte_carlo(
     for a count below 1 and where the simulator's functions or the actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
-    reward, settings = E.prepare("monte_carlo", key, sim, reward, actions, episodes=episodes)
+    before = incidents(sim)
+    # the episodes that scale the reward are the same for every key: no part of a random sample
+    reward, actions, settings, _ = prepare(
+        "monte_carlo", key, sim, reward, actions, episodes=episodes
+    )
     lanes = HOSTED if hosted(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
     key = tree_keys(key, 1)[0]
     if settings is None:
@@ -84,8 +91,6 @@ def monte_carlo(
         found, counted = _chunk(key, sim, reward, actions, _nothing(sim, 1), 0, episodes, lanes)
         best = jax.tree.map(lambda a: a[0], _rebuild(key, sim, reward, actions, found.number[None]))
         return E.finish_traced(sim, reward, counted, best, found.reward[None])
-
-    before = incidents(sim)
 
     def chunk(found, begin, end):
         if record:

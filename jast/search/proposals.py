@@ -23,8 +23,8 @@ def kinds(sim: Simulator, actions: Any) -> tuple[str, str]:
     """How x0 and x are proposed: "latent" where they have a quantile function or a box, else
     "copy".
     """
-    if isinstance(actions, choices.Quantiles):
-        return "latent", "latent"
+    if isinstance(actions, choices.Quantiles | choices.Wide):
+        return "latent" if outline(sim).start.quantile else "copy", "latent"
     if isinstance(actions, choices.UniformBox):  # a start is not of the box
         return "latent" if outline(sim).start.quantile else "copy", "latent"
     return "copy", "copy"

@@ -137,9 +137,8 @@ def _words(result):
     else:
         text = (
             "no failure was found; the nearest episode came to distance"
-            f" {float(result.best.distance):.4f}\nto find one: more episodes; a reward in which the"
-            " miss distance outweighs log p, as\n  reward=jast.rewards.shaped(100.0);"
-            " jast.estimate.failure_probability, which looks for failures alone"
+            f" {float(result.best.distance):.4f}\nto find one: more episodes{_advice(result)};"
+            "\n  jast.estimate.failure_probability, which looks for failures alone"
         )
     if result.invalid:
         text += (
@@ -161,3 +160,14 @@ def _words(result):
         )
     note = (result.settings or {}).get("interrupted")
     return text + (f"\ninterrupted: {note}" if note else "")
+
+
+def _advice(result):
+    """What to change where no failure was found; nothing of what is the default already."""
+    settings = result.settings or {}
+    advice = ""
+    if settings.get("reward", "") != "rewards.lexicographic":
+        advice += ";\n  the default reward, which ranks any failure above all misses"
+    if settings.get("actions") == "actions.samples" and settings.get("method") != "monte_carlo":
+        advice += ";\n  actions=jast.actions.wide(3.0), which reach into the tails"
+    return advice

@@ -61,7 +61,7 @@ def edges_of(problem, axes, tree, children):
     visits, total = tree.edges[at + VISITS], tree.edges[at + RETURNS]
     own = jnp.take_along_axis(node.reward, parent, axis=0)  # up to s
     valid = ((tree.outcome & FRESH) > 0) & ~tree.ended[None] & (visits > 0)
-    q = jnp.where(valid, total / jnp.maximum(visits, 1) - own, 0)
+    q = jnp.where(valid, problem.onward(total, visits, own), 0)
     parent_q = jnp.take_along_axis(jnp.concatenate([jnp.zeros_like(q[:1]), q]), parent, axis=0)
 
     def one(problem, keys, states, parent, slot):

@@ -11,12 +11,16 @@ from typing import Any, NamedTuple
 import jax
 
 from jast._jax import is_traced
+from jast.actions import samples
 from jast.counter import tree_keys
 from jast.heads.rounds import School, enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import HeadSettings, checked
 from jast.incidents import hosted, incidents, since
-from jast.search.lockstep import prepare, whole
+from jast.rewards import STANDARD, Lexicographic, lexicographic
+from jast.search.lockstep import whole
+from jast.search.pilot import Pilot, joined
+from jast.search.prepare import default_actions, prepare
 from jast.search.result import SearchResult
 from jast.search.tree.guide import guide
 from jast.search.tree.harvest import result, traced_result
@@ -29,6 +33,10 @@ from jast.watch import Watch
 __all__ = ["grow_trees"]
 
 MEMOIZE = ("auto", "node", "root", "none")
+PUBLISHED = ("paper", "thesis")
+"""Modes that maximise the reward of before by default, over draws of the model."""
+BOUNDED = 1.0
+"""``exploration`` for `jast.rewards.lexicographic`, whose range is (-1, 1]."""
 CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
 
 
@@ -43,6 +51,8 @@ class Job(NamedTuple):
     """Trees of a round: all of them where no heads learn."""
     settings: dict | None
     """What was asked for, for the result; None in a traced search."""
+    pilot: Pilot | None = None
+    """The episodes that gave the scales."""
     school: School | None = None
     """The heads, where there are any."""
     head_settings: HeadSettings | None = None
@@ -77,13 +87,15 @@ def grow_trees(
     counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
     given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
     trees, prunes, simulations, top, *_ = whole(method, **counts, **given)
+    before = incidents(sim)
     job = plan(
         method, key, sim, chosen, trees, prunes, simulations, reward, actions, exploration, memoize
     )
     if heads is not None:
         job = enlist(job, key, heads, head_settings, chosen, memoize)
     if job.settings is None:
-        return traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
+        found = traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
+        return joined(sim, job.problem.reward, job.pilot, found, top)
     wanted = job.plan._replace(record=bool(record))
     fitted, threads, lanes = fit(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
@@ -92,7 +104,7 @@ def grow_trees(
     job.settings.update(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.school is not None:
         job.settings.update(_of_heads(heads, job))
-    before, settings = incidents(sim), job.settings
+    settings = job.settings
     total = trees * job.plan.prunes * simulations
     with Watch(method, total, "sim", progress, callback) as watch:
         harvests, school, interrupted = grow_rounds(job, key, threads, lanes, top, watch.more)
@@ -101,6 +113,7 @@ def grow_trees(
     if not harvests:
         raise KeyboardInterrupt
     found = result(sim, job.problem.reward, harvests, settings, top, school)
+    found = joined(sim, job.problem.reward, job.pilot, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 
@@ -122,9 +135,18 @@ def plan(
         raise ValueError(
             f'{method}: memoize must be "auto", "node", "root" or "none", received {memoize!r}'
         )
+    published = chosen["mode"] in PUBLISHED
+    if actions is None:
+        actions = samples() if published else default_actions(sim)
+    if reward is None:
+        reward = STANDARD if published else lexicographic()
+    if exploration is None:
+        exploration = BOUNDED if isinstance(reward, Lexicographic) else 10.0
+    if chosen["focus"] is None:
+        chosen = chosen | dict(focus=getattr(actions, "focus", 1.0))
     asked = dict(trees=trees, simulations=simulations, exploration=exploration) | chosen
     asked["widening"] = list(chosen["widening"])
-    reward, settings = prepare(method, key, sim, reward, actions, **asked)
+    ready = prepare(method, key, sim, reward, actions, **asked)
     prunes = min(prunes, levels(sim))  # a tree of so many roots is at an episode's end
     total = prunes * simulations
     if total >= 2**24:
@@ -132,11 +154,12 @@ def plan(
             f"{method}: prunes * simulations must be below 2**24, received {prunes} *"
             f" {simulations}: grow more trees instead"
         )
-    problem = problem_of(sim, reward, actions, chosen, exploration, total)
+    problem = problem_of(sim, ready.reward, ready.actions, chosen, exploration, total)
     table = problem.settings.widths
     children = total + 1 if is_traced(table) else int(table.max())
     kept = "node" if memoize == "auto" else memoize
-    return Job(method, problem, Plan(prunes, simulations, children, kept), trees, trees, settings)
+    made = Plan(prunes, simulations, children, kept)
+    return Job(method, problem, made, trees, trees, ready.settings, ready.pilot)
 
 
 def enlist(

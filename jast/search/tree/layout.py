@@ -28,6 +28,7 @@ from jax import lax
 from jast._jax import is_traced
 from jast.outline import outline
 from jast.progress import advance, begin, blank, conclude
+from jast.rewards import once
 from jast.search.tree.guide import rolled
 from jast.search.tree.incumbent import fed_or, feed_level, follows, lead_of
 from jast.search.tree.packing import pack
@@ -87,6 +88,13 @@ class Problem(NamedTuple):
     def values(self):
         """Whether children have a v(s, a)."""
         return self.guide != () and self.guide.heads.value is not None
+
+    def onward(self, total, visits, before):
+        """Q(s, a), 0 where there are no visits: the mean of the returns ``total`` less what was
+        paid ``before``, up to s; a reward of whole episodes pays nothing before the end.
+        """
+        mean = total / jnp.maximum(visits, 1)
+        return jnp.where(visits > 0, mean if once(self.reward) else mean - before, 0)
 
 
 class Tree(NamedTuple):

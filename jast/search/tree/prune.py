@@ -61,7 +61,7 @@ def prune(problem, axes, tree, children, memoize="node"):
     state = _root_state(problem, axes, tree, memoize)
     tree = _settle(tree)
     rows, visits, total, child, reward = _children(tree, children)
-    q = jnp.where(visits > 0, total / jnp.maximum(visits, 1) - tree.root_reward[:, None], 0)
+    q = problem.onward(total, visits, tree.root_reward[:, None])
 
     slots, lane = jnp.arange(children, dtype=jnp.int32), jnp.arange(len(root), dtype=jnp.int32)
     source, fed = (), ()

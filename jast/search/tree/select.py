@@ -102,7 +102,7 @@ def select(problem, tree):
     def body(w):
         desk, row = read(w)
         n, total = row[:, VISITS:RETURNS], row[:, RETURNS:CHILD]
-        q = jnp.where(n > 0, total / jnp.maximum(n, 1) - w.reward[:, None], 0)
+        q = problem.onward(total, n, w.reward[:, None])
         if valued:
             values = lax.dynamic_update_slice_in_dim(
                 w.values, tree.values.reshape(-1, PAGE + 1)[w.row][None], first, 0

@@ -28,7 +28,8 @@ def settled(
         method: the search, for messages.
         modes: name of a mode -> its settings: ``widening``, ``focus`` and the ``SWITCHES``.
         mode: which one.
-        actions: of `jast.actions`; they say how near to the mode a ``focus`` of None draws.
+        actions: of `jast.actions`, which say how near to the mode a ``focus`` of None draws; it
+            stays None with actions of None.
         **given: settings by name that take the place of the mode's own, where they are not None.
 
     Returns:
@@ -40,7 +41,7 @@ def settled(
     if mode not in modes:
         raise ValueError(f"{method}: mode must be one of {sorted(modes)}, received {mode!r}")
     chosen = modes[mode] | {name: value for name, value in given.items() if value is not None}
-    if chosen["focus"] is None:
+    if chosen["focus"] is None and actions is not None:
         chosen["focus"] = getattr(actions, "focus", 1.0)
     widening, focus = chosen["widening"], chosen["focus"]
     pair = isinstance(widening, tuple | list) and len(widening) == 2
@@ -49,7 +50,7 @@ def settled(
             f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received"
             f" {widening!r}"
         )
-    if not is_traced(focus) and not focus > 0:
+    if focus is not None and not is_traced(focus) and not focus > 0:
         raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
     for name in SWITCHES:
         if not isinstance(chosen[name], bool):
