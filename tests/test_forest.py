@@ -159,7 +159,7 @@ def test_a_result_is_readable():
         assert max(map(len, text.splitlines())) < 120
     assert "likeliest failure: reward" in found
     assert "no failure was found; the nearest episode came to distance" in none
-    assert "to find one: more episodes; a reward" in none
+    assert "more episodes;\n  the default reward, which ranks any failure above" in none
 
 
 def test_random_starts_are_found():
