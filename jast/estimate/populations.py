@@ -17,11 +17,12 @@ from jax.scipy.special import logsumexp
 
 from jast.counter import generator
 from jast.limit_state import dimension, log_ratios, normal_numbers, outcomes
+from jast.markov import WIDTHS, proposed
 
 __all__ = ["cool", "explore"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
-WIDTHS, FAILING, COLD, COOLING, DRAWS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.25, 60, 4
+FAILING, COLD, COOLING, DRAWS = 0.1, 0.25, 60, 4
 
 
 class Explored(NamedTuple):
@@ -213,7 +214,7 @@ def _move(sim, people, rows, noise, level, scale, width, covered):
     accepted share).
     """
     people = jax.tree.map(lambda a: a[rows], people)
-    new = _judge(sim, jnp.sqrt(1 - scale**2) * people.z + scale * width * noise, covered)
+    new = _judge(sim, proposed(people.z, noise, scale, width), covered)
     good = new.score <= level
     kept = jax.tree.map(
         lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people

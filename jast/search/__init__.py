@@ -2,6 +2,7 @@
 
 from jast._doors import listed
 from jast.search.cem import cem
+from jast.search.chain import chain
 from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.forest import forest
 from jast.search.go_explore import go_explore
@@ -17,6 +18,7 @@ __all__ = [
     "Refined",
     "SearchResult",
     "cem",
+    "chain",
     "forest",
     "go_explore",
     "mcts",

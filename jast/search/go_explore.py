@@ -295,7 +295,7 @@ def _backward(key, sim, reward, plan, kept, traces, begin, end, since, whole):
             kept, played, live, number, jax.vmap(partial(C.features, sim))(ends.progress.state)
         )
         more = _tally(played, new, live, number)
-        counted = E.add(counted, more._replace(steps=more.steps + jnp.sum(steps)))
+        counted = E.add(counted, more._replace(steps=more.steps + jnp.sum(steps, dtype=jnp.int32)))
         return (kept, _bettered(traces, played, live)), counted
 
     return _blocks(block, plan, begin, end, (kept, traces))

@@ -1,0 +1,25 @@
+"""Markov moves over normal numbers, which keep N(0, width^2 I): what all chains share."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+__all__ = ["WIDTHS", "proposed"]
+
+WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0
+"""Of the noise, in the order in which failures are looked for."""
+
+
+def proposed(z: jax.Array, noise: jax.Array, scale: Any, width: Any) -> jax.Array:
+    """The points that ``z`` may move to, reversibly with respect to N(0, width^2 I): the
+    preconditioned Crank-Nicolson proposal (Cotter, Roberts, Stuart and White 2013), which is
+    conditional sampling (Papaioannou, Betz, Zwirglmaier and Straub 2015).
+
+    Args:
+        z: points.
+        noise: standard normal numbers, as many.
+        scale: from 0, no move, to 1, an independent draw.
+        width: of the normal numbers.
+    """
+    return jnp.sqrt(1 - scale**2) * z + scale * width * noise
