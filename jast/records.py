@@ -22,6 +22,8 @@ RECORDS = {
     "SearchHistory": "jast.search.result:History",
     "Trials": "jast.search.result:Trials",
     "Refined": "jast.search.refinement:Refined",
+    "Report": "jast.stress_testing.report:Report",
+    "Tried": "jast.stress_testing.report:Tried",
     "Mode": "jast.search.failure_modes:Mode",
     "Modes": "jast.search.failure_modes:Modes",
     "Roots": "jast.search.tree.prune:Roots",

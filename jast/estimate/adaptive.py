@@ -32,7 +32,15 @@ APART = 0.6
 
 
 def failure_probability(
-    key, sim, budget=100_000, *, gradients=True, level=0.95, progress=False, callback=None
+    key,
+    sim,
+    budget=100_000,
+    *,
+    failures=None,
+    gradients=True,
+    level=0.95,
+    progress=False,
+    callback=None,
 ):
     """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its
     own finding: `Estimate`.
@@ -46,6 +54,9 @@ def failure_probability(
     budget, about half, is drawn from the proposal as it then stands: the estimate and its interval
     are of these episodes alone. Where plain Monte Carlo would be more exact, these are drawn from
     the model.
+
+    ``failures``: known ones (an archive, `jast.failures`), which join what the explorers find, so
+    that no mode among them is lost. They lead to a proposal and never enter the estimate.
 
     A failure mode that all explorers miss is missing without a sign. ``modes`` are parts of the
     estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`; ``history`` tells
@@ -66,6 +77,8 @@ def failure_probability(
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     for_search, key = jax.random.split(key)
     s = Seeker(for_search, sim, budget)
+    if failures is not None:
+        s.known = latent.normal_of(sim, failures.episodes)
     try:
         seek(s, gradients)
         found = _with_the_rest(key, s, level, progress, callback)

@@ -46,6 +46,7 @@ class Seeker:
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
         self.anchors = np.zeros((0, self.dimension))
+        self.known = self.anchors  # failures that came with the call
         self.seeds = self.anchors  # failures of many places, whatever their probability
         self.spent, self.reasons, self.history = 0, [], []
 
@@ -130,6 +131,8 @@ def _explore(s, gradients):
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return len(points) > 0
 
+    if len(s.known):
+        around("failures given", distinct(s.known.astype(np.float64), POINTS), 0)
     found = (
         design_points(s.next_key(), s.sim, int(np.clip(s.budget // 2000, 4, 48)), POINTS)
         if gradients

@@ -22,10 +22,12 @@ POINTS, DIFFERENCES, GRADIENT = 16, 64, 4
 """Failures that are pulled side by side; differences of a point in a round; evaluations that a
 gradient of distance and log p is counted as.
 """
-LOOK, LIKE, STILL, ENOUGH = 10, 0.02, 1e-6, 30
+LOOK, LIKE, STILL, STILL_FOR, ENOUGH, FILLING, ALIKE = 5, 0.02, 1e-6, 6, 15, 0.5, 0.7
 """Rounds between two looks at the points; those nearer to one another than this share of their way
-from the anchor go on as one; the work ends where no cost falls by more than this share of it; the
-budget gives each point at least so many rounds.
+from the anchor go on as one; a point has arrived where so many looks gained less than this share of
+its cost; further failures are started with where there are so many rounds for each, in this share
+of the budget. In the rest, of points with a cosine above the last number only the likeliest goes
+on.
 """
 LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2
 
@@ -84,8 +86,9 @@ def refine(
             distance is flat, has its slopes told from differences.
 
     Returns:
-        `Refined`: at most 16 of the failures, the likeliest and those farthest from one another,
-        each moved as far as the budget goes; those that meet are one. log p counts relative to the
+        `Refined`: the likeliest failures near those given, which are started with 16 at a time, the
+        likeliest and those farthest from one another first, for as long as the budget lasts; those
+        that meet are one. log p counts relative to the
         mode wherever the distributions have modes. A failure that nothing betters comes back as it
         was, and one that does not replay is left out.
 
@@ -103,85 +106,124 @@ def refine(
     if not np.ndim(given.length):
         given = jax.tree.map(lambda a: np.asarray(a)[None], given)
     given = jax.device_get(given._replace(states=None))
-    rng, home, z = generator(key), M.anchor(sim), normal_of(sim, given)
-    cost = M.SIZE + (GRADIENT if gradients else min(DIFFERENCES, len(home)))
-    rows = spread(z, np.asarray(given.reward), max(1, min(POINTS, budget // (ENOUGH * cost))))
-    points, spent = _started(sim, home, z[rows])
-    work = _Work(rng, sim, home, points, rows, gradients, cost)
-    work.run(budget - spent)
-    return work.result(given, settings, spent)
+    work = _Work(generator(key), sim, given, gradients)
+    work.run(budget)
+    return work.result(settings)
 
 
-def spread(z: np.ndarray, value: np.ndarray, n: int) -> np.ndarray:
-    """At most ``n`` rows of ``z`` [m, D]: the one of the highest ``value`` [m], then by turns the
-    farthest from those and the next by value.
-    """
-    left = list(np.argsort(-value, kind="stable"))
-    unit = z / np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-12)
-    kept = [left.pop(0)] if left else []
-    while left and len(kept) < n:
-        nearest = (unit[left] @ unit[kept].T).max(axis=1)
-        kept.append(left.pop(0 if len(kept) % 4 == 3 else int(np.argmin(nearest))))
-    return np.array(kept, np.int64)
+class _Track:
+    """One point on its way."""
 
+    def __init__(self, point: M.Point, origin: int, spent: int):
+        self.point, self.origin = point, origin
+        self.first = float(point.cost)
+        self.log = [(spent, self.first)]
 
-def _started(sim: Simulator, home: jax.Array, z: np.ndarray) -> tuple[M.Point, int]:
-    """The `Point` of each of ``z`` [n, D], lifted from the anchor as little as makes it fail, on
-    the host; cost inf where nothing does. And the evaluations.
-    """
-    lifted = np.asarray(home) + (z - np.asarray(home)) * (1 + np.array(LIFTS))[:, None, None]
-    n, d = z.shape
-    points, verdict = jax.device_get(M.begun(sim, jnp.asarray(lifted.reshape(-1, d), z.dtype)))
-    fails = verdict.failure.reshape(len(LIFTS), n)
-    first = np.argmax(fails, axis=0) * n + np.arange(n)
-    points = jax.tree.map(lambda a: a[first], points)
-    return points._replace(cost=np.where(fails.any(axis=0), points.cost, np.inf)), len(lifted) * n
+    def still(self) -> bool:
+        """Whether the last looks gained nothing to speak of."""
+        before = self.log[-1 - STILL_FOR][1] if len(self.log) > STILL_FOR else np.inf
+        return before - self.log[-1][1] <= STILL * abs(before)
 
 
 class _Work:
-    """Points on their way, those of one place put together, and what they cost."""
+    """Points on their way, those that have arrived, failures yet to be tried, and the cost."""
 
-    def __init__(self, rng, sim, home, points, rows, gradients, cost):
-        alive = np.isfinite(points.cost)
-        self.rng, self.sim, self.home, self.gradients = rng, sim, home, gradients
-        self.points, self.origin = jax.tree.map(lambda a: a[alive], points), rows[alive]
-        self.first, self.cost = self.points.cost.copy(), cost
-        self.spent, self.invalid, self.log = 0, 0, []
+    def __init__(self, rng, sim, given, gradients):
+        self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
+        self.home, z = M.anchor(sim), normal_of(sim, given)
+        self.v = z - np.asarray(self.home)
+        self.value = np.asarray(given.reward, np.float64)
+        self.left = list(np.argsort(-self.value, kind="stable"))
+        self.seen = np.zeros((0, z.shape[1]))
+        self.live, self.arrived, self.done = [], [], []
+        self.cost = M.SIZE + (GRADIENT if gradients else min(DIFFERENCES, z.shape[1]))
+        self.spent = self.invalid = self.turn = 0
 
     def run(self, budget):
-        self.log.append((0, self.points.cost))
-        while len(self.origin):
-            before = self.points.cost.sum()
-            size = 1 << (len(self.origin) - 1).bit_length()
+        thinned = False
+        while True:
+            if self.spent < FILLING * budget or not self.live + self.arrived:
+                self._fill(budget)
+            elif not thinned:
+                self._thin()
+                thinned = True
+            if not self.live:
+                return
+            size = 1 << (len(self.live) - 1).bit_length()
             for _ in range(LOOK):
                 if self.spent + size * self.cost > budget:
                     return
                 self._round(size)
-            self.log.append((self.spent, self.points.cost))
-            still = before - self.points.cost.sum() <= STILL * abs(before)
-            if still and self.points.turn.min() >= 4 * LOOK:
-                return
+            for track in self.live:
+                track.log.append((self.spent, float(track.point.cost)))
             self._merge()
+            self.arrived += [t for t in self.live if t.still()]
+            self.live = [t for t in self.live if not t.still()]
+
+    def _fill(self, budget):
+        """Start with further failures where there is room: as many as get `ENOUGH` rounds."""
+        worth = (budget - self.spent) // (ENOUGH * self.cost)
+        room = 1 << (max(1, min(POINTS, worth)).bit_length() - 1)
+        if 2 * len(self.live) > room or (worth < 1 and self.arrived + self.live):
+            return
+        rows = self._next(room - len(self.live))
+        if not len(rows):
+            return
+        home = np.asarray(self.home)
+        lifted = home + self.v[rows] * (1 + np.array(LIFTS))[:, None, None]
+        n, d = len(rows), lifted.shape[-1]
+        flat = np.resize(lifted.reshape(-1, d), (len(LIFTS) << (n - 1).bit_length(), d))
+        points, verdict = jax.device_get(M.begun(self.sim, jnp.asarray(flat, self.v.dtype)))
+        self.spent += len(flat)
+        fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
+        for k, row in enumerate(rows):
+            if fails[:, k].any():
+                first = int(np.argmax(fails[:, k])) * n + k
+                point = jax.tree.map(lambda a, first=first: a[first], points)
+                self.live.append(_Track(point, int(row), self.spent))
+
+    def _next(self, n):
+        """At most ``n`` of the failures not yet tried: the likeliest; then by turns the likeliest
+        for how far it points away from all that were tried and found, the farthest, and the next.
+        """
+        found = [t.point.z - np.asarray(self.home) for t in self.live + self.arrived]
+        known = _unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
+        unit, rows = _unit(self.v), []
+        worth = np.exp(-2 * (self.value.max(initial=-np.inf) - self.value) / self._scale())
+        while self.left and len(rows) < n:
+            i, turn = 0, len(self.seen) % 4
+            if len(known) and turn != 3:
+                apart = 1 - (unit[self.left] @ known.T).max(axis=1)
+                i = int(np.argmax(apart * worth[self.left] if turn == 1 else apart))
+            row = self.left.pop(i)
+            rows.append(row)
+            self.seen = np.concatenate([self.seen, self.v[row : row + 1]])
+            known = np.concatenate([known, unit[row : row + 1]])
+        return rows
+
+    def _scale(self):
+        return max(-self.value.max(initial=-1.0), 1.0)
 
     def _round(self, size):
-        rows = np.arange(size) % len(self.origin)
-        points = jax.tree.map(lambda a: jnp.asarray(a[rows]), self.points)
+        tracks = [self.live[k % len(self.live)] for k in range(size)]
+        points = jax.tree.map(lambda *a: jnp.asarray(np.stack(a)), *(t.point for t in tracks))
         d, real = len(self.home), points.z.dtype
         part = min(DIFFERENCES, d)
-        first = part * int(self.points.turn[0])
         uniform = lambda *shape: jnp.asarray(self.rng.random(shape), real)
         noise = M.Noise(
             jnp.asarray(self.rng.standard_normal((size, M.WALKS, d)), real),
             uniform(size, M.REMOVALS, d),
             uniform(size, M.REMOVALS) ** 2,
             jnp.asarray(10.0 ** -self.rng.integers(0, 5, (size, M.REMOVALS)), real),
-            jnp.asarray(np.tile((first + np.arange(part)) % d, (size, 1)), jnp.int32),
+            jnp.asarray(np.tile((part * self.turn + np.arange(part)) % d, (size, 1)), jnp.int32),
             jnp.asarray(self._shifts(size), jnp.int32),
         )
         points, invalid = M.round_of(self.sim, self.home, points, noise, self.gradients)
-        n = len(self.origin)
-        self.points = jax.tree.map(lambda a: np.asarray(a)[:n], points)
+        points = jax.device_get(points)
+        for k, track in enumerate(self.live):
+            track.point = jax.tree.map(lambda a, k=k: a[k], points)
         self.invalid += int(invalid)
+        self.turn += 1
         self.spent += size * self.cost
 
     def _shifts(self, size):
@@ -189,49 +231,68 @@ class _Work:
         return np.concatenate([np.ones_like(far), -np.ones_like(far), far, -far], axis=1)
 
     def _merge(self):
-        """Of points of one place the cheapest goes on."""
-        z = self.points.z - np.asarray(self.home)
+        """Of points of one place the likeliest goes on."""
+        away = lambda t: t.point.z - np.asarray(self.home)
         kept = []
-        for i in np.argsort(self.points.cost, kind="stable"):
-            near = [np.linalg.norm(z[i] - z[j]) <= LIKE * np.linalg.norm(z[j]) for j in kept]
-            if not any(near):
-                kept.append(i)
-        kept = np.sort(kept)
-        self.points = jax.tree.map(lambda a: a[kept], self.points)
-        self.origin, self.first = self.origin[kept], self.first[kept]
-        self.log = [(at, cost[kept]) for at, cost in self.log]
+        for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
+            size = LIKE * max(float(np.linalg.norm(away(t))), 1e-12)
+            if all(np.linalg.norm(away(t) - away(other)) > size for other in kept):
+                kept.append(t)
+        self.arrived = [t for t in self.arrived if t in kept]
+        self.live = [t for t in self.live if t in kept]
 
-    def result(self, given, settings, spent):
-        n = len(self.origin)
-        residual = np.full(n, np.nan)
-        if self.gradients and n:
-            residual = np.asarray(M.residuals(self.sim, self.home, self.points), np.float64)
-        late = [cost for at, cost in self.log if at <= 0.9 * self.spent][-1] - self.points.cost
+    def _thin(self):
+        """Points that are like a likelier one end here: what is left of the budget is for those.
+        One that had arrived goes on, as it may have been unlucky.
+        """
+        kept, units = [], np.zeros((0, len(self.home)))
+        for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
+            unit = _unit((t.point.z - np.asarray(self.home))[None])
+            if not len(kept) or (units @ unit[0]).max() < ALIKE:
+                kept.append(t)
+                units = np.concatenate([units, unit])
+        self.done = [t for t in self.arrived + self.live if t not in kept]
+        for t in kept:
+            t.log = t.log[-1:] if t in self.arrived else t.log
+        self.live, self.arrived = kept[:POINTS], kept[POINTS:]
+
+    def result(self, settings):
+        tracks = self.arrived + self.live + self.done
+        n = len(tracks)
+        costs = np.array([float(t.point.cost) for t in tracks])
+        gain = np.array([t.first for t in tracks]) - costs
+        before = [[c for at, c in t.log if at <= 0.9 * self.spent] or [t.log[0][1]] for t in tracks]
+        late = np.array([c[-1] for c in before]) - costs
+        origin, residual = np.array([t.origin for t in tracks], np.int64), np.full(n, np.nan)
+        if n:
+            points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
+            z = points.z
+            if self.gradients:
+                padded = np.arange(1 << (n - 1).bit_length()) % n
+                rows = jax.tree.map(lambda a: jnp.asarray(a[padded]), points)
+                residual = np.asarray(M.residuals(self.sim, self.home, rows), np.float64)[:n]
         reward, kept = M.likelihood(self.sim), []
-        z, home = self.points.z, np.asarray(self.home)
+        home = np.asarray(self.home)
         for i in range(n):
             tries = home + (z[i] - home) * (1 + np.array(LIFTS))[:, None]
             tries = jax.device_get(episodes(self.sim, jnp.asarray(tries, z.dtype)))
-            own = jax.tree.map(lambda a, i=i: a[self.origin[i]], given)
+            own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
             tries = [jax.tree.map(lambda a, k=k: a[k], tries) for k in range(len(LIFTS))]
-            for e in [*tries, own._replace(states=None)]:
+            for e in [*tries, own]:
                 if bool(replay(self.sim, e, reward=reward).failure):
                     kept.append((i, e))
                     break
-        if kept:
+        if not kept:
+            found, i = empty(self.sim), np.zeros(0, np.int64)
+        else:
             stacked = jax.tree.map(lambda *a: np.stack(a), *(e for _, e in kept))
             which = np.array([i for i, _ in kept])
             found = collect(self.sim, reward, stacked, simulation=which, top=len(which))
             i = found.simulation
-        else:
-            found, i = empty(self.sim), np.zeros(0, np.int64)
         return Refined(
-            found,
-            self.origin[i],
-            residual[i],
-            (self.first - self.points.cost)[i].astype(np.float64),
-            late[i].astype(np.float64),
-            spent + self.spent,
-            self.invalid,
-            settings,
+            found, origin[i], residual[i], gain[i], late[i], self.spent, self.invalid, settings
         )
+
+
+def _unit(v):
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,150 @@
+"""The explorers of `jast.stress`: ways to find failures, each a function ``(key, sim, budget) ->
+Haul``.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import limit_state as latent
+from jast.episode import Episode
+from jast.estimate.design_points import design_points
+from jast.estimate.populations import cool, explore
+from jast.failures import empty
+from jast.incidents import hosted
+from jast.outline import outline
+from jast.search.cem import cem
+from jast.search.forest import forest
+from jast.search.monte_carlo import monte_carlo
+from jast.search.moves import likelihood
+from jast.simulator import Simulator
+
+__all__ = ["EXPLORERS", "Haul", "explorers_of", "ranked"]
+
+KEPT = 128
+"""Failures that an explorer hands over, the most."""
+
+
+class Haul(NamedTuple):
+    """What an explorer brought in."""
+
+    episodes: Episode
+    """Failing ones [m], on the host."""
+    evaluations: int
+    failing: int
+    """Failing episodes among those simulated, where they were counted; else m"""
+    invalid: int
+    distance: float
+    """The least miss distance seen of an episode that did not fail; inf where unknown"""
+
+
+def ranked(sim: Simulator) -> Callable:
+    """The reward of searches that rank failures first themselves: of a failure log p, relative to
+    the mode where the disturbances of ``sim`` have modes, and of the rest the nearness.
+    """
+    about = outline(sim)
+    return by_mode if about.start.mode and about.disturbance.mode else by_density
+
+
+def by_mode(log_p, event, distance, terminal, approach=0.0):
+    return jnp.where(event, log_p, -distance)
+
+
+def by_density(log_p, event, distance, terminal, approach=0.0):
+    return jnp.where(event, log_p, -distance)
+
+
+by_mode.once = by_density.once = True
+by_mode.density = "mode"
+
+
+def plain(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """Draws of the model."""
+    return _of_search(monte_carlo(key, sim, episodes=budget, reward=likelihood(sim), top=KEPT))
+
+
+def cooled(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """Wider noise, cooled down: chains that start where failures are frequent."""
+    return _of_points(sim, cool(key, sim, int(np.clip(budget // 84, 8, KEPT))))
+
+
+def levels(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """Subset simulation: down the levels of the miss distance."""
+    found = explore(key, sim, int(np.clip(budget // 12, 50, 1000)), most=budget)
+    return _of_points(sim, found)
+
+
+def slopes(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """Gradients of the miss distance, from draws of the model."""
+    found = design_points(key, sim, int(np.clip(budget // 108, 4, 48)))
+    return _of_points(sim, found)
+
+
+def likest(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """The cross-entropy method, on the rank of a failure."""
+    samples = max(10, budget // 15)
+    elites = max(2, samples // 10)
+    reward = ranked(sim)
+    return _of_search(
+        cem(key, sim, samples=samples, elites=elites, iterations=15, reward=reward, top=KEPT)
+    )
+
+
+def trees(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """A forest of search trees."""
+    number = int(np.clip(budget // 2000, 1, 64))
+    each = max(10, budget // (10 * number))
+    return _of_search(forest(key, sim, trees=number, prunes=10, simulations=each, top=KEPT))
+
+
+EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {
+    "plain draws": plain,
+    "widened noise, cooled": cooled,
+    "gradients": slopes,
+    "levels of distance": levels,
+    "cross-entropy": likest,
+    "forest": trees,
+}
+LATENT = {"widened noise, cooled", "gradients", "levels of distance"}
+LEAST = {"forest": 2000, "cross-entropy": 600, "levels of distance": 600, "gradients": 432}
+"""Evaluations below which an explorer is not worth a call; else 84."""
+
+
+def explorers_of(sim: Simulator, budget: int) -> list[str]:
+    """The names of those that work on ``sim``, with ``budget`` evaluations each."""
+    about = outline(sim)
+    quantiles = about.start.quantile and about.disturbance.quantile
+    floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(about.x))
+    fits = {
+        name: budget >= LEAST.get(name, 84)
+        and (quantiles or name not in LATENT)
+        and (name != "gradients" or (floats and not hosted(sim)))
+        for name in EXPLORERS
+    }
+    return [name for name, fit in fits.items() if fit]
+
+
+def _of_search(result: Any) -> Haul:
+    """The `Haul` of a `jast.search.SearchResult`."""
+    near = float(result.best.distance)
+    return Haul(
+        result.failures.episodes,
+        result.episodes,
+        int(result.failing),
+        int(result.invalid),
+        np.inf if result.best.failure else near,
+    )
+
+
+def _of_points(sim: Simulator, found: Any) -> Haul:
+    """The `Haul` of failing points [m, D] of normal numbers."""
+    points = np.asarray(found.points)[:KEPT]
+    invalid = int(getattr(found, "invalid", 0))
+    if not len(points):
+        return Haul(empty(sim).episodes, found.evaluations, 0, invalid, np.inf)
+    e = jax.device_get(latent.episodes(sim, jnp.asarray(points, latent.normal_numbers(sim))))
+    e = jax.tree.map(lambda a: a[e.failure], e)
+    return Haul(e, found.evaluations, len(e.length), invalid, np.inf)

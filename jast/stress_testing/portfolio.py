@@ -1,0 +1,261 @@
+"""jast.stress: check, nominal, explorers, refinement, modes, probability; one budget."""
+
+import warnings
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jast import _checks
+from jast import limit_state as latent
+from jast.contract import check
+from jast.crude import nominal
+from jast.estimate import adaptive
+from jast.estimate.batches import drawn, numbers
+from jast.failures import Failures, collect, empty, merge
+from jast.outline import outline
+from jast.results import asked
+from jast.search.failure_modes import Mode, Modes, assigned, modes
+from jast.search.moves import anchor, likelihood
+from jast.search.refinement import refine
+from jast.simulator import Simulator
+from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of
+from jast.stress_testing.report import Report, Tried
+from jast.watch import Watch
+
+__all__ = ["stress"]
+
+LEAST, ESTIMABLE = 300, 5000
+"""Evaluations of a call, and of an estimate that finds its own proposal."""
+NOMINAL, SEARCH, REFINE = 0.05, 0.2, 0.15
+"""Shares of the budget; the rest is for the probability. Without an estimate of its own the last
+two take it all.
+"""
+FIRST, CALLS, FADING = 0.5, 6, 0.1
+"""Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
+of its last gain is expected of one that gained nothing since.
+"""
+SAMPLES = 128
+"""Failures of the estimate that are told apart by mode."""
+
+
+def stress(
+    key: jax.Array,
+    sim: Simulator,
+    budget: int = 200_000,
+    *,
+    top: int = 64,
+    progress: bool = False,
+    callback: Callable | None = None,
+) -> Report:
+    """How does the system fail, how likely, and what is its likeliest failure?
+
+    It checks the simulator, runs it undisturbed and under plain draws, looks for failures with a
+    portfolio of explorers (those whose failures get likelier are given more of the budget), pulls
+    what they found to where log p is greatest (`jast.search.refine`), sorts it into failure modes,
+    and estimates the probability of failure (`jast.estimate.failure_probability`), for which the
+    modes found are where to look; they never enter the estimate itself.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
+            least 300. Below 8,334 the probability is told from the plain draws alone.
+        top: failures kept, at least one for each mode.
+        progress: whether there is a bar.
+        callback: called as ``callback(done, total, None)`` after every piece of the work.
+
+    Returns:
+        `Report`: print it. A KeyboardInterrupt ends the work with what was found by then, and is
+        raised before there is anything.
+
+    Raises:
+        ValueError: for a budget below 300, and where the simulator's functions do not fit together.
+    """
+    name = "stress"
+    _checks.random_key(name, key)
+    budget = _checks.whole(name, "budget", budget, LEAST)
+    top = _checks.whole(name, "top", top, 1)
+    check(sim)
+    settings = asked(name, key, budget=budget, top=top)
+    with Watch(name, budget, "sim", progress, callback) as watch:
+        work = _Work(key, sim, budget, top, watch)
+        try:
+            work.look()
+            work.search()
+            work.refine()
+            work.estimate()
+        except KeyboardInterrupt:
+            if work.nominal is None:
+                raise
+            settings["interrupted"] = f"after {work.spent} of {budget} evaluations"
+    return work.report(settings)
+
+
+class _Work:
+    """What is known so far, and what it cost."""
+
+    def __init__(self, key, sim, budget, top, watch):
+        self.key, self.sim, self.budget, self.top, self.watch = key, sim, budget, top, watch
+        about = outline(sim)
+        self.latent = about.start.quantile and about.disturbance.quantile
+        self.reward = likelihood(sim)
+        self.nominal = self.probability = None
+        self.pool = self.failures = self.known = empty(sim)
+        self.modes, self.tried, self.spent, self.invalid = Modes(), [], 0, 0
+        self.residual = self.late = np.nan
+        self.estimable = self.latent and (1 - NOMINAL - SEARCH - REFINE) * budget >= ESTIMABLE
+
+    def next_key(self):
+        self.key, key = jax.random.split(self.key)
+        return key
+
+    def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
+        self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
+        self.spent += int(evaluations)
+        self.invalid += int(invalid)
+        self.watch.reach(min(self.spent, self.budget))
+        self.watch.tell()
+
+    def share(self, part):
+        """Evaluations of a part of the search, of which there is more without an estimate."""
+        return int(self.budget * part / (1 if self.estimable else NOMINAL + SEARCH + REFINE))
+
+    def look(self):
+        """The system as it is."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the report says it
+            self.nominal = nominal(self.next_key(), self.sim, self.share(NOMINAL))
+        quiet, n = self.nominal.undisturbed, self.nominal
+        self.note("nominal", n.episodes, n.failing, invalid=n.invalid)
+        if quiet is not None and bool(quiet.failure):
+            one = jax.tree.map(lambda a: np.asarray(a)[None], quiet._replace(states=None))
+            self.pool = collect(self.sim, self.reward, one)
+
+    def search(self):
+        """Every explorer once; then those again whose failures get likelier for what they cost."""
+        total = self.share(SEARCH)
+        names = explorers_of(self.sim, max(84, int(FIRST * total / len(EXPLORERS))))
+        each, end = int(FIRST * total / len(names)), self.spent + total
+        gains = {name: self.explore(name, each) for name in names}
+        calls = dict.fromkeys(names, 1)
+        again = int((1 - FIRST) * total / CALLS)
+        while self.spent + again <= end:
+            # of those that expect as much, the one that was called least
+            name = max(names, key=lambda n: (gains[n], -calls[n]))
+            # what paid once may pay again, but less is expected of it
+            gains[name] = max(self.explore(name, again), FADING * gains[name])
+            calls[name] += 1
+
+    def explore(self, name, budget):
+        """Call one explorer; returns by how much the likeliest failure got likelier per
+        evaluation.
+        """
+        haul: Haul = EXPLORERS[name](self.next_key(), self.sim, budget)
+        found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
+        best = float(found.best.reward) if len(found) else -np.inf
+        before = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        self.pool = merge(self.pool, found, top=8 * self.top)
+        self.note(name, haul.evaluations, haul.failing, best, haul.invalid)
+        if best <= before:
+            return 0.0
+        gain = 1.0 if before == -np.inf else best - before
+        return gain / max(haul.evaluations, 1)
+
+    def refine(self):
+        """The pool to where log p is greatest: many failures a little, then each mode's best."""
+        self.failures = self.pool
+        if not len(self.pool):
+            return
+        if not self.latent:
+            best = self.pool[0]
+            self.modes = Modes([Mode(best, int(self.pool.counts.sum()), 1.0)])
+            return
+        budget = self.share(REFINE)
+        chosen = self.pool
+        for part in (0.6, 0.4):
+            result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
+            found = result.failures
+            if len(found):
+                self.residual, self.late = float(result.residual[0]), float(result.late[0])
+                self.failures = merge(self.failures, found, top=8 * self.top)
+                self.known = merge(self.known, found, top=self.top)
+            self.note(
+                "refine",
+                result.episodes,
+                len(found),
+                float(found.best.reward) if len(found) else -np.inf,
+                result.invalid,
+            )
+            self.modes = modes(self.sim, found if len(found) else self.pool[:1], self.pool)
+            chosen = self.bests()
+        self.failures = merge(self.bests(), self.failures, top=self.top)
+
+    def bests(self) -> Failures:
+        """The likeliest failure of each mode."""
+        each = [m.failure._replace(states=None) for m in self.modes]
+        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+        return collect(self.sim, self.reward, stacked)
+
+    def estimate(self):
+        """The probability, with what is left."""
+        rest = max(self.budget - self.spent, 1)
+        if not self.estimable:
+            more = adaptive.monte_carlo(self.next_key(), self.sim, max(rest, 100))
+            self.note("plain draws", more.episodes, more.failing, invalid=more.invalid)
+            self.probability = more
+            return
+        known = self.known if len(self.known) else None
+        rest = max(rest - self.counted(), ESTIMABLE)
+        p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
+        self.probability = p
+        self.note("probability", p.episodes, p.failing, invalid=p.invalid)
+        if self.modes and p.proposal is not None and p.reliable:
+            self.tell_shares(p.proposal)
+
+    def counted(self):
+        return 20 * SAMPLES if len(self.modes) > 1 else 0
+
+    def tell_shares(self, q):
+        """The share of the probability that each mode has, of failures drawn from the proposal."""
+        if len(self.modes) == 1:
+            self.modes = Modes([self.modes[0]._replace(share=1.0)])
+            return
+        n = 16 * SAMPLES
+        z, o, log_w, _ = jax.device_get(
+            drawn(self.sim, q, *numbers(self.next_key(), n, q.means.shape[1], q.means.dtype))
+        )
+        log_w = np.where(o.failure, log_w.astype(np.float64), -np.inf)
+        self.note("shares of modes", n, int(o.failure.sum()))
+        if not o.failure.any():
+            return
+        w = np.exp(log_w - log_w.max())
+        at = (np.arange(SAMPLES) + 0.5) / SAMPLES
+        rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
+        home = np.asarray(anchor(self.sim), np.float64)
+        bests = [m.failure for m in self.modes]
+        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests)
+        stacked = stacked._replace(states=None)
+        v = latent.normal_of(self.sim, stacked).astype(np.float64) - home
+        used = np.arange(z.shape[1])[None] < o.used[rows][:, None]
+        points = np.where(used, z[rows].astype(np.float64) - home, 0)
+        many, known = (points, o.length[rows]), (v, stacked.length)
+        owner = assigned(self.sim, home, many, known, np.arange(len(self.modes)))
+        shares = np.bincount(owner, minlength=len(self.modes)) / SAMPLES
+        self.modes = Modes(
+            m._replace(share=float(s)) for m, s in zip(self.modes, shares, strict=True)
+        )
+
+    def report(self, settings):
+        return Report(
+            self.nominal,
+            self.failures[: self.top],
+            self.modes,
+            self.probability,
+            self.residual,
+            self.late,
+            tuple(self.tried),
+            self.spent,
+            self.invalid,
+            settings,
+        )

@@ -1,0 +1,124 @@
+"""What `jast.stress` says: one screen."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jast import results
+from jast.crude import Nominal
+from jast.estimate.estimate import Estimate
+from jast.failures import Failures
+from jast.search.failure_modes import Modes
+
+__all__ = ["Report", "Tried"]
+
+
+@results.shown()
+class Tried(NamedTuple):
+    """One piece of the work."""
+
+    name: str
+    evaluations: int
+    failing: int
+    """Failures that it brought in."""
+    best: float
+    """log p relative to the mode of the likeliest of them; -inf without one."""
+
+
+@results.result("episodes")
+class Report(NamedTuple):
+    """The outcome of `jast.stress`."""
+
+    nominal: Nominal
+    """The system as it is: undisturbed, and under plain draws."""
+    failures: Failures
+    """By falling log p relative to the mode, which is their reward; all replay."""
+    modes: Modes
+    """The ways to fail, the likeliest first."""
+    probability: Estimate | None
+    """None where the work was interrupted before."""
+    residual: float
+    """Of the likeliest failure, how far it is from a local optimum: the slope of log p along the
+    boundary of failure as a share of its whole slope; NaN where the distance has no gradient."""
+    late: float
+    """log p that the likeliest failure gained in the last tenth of its refinement."""
+    tried: tuple
+    """`Tried`: what was done, in order."""
+    episodes: int
+    """Evaluations in all; one with its gradient counts for more."""
+    invalid: int
+    settings: dict
+
+    @property
+    def spent(self) -> dict:
+        """Evaluations by the name of what they were spent on."""
+        spent = {}
+        for part in self.tried:
+            spent[part.name] = spent.get(part.name, 0) + part.evaluations
+        return spent
+
+    def __str__(self):
+        lines = [*_verdict(self), ""]
+        if self.modes:
+            lines += [str(self.modes), ""]
+        lines += [*_work(self), "", *_next(self)]
+        return "\n".join(lines)
+
+
+def _verdict(r):
+    quiet = r.nominal.undisturbed
+    if quiet is None:
+        alone = "not defined: a disturbance has neither a mode nor a median"
+    else:
+        outcome = "FAILS" if bool(quiet.failure) else "no failure"
+        alone = f"{outcome}, distance {float(quiet.distance):.4g}, {int(quiet.length)} steps"
+    rows = [("undisturbed", alone)]
+    rows.append(("plain draws", f"{r.nominal.failing} of {r.nominal.episodes} fail"))
+    p = r.probability
+    if p is None:
+        rows.append(("probability", "not estimated"))
+    elif np.isnan(p.log_mean):
+        bound = f"below {p.interval[1]:.3g} at {p.level:.0%}"
+        rows.append(("probability", f"no failure in {p.samples} draws of the model: {bound}"))
+    elif not p.reliable:
+        rows.append(("probability", f"UNRELIABLE: {p.warnings[0]}"))
+        rows.append(("", f"{p.mean:.4g}, which must not be believed"))
+    else:
+        low, high = p.interval
+        rows.append(("probability", f"{p.mean:.4g}   {p.level:.0%} [{low:.4g}, {high:.4g}]"))
+    if len(r.failures):
+        e = r.failures.best
+        text = f"log p {float(e.reward):.4f} relative to the mode, {int(e.length)} steps"
+        if np.isfinite(r.residual) and r.residual < 0.05:
+            text += f"; locally likeliest, residual {r.residual:.1e}"
+        elif np.isfinite(r.late):
+            text += f"; its refinement last gained {r.late:.1e}"
+        rows.append(("likeliest", text))
+    else:
+        rows.append(("likeliest", "no failure was found"))
+    if r.invalid:
+        rows.append(("invalid", f"{r.invalid} episodes gave numbers that are not finite"))
+    if "interrupted" in r.settings:
+        rows.append(("interrupted", r.settings["interrupted"]))
+    return [f"{name:<13}{text}" for name, text in rows]
+
+
+def _work(r):
+    lines = [f"{'tried':<24} {'evaluations':>12} {'failing':>9} {'best log p rel.':>16}"]
+    for part in r.tried:
+        best = "-" if part.best == -np.inf else f"{part.best:.4f}"
+        lines.append(f"{part.name:<24} {part.evaluations:12d} {part.failing:9d} {best:>16}")
+    lines.append(f"{'in all':<24} {r.episodes:12d}")
+    return lines
+
+
+def _next(r):
+    """What a user would do next."""
+    if r.nominal.undisturbed is not None and bool(r.nominal.undisturbed.failure):
+        return ["next: mend the system, which fails without any disturbance"]
+    if not len(r.failures):
+        return ["next: a larger budget; a miss distance that falls on the way to a failure"]
+    words = ["next: jast.replay(sim, report.failures[0]) for its states"]
+    if r.probability is not None and not r.probability.reliable:
+        words.append("a larger budget, or jast.estimate.subset_simulation, for the probability")
+    return ["; ".join(words)]

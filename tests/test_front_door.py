@@ -1,0 +1,138 @@
+"""jast.stress: one call from a simulator to a report."""
+
+import math
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from benchmarks.stress_systems import PEDESTRIANS, pedestrians
+from jast.distributions import Normal, seeds
+
+
+def walk(limit=4.0, **changes):
+    given = dict(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
+        horizon=2,
+    )
+    return jast.Simulator(**given | changes)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """The report on two pedestrians, whose modes have closed forms."""
+    return pedestrians(), jast.stress(jax.random.key(0), pedestrians(), 60_000)
+
+
+def test_the_likeliest_failure_of_each_mode(crossing):
+    sim, report = crossing
+    costs = [away**2 / (2 * steps * noise**2) for steps, away, noise in PEDESTRIANS]
+    assert [float(m.failure.reward) for m in report.modes] == pytest.approx(
+        [-c for c in costs], abs=0.02
+    )
+    assert float(report.failures.best.reward) == pytest.approx(-costs[0], abs=0.02)
+    assert (np.diff(report.failures.episodes.reward) <= 0).all()
+    for e in report.failures:
+        assert bool(jast.replay(sim, e).failure)
+
+
+def test_the_probability_and_the_shares_of_modes(crossing):
+    """Phi(-beta) of each pedestrian; the shares are of 128 failures drawn: 4 standard errors."""
+    _, report = crossing
+    tails = [
+        math.erfc(away / noise / math.sqrt(steps) / math.sqrt(2)) / 2
+        for steps, away, noise in PEDESTRIANS
+    ]
+    p = report.probability
+    assert p.reliable and abs(p.mean / sum(tails) - 1) < 4 * p.relative_error
+    share = tails[0] / sum(tails)
+    assert abs(report.modes[0].share - share) < 4 * math.sqrt(share * (1 - share) / 128)
+    assert sum(m.share for m in report.modes) == pytest.approx(1)
+
+
+def test_what_was_spent_is_told(crossing):
+    _, report = crossing
+    assert sum(report.spent.values()) == report.episodes <= 1.1 * 60_000
+    assert {"nominal", "plain draws", "refine", "probability"} <= report.spent.keys()
+    text = str(report)
+    for words in ("undisturbed", "probability", "likeliest", "mode", "tried", "next"):
+        assert words in text
+    assert len(text.splitlines()) < 45
+
+
+def test_a_report_is_saved(crossing, tmp_path):
+    sim, report = crossing
+    jast.save(tmp_path / "report", report)
+    assert str(jast.load(tmp_path / "report", sim)) == str(report)
+
+
+def test_the_same_key_gives_the_same_report(key):
+    one, two = (jast.stress(key, walk(), 600) for _ in range(2))
+    assert str(one) == str(two)
+    np.testing.assert_array_equal(
+        one.failures.episodes.disturbances, two.failures.episodes.disturbances
+    )
+    assert float(one.failures.best.reward) == pytest.approx(-4, abs=0.05)
+
+
+def test_a_system_that_never_fails_has_an_upper_bound(key):
+    sim = walk(evaluate=lambda s: (jnp.zeros((), bool), jnp.abs(s) + 1))
+    report = jast.stress(key, sim, 1000)
+    assert len(report.failures) == 0 and report.modes == ()
+    assert 0 < report.probability.interval[1] < 0.02
+    assert "no failure was found" in str(report) and "below" in str(report)
+
+
+def test_a_system_that_fails_undisturbed_is_told_so(key):
+    sim = walk(init=lambda x0: jnp.full((), 5.0), step=lambda s, x: s + 0 * x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = jast.stress(key, sim, 400)
+    assert "FAILS" in str(report)
+    assert float(report.failures.best.reward) == 0
+
+
+def test_seeds_of_unknown_density_make_one_mode(key):
+    sim = walk(
+        disturbance=lambda s: seeds(),
+        step=lambda s, x: s + jax.random.normal(jax.random.wrap_key_data(jnp.stack([x, x]))),
+        limit=2.0,
+    )
+    report = jast.stress(key, sim, 2000)
+    assert len(report.modes) == 1 and len(report.failures)
+    assert report.probability.mean == pytest.approx(math.erfc(1) / 2, rel=0.5)
+
+
+def test_a_black_box_takes_the_same_call(key):
+    """300 calls; every one is counted."""
+    calls = []
+
+    def run(x):
+        calls.append(1)
+        total = float(np.cumsum(x).max())
+        return total >= 4, max(4 - total, 0.0)
+
+    sim = jast.blackbox.from_python(run, horizon=4, disturbance=Normal(0.0, 1.0))
+    report = jast.stress(key, sim, 300)
+    assert len(report.failures)
+    assert float(report.failures.best.reward) > -8
+
+
+def test_bad_input_and_interrupts(key):
+    with pytest.raises(ValueError, match="stress: budget"):
+        jast.stress(key, walk(), 299)
+    with pytest.raises(ValueError, match="stress: key"):
+        jast.stress(0, walk(), 300)
+
+    def stop(done, total, result):
+        if done > 100:
+            raise KeyboardInterrupt
+
+    report = jast.stress(key, walk(), 600, callback=stop)
+    assert "interrupted" in str(report) and report.probability is None
