@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 import jast
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
+from jast import limit_state as L
 from jast.estimate import (
     adaptive_cross_entropy,
     failure_probability,
@@ -24,7 +25,6 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate import limit_state as L
 from jast.estimate.adaptive import LEAST
 from jast.estimate.batches import Batch, drawn, numbers
 from jast.estimate.design_points import design_points, distinct

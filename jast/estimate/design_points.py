@@ -1,25 +1,17 @@
 """Most probable failure points by gradients: the points of least norm on the boundary of failure,
-from many starts.
-
-Each step goes to the nearest point of the linearised boundary (Hasofer and Lind 1974; Rackwitz and
-Fiessler 1978). A miss distance is flat once a system fails, so a step that arrives among the
-failures is halved back to the boundary.
+from many starts (`jast.boundary`).
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jast.episode import rollout
-from jast.limit_state import dimension, normal_numbers, outcome, policy_of
-from jast.rewards import log_likelihood
+from jast.boundary import EPISODES, STEPS, descents
+from jast.limit_state import dimension, normal_numbers
 
 __all__ = ["design_points", "distinct"]
 
-STEPS, HALVINGS = 12, 5
 APART = 0.5
 """Points nearer to one another than so much of their norm are one."""
 GRADIENT = 3
@@ -39,9 +31,9 @@ def design_points(key, sim, starts=48, limit=16):
     where the miss distance has no useful gradient.
     """
     z = jax.random.normal(key, (starts, dimension(sim)), normal_numbers(sim))
-    points, failing = jax.device_get(_descend(sim, z))
+    points, failing = jax.device_get(descents(sim, z)[:2])
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
-    return DesignPoints(distinct(points, limit), starts * STEPS * (GRADIENT + HALVINGS + 1))
+    return DesignPoints(distinct(points, limit), starts * (STEPS * GRADIENT + EPISODES))
 
 
 def distinct(points, limit):
@@ -54,51 +46,3 @@ def distinct(points, limit):
         ):
             kept.append(z)
     return np.array(kept).reshape(-1, points.shape[-1])
-
-
-@jax.jit
-def _descend(sim, starts):
-    return jax.vmap(partial(_one, sim))(starts)
-
-
-def _one(sim, z):
-    """The failing point that the steps from ``z`` end at, and whether there is one."""
-
-    def step(carry, _):
-        z, best, found = carry
-        g, slope = jax.value_and_grad(
-            lambda z: rollout(jax.random.key(0), sim, policy_of(sim, z), log_likelihood).distance
-        )(z)
-        square = jnp.sum(slope**2)
-        usable = jnp.isfinite(g) & jnp.isfinite(square) & (square > 0)
-        aim = jnp.where(
-            usable, (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1), 0
-        ) * jnp.where(usable, slope, 0)
-        aim = jnp.where(usable, aim, z)
-        # a linear extrapolation of a curved function can be wild: no step ends farther out than the
-        # last one by more than half
-        length = jnp.linalg.norm(aim)
-        most = 1.5 * jnp.linalg.norm(z) + 3
-        aim = (
-            aim
-            * jnp.minimum(1, most / jnp.maximum(length, 1e-6))
-            * jnp.asarray(1.0 + 1e-4, z.dtype)
-        )
-
-        def halve(ends, _):
-            outside, inside = ends
-            middle = (outside + inside) / 2
-            fails = outcome(sim, middle).failure
-            return (jnp.where(fails, outside, middle), jnp.where(fails, middle, inside)), None
-
-        fails = outcome(sim, aim).failure
-        (outside, inside), _ = jax.lax.scan(halve, (z, aim), length=HALVINGS)
-        better = fails & (~found | (jnp.sum(inside**2) < jnp.sum(best**2)))
-        return (
-            jnp.where(fails, outside, aim),
-            jnp.where(better, inside, best),
-            found | fails,
-        ), None
-
-    (_, best, found), _ = jax.lax.scan(step, (z, z, jnp.zeros((), bool)), length=STEPS)
-    return best, found

@@ -6,6 +6,7 @@ from jast.search.chain import chain
 from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.forest import forest
 from jast.search.go_explore import go_explore
+from jast.search.gradient import gradient
 from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
 from jast.search.refinement import Refined, refine
@@ -21,6 +22,7 @@ __all__ = [
     "chain",
     "forest",
     "go_explore",
+    "gradient",
     "mcts",
     "modes",
     "monte_carlo",

@@ -45,13 +45,9 @@ def likelihood(sim: Simulator) -> rewards.Standard:
 
 def none(sim: Simulator, k: int, mark: Any = ()) -> Kept:
     """No episode yet. ``mark``: of one, shapes and dtypes."""
-    about = outline(sim)
-    zero = lambda s, *axes: jnp.zeros((k, *axes, *s.shape), s.dtype)
-    real, whole = jnp.zeros(k, about.dtype), jnp.zeros(k, jnp.int32)
-    x0, x = jax.tree.map(zero, about.x0), jax.tree.map(lambda s: zero(s, sim.horizon), about.x)
-    episode = Episode(x0, x, real, real, jnp.zeros(k, bool), whole, real - jnp.inf)
-    mark = jax.tree.map(zero, mark)
-    return Kept(episode, real - jnp.inf, whole.astype(jnp.uint32), whole, whole, mark)
+    episode, whole = E.blank(sim, k), jnp.zeros(k, jnp.int32)
+    mark = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), mark)
+    return Kept(episode, episode.reward, whole.astype(jnp.uint32), whole, whole, mark)
 
 
 def merged(kept: Kept, played: E.Played, live: Any, number: Any, mark: Any = ()) -> Kept:

@@ -166,7 +166,7 @@ def _advice(result):
     """What to change where no failure was found; nothing of what is the default already."""
     settings = result.settings or {}
     advice = ""
-    if settings.get("reward", "") != "rewards.lexicographic":
+    if settings.get("reward", "rewards.lexicographic") != "rewards.lexicographic":
         advice += ";\n  the default reward, which ranks any failure above all misses"
     if settings.get("actions") == "actions.samples" and settings.get("method") != "monte_carlo":
         advice += ";\n  actions=jast.actions.wide(3.0), which reach into the tails"
