@@ -2,15 +2,17 @@
 benchmarks.probability [--json] [--quick | --smoke] [--only PART ...]``.
 
 ``landing``: importance resampling of traces and policies on the landing (truth 4.0237e-13), the
-published Algorithm 2, traces a second; ``range``: log P to 1e-100 in float32; ``policy``: learned
-failure policies, with compilation; ``default``: `failure_probability` over seeds, with and without
-gradients, beside OpenTURNS on the same limit states and evaluations; ``cases``: the fixed cases;
+published Algorithm 2, traces a second; ``range``: log P to 1e-100 in float32; ``policy``: failure
+policies by both learners at equal steps of the simulator; ``default``: `failure_probability` over
+seeds, with and without gradients, beside OpenTURNS on the same limit states and evaluations;
+``cases``: the fixed cases;
 ``coverage``: problems drawn by seed (benchmarks.limit_states), how often the 95 % interval covers,
 how often an estimate is flagged, and how often an interval misses without a flag. Float32
 throughout.
 """
 
 import argparse
+import itertools
 import json
 import time
 
@@ -36,6 +38,7 @@ from jast.estimate import (
 from jast.policy import Policy
 
 LANDING = 4.0236721906842e-13
+TRUTHS = {"landing": LANDING, "pendulum": 8.169e-3}
 PARTS = ("landing", "range", "policy", "default", "cases", "coverage")
 
 
@@ -106,33 +109,51 @@ def to_small(samples=262_144):
     return rows
 
 
-def policies(seeds):
-    """Learned policies on the landing: training and estimation from nothing, compilation included
-    in the first.
+def policies(
+    seeds,
+    episodes,
+    systems,
+    samples=100_000,
+):
+    """Learned policies by both learners at equal steps of the simulator: training and estimation
+    from nothing. Yields each row's name and numbers; the first seed compiles, so of the CPU seconds
+    the median is reported.
     """
-    sim, runs, clocks = jast.simulators.landing(), [], []
-    for seed in range(seeds):
-        jax.clear_caches()
-        wall, cpu = time.perf_counter(), time.process_time()
-        policy = jast.policies.sac(jax.random.key(seed), sim)
-        r = importance(jax.random.key(100 + seed), sim, policy_proposal(sim, policy), 100_000)
-        clocks.append((time.perf_counter() - wall, time.process_time() - cpu))
-        samples = jast.estimate.failure_samples(
-            jax.random.key(200 + seed), sim, policy_proposal(sim, policy), 500, moves=0
-        ).failures
-        upper = float(np.mean(samples.x0 + samples.disturbances.sum(axis=1) > 0))
-        runs.append((r, LANDING, upper))
-    good = sum(
-        abs(r.mean / LANDING - 1) <= 0.1 and r.relative_error <= 0.02 and 0.2 < upper < 0.8
-        for r, _, upper in runs
-    )
-    extra = {
-        "good": good,
-        "upper_mode": [upper for *_, upper in runs],
-        "wall_s": [w for w, _ in clocks],
-        "cpu_s": [c for _, c in clocks],
-    }
-    return summary([run[:2] for run in runs]) | extra
+    for system, n, method in itertools.product(systems, episodes, ("sac", "ppo")):
+        sim, truth = getattr(jast.simulators, system)(), TRUTHS[system]
+        runs, seen, clocks = [], [], []
+        for seed in range(seeds):
+            wall, cpu = time.perf_counter(), time.process_time()
+            teach = getattr(jast.policies, method)
+            policy = teach(jax.random.key(seed), sim, episodes=n)
+            proposal = policy_proposal(sim, policy)
+            r = importance(jax.random.key(100 + seed), sim, proposal, samples)
+            clocks.append((time.perf_counter() - wall, time.process_time() - cpu))
+            runs.append((r, truth))
+            upper = np.nan
+            if system == "landing" and r.failures_seen:
+                found = jast.estimate.failure_samples(
+                    jax.random.key(200 + seed), sim, proposal, 500, moves=0
+                ).failures
+                upper = float(np.mean(found.x0 + found.disturbances.sum(axis=1) > 0))
+            seen.append((policy.steps, policy.history.failing_share[-1], upper))
+        steps, failing, upper = np.array(seen, np.float64).T
+        errors = [float(r.relative_error) for r, _ in runs]
+        yield (
+            f"{system}, {n} episodes, {method}",
+            summary(runs)
+            | {
+                "relative_errors": errors,
+                "relative_error_mean": float(np.mean(errors)),
+                "relative_error_spread": float(np.std(errors, ddof=1)) if seeds > 1 else None,
+                "failing_share": failing.tolist(),
+                "upper_mode": None if np.isnan(upper).all() else upper.tolist(),
+                "steps": float(np.mean(steps)),
+                "wall_s": [w for w, _ in clocks],
+                "cpu_s": float(np.median([c for _, c in clocks])),
+                "cpu_s_each": [c for _, c in clocks],
+            },
+        )
 
 
 def default(seeds, peers, budget=100_000):
@@ -243,13 +264,21 @@ def main(argv=None):
                 f" {100 * r['relative_error']:.2f} %"
             )
     if "policy" in parts:
-        report["policy"] = r = policies(2 if quick else 10)
-        say(
-            "learned policies on the landing",
-            line("soft actor-critic", r),
-            f"  good {r['good']} of {r['seeds']}, wall {max(r['wall_s']):.0f} s at most",
-            sep="\n",
+        report["policy"] = {}
+        plan = size(
+            args,
+            ((2000, 12_000), ("landing", "pendulum"), 100_000),
+            ((2000,), ("landing",), 100_000),
+            ((300,), ("landing",), 1000),
         )
+        say("learned policies at equal steps of the simulator")
+        for name, r in policies(seeds(10, 2, 1), *plan):
+            report["policy"][name] = r
+            spread = r["relative_error_spread"] or np.nan
+            say(
+                line(name, r) + f"  SE {100 * r['relative_error_mean']:.2f}"
+                f" +- {100 * spread:.2f} %, {r['steps']:.0f} steps"
+            )
     if "default" in parts:
         say(f"failure_probability, budget {budget}")
         peers = [] if quick or args.smoke else ["subset", "nais", "form_16", "form_by_hand"]

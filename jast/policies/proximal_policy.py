@@ -23,6 +23,8 @@ __all__ = ["ppo"]
 
 LONGEST = 128
 """Steps of a lane between updates, at most, where nobody says."""
+ITERATIONS, LANES = 150, (8, 64)
+"""Lanes, where nobody says: such that the policy changes so often, within these bounds."""
 LOOKED_AT = 100_000
 """Transitions of the look around whose moments are taken."""
 
@@ -38,7 +40,7 @@ def ppo(
     shaping: str = "auto",
     widen: float | str = "auto",
     components: int = 2,
-    lanes: int = 64,
+    lanes: int | str = "auto",
     hidden: Sequence[int] = (100, 100),
     learning_rate: float = 1e-3,
     steps: int | str = "auto",
@@ -68,7 +70,8 @@ def ppo(
             lane.
         scale, bonus, shaping, widen, components, hidden: as for `sac`.
         alpha: temperature, above 0; 1 for importance sampling. It stays as it is.
-        lanes: episodes side by side.
+        lanes: episodes side by side; "auto": such that about 150 updates of the policy follow one
+            another, from 8 to 64.
         steps: of each lane between updates, at least 1; "auto": the horizon, at most 128. An
             episode that is not over then is judged by V, and goes on.
         epochs: times that all steps since the last updates are learned from, in another order each
@@ -94,11 +97,16 @@ def ppo(
     """
     random_key("ppo", key)
     contract(sim)
-    counts = dict(episodes=episodes, lanes=lanes, batch=batch, epochs=epochs, components=components)
-    episodes, lanes, batch, epochs, components = (
+    if settings.auto(steps):
+        steps = min(sim.horizon, LONGEST)
+    counts = dict(episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps)
+    episodes, batch, epochs, components, steps = (
         whole("ppo", name, value) for name, value in counts.items()
     )
-    steps = min(sim.horizon, LONGEST) if settings.auto(steps) else whole("ppo", "steps", steps)
+    if settings.auto(lanes):
+        fewest, most = LANES
+        lanes = min(max(fewest, episodes * sim.horizon // (steps * ITERATIONS)), most)
+    lanes = whole("ppo", "lanes", lanes)
     plan = settings.plan("ppo", episodes, sim.horizon, lanes, steps)
     hidden = settings.widths("ppo", hidden)
     dense = settings.shaped("ppo", shaping, sim)
