@@ -109,17 +109,12 @@ def to_small(samples=262_144):
     return rows
 
 
-def policies(
-    seeds,
-    episodes,
-    systems,
-    samples=100_000,
-):
+def policies(seeds, episodes, systems, samples=100_000, methods=("sac", "ppo")):
     """Learned policies by both learners at equal steps of the simulator: training and estimation
     from nothing. Yields each row's name and numbers; the first seed compiles, so of the CPU seconds
     the median is reported.
     """
-    for system, n, method in itertools.product(systems, episodes, ("sac", "ppo")):
+    for system, n, method in itertools.product(systems, episodes, methods):
         sim, truth = getattr(jast.simulators, system)(), TRUTHS[system]
         runs, seen, clocks = [], [], []
         for seed in range(seeds):
