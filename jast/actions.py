@@ -283,8 +283,8 @@ def wide(width: Any = None) -> Wide:
     start is widened likewise where it has such a function.
 
     ``width``: above 0; 1 is the model. None: a search takes the first of 1, 1.5, 2, 3, 4, 6 at
-    which a tenth of a small batch of episodes fails; where none reaches that the one at which most
-    fail, and where none fails at all the one that comes nearest. It is the default of searches
+    which a hundredth of a small batch of episodes fails; where none reaches that the one at which
+    most fail, and where none fails at all the one that comes nearest. It is the default of searches
     where disturbances have a quantile function. ValueError for a width that is not above 0.
     """
     if width is not None and not is_traced(width) and not width > 0:

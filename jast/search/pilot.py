@@ -29,8 +29,10 @@ __all__ = ["Pilot", "fly", "joined"]
 
 EPISODES, HOSTED = 128, 10
 """Of a batch; of a system on the host, where episodes are dear."""
-WIDTHS, FAILING, NEAREST = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.1, 0.1
-"""The widths that are tried, the share that is to fail, the share of episodes that are near."""
+WIDTHS, FAILING, NEAREST = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.01, 0.1
+"""The widths that are tried; the share that is to fail, from which a search goes on (more noise
+found less likely failures); the share of episodes that are near.
+"""
 
 
 class Pilot(NamedTuple):
@@ -66,8 +68,8 @@ def fly(sim: Simulator, density: str, widen: str) -> Pilot:
     Args:
         sim: the system.
         density: "mode" or "raw", in which ``rare`` and ``likely`` are told.
-        widen: "never": the width is 1; "always": till a tenth fails; "blind": only where nothing
-            else points to failures, as all plain episodes have one miss distance.
+        widen: "never": the width is 1; "always": till a hundredth fails; "blind": only where
+            nothing else points to failures, as all plain episodes have one miss distance.
     """
     widths = 1 if widen == "never" else len(WIDTHS)
     host = hosted(sim)
