@@ -56,7 +56,8 @@ def ppo(
     `jast.policies.sac` hands out, by clipped proximal policy optimisation with generalised
     advantages.
 
-    It learns only from the episodes of the policy as it is, and keeps none of them. The latents,
+    It learns only from the episodes of the policy as it is, and keeps none of them: an episode
+    costs less to learn from than with `sac`, and teaches less (docs/figures.md). The latents,
     the reward of a step (Lipkis and Agogino eq. 21, less ``alpha`` times the log density of what
     was drawn), the look around before the learning, and what becomes of numbers that are not finite
     are those of `sac`. So are random starts: drawn ``widen`` times as wide as p(x0), and handed out
