@@ -77,6 +77,7 @@ def search(scenario, kind, trees, heads=None, prunes=PRUNES):
         prunes=prunes,
         simulations=SIMULATIONS,
         reward=REWARD,
+        actions=jast.actions.samples(),
         heads=heads,
     )
     result, seconds, _ = timed(grow)

@@ -125,7 +125,7 @@ def rows(trees, prunes=18, simulations=500):
         "forest, paper": forest(mode="paper"),
         "mcts, paper": mcts(mode="paper"),
         "forest, default": forest(),
-        "forest as typed, no actions": forest(actions=None),
+        "forest, draws of the model": forest(actions=jast.actions.samples()),
         "mcts, default": mcts(),
         "forest, S0b, paper": forest(s0b, mode="paper"),
         "forest, S0b, default": forest(s0b),

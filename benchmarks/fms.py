@@ -48,8 +48,9 @@ def searches(evaluations, seeds):
     monte_carlo = lambda key, sim: jast.search.monte_carlo(
         key, sim, episodes=evaluations * seeds, reward=safe, record=True
     )
+    plain = jast.actions.samples()
     mcts = lambda key, sim, **of: jast.search.mcts(
-        key, sim, trees=seeds, simulations=evaluations, record=True, **of
+        key, sim, trees=seeds, simulations=evaluations, record=True, actions=plain, **of
     )
     cem = dict(
         samples=evaluations // 10,
@@ -64,7 +65,7 @@ def searches(evaluations, seeds):
     deep = dict(mode="episodic", reward=safe, exploration=1000.0)
     # among failures log p decides
     likely = dict(mode="episodic", reward=jast.rewards.standard(event_bonus=600.0), exploration=3.0)
-    roots = dict(trees=seeds, prunes=5, simulations=evaluations // 5, record=True)
+    roots = dict(trees=seeds, prunes=5, simulations=evaluations // 5, record=True, actions=plain)
     return {
         "database": (monte_carlo, dict(database=True)),
         "monte carlo": (monte_carlo, {}),
