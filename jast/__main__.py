@@ -1,16 +1,17 @@
-"""``python -m jast``: search one of the built-in systems for its likeliest failure, beside a Monte
-Carlo baseline of as many simulations.
+"""``python -m jast``: `jast.stress` of a built-in system, or of one in a file of the user;
+or one search of a built-in system, beside a Monte Carlo baseline of as many simulations.
 """
 
 import argparse
 import contextlib
+import importlib.util
 import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jast import actions, failures, nominal, plot, rewards, simulators
+from jast import actions, failures, nominal, plot, replay, rewards, save, simulators
 from jast.actions import UniformBox
 from jast.contract import check
 from jast.intervals import clopper_pearson
@@ -18,7 +19,10 @@ from jast.search.cem import cem
 from jast.search.forest import forest
 from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
+from jast.search.moves import likelihood
 from jast.search.result import table
+from jast.simulator import Simulator
+from jast.stress_testing import stress
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
@@ -49,6 +53,12 @@ def main(argv=None):
     """
     parser = _parser()
     options = parser.parse_args(argv)
+    if options.method is None:
+        options.method = "forest" if _of_a_search(options) and not options.system else "stress"
+    if options.system and options.method != "stress":
+        parser.error("argument --method: a system of your own has stress, no other")
+    if options.method == "stress" and _of_a_search(options):
+        parser.error("argument --budget: stress has a budget; the other counts are of searches")
     if options.prunes is not None and options.method != "forest":
         parser.error(f"argument --prunes: only of --method forest, not of {options.method}")
     if options.heads and options.method != "forest":
@@ -62,7 +72,8 @@ def main(argv=None):
     except OSError as e:
         parser.error(f"argument --output: {e}")
     try:
-        return _run(options)
+        own = _loaded(parser, options.system) if options.system else None
+        return _stress(options, own) if options.method == "stress" else _run(options)
     except ValueError as e:
         # a count that the search refuses
         if not str(e).startswith(f"{options.method.replace('-', '_')}: "):
@@ -76,11 +87,16 @@ def main(argv=None):
 def _parser():
     parser = argparse.ArgumentParser(
         "python -m jast",
-        description=(
-            "Find the likeliest failure of a built-in system, with Monte Carlo as the baseline."
-        ),
+        description=("Find the likeliest failures of a system, their modes and their probability."),
     )
     add = parser.add_argument
+    add(
+        "system",
+        nargs="?",
+        metavar="FILE.py:NAME",
+        help="a simulator of your own: NAME in the file, or a function of no arguments that makes"
+        " it; default: the built-in one of --simulator",
+    )
     add(
         "--simulator",
         choices=SYSTEMS,
@@ -92,13 +108,18 @@ def _parser():
     )
     add(
         "--method",
-        choices=["forest", "mcts", "cem", "monte-carlo"],
-        default="forest",
-        help="search (default: forest)",
+        choices=["stress", "forest", "mcts", "cem", "monte-carlo"],
+        help="jast.stress, or one search with its Monte Carlo baseline (default: stress; forest"
+        " where a count of a search is given)",
     )
     add(
-        "--trees", type=_count, default=200, metavar="N", help="independent searches (default: 200)"
+        "--budget",
+        type=_count,
+        default=200_000,
+        metavar="N",
+        help="evaluations of stress (default: 200000)",
     )
+    add("--trees", type=_count, metavar="N", help="independent searches (default: 200)")
     add(
         "--simulations",
         type=_count,
@@ -134,6 +155,50 @@ def _count(text):
     return int(text)
 
 
+def _of_a_search(options):
+    """Whether an option was given that only a search has."""
+    given = options.trees, options.simulations, options.prunes, options.heads, options.paper
+    return any(given)
+
+
+def _loaded(parser, place):
+    """The simulator at FILE.py:NAME."""
+    file, _, name = place.rpartition(":")
+    if not Path(file).is_file():
+        parser.error(f"argument FILE.py:NAME: there is no file {file!r}")
+    spec = importlib.util.spec_from_file_location(Path(file).stem, file)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    found = getattr(module, name, None)
+    if callable(found) and not isinstance(found, Simulator):
+        found = found()
+    if not isinstance(found, Simulator):
+        parser.error(f"argument FILE.py:NAME: {name} in {file} is no jast.Simulator: {found!r}")
+    return found
+
+
+def _stress(options, own):
+    """The report of `jast.stress`, the likeliest failure, files."""
+    name = options.system or options.simulator
+    sim = SYSTEMS[name][0]() if own is None else own
+    key = jax.random.key(options.seed)
+    report = stress(key, sim, options.budget, progress=not options.quiet)
+    print(f"{name}, seed {options.seed}\n{report}\n", flush=True)
+    best = report.failures.best
+    if best is not None:
+        best = replay(sim, best, reward=likelihood(sim))
+        print(f"{_episode(best)}\n")
+    path = options.output / "report.npz"
+    save(path, report)
+    archive = options.output / "failures.npz"
+    failures.save(archive, report.failures, report.settings | dict(simulator=name))
+    print(f"saved {path}\nsaved {archive}")
+    if best is not None:
+        _pictures(options, {"episode": lambda: _drawn(options, own, best, sim)})
+    return 130 if "interrupted" in report.settings else 0
+
+
 def _run(options):
     make, reward, chosen = SYSTEMS[options.simulator]
     sim = check(make(), chosen)
@@ -166,7 +231,7 @@ def _run(options):
 
 def _search(key, sim, options, common):
     trees, each = (
-        options.trees,
+        options.trees or 200,
         options.simulations or (500 if options.method == "forest" else 9000),
     )
     mode = "paper" if options.paper else "default"
@@ -255,6 +320,22 @@ def _episode(episode):
 
 
 def _draw(options, sim, results):
+    best = results[options.method].best
+    history = lambda: plot.history(results, total=True)
+    _pictures(options, {"episode": lambda: _drawn(options, None, best, sim), "history": history})
+
+
+def _drawn(options, own, best, sim):
+    """Axes with the episode ``best``: the system's own picture, or its disturbances."""
+    if own is None and options.simulator in ("ferry", "ferry-b"):
+        return plot.ferry(best, sim)
+    if own is None and options.simulator == "colav":
+        return plot.colav(best, sim)[0]
+    return plot.disturbances(best)[0]
+
+
+def _pictures(options, draw):
+    """A file for each of ``draw``, name -> function that returns axes."""
     try:
         import matplotlib
     except ImportError:
@@ -263,15 +344,8 @@ def _draw(options, sim, results):
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    best = results[options.method].best
-    draw = {
-        "ferry": plot.ferry,
-        "ferry-b": plot.ferry,
-        "colav": lambda *of: plot.colav(*of)[0],
-    }.get(options.simulator)
-    first = plot.disturbances(best)[0] if draw is None else draw(best, sim)
-    for name, ax in dict(episode=first, history=plot.history(results, total=True)).items():
-        path = options.output / f"{name}.png"
+    for name, axes in draw.items():
+        ax, path = axes(), options.output / f"{name}.png"
         ax.figure.savefig(path, dpi=120)
         plt.close(ax.figure)
         print(f"saved {path}")

@@ -28,6 +28,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "probability": ["--smoke"],
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
+    "stress": ["--smoke"],
     "weakness": ["--smoke"],
 }
 QUICK = {
@@ -40,6 +41,7 @@ QUICK = {
     "fms": ["--quick", "--seeds", "1"],
     "limit_states": ["--seeds", "1"],
     "probability": ["--quick", "--seeds", "1"],
+    "stress": ["--quick"],
     "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }

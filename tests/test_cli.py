@@ -51,6 +51,47 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
     )
 
 
+OWN = """
+import jax.numpy as jnp
+import jast
+
+def walk():
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: jast.distributions.Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= 4, jnp.maximum(4 - s, 0.0)),
+        horizon=2,
+    )
+"""
+
+
+def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    command = [f"{tmp_path / 'own.py'}:walk", "--budget", "600", "--quiet"]
+    assert cli.main([*command, "--output", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert "undisturbed" in text and "likeliest failure: " in text and "next: " in text
+    report = jast.load(tmp_path / "out/report.npz")
+    assert float(report.failures.best.reward) == pytest.approx(-4, abs=0.05)
+    for place, words in (
+        (f"{tmp_path / 'own.py'}:run", "no jast.Simulator"),
+        ("a.py:b", "no file"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main([place, "--output", str(tmp_path / "out")])
+        assert words in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_stress_is_what_is_run_where_nothing_is_said(capsys, tmp_path):
+    assert cli.main(["--budget", "20000", "--quiet", "--output", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert (
+        "undisturbed" in text and "probability" in text and (tmp_path / "out/report.npz").exists()
+    )
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "simulator",

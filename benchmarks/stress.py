@@ -1,0 +1,133 @@
+"""`jast.stress` against single searches at equal evaluations, on systems with failures to find:
+``python -m benchmarks.stress [--json] [--quick | --smoke] [--cases ...] [--seeds N]``.
+
+For each system: seeds that found a failure, and the best log p relative to the mode (median of
+those that found one, and the worst), beside the closed form where there is one. Searches are called
+as a user types them. `stress` also estimates the probability within the same budget, and counts its
+failure modes.
+"""
+
+import argparse
+import json
+import time
+import warnings
+
+import jax
+import numpy as np
+
+import jast
+from benchmarks.sizes import options, size
+from benchmarks.stress_systems import CASES, JUDGED
+from jast.search.moves import likelihood
+
+__all__ = ["METHODS", "run"]
+
+
+def stress(key, sim, budget):
+    """Best log p relative to the mode, evaluations, and the number of modes."""
+    report = jast.stress(key, sim, budget)
+    return _best(report.failures), report.episodes, len(report.modes)
+
+
+def monte_carlo(key, sim, budget):
+    return _searched(sim, jast.search.monte_carlo(key, sim, episodes=budget))
+
+
+def cem(key, sim, budget):
+    samples = max(10, budget // 30)
+    found = jast.search.cem(key, sim, samples=samples, elites=max(2, samples // 10))
+    return _searched(sim, found)
+
+
+def forest(key, sim, budget):
+    trees = max(1, budget // 4000)
+    each = max(1, budget // (trees * 18))
+    return _searched(sim, jast.search.forest(key, sim, trees=trees, simulations=each))
+
+
+def mcts(key, sim, budget):
+    trees = max(1, budget // 9000)
+    return _searched(sim, jast.search.mcts(key, sim, trees=trees, simulations=budget // trees))
+
+
+METHODS = {f.__name__: f for f in (stress, monte_carlo, cem, forest, mcts)}
+
+
+def _best(failures):
+    return float(failures.best.reward) if len(failures) else None
+
+
+def _searched(sim, result):
+    """The same of a search, whose failures are scored by log p relative to the mode."""
+    scores = [jast.replay(sim, e, reward=likelihood(sim)).reward for e in result.failures]
+    return (max(map(float, scores)) if scores else None), result.episodes, None
+
+
+def run(cases, methods, budget, seeds):
+    """Rows by case and method."""
+    report = {}
+    for name in cases:
+        case, rows = CASES[name], {}
+        for method in methods:
+            begin, found = time.process_time(), []
+            for seed in range(seeds):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    found.append(METHODS[method](jax.random.key(seed), case.make(), budget))
+            best = [b for b, _, _ in found if b is not None]
+            rows[method] = dict(
+                found=len(best),
+                seeds=seeds,
+                median=float(np.median(best)) if best else None,
+                worst=min(best) if best else None,
+                evaluations=float(np.mean([n for _, n, _ in found])),
+                modes=[m for _, _, m in found if m is not None],
+                cpu_seconds=time.process_time() - begin,
+            )
+        report[name] = dict(optimum=case.optimum, modes=case.modes, rows=rows)
+    return report
+
+
+def table(report):
+    """The report as text."""
+    number = lambda v: f"{'-':>9}" if v is None else f"{v:9.3f}"
+    lines = [
+        f"{'system':<16} {'optimum':>9} {'method':<12} {'found':>7} {'median':>9} {'worst':>9}"
+        f" {'evaluations':>12} {'modes':>12} {'CPU s':>7}"
+    ]
+    for name, case in report.items():
+        for method, r in case["rows"].items():
+            modes = ""
+            if r["modes"]:
+                right = sum(m == case["modes"] for m in r["modes"])
+                planted = case["modes"] is not None
+                modes = f"{right}/{r['seeds']} right" if planted else f"{np.median(r['modes']):g}"
+            lines.append(
+                f"{name:<16} {number(case['optimum'])} {method:<12}"
+                f" {r['found']:3d}/{r['seeds']:<3d} {number(r['median'])} {number(r['worst'])}"
+                f" {r['evaluations']:12.0f} {modes:>12} {r['cpu_seconds']:7.1f}"
+            )
+    return "\n".join(lines)
+
+
+def main(argv=None):
+    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, few evaluations")
+    parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
+    parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
+    parser.add_argument("--seeds", type=int, help="default: 20")
+    args = parser.parse_args(argv)
+    cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
+    methods = args.methods or size(args, list(METHODS), list(METHODS), ["stress", "monte_carlo"])
+    budget = args.budget or size(args, 100_000, 10_000, 600)
+    seeds = args.seeds or size(args, 20, 1, 1)
+    report = run(cases, methods, budget, seeds)
+    if args.json:
+        settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
+        print(json.dumps(dict(settings=settings, systems=report)))
+    else:
+        print(table(report))
+
+
+if __name__ == "__main__":
+    main()
