@@ -68,7 +68,7 @@ def plain(key: jax.Array, sim: Simulator, budget: int) -> Haul:
 
 def cooled(key: jax.Array, sim: Simulator, budget: int) -> Haul:
     """Wider noise, cooled down: chains that start where failures are frequent."""
-    return _of_points(sim, cool(key, sim, int(np.clip(budget // 84, 8, KEPT))))
+    return _of_points(sim, cool(key, sim, int(np.clip(budget // 84, 1, KEPT))))
 
 
 def levels(key: jax.Array, sim: Simulator, budget: int) -> Haul:
@@ -109,22 +109,29 @@ EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {
     "forest": trees,
 }
 LATENT = {"widened noise, cooled", "gradients", "levels of distance"}
-LEAST = {"forest": 2000, "cross-entropy": 600, "levels of distance": 600, "gradients": 432}
-"""Evaluations below which an explorer is not worth a call; else 84."""
+LEAST = {
+    "widened noise, cooled": 84,
+    "plain draws": 30,
+    "gradients": 432,
+    "levels of distance": 600,
+    "cross-entropy": 600,
+    "forest": 2000,
+}
+"""Evaluations below which an explorer is not worth a call; those that come first are left last."""
 
 
-def explorers_of(sim: Simulator, budget: int) -> list[str]:
-    """The names of those that work on ``sim``, with ``budget`` evaluations each."""
+def explorers_of(sim: Simulator, budget: int) -> dict[str, int]:
+    """The names of those that work on ``sim``, with what each has of ``budget`` evaluations."""
     about = outline(sim)
     quantiles = about.start.quantile and about.disturbance.quantile
     floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(about.x))
-    fits = {
-        name: budget >= LEAST.get(name, 84)
-        and (quantiles or name not in LATENT)
-        and (name != "gradients" or (floats and not hosted(sim)))
-        for name in EXPLORERS
-    }
-    return [name for name, fit in fits.items() if fit]
+    chosen, left = [], budget
+    for name, least in LEAST.items():
+        fits = (quantiles or name not in LATENT) and least <= left
+        if fits and (name != "gradients" or (floats and not hosted(sim))):
+            chosen.append(name)
+            left -= least
+    return {name: LEAST[name] + left // len(chosen) for name in chosen}
 
 
 def _of_search(result: Any) -> Haul:

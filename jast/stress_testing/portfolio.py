@@ -31,9 +31,10 @@ NOMINAL, SEARCH, REFINE = 0.05, 0.2, 0.15
 """Shares of the budget; the rest is for the probability. Without an estimate of its own the last
 two take it all.
 """
-FIRST, CALLS, FADING = 0.5, 6, 0.1
+FIRST, CALLS, FADING, FEW = 0.5, 6, 0.1, 2000
 """Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
-of its last gain is expected of one that gained nothing since.
+of its last gain is expected of one that gained nothing since; evaluations below which each explorer
+is called once, and what was found is pulled once.
 """
 SAMPLES = 128
 """Failures of the estimate that are told apart by mode."""
@@ -135,14 +136,14 @@ class _Work:
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
         total = self.share(SEARCH)
-        names = explorers_of(self.sim, max(84, int(FIRST * total / len(EXPLORERS))))
-        each, end = int(FIRST * total / len(names)), self.spent + total
-        gains = {name: self.explore(name, each) for name in names}
-        calls = dict.fromkeys(names, 1)
+        end, few = self.spent + total, total < FEW
+        first = explorers_of(self.sim, total if few else int(FIRST * total))
+        gains = {name: self.explore(name, each) for name, each in first.items()}
+        calls = dict.fromkeys(first, 1)
         again = int((1 - FIRST) * total / CALLS)
-        while self.spent + again <= end:
+        while not few and self.spent + again <= end:
             # of those that expect as much, the one that was called least
-            name = max(names, key=lambda n: (gains[n], -calls[n]))
+            name = max(first, key=lambda n: (gains[n], -calls[n]))
             # what paid once may pay again, but less is expected of it
             gains[name] = max(self.explore(name, again), FADING * gains[name])
             calls[name] += 1
@@ -173,7 +174,7 @@ class _Work:
             return
         budget = self.share(REFINE)
         chosen = self.pool
-        for part in (0.6, 0.4):
+        for part in (1.0,) if budget < FEW else (0.6, 0.4):
             result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
             found = result.failures
             if len(found):
