@@ -11,8 +11,9 @@ from systems import ring, walk
 
 import jast
 from jast.estimate import importance, policy_proposal
-from jast.policies import FailurePolicy, ppo, sac
+from jast.policies import FailurePolicy, ppo, proximal_training, sac
 from jast.policies import proximal as X
+from jast.policies.actor import act, entropy_term
 from jast.policies.failure_policy import assemble
 
 TINY = dict(episodes=256, lanes=8, hidden=(8,), batch=16, epochs=2)
@@ -87,7 +88,7 @@ def drawn(key, n=64):
     for_inputs, for_z, for_numbers = jax.random.split(key, 3)
     inputs = jax.random.normal(for_inputs, (n, 3), jnp.float32)
     z = jax.random.normal(for_z, (n, 2), jnp.float32)
-    log_pi = jax.vmap(lambda i, z: X.entropy_term(z, *X.act(applies[0], new.actor, i)))(inputs, z)
+    log_pi = jax.vmap(lambda i, z: entropy_term(z, *act(applies[0], new.actor, i)))(inputs, z)
     advantage, goal = jax.random.normal(for_numbers, (2, n), jnp.float32)
     return (
         new,
@@ -251,7 +252,7 @@ def test_an_interruption_before_anything_was_learned_is_raised(monkeypatch):
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(X, "stretch", stop)
+    monkeypatch.setattr(proximal_training, "stretch", stop)
     with pytest.raises(KeyboardInterrupt):
         ppo(jax.random.key(3), WALK, **TINY)
 

@@ -12,11 +12,12 @@ from jast._checks import random_key, whole
 from jast.contract import contract
 from jast.outline import outline
 from jast.policies import course, settings
-from jast.policies import proximal as X
+from jast.policies import proximal_training as T
 from jast.policies.checkpoints import Book
 from jast.policies.exploring import Shape
 from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
 from jast.policies.latent import sizes
+from jast.policies.proximal import Rates, networks
 from jast.simulator import Simulator
 
 __all__ = ["ppo"]
@@ -116,7 +117,7 @@ def ppo(
     number = lambda name, value, holds, expected: settings.number(
         "ppo", name, value, holds, expected
     )
-    rates = X.Rates(
+    rates = Rates(
         learning_rate=settings.positive("ppo", "learning_rate", learning_rate),
         clip=number("clip", clip, lambda v: 0 < v < 1, "above 0 and below 1"),
         trace=number("trace", trace, lambda v: 0 <= v <= 1, "of 0 to 1"),
@@ -144,12 +145,12 @@ def ppo(
     )
 
     for_first, for_steps, for_start = jax.random.split(key, 3)
-    applies = tuple(apply for _, apply in X.networks(n, hidden, components))
+    applies = tuple(apply for _, apply in networks(n, hidden, components))
     rates = jax.tree.map(jnp.float32, rates)
-    begin = lambda: X.first(for_first, sim, shape, rates.alpha)
-    look = lambda training, steps: X.look(for_steps, sim, shape, applies[0], training, steps)
+    begin = lambda: T.first(for_first, sim, shape, rates.alpha)
+    look = lambda training, steps: T.look(for_steps, sim, shape, applies[0], training, steps)
     run = lambda training, n: jax.block_until_ready(
-        X.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
+        T.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
     )
     book = Book("ppo", checkpoint, sim, known)
     training, rows = book.resume(jax.eval_shape(begin)._replace(buffer=())) or course.look(
@@ -166,7 +167,7 @@ def ppo(
         callback=callback,
         keep=book.keep,
     )
-    tilt = X.tilt(for_start, sim, shape, applies[1], training, rates.bonus) if n0 else ()
+    tilt = T.tilt(for_start, sim, shape, applies[1], training, rates.bonus) if n0 else ()
     learned = Learned(
         training.learner.actor,
         training.learner.critic,
