@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from checks import archive_replays
 from systems import ring
+from trees import large_copies
 
 import jast
 from benchmarks import stress_systems
@@ -174,6 +175,18 @@ def test_a_black_box(key, equal):
     sim = jast.blackbox.from_python(Walk, horizon=6, disturbance=Normal(0.0, 1.0))
     r = go_explore(key, sim, episodes=400)
     assert archive_replays(sim, r, RELATIVE, equal)
+
+
+@pytest.mark.long
+def test_the_archive_is_not_copied(key):
+    """Within the loop: the disturbances of all slots, the largest array, are written in place."""
+    sim = climb(200)
+    search = module._Search(key, sim, None, module.Plan(64, 4, 4), 10_000, 5000)
+    mark = jax.eval_shape(lambda: module.C.features(sim, jnp.int32(0)))
+    cells, kept = module.C.empty(sim, 2048), module.K.none(sim, 64, mark)
+    args = search.key, sim, search.reward, None, search.plan, cells, kept
+    text = module._explore.lower(*args, jnp.int32(0), jnp.int32(64)).compile().as_text()
+    assert "[2048,200]" in text and not large_copies(text, 2048 * 200)
 
 
 @pytest.mark.parametrize(
