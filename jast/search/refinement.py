@@ -121,7 +121,9 @@ class _Track:
 
     def still(self) -> bool:
         """Whether the last looks gained nothing to speak of."""
-        before = self.log[-1 - STILL_FOR][1] if len(self.log) > STILL_FOR else np.inf
+        if len(self.log) <= STILL_FOR:
+            return False
+        before = self.log[-1 - STILL_FOR][1]
         return before - self.log[-1][1] <= STILL * abs(before)
 
 
