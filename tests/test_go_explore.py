@@ -181,11 +181,11 @@ def test_a_black_box(key, equal):
 def test_the_archive_is_not_copied(key):
     """Within the loop: the disturbances of all slots, the largest array, are written in place."""
     sim = climb(200)
-    search = module._Search(key, sim, None, module.Plan(64, 4, 4), 10_000, 5000)
+    search = module._Search(key, sim, None, module.P.Plan(64, 4, 4), 10_000, 5000)
     mark = jax.eval_shape(lambda: module.C.features(sim, jnp.int32(0)))
     cells, kept = module.C.empty(sim, 2048), module.K.none(sim, 64, mark)
     args = search.key, sim, search.reward, None, search.plan, cells, kept
-    text = module._explore.lower(*args, jnp.int32(0), jnp.int32(64)).compile().as_text()
+    text = module.P.explore.lower(*args, jnp.int32(0), jnp.int32(64)).compile().as_text()
     assert "[2048,200]" in text and not large_copies(text, 2048 * 200)
 
 
