@@ -39,7 +39,7 @@ def test_every_width_has_its_distribution(key):
     for i in range(600):
         ends = jnp.int32(64 * 4 * i), jnp.int32(64 * 4 * (i + 1))
         args = search.key, sim, search.reward, kept, chains, widths, *ends
-        (kept, chains), _ = module._walk(*args)
+        (kept, chains), _ = module.T.walk(*args)
         if i >= 100:
             seen.append(_numbers(np.asarray(chains.z), np.asarray(chains.used), d))
     assert (chains.swapped > 0.1).all()
