@@ -104,11 +104,17 @@ def _verdict(r):
 
 
 def _work(r):
-    lines = [f"{'tried':<24} {'evaluations':>12} {'failing':>9} {'best log p rel.':>16}"]
-    for part in r.tried:
-        best = "-" if part.best == -np.inf else f"{part.best:.4f}"
-        lines.append(f"{part.name:<24} {part.evaluations:12d} {part.failing:9d} {best:>16}")
-    lines.append(f"{'in all':<24} {r.episodes:12d}")
+    """What was tried, each name once."""
+    lines = [
+        f"{'tried':<22} {'calls':>5} {'evaluations':>12} {'failing':>9} {'best log p rel.':>16}"
+    ]
+    for name, evaluations in r.spent.items():
+        parts = [part for part in r.tried if part.name == name]
+        best = max(part.best for part in parts)
+        text = "-" if best == -np.inf else f"{best:.4f}"
+        failing = sum(part.failing for part in parts)
+        lines.append(f"{name:<22} {len(parts):5d} {evaluations:12d} {failing:9d} {text:>16}")
+    lines.append(f"{'in all':<28} {r.episodes:12d}")
     return lines
 
 
