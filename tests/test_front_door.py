@@ -30,6 +30,7 @@ def crossing():
     return pedestrians(), jast.stress(jax.random.key(0), pedestrians(), 60_000)
 
 
+@pytest.mark.long
 def test_the_likeliest_failure_of_each_mode(crossing):
     sim, report = crossing
     costs = [away**2 / (2 * steps * noise**2) for steps, away, noise in PEDESTRIANS]
@@ -42,6 +43,7 @@ def test_the_likeliest_failure_of_each_mode(crossing):
         assert bool(jast.replay(sim, e).failure)
 
 
+@pytest.mark.long
 def test_the_probability_and_the_shares_of_modes(crossing):
     """Phi(-beta) of each pedestrian; the shares are of 128 failures drawn: 4 standard errors."""
     _, report = crossing
@@ -56,6 +58,7 @@ def test_the_probability_and_the_shares_of_modes(crossing):
     assert sum(m.share for m in report.modes) == pytest.approx(1)
 
 
+@pytest.mark.long
 def test_what_was_spent_is_told(crossing):
     _, report = crossing
     assert sum(report.spent.values()) == report.episodes <= 1.1 * 60_000
@@ -66,6 +69,7 @@ def test_what_was_spent_is_told(crossing):
     assert len(text.splitlines()) < 45
 
 
+@pytest.mark.long
 def test_a_report_is_saved(crossing, tmp_path):
     sim, report = crossing
     jast.save(tmp_path / "report", report)
