@@ -30,7 +30,7 @@ def test_the_example_runs_and_finds_a_failure(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     shown = TEXT.split("This prints")[1]
-    for words in ("undisturbed  no failure", "locally likeliest", "probability  5."):
+    for words in ("undisturbed  no failure", "locally likeliest", "likeliest    log p -10.79"):
         assert words in done.stdout and words in shown
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
+from jast.incidents import hosted
 from jast.limit_state import normal_numbers, normal_of
 from jast.outline import outline
 from jast.pytrees import count
@@ -20,9 +21,10 @@ from jast.simulator import Simulator
 __all__ = ["Mode", "Modes", "modes"]
 
 PLACES = 7
-LIFTS, OPPOSITE = (1.0, 1.03, 1.06, 1.1), -0.5
+LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
 """Points of a path between two failures, and how much farther out than the line between them it may
-run: "by much" is a tenth of the way from the anchor. The least cosine between the two.
+run: "by much" is a tenth of the way from the anchor. The least cosine between the two;
+the least of those that are alike.
 """
 
 
@@ -40,14 +42,20 @@ class Mode(NamedTuple):
 
 
 class Modes(tuple):
-    """A tuple of `Mode`, the likeliest first; prints as a table."""
+    """A tuple of `Mode`, the likeliest first; prints as a table. ``evaluations``: episodes that it
+    took to tell them apart.
+    """
 
-    def __new__(cls, items: Iterable[Mode] = ()):
-        return super().__new__(cls, items)
+    evaluations = 0
+
+    def __new__(cls, items: Iterable[Mode] = (), evaluations: int = 0):
+        self = super().__new__(cls, items)
+        self.evaluations = evaluations
+        return self
 
     def _asdict(self):
         """For files."""
-        return dict(items=tuple(self))
+        return dict(items=tuple(self), evaluations=self.evaluations)
 
     def __str__(self):
         if not self:
@@ -67,7 +75,9 @@ class Modes(tuple):
     __repr__ = __str__
 
 
-def modes(sim: Simulator, likeliest: Failures, others: Failures | None = None) -> Modes:
+def modes(
+    sim: Simulator, likeliest: Failures, others: Failures | None = None, *, budget: int = 100_000
+) -> Modes:
     """Sort failures into modes.
 
     Two failures are of one mode where a path between them never leaves the failures by much: the
@@ -80,6 +90,8 @@ def modes(sim: Simulator, likeliest: Failures, others: Failures | None = None) -
         sim: the simulator; its disturbances have quantile functions.
         likeliest: refined failures, by falling log p relative to the mode (`jast.search.refine`).
         others: further failures to be counted as members.
+        budget: evaluations, nearly. Where they are used up, failures are told apart by direction
+            alone: of one mode are those with a cosine above 0.8.
 
     Returns:
         `Modes`. A further failure that has no path to any of ``likeliest`` counts for the mode
@@ -93,7 +105,8 @@ def modes(sim: Simulator, likeliest: Failures, others: Failures | None = None) -
     ends = likeliest.episodes.length
     i, j = np.tril_indices(n, -1)
     pairs = list(zip(i, j, strict=True))
-    joined = joined_by(sim, home, (v[i], ends[i]), (v[j], ends[j]))
+    known = Paths(sim, home, budget)
+    joined = known.between((v[i], ends[i]), (v[j], ends[j]))
     owner = np.arange(n)
     for (i, j), one in zip(pairs, joined, strict=True):
         if one:
@@ -103,13 +116,14 @@ def modes(sim: Simulator, likeliest: Failures, others: Failures | None = None) -
     members = {k: int(likeliest.counts[owner == k].sum()) for k in heads}
     if others is not None and len(others):
         rest = centre(others), others.episodes.length
-        for k, times in zip(assigned(sim, home, rest, (v, ends), owner), others.counts):
+        for k, times in zip(assigned(known, rest, (v, ends), owner), others.counts, strict=True):
             members[k] += int(times)
     total = max(sum(members.values()), 1)
-    return Modes(Mode(likeliest[first[k]], members[k], members[k] / total) for k in heads)
+    each = (Mode(likeliest[first[k]], members[k], members[k] / total) for k in heads)
+    return Modes(each, known.spent)
 
 
-def assigned(sim, home, many, known, owner):
+def assigned(paths, many, known, owner):
     """Of each of ``many`` failures (points [m, D], steps [m]) the owner, given those of ``known``
     (points [n, D], steps [n]).
     """
@@ -124,23 +138,10 @@ def assigned(sim, home, many, known, owner):
         if not len(rows):
             break
         other = order[rows, k]
-        joined = joined_by(sim, home, (w[rows], ends[rows]), (v[other], known_ends[other]))
+        joined = paths.between((w[rows], ends[rows]), (v[other], known_ends[other]))
         out[rows[joined]] = owner[order[rows[joined], k]]
         left[rows[joined]] = False
     return out
-
-
-def joined_by(sim, home, first, second):
-    """Whether there is a path between each of the failures ``first`` and that of ``second`` (points
-    [n, D], steps [n]), as they are or with the first moved in time: [n].
-    """
-    (v, v_ends), (w, w_ends) = first, second
-    joined = paths(sim, home, v, w)
-    rows = np.flatnonzero(~joined & (v_ends != w_ends))
-    moved = [moved_by(sim, v[r], int(w_ends[r]) - int(v_ends[r])) for r in rows]
-    if len(rows):
-        joined[rows] = paths(sim, home, np.stack(moved), w[rows], of_both=True)
-    return joined
 
 
 def moved_by(sim: Simulator, v: np.ndarray, steps: int) -> np.ndarray:
@@ -155,28 +156,52 @@ def moved_by(sim: Simulator, v: np.ndarray, steps: int) -> np.ndarray:
     return np.concatenate([v[:size], out.reshape(-1)])
 
 
-def paths(
-    sim: Simulator, home: np.ndarray, v: np.ndarray, w: np.ndarray, of_both: bool = False
-) -> np.ndarray:
-    """Whether failures lead from each of ``v`` [n, D] to that of ``w``, both from ``home``: [n].
-    ``of_both``: ``v`` itself is yet to be seen failing.
+class Paths:
+    """Looks for paths of failures between points, all of them from ``home``, for at most ``budget``
+    evaluations.
     """
-    n, d = v.shape
-    if not n:
-        return np.zeros(0, bool)
-    t = (np.arange(0 if of_both else 1, PLACES + 1) / (PLACES + 1))[:, None, None]
-    norm = lambda a: np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-12)
-    line = (1 - t) * v / norm(v) + t * w / norm(w)
-    size = (1 - t) * norm(v) + t * norm(w)
-    arc = np.where(norm(line) > 1e-3, line / norm(line) * size, 0)
-    points = home + arc[None] * np.array(LIFTS)[:, None, None, None]
-    total = n * len(t) * len(LIFTS)
-    flat = np.resize(points.reshape(-1, d), (1 << (total - 1).bit_length(), d))
-    fails = np.asarray(_fails(sim, jnp.asarray(flat, normal_numbers(sim))))
-    fails = fails[:total].reshape(len(LIFTS), len(t), n)
-    # no arc is meant between opposite points
-    along = np.sum(v / norm(v) * w / norm(w), axis=1) > OPPOSITE
-    return fails.any(axis=0).all(axis=0) & along
+
+    def __init__(self, sim: Simulator, home: np.ndarray, budget: int):
+        self.sim, self.home, self.budget, self.spent = sim, home, budget, 0
+
+    def between(self, first, second):
+        """Whether there is a path between each of the failures ``first`` and that of ``second``
+        (points [n, D], steps [n]), as they are or with the first moved in time: [n].
+        """
+        (v, v_ends), (w, w_ends) = first, second
+        joined = self.straight(v, w)
+        rows = np.flatnonzero(~joined & (v_ends != w_ends))
+        if len(rows):
+            steps = (w_ends - v_ends)[rows]
+            moved = [moved_by(self.sim, v[r], int(k)) for r, k in zip(rows, steps, strict=True)]
+            joined[rows] = self.straight(np.stack(moved), w[rows], of_both=True)
+        return joined
+
+    def straight(self, v, w, of_both=False):
+        """Whether the arc between each of ``v`` [n, D] and that of ``w`` keeps to the failures:
+        [n]. ``of_both``: ``v`` itself is yet to be seen failing.
+        """
+        n, d = v.shape
+        if not n:
+            return np.zeros(0, bool)
+        t = (np.arange(0 if of_both else 1, PLACES + 1) / (PLACES + 1))[:, None, None]
+        norm = lambda a: np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-12)
+        cosine = np.sum(v / norm(v) * w / norm(w), axis=1)
+        total = n * len(t) * len(LIFTS)
+        if self.spent + total > self.budget:
+            return cosine > ALIKE
+        line = (1 - t) * v / norm(v) + t * w / norm(w)
+        size = (1 - t) * norm(v) + t * norm(w)
+        arc = np.where(norm(line) > 1e-3, line / norm(line) * size, 0)
+        points = self.home + arc[None] * np.array(LIFTS)[:, None, None, None]
+        # few shapes are few programs; a system on the host has none
+        rows = total if hosted(self.sim) else 1 << (total - 1).bit_length()
+        flat = np.resize(points.reshape(-1, d), (rows, d))
+        fails = np.asarray(_fails(self.sim, jnp.asarray(flat, normal_numbers(self.sim))))
+        self.spent += rows
+        fails = fails[:total].reshape(len(LIFTS), len(t), n)
+        # no arc is meant between opposite points
+        return fails.any(axis=0).all(axis=0) & (cosine > OPPOSITE)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from jast.estimate.batches import drawn, numbers
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked
-from jast.search.failure_modes import Mode, Modes, assigned, modes
+from jast.search.failure_modes import Mode, Modes, Paths, assigned, modes
 from jast.search.moves import anchor, likelihood
 from jast.search.refinement import refine
 from jast.simulator import Simulator
@@ -27,9 +27,9 @@ __all__ = ["stress"]
 
 LEAST, ESTIMABLE = 300, 5000
 """Evaluations of a call, and of an estimate that finds its own proposal."""
-NOMINAL, SEARCH, REFINE = 0.05, 0.2, 0.15
-"""Shares of the budget; the rest is for the probability. Without an estimate of its own the last
-two take it all.
+NOMINAL, SEARCH, REFINE, PATHS = 0.05, 0.2, 0.15, 0.05
+"""Shares of the budget; the last is the most that a look at the modes may cost. What is left is for
+the probability. Without an estimate of its own all is divided between the first three.
 """
 FIRST, CALLS, FADING, FEW = 0.5, 6, 0.1, 2000
 """Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
@@ -188,7 +188,9 @@ class _Work:
                 float(found.best.reward) if len(found) else -np.inf,
                 result.invalid,
             )
-            self.modes = modes(self.sim, found if len(found) else self.pool[:1], self.pool)
+            known = found if len(found) else self.pool[:1]
+            self.modes = modes(self.sim, known, self.pool, budget=int(PATHS * self.budget))
+            self.note("telling modes apart", self.modes.evaluations)
             chosen = self.bests()
         self.failures = merge(self.bests(), self.failures, top=self.top)
 
@@ -215,7 +217,8 @@ class _Work:
             self.tell_shares(p.proposal)
 
     def counted(self):
-        return 20 * SAMPLES if len(self.modes) > 1 else 0
+        """What telling the shares of modes will take."""
+        return 16 * SAMPLES + int(PATHS * self.budget) if len(self.modes) > 1 else 0
 
     def tell_shares(self, q):
         """The share of the probability that each mode has, of failures drawn from the proposal."""
@@ -241,7 +244,9 @@ class _Work:
         used = np.arange(z.shape[1])[None] < o.used[rows][:, None]
         points = np.where(used, z[rows].astype(np.float64) - home, 0)
         many, known = (points, o.length[rows]), (v, stacked.length)
-        owner = assigned(self.sim, home, many, known, np.arange(len(self.modes)))
+        paths = Paths(self.sim, home, int(PATHS * self.budget))
+        owner = assigned(paths, many, known, np.arange(len(self.modes)))
+        self.note("telling modes apart", paths.spent)
         shares = np.bincount(owner, minlength=len(self.modes)) / SAMPLES
         self.modes = Modes(
             m._replace(share=float(s)) for m, s in zip(self.modes, shares, strict=True)
