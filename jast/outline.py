@@ -64,6 +64,13 @@ class Outline:
         """Whether x0 is a choice: ``start`` is not `jast.simulator.fixed`."""
         return bool(jax.tree.leaves(self.x0))
 
+    @property
+    def density(self) -> str:
+        """What log p counts in, free of units where it can be: "mode" (less its value at the mode)
+        where x0 and x have modes, else "raw".
+        """
+        return "mode" if self.start.mode and self.disturbance.mode else "raw"
+
 
 def outline(sim: Simulator) -> Outline:
     """The `Outline` of ``sim``: each of its functions but ``step`` and ``is_terminal`` is traced

@@ -136,7 +136,7 @@ def over(sim, *, reward=None, actions=None):
         if not offer.quantile and not (box and name == "disturbance"):
             raise ValueError(f"over: {name}: {offer.lacking} has no quantile function{other}")
     contract(sim, actions, observed=False)
-    density = "mode" if about.start.mode and about.disturbance.mode else "raw"
+    density = about.density
     return Stress(sim, LogLikelihood(density) if reward is None else as_pytree(reward), actions)
 
 

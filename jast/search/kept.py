@@ -38,9 +38,7 @@ def likelihood(sim: Simulator) -> rewards.Standard:
     """The reward of searches that want failures alone, and of these the likeliest: log p of a
     failure, relative to the mode where the disturbances of ``sim`` have modes.
     """
-    about = outline(sim)
-    modes = about.disturbance.mode and about.start.mode
-    return rewards.standard(density="mode" if modes else "raw")
+    return rewards.standard(density=outline(sim).density)
 
 
 def none(sim: Simulator, k: int, mark: Any = ()) -> Kept:

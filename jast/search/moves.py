@@ -47,8 +47,7 @@ def likelihood(sim: Simulator) -> Callable:
     """The log density as a reward: relative to the mode, and so free of units, where the
     disturbances of ``sim`` have modes.
     """
-    about = outline(sim)
-    return of_mode if about.disturbance.mode and about.start.mode else log_likelihood
+    return of_mode if outline(sim).density == "mode" else log_likelihood
 
 
 def of_mode(log_p, event, distance, terminal, approach=0.0):
@@ -89,8 +88,6 @@ class Point(NamedTuple):
     """[D] of the distance, and"""
     rise: Any
     """[D] of the cost, where both are told from differences"""
-    turn: Any
-    """int32: rounds so far"""
 
 
 class Noise(NamedTuple):
@@ -151,19 +148,7 @@ def begun(sim: Simulator, z: jax.Array) -> tuple[Point, Verdict]:
     v = jax.vmap(partial(judge, sim))(z)
     full = lambda value: jnp.full(len(z), value, z.dtype)
     zero = jnp.zeros_like(z)
-    point = Point(
-        z,
-        v.cost,
-        v.used,
-        full(0.3),
-        full(1),
-        full(0.5),
-        zero,
-        zero,
-        zero,
-        jnp.zeros(len(z), jnp.int32),
-    )
-    return point, v
+    return Point(z, v.cost, v.used, full(0.3), full(1), full(0.5), zero, zero, zero), v
 
 
 @partial(jax.jit, static_argnums=4)
@@ -182,7 +167,7 @@ def _round(sim, gradients, home, point, noise):
     v, radius = point.z - home, jnp.linalg.norm(point.z - home)
     if gradients:
         edge = home + (1 - point.gap) * v
-        _, slope, rise = _slopes(sim, edge)
+        slope, rise = _slopes(sim, edge)
     else:
         slope, rise = _differences(sim, home, v, radius, point, noise.part)
     along, usable = _along(slope, rise)
@@ -233,10 +218,9 @@ def _round(sim, gradients, home, point, noise):
         jnp.clip(gap, NEAREST, FARTHEST),
         jnp.clip(length, 1e-3, 1),
         jnp.clip(width, 1e-3, 1),
-        jnp.where(better, step - v, jnp.where(took(c, c + 1), 0, point.last)),
+        jnp.where(better, step - v, point.last),
         slope,
         rise,
-        point.turn + 1,
     )
     return new, jnp.sum(verdict.invalid, dtype=jnp.int32)
 
@@ -259,7 +243,7 @@ def _along(slope, rise):
 
 
 def _slopes(sim, z):
-    """The distance at ``z``, and the gradients of the distance and of the cost."""
+    """The gradients of the distance and of the cost at ``z``."""
 
     def both(z):
         e = rollout(jax.random.key(0), sim, policy_of(sim, z), likelihood(sim))
@@ -267,7 +251,7 @@ def _slopes(sim, z):
 
     (distance, _), back = jax.vjp(both, z)
     one, zero = jnp.ones_like(distance), jnp.zeros_like(distance)
-    return distance, back((one, zero))[0], back((zero, one))[0]
+    return back((one, zero))[0], back((zero, one))[0]
 
 
 def _differences(sim, home, v, radius, point, part):
@@ -292,7 +276,7 @@ def residuals(sim: Simulator, home: jax.Array, points: Point) -> jax.Array:
     """
 
     def one(point):
-        _, slope, rise = _slopes(sim, home + (1 - point.gap) * (point.z - home))
+        slope, rise = _slopes(sim, home + (1 - point.gap) * (point.z - home))
         along, usable = _along(slope, rise)
         share = jnp.linalg.norm(along) / jnp.maximum(jnp.linalg.norm(rise), NEAREST)
         return jnp.where(usable, share, jnp.nan)

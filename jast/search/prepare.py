@@ -78,9 +78,8 @@ def _scaled(sim: Simulator, reward: Any, actions: Any, widen: str) -> tuple[Any,
     if not (bare or wide):
         return reward, actions, None
     about, widen = outline(sim), widen if wide else "never"
-    has_mode = about.start.mode and about.disturbance.mode
     given = getattr(reward, "density", None) if bare else "raw"
-    density = given or ("mode" if has_mode else "raw")
+    density = given or about.density
     pilot = fly(sim, density, widen)
     told = pilot.near, pilot.rare, pilot.likely, pilot.width
     if not is_traced(told):

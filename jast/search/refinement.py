@@ -88,9 +88,9 @@ def refine(
     Returns:
         `Refined`: the likeliest failures near those given, which are started with 16 at a time, the
         likeliest and those farthest from one another first, for as long as the budget lasts; those
-        that meet are one. log p counts relative to the
-        mode wherever the distributions have modes. A failure that nothing betters comes back as it
-        was, and one that does not replay is left out.
+        that meet are one. log p counts relative to the mode wherever the distributions have modes.
+        A failure that nothing betters comes back as it was, and one that does not replay is left
+        out.
 
     Raises:
         ValueError: for a budget below 100, failures that do not fit the simulator, and disturbances

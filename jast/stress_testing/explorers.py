@@ -37,16 +37,13 @@ class Haul(NamedTuple):
     failing: int
     """Failing episodes among those simulated, where they were counted; else m"""
     invalid: int
-    distance: float
-    """The least miss distance seen of an episode that did not fail; inf where unknown"""
 
 
 def ranked(sim: Simulator) -> Callable:
     """The reward of searches that rank failures first themselves: of a failure log p, relative to
     the mode where the disturbances of ``sim`` have modes, and of the rest the nearness.
     """
-    about = outline(sim)
-    return by_mode if about.start.mode and about.disturbance.mode else by_density
+    return by_mode if outline(sim).density == "mode" else by_density
 
 
 def by_mode(log_p, event, distance, terminal, approach=0.0):
@@ -136,14 +133,8 @@ def explorers_of(sim: Simulator, budget: int) -> dict[str, int]:
 
 def _of_search(result: Any) -> Haul:
     """The `Haul` of a `jast.search.SearchResult`."""
-    near = float(result.best.distance)
-    return Haul(
-        result.failures.episodes,
-        result.episodes,
-        int(result.failing),
-        int(result.invalid),
-        np.inf if result.best.failure else near,
-    )
+    found = result.failures.episodes
+    return Haul(found, result.episodes, int(result.failing), int(result.invalid))
 
 
 def _of_points(sim: Simulator, found: Any) -> Haul:
@@ -151,7 +142,7 @@ def _of_points(sim: Simulator, found: Any) -> Haul:
     points = np.asarray(found.points)[:KEPT]
     invalid = int(getattr(found, "invalid", 0))
     if not len(points):
-        return Haul(empty(sim).episodes, found.evaluations, 0, invalid, np.inf)
+        return Haul(empty(sim).episodes, found.evaluations, 0, invalid)
     e = jax.device_get(latent.episodes(sim, jnp.asarray(points, latent.normal_numbers(sim))))
     e = jax.tree.map(lambda a: a[e.failure], e)
-    return Haul(e, found.evaluations, len(e.length), invalid, np.inf)
+    return Haul(e, found.evaluations, len(e.length), invalid)
