@@ -453,7 +453,8 @@ def test_vmap_over_a_setting_is_a_loop():
 def test_a_traced_result_counts_as_an_eager_one():
     """Also where trees fail; without an archive, and with -1 in place of None."""
     eager = once("landing")
-    traced = jax.jit(lambda key: forest(key, LANDING, **SIZE, reward=BONUS))(jax.random.key(3))
+    choices = dict(reward=BONUS, actions=ACTIONS["samples"])
+    traced = jax.jit(lambda key: forest(key, LANDING, **SIZE, **choices))(jax.random.key(3))
     assert traced.failures is None and traced.history is None
     assert (traced.episodes, traced.steps, traced.first_failure) == (
         eager.episodes,
@@ -490,16 +491,15 @@ def test_float64_within_a_block(x64):
 
 @pytest.mark.long
 def test_a_forest_beats_random_search():
-    """At equal budget, on a walk that fails about once in 8000 episodes, a forest sees far more
-    failures, and a likelier one.
+    """At equal budget, on a walk that fails about once in 8000 episodes, a forest over draws of the
+    model sees far more failures, and a likelier one.
     """
     sim, reward = (
         jast.simulators.walk1d("one-sided", threshold=12.0),
         jast.rewards.standard(event_bonus=20.0, density="mode"),
     )
-    result = forest(
-        jax.random.key(1), sim, trees=10, prunes=8, simulations=150, reward=reward, exploration=3.0
-    )
+    size = dict(trees=10, prunes=8, simulations=150, exploration=3.0)
+    result = forest(jax.random.key(1), sim, **size, reward=reward, actions=ACTIONS["samples"])
     random = jax.vmap(lambda key: jast.rollout(key, sim, reward=reward)._replace(states=None))(
         jax.random.split(jax.random.key(101), result.episodes)
     )
