@@ -13,7 +13,7 @@ from jast import limit_state as latent
 from jast.distributions import Exponential, MultivariateNormalDiag, Normal
 from jast.failures import collect
 from jast.search import moves as M
-from jast.search import refine
+from jast.search import refine, refinement
 from jast.search.failure_modes import modes
 
 
@@ -52,6 +52,17 @@ def test_what_comes_back_replays_and_is_sorted(key):
         assert gain >= 0
         before = float(found[int(origin)].reward)
         assert float(e.reward) >= before - 1e-3 * abs(before)
+
+
+def test_on_a_knife_edge_the_replay_counts(key, monkeypatch):
+    """Another program may round a failing episode to one that does not fail."""
+    sim = linear(10)
+    found = draws(sim, 4.0)
+    says_no = lambda sim, z: latent.episodes(sim, z)._replace(failure=jnp.zeros(len(z), bool))
+    monkeypatch.setattr(refinement, "episodes", says_no)
+    result = refine(key, sim, found, budget=200)
+    assert len(result.failures) == 1 and result.gain[0] > 0
+    assert float(result.failures.best.reward) > float(found.best.reward)
 
 
 def test_slips_of_whole_numbers_are_taken_out(key):

@@ -113,6 +113,7 @@ def judge(sim: Simulator, z: jax.Array) -> Verdict:
     return Verdict(end.failure, cost.astype(z.dtype), end.distance, end.invalid, used)
 
 
+@jax.jit
 def anchor(sim: Simulator) -> jax.Array:
     """The point [D] of the episode in which every disturbance is at its mode; 0 where there is
     none, and no number beyond +-5.
