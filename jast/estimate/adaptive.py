@@ -13,9 +13,10 @@ from jast import limit_state as latent
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
-from jast.estimate import sums
+from jast.estimate import diagnostics, sums
 from jast.estimate.batches import balanced, drawn, numbers
 from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
 from jast.estimate.multilevel import failure_proposal
 from jast.estimate.populations import explore
@@ -29,6 +30,10 @@ __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subs
 
 LEAST = 5000
 APART = 0.6
+EXACT, MODEL = 0.01, (0.1, 0.5)
+"""Relative standard error beyond which draws serve better as the model's own; their least and
+greatest share of the last part.
+"""
 
 
 def failure_probability(
@@ -103,9 +108,11 @@ def _with_the_rest(key, s, level, progress, callback):
         return of_counts(
             name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
         )
-    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, s.q, lanes)
+    share = _of_the_model(s, n)
+    q = together(s.q, s.model(), share)
+    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, q, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
-    groups = _by_direction(s.q) if total.first > 0 else []
+    groups = _groups(q, total) if total.first > 0 else []
     return estimate(
         name,
         total,
@@ -113,8 +120,18 @@ def _with_the_rest(key, s, level, progress, callback):
         evaluations=s.spent + total.samples,
         groups=groups,
         proposal=s.q,
+        control=int(share * total.samples) + s.batch,
         **about,
     )
+
+
+def _of_the_model(s, n):
+    """The share of the last ``n`` draws that are the model's own: as great as leaves a standard
+    error of `EXACT`. They bound what nothing led to.
+    """
+    b = s.batches[-1]
+    ess = effective(b.log_weight[b.failure]) / len(b.z) * n
+    return float(np.clip(1 - 1 / (EXACT**2 * ess), *MODEL))
 
 
 def _of_the_search(s, level):
@@ -264,6 +281,17 @@ def _plain_is_better(s):
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
     return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
+
+
+def _groups(q, total):
+    """The components of ``q`` by failure mode; what the model's own draws carry is one of its own
+    where it matters, and else counts with the greatest.
+    """
+    groups, share = _by_direction(q), lambda g: total.by_component[g].sum() / total.first
+    central = lambda g: not np.asarray(q.means)[g].any()
+    plain = [g for g in groups if central(g) and share(g) < diagnostics.MATTERS]
+    others = sorted((g for g in groups if g not in plain), key=share)
+    return [*others[:-1], sum(plain, others[-1])] if others else groups
 
 
 def _by_direction(q):

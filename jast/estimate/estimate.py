@@ -7,6 +7,7 @@ import numpy as np
 
 from jast import results
 from jast.estimate import diagnostics
+from jast.estimate.sums import skewness
 from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
 __all__ = ["Estimate", "estimate", "of_counts"]
@@ -35,8 +36,8 @@ class Estimate(NamedTuple):
     relative_error: float
     """standard_error / mean, also where both are below the least double"""
     interval: tuple
-    """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is); of plain counts
-    Clopper and Pearson's
+    """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is), with ``high``
+    corrected for the skewness of the weights; of plain counts Clopper and Pearson's
     """
     level: float
     ess: float
@@ -69,6 +70,10 @@ class Estimate(NamedTuple):
     """Of plain counts: upper bound at one-sided ``level`` (the paper's eq. 17)"""
     jeffreys: float | None = None
     """Of plain counts: upper bound at one-sided ``level`` by Jeffreys' prior (eq. 18)"""
+    unseen: float | None = None
+    """Where a share of the draws was the model's own: the upper bound, at one-sided ``level``, on
+    the probability of failures that nothing led to and none of these draws met: -log(1 - level) / n
+    """
     proposal: Any = None
     """What it was drawn from, where the method found it: for `jast.estimate.failure_samples`"""
     history: Any = None
@@ -133,6 +138,8 @@ class Estimate(NamedTuple):
             )
         if self.invalid:
             rows.append(("invalid", f"{self.invalid}"))
+        if self.unseen is not None and self.unseen > self.interval[1]:
+            rows.append(("unseen", f"below {self.unseen:.2g}, by draws of the model"))
         head = [] if self.reliable else ["UNRELIABLE: " + f"\n{'':12}".join(self.warnings)]
         tail = [f"{'remark':<14} {text}" for text in self.warnings] if self.reliable else []
         return "\n".join(
@@ -156,11 +163,13 @@ def estimate(
     groups=None,
     proposal=None,
     history=None,
+    control=0,
 ):
     """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside,
     ``notes`` are remarks.
 
     ``groups``: lists of components that are one failure mode (default: each by itself).
+    ``control``: episodes that were the model's own draws.
     """
     level = checked_level(method, level)
     n, seen = sums.samples, sums.first > 0
@@ -195,7 +204,7 @@ def estimate(
         mean=mean,
         standard_error=mean * relative,
         relative_error=relative,
-        interval=log_normal(log_mean, relative, level) if seen else (0.0, 1.0),
+        interval=log_normal(log_mean, relative, level, skewness(sums)) if seen else (0.0, 1.0),
         level=level,
         ess=ess,
         k_hat=k_hat,
@@ -208,6 +217,7 @@ def estimate(
         modes=modes,
         reliable=not found,
         warnings=(*found, *_remarks(sums), *notes),
+        unseen=-math.log1p(-level) / control if control else None,
         proposal=proposal,
         history=history,
     )

@@ -82,6 +82,10 @@ class Seeker:
         n = len(z)
         return fit(self.rng, self.filled(z, used), np.full(n, 1 / n), n / 5, n / 20)
 
+    def model(self):
+        """The model itself, as a `Latent`."""
+        return as_latent([(1.0, unit(np.zeros((1, self.dimension))))], self.dtype)
+
     def thin(self):
         """The log density ratio q / p below which a failure is not covered."""
         return -self.log_mean - math.log(COVERED)
@@ -98,6 +102,7 @@ def seek(s, gradients=True):
     """Take the `Seeker` ``s`` to the end of the search: its ``q`` is the proposal, None where no
     failure was found.
     """
+    _look(s)
     parts = _explore(s, gradients and not hosted(s.sim))
     if not parts:
         return
@@ -133,6 +138,8 @@ def _explore(s, gradients):
 
     if len(s.known):
         around("failures given", distinct(s.known.astype(np.float64), POINTS), 0)
+    if s.batches[0].failure.any():  # what no distance and no gradient need lead to
+        around("draws of the model", distinct(s.filled(*_failing(s.batches[:1])), POINTS), 0)
     found = (
         design_points(s.next_key(), s.sim, int(np.clip(s.budget // 2000, 4, 48)), POINTS)
         if gradients
@@ -157,18 +164,30 @@ def _explore(s, gradients):
     return parts
 
 
+def _look(s):
+    """A batch of the model itself."""
+    b = _drawn(s, s.model())
+    s.batches.append(b)
+    s.note(f"draws of the model: {b.failure.sum()} fail", s.batch)
+
+
+def _drawn(s, q):
+    """A `Batch` of ``q``."""
+    numbers = (
+        jnp.asarray(a, s.dtype)
+        for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension)))
+    )
+    z, o, log_w, _ = jax.device_get(drawn(s.sim, q, *numbers))
+    return Batch(q, z, o.used, o.failure, log_w.astype(np.float64))
+
+
 def _refine(s, most):
     """At most ``most`` batches, each of the mixture fitted to all before it, for as long as they
     get better.
     """
     before, limit = 0.0, s.spent + most * s.batch
     while s.spent < limit and (before == 0 or s.spent < REFITTING * s.budget):
-        numbers = (
-            jnp.asarray(a, s.dtype)
-            for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension)))
-        )
-        z, o, log_w, _ = jax.device_get(drawn(s.sim, s.q, *numbers))
-        b = Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))
+        b = _drawn(s, s.q)
         if not b.failure.any():
             s.note("batch: no failure", s.batch)
             return
@@ -192,10 +211,7 @@ def _fit(s):
     w = np.exp(log_w - log_w.max())
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
     s.rare = s.log_mean < RARE
-    z, used = (
-        np.concatenate([getattr(b, name) for b in s.batches])[failing] for name in ("z", "used")
-    )
-    points, centres = s.filled(z, used), s.centres()
+    points, centres = s.filled(*_failing(s.batches)), s.centres()
     owner = _nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW
     owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
@@ -219,6 +235,12 @@ def _fit(s):
     name = min(choices, key=lambda name: variance(choices[name]))
     s.q = choices[name]
     return name, effective(log_w)
+
+
+def _failing(batches):
+    """The failing points [n, D] of ``batches`` and how many numbers each has used [n]."""
+    failing = np.concatenate([b.failure for b in batches])
+    return tuple(np.concatenate([getattr(b, a) for b in batches])[failing] for a in ("z", "used"))
 
 
 def _by_owner(s, points, log_w, owner):

@@ -2,11 +2,12 @@
 precision, any range.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["add", "nothing"]
+__all__ = ["add", "nothing", "skewness"]
 
 
 class Sums(NamedTuple):
@@ -29,6 +30,8 @@ class Sums(NamedTuple):
     """Sum of w / exp(top)"""
     second: float
     """Sum of the squares"""
+    third: float
+    """Sum of the cubes"""
     by_component: Any
     """[K] sums by the component that made a trace (its probability)"""
     squares: Any
@@ -40,7 +43,9 @@ class Sums(NamedTuple):
 
 def nothing(samples):
     """The `Sums` before the first of ``samples`` episodes."""
-    return Sums(0, 0, 0, 0, 0.0, 0, -np.inf, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples))
+    return Sums(
+        0, 0, 0, 0, 0.0, 0, -np.inf, 0.0, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples)
+    )
 
 
 def tail_size(samples):
@@ -76,8 +81,18 @@ def add(total, traces):
         top=top,
         first=total.first * rescale + w.sum(),
         second=total.second * rescale**2 + (w**2).sum(),
+        third=total.third * rescale**3 + (w**3).sum(),
         by_component=by if total.by_component is None else total.by_component * rescale + by,
         squares=squares if total.squares is None else total.squares * rescale**2 + squares,
         tail=np.sort(tail)[::-1],
         keep=total.keep,
     )
+
+
+def skewness(sums):
+    """Of the mean of the weights, 0 where it is not known."""
+    n, m = sums.samples, sums.first / max(sums.samples, 1)
+    variance = sums.second / max(n, 1) - m**2
+    if n < 2 or not variance > 0:
+        return 0.0
+    return (sums.third / n - 3 * m * sums.second / n + 2 * m**3) / variance**1.5 / math.sqrt(n)
