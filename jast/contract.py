@@ -6,6 +6,8 @@ handful of steps, for what only numbers show: NaN, densities of zero, randomness
 disturbance.
 """
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from jast._jax import is_traced, is_tracing
 from jast.actions import Quantiles, Samples, UniformBox, Wide
 from jast.incidents import incidents, since, sources
 from jast.outline import outline
+from jast.rounding import rounded
 from jast.simulator import Simulator
 
 __all__ = ["check", "contract"]
@@ -43,7 +46,9 @@ def check(sim, actions=None):
     impossible under p(x | s) in more than half of 64 draws at the start. Only the traced half runs
     where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system,
     and the first steps of another. Warns (UserWarning) where objects of `jast.blackbox` that are
-    judged at the end only (``episodic=True``) failed on the way in some of 16 more.
+    judged at the end only (``episodic=True``) failed on the way in some of 16 more, and where the
+    floats of the state are too coarse for what a disturbance does to it (`jast.rounding`, up to 48
+    episodes).
     """
     contract(sim, actions)
     if is_traced(sim, actions) or is_tracing():
@@ -56,6 +61,8 @@ def check(sim, actions=None):
     _densities(found)
     _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
+    if (coarse := rounded(sim)) is not None:
+        warnings.warn(f"check: step: {coarse}", UserWarning, stacklevel=2)
     for source in sources(sim, "compare"):  # a black box that is judged at the end only
         source.compare(sim)
     if actions is not None and (share := found["actions"]) > 0.5:

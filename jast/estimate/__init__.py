@@ -7,7 +7,6 @@ from jast.estimate.adaptive import (
     adaptive_cross_entropy,
     failure_probability,
     monte_carlo,
-    subset_simulation,
 )
 from jast.estimate.diagnostics import pareto_k
 from jast.estimate.estimate import Estimate
@@ -15,6 +14,7 @@ from jast.estimate.failure_samples import FailureSamples, failure_samples
 from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
+from jast.estimate.subset import subset_simulation
 from jast.intervals import chernoff, clopper_pearson, jeffreys
 
 __all__ = [

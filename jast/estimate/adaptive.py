@@ -15,21 +15,27 @@ from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import diagnostics, sums
 from jast.estimate.batches import balanced, drawn, numbers
-from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
 from jast.estimate.multilevel import failure_proposal
-from jast.estimate.populations import explore
 from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import Seeker, seek
-from jast.intervals import checked_level, log_normal
+from jast.estimate.subset import by_levels
+from jast.intervals import checked_level
 from jast.policy import nominal_policy
 from jast.results import asked
+from jast.rounding import rounded
 
-__all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo", "subset_simulation"]
+__all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo"]
 
 LEAST = 5000
 APART = 0.6
+SEEN, LOST = 100, 2.0
+"""Failures of the model from which plain draws tell a probability; what may be lost, as a multiple
+of what was found, from which the proposal is given up.
+"""
+ASTRAY = "no proposal was found that draws failures by their weights"
 EXACT, MODEL = 0.01, (0.1, 0.5)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
@@ -57,15 +63,20 @@ def failure_probability(
     of a few batches. A guard, a population that is kept out of what the proposal covers, looks for
     lost failure modes, which are taken in, or else the estimate is UNRELIABLE. What is left of the
     budget, about half, is drawn from the proposal as it then stands: the estimate and its interval
-    are of these episodes alone. Where plain Monte Carlo would be more exact, these are drawn from
-    the model.
+    are of these episodes alone. A tenth of them or more, up to half where the standard error stays
+    below 1 %, are the model's own draws, which meet what no explorer was led to; ``unseen`` bounds
+    what they did not meet. Where plain Monte Carlo would be more exact, or the proposal is given up
+    and the model fails often enough, all are drawn from the model; where it does not, the answer is
+    subset simulation's, and UNRELIABLE. So is one of a system whose floats are too coarse
+    (`jast.rounding`).
 
     ``failures``: known ones (an archive, `jast.failures`), which join what the explorers find, so
     that no mode among them is lost. They lead to a proposal and never enter the estimate.
 
-    A failure mode that all explorers miss is missing without a sign. ``modes`` are parts of the
-    estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`; ``history`` tells
-    how the search went. ``evaluations`` counts each episode, and three for one with its gradient.
+    A failure mode below ``unseen`` that all explorers miss is missing without a sign. ``modes`` are
+    parts of the estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`;
+    ``history`` tells how the search went. ``evaluations`` counts each episode, and three for one
+    with its gradient.
 
     The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
     total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. One that comes
@@ -82,6 +93,8 @@ def failure_probability(
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     for_search, key = jax.random.split(key)
     s = Seeker(for_search, sim, budget)
+    if (coarse := rounded(sim)) is not None:
+        s.coarse.append(coarse)
     if failures is not None:
         s.known = latent.normal_of(sim, failures.episodes)
     try:
@@ -100,11 +113,19 @@ def _with_the_rest(key, s, level, progress, callback):
     """The `Estimate` of what is left of the budget, by the proposal that was found."""
     name, sim, n = "failure_probability", s.sim, s.budget - s.spent
     lanes = s.batch  # one program for the search and for this
-    about = dict(level=level, reasons=s.reasons, history=tuple(s.history))
-    if s.log_mean is None or _plain_is_better(s):
+    about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
+    astray, log_p = _astray(s, n), _about(s)
+    enough = math.exp(min(log_p, 0.0)) * n >= SEEN
+    if astray and not enough:
+        found = by_levels(key, sim, n, log_p, level, about["reasons"] or [ASTRAY])
+        if found is not None:
+            return found._replace(
+                episodes=s.spent + found.episodes, history=(*about["history"], *found.history)
+            )
+    if s.log_mean is None or (astray and enough) or _plain_is_better(s):
         simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
-        about["reasons"] = ()  # which are about the proposal
+        about["reasons"] = s.coarse  # the others are about the proposal
         return of_counts(
             name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
         )
@@ -123,6 +144,21 @@ def _with_the_rest(key, s, level, progress, callback):
         control=int(share * total.samples) + s.batch,
         **about,
     )
+
+
+def _about(s):
+    """The log probability, roughly; -inf where no failure was seen."""
+    if s.log_mean is not None:
+        return s.log_mean
+    return max((p.log_mean for p in s.populations if p.reached), default=-math.inf)
+
+
+def _astray(s, n):
+    """Whether ``n`` draws of the proposal would not tell the probability."""
+    if s.log_mean is None or s.lost > LOST:
+        return True
+    b = s.batches[-1]
+    return effective(b.log_weight[b.failure]) / len(b.z) * n < diagnostics.ESS
 
 
 def _of_the_model(s, n):
@@ -150,7 +186,7 @@ def _of_the_search(s, level):
         "failure_probability",
         sums.add(sums.nothing(rows), seen),
         level=level,
-        reasons=[against],
+        reasons=[*s.coarse, against],
         evaluations=s.spent,
         proposal=s.q,
         history=tuple(s.history),
@@ -178,74 +214,6 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     return of_counts(name, total, level=level, notes=notes)._replace(settings=settings)
 
 
-def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
-    """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
-    ``samples``: `Estimate`, the mean of theirs.
-
-    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too,
-    ``samples`` counts the members of the last populations. It needs a miss distance that leads to
-    failures, and no gradient; a mode that few members reach is lost at times, and the others do not
-    show it. A population gives up below a probability of 1e-300. Raises ValueError for fewer than
-    100 samples or 3 replicates, and as `failure_probability`.
-    """
-    name = "subset_simulation"
-    random_key(name, key)
-    samples, replicates = (
-        whole(name, "samples", samples, 100),
-        whole(name, "replicates", replicates, 3),
-    )
-    level = checked_level(name, level)
-    latent.check(name, sim)
-    runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
-    logs = np.array([r.log_mean for r in runs])
-    evaluations, invalid = sum(r.evaluations for r in runs), sum(r.invalid for r in runs)
-    history = tuple(
-        f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
-        for r in runs
-    )
-    seen, found = int(np.isfinite(logs).sum()), []
-    if seen < replicates:
-        found.append(f"{replicates - seen} of {replicates} populations reached no failure")
-    top = logs.max() if seen else 0.0
-    p = np.exp(logs - top)
-    log_mean, relative = (
-        (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean()))
-        if seen
-        else (math.nan, math.nan)
-    )
-    if relative > 0.5:
-        found.append(f"the replicates disagree: relative standard error {relative:.0%}")
-    # few replicates: Student's t in place of the normal quantile, as a wider error
-    interval = (
-        log_normal(log_mean, relative * _student(replicates - 1, level), level)
-        if seen
-        else (0.0, 1.0)
-    )
-    mean = math.exp(log_mean)
-    return Estimate(
-        method=name,
-        log_mean=log_mean,
-        mean=mean,
-        standard_error=mean * relative,
-        relative_error=relative,
-        interval=interval,
-        level=level,
-        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0,
-        k_hat=math.nan,
-        max_share=float(p.max() / p.sum()) if seen else math.nan,
-        failing=sum(len(r.points) for r in runs),
-        samples=sum(max(len(r.points), samples) for r in runs),
-        episodes=evaluations,
-        steps=0,
-        invalid=invalid,
-        modes=None,
-        reliable=not found,
-        warnings=tuple(found),
-        history=history,
-        settings=asked(name, key, samples=samples, replicates=replicates, level=level),
-    )
-
-
 def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one
     Gaussian, then importance sampling with the rest: `Estimate`.
@@ -264,12 +232,13 @@ def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
     result = importance(key, sim, found.policy, budget - int(found.episodes), level=level)
     against = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
+    words = "one Gaussian covers one failure mode; nothing has looked for others"
     return result._replace(
         method=name,
         episodes=budget,
         settings=settings,
         reliable=result.reliable and not against,
-        warnings=(*against, *result.warnings),
+        warnings=(*against, *result.warnings, words),
         history=tuple(str(found).splitlines()),
     )
 
@@ -316,21 +285,6 @@ def _by_direction(q):
         out.append(sorted(group))
         left = [i for i in left if i not in group]
     return out
-
-
-def _student(degrees, level):
-    """The quantile of Student's t over that of the normal distribution (Cornish and Fisher's
-    expansion; to 2 % from 2 degrees on).
-    """
-    from statistics import NormalDist
-
-    z = NormalDist().inv_cdf((1 + level) / 2)
-    terms = (
-        (z**3 + z) / 4 / degrees
-        + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / degrees**2
-        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / degrees**3
-    )
-    return 1 + terms / z
 
 
 def _traces(key, sim, q, n):

@@ -79,6 +79,7 @@ def guarded(s, i, last):
     if not found:
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
+        s.lost = asked
         s.reasons.append(
             f"failures that the proposal hardly draws may carry {_share(asked)} what it found"
         )

@@ -49,6 +49,8 @@ class Seeker:
         self.known = self.anchors  # failures that came with the call
         self.seeds = self.anchors  # failures of many places, whatever their probability
         self.spent, self.reasons, self.history = 0, [], []
+        self.lost = 0.0  # a share that the proposal may have lost
+        self.coarse = []  # what is wrong with the system's floats
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)

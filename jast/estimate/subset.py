@@ -1,0 +1,131 @@
+"""Subset simulation, as an estimator of its own and as what is left where no proposal was found."""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from jast import limit_state as latent
+from jast._checks import random_key, whole
+from jast.estimate.estimate import Estimate
+from jast.estimate.populations import LAST, QUANTILE, Explored, explore
+from jast.intervals import checked_level, log_normal
+from jast.results import asked
+from jast.simulator import Simulator
+
+__all__ = ["subset_simulation"]
+
+LOST = "a mode that few members of a population reach is lost at times, and nothing shows it"
+REPLICATES, LEAST = 5, 100
+
+
+def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
+    """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
+    ``samples``: `Estimate`, the mean of theirs.
+
+    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too,
+    ``samples`` counts the members of the last populations. It needs a miss distance that leads to
+    failures, and no gradient; a mode that few members reach is lost at times, and the others do not
+    show it. A population gives up below a probability of 1e-300. Raises ValueError for fewer than
+    100 samples or 3 replicates, and as `failure_probability`.
+    """
+    name = "subset_simulation"
+    random_key(name, key)
+    samples, replicates = (
+        whole(name, "samples", samples, 100),
+        whole(name, "replicates", replicates, 3),
+    )
+    level = checked_level(name, level)
+    latent.check(name, sim)
+    runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
+    settings = asked(name, key, samples=samples, replicates=replicates, level=level)
+    return of_populations(name, runs, samples, level)._replace(settings=settings)
+
+
+def of_populations(
+    method: str, runs: list[Explored], samples: int, level: float, reasons: Sequence[str] = ()
+) -> Estimate:
+    """The `Estimate` of independent populations of ``samples``; ``reasons`` speak against it."""
+    replicates = len(runs)
+    evaluations, invalid = sum(r.evaluations for r in runs), sum(r.invalid for r in runs)
+    logs = np.array([r.log_mean for r in runs])
+    history = tuple(
+        f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
+        for r in runs
+    )
+    seen, found = int(np.isfinite(logs).sum()), list(reasons)
+    if seen < replicates:
+        found.append(f"{replicates - seen} of {replicates} populations reached no failure")
+    top = logs.max() if seen else 0.0
+    p = np.exp(logs - top)
+    log_mean, relative = (
+        (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean()))
+        if seen
+        else (math.nan, math.nan)
+    )
+    if relative > 0.5:
+        found.append(f"the replicates disagree: relative standard error {relative:.0%}")
+    # few replicates: Student's t in place of the normal quantile, as a wider error
+    interval = (
+        log_normal(log_mean, relative * _student(replicates - 1, level), level)
+        if seen
+        else (0.0, 1.0)
+    )
+    mean = math.exp(log_mean)
+    return Estimate(
+        method=method,
+        log_mean=log_mean,
+        mean=mean,
+        standard_error=mean * relative,
+        relative_error=relative,
+        interval=interval,
+        level=level,
+        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0,
+        k_hat=math.nan,
+        max_share=float(p.max() / p.sum()) if seen else math.nan,
+        failing=sum(len(r.points) for r in runs),
+        samples=sum(max(len(r.points), samples) for r in runs),
+        episodes=evaluations,
+        steps=0,
+        invalid=invalid,
+        modes=None,
+        reliable=not found,
+        warnings=(*found, LOST),
+        history=history,
+    )
+
+
+def by_levels(
+    key: jax.Array, sim: Simulator, budget: int, log_mean: float, level: float, reasons: list[str]
+) -> Estimate | None:
+    """The `Estimate` of populations for ``budget`` evaluations, where ``log_mean`` is about what
+    they will find; None where the budget is too small.
+    """
+    levels = max(log_mean, -690.0) / math.log(QUANTILE) + 2
+    size = int(budget / REPLICATES / (levels + LAST + 1))
+    if size < LEAST:
+        return None
+    runs = [
+        explore(k, sim, size, least=-690.0, most=budget // REPLICATES)
+        for k in jax.random.split(key, REPLICATES)
+    ]
+    if not any(r.reached for r in runs):
+        return None
+    words = f"this is the answer of subset simulation, {REPLICATES} populations of {size}"
+    return of_populations("failure_probability", runs, size, level, [*reasons, words])
+
+
+def _student(degrees, level):
+    """The quantile of Student's t over that of the normal distribution (Cornish and Fisher's
+    expansion; to 2 % from 2 degrees on).
+    """
+    from statistics import NormalDist
+
+    z = NormalDist().inv_cdf((1 + level) / 2)
+    terms = (
+        (z**3 + z) / 4 / degrees
+        + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / degrees**2
+        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / degrees**3
+    )
+    return 1 + terms / z
