@@ -36,7 +36,7 @@ SEEN, LOST = 100, 2.0
 of what was found, from which the proposal is given up.
 """
 ASTRAY = "no proposal was found that draws failures by their weights"
-EXACT, MODEL = 0.01, (0.1, 0.5)
+EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
 """
@@ -63,11 +63,11 @@ def failure_probability(
     of a few batches. A guard, a population that is kept out of what the proposal covers, looks for
     lost failure modes, which are taken in, or else the estimate is UNRELIABLE. What is left of the
     budget, about half, is drawn from the proposal as it then stands: the estimate and its interval
-    are of these episodes alone. A tenth of them or more, up to half where the standard error stays
-    below 1 %, are the model's own draws, which meet what no explorer was led to; ``unseen`` bounds
-    what they did not meet. Where plain Monte Carlo would be more exact, or the proposal is given up
-    and the model fails often enough, all are drawn from the model; where it does not, the answer is
-    subset simulation's, and UNRELIABLE. So is one of a system whose floats are too coarse
+    are of these episodes alone. A tenth of them or more, up to two fifths where the standard error
+    stays below 1 %, are the model's own draws, which meet what no explorer was led to; ``unseen``
+    bounds what they did not meet. Where plain Monte Carlo would be more exact, or the proposal is
+    given up and the model fails often enough, all are drawn from the model; where it does not, the
+    answer is subset simulation's, and UNRELIABLE. So is one of a system whose floats are too coarse
     (`jast.rounding`).
 
     ``failures``: known ones (an archive, `jast.failures`), which join what the explorers find, so
