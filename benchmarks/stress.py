@@ -60,7 +60,7 @@ def _best(failures):
 def _searched(sim, result):
     """The same of a search, whose failures are scored by log p relative to the mode."""
     scores = [jast.replay(sim, e, reward=likelihood(sim)).reward for e in result.failures]
-    return (max(map(float, scores)) if scores else None), result.episodes, None
+    return (max(map(float, scores)) if scores else None), result.evaluations, None
 
 
 def run(cases, methods, budget, seeds):

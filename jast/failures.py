@@ -43,9 +43,11 @@ class Failures:
     counts: np.ndarray
     """int32 [n]: how often each was found."""
     tree: np.ndarray
-    """int32 [n]: the tree that found it first (least simulation, then least tree)."""
+    """int32 [n]: the tree that found it first (least simulation, then least tree); -1: the episodes
+    before the search, -2: its refinement.
+    """
     simulation: np.ndarray
-    """int32 [n]: the simulation of that tree."""
+    """int32 [n]: the simulation of that tree; of a refinement, its row in ``refined.failures``."""
     seen: int
     """Failing episodes simulated in all, repetitions and those beyond the best n included."""
     dropped: int

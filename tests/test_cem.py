@@ -84,7 +84,7 @@ def test_ferry(key, equal, choice):
 @pytest.mark.parametrize("choice", [None, actions.samples(), actions.uniform(0.0, 1.0)])
 def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim = ring()
-    r = cem(key, sim, actions=choice, trees=4)
+    r = cem(key, sim, actions=choice, trees=4, refine=0)
     assert archive_replays(sim, r, reward_of(r), equal)
     assert (
         r.failing_per_tree.all()
@@ -109,7 +109,7 @@ def _far_from_the_line(log_p, event, distance, terminal, approach):
 def test_seeds_of_unknown_density(key, equal):
     sim = lock()
     assert not monte_carlo(key, sim, episodes=9000).failing_per_tree.any()
-    r = cem(key, sim, trees=3)
+    r = cem(key, sim, trees=3, refine=0)
     assert r.failing_per_tree.all() and r.settings["actions"] == "actions.samples"
     assert archive_replays(sim, r, reward_of(r), equal)
 

@@ -20,7 +20,7 @@ from jast.search import kept as K
 from jast.search.chain import chain
 
 module = importlib.import_module("jast.search.chain")
-SMALL = dict(episodes=3000)
+SMALL = dict(episodes=3000, refine=0)
 BRANCHES = stress_systems.branches(3.0)
 
 

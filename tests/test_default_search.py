@@ -129,7 +129,7 @@ def test_the_default_finds_the_likeliest_where_raw_log_p_finds_nothing(key, equa
     sim = filter(beta=4.5)
     before = cem(key, sim, **TOLD | dict(actions=actions.quantiles()))
     assert before.failures.size == 0
-    found = cem(key, sim)
+    found = cem(key, sim, refine=0)
     assert archive_replays(sim, found, reward_of(found), equal)
     rare = found.settings["reward_settings"]["rare"]
     assert rare * (1 / found.best.reward - 1) == pytest.approx(4.5**2 / 2, abs=0.1)
@@ -178,6 +178,7 @@ def test_published_modes_keep_their_reward(key, mode):
     found = mcts(key, sim, simulations=30, mode=mode)
     named = mcts(key, sim, simulations=30, mode=mode, exploration=10.0, **TOLD)
     assert found.settings == named.settings and found.episodes == 30
+    assert found.settings["refine"] == 0
     assert found.best.reward == named.best.reward
     assert mcts(key, sim, simulations=30, reward=rewards.STANDARD).settings["exploration"] == 10
     assert mcts(key, sim, simulations=30).settings["exploration"] == 1

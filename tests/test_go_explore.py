@@ -45,7 +45,7 @@ def _height(s):
     return s >= 8, jnp.maximum(8 - s, 0).astype(float)
 
 
-SMALL = dict(episodes=1500)
+SMALL = dict(episodes=1500, refine=0)
 
 
 def test_finds_a_sparse_failure_that_chance_does_not(key, equal):
@@ -80,7 +80,7 @@ def test_the_second_phase_makes_failures_likelier(key):
 def test_kinds_of_disturbances(key, equal, make):
     """Whole-numbered disturbances, random starts, episodic systems."""
     sim = make()
-    r = go_explore(key, sim, episodes=4000)
+    r = go_explore(key, sim, episodes=4000, refine=0)
     assert r.failing_per_tree.all() and archive_replays(sim, r, module.K.likelihood(sim), equal)
 
 

@@ -116,7 +116,7 @@ def test_episodes_do_not_depend_on_their_number_or_the_lanes(key, equal, monkeyp
 def test_kinds_of_disturbances(key, equal, make):
     """Joint and integer disturbances, seeds of unknown density, random starts."""
     sim = make()
-    r = monte_carlo(key, sim, episodes=3000)
+    r = monte_carlo(key, sim, episodes=3000, refine=0)
     archive_replays(sim, r, reward_of(r), equal)
     assert r.failing_per_tree.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
@@ -154,7 +154,7 @@ def test_uniform_actions(key, equal):
 
 def test_invalid_episodes_are_counted_and_never_best(key):
     sim = walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x))
-    r = monte_carlo(key, sim, episodes=2000)
+    r = monte_carlo(key, sim, episodes=2000, refine=0)
     assert 0.2 < r.invalid / 2000 < 0.5 and np.isfinite(r.best.reward) and r.failing_per_tree.any()
     assert np.isfinite(r.failures.episodes.reward).all() and "invalid" in str(r)
     r = monte_carlo(key, walk(step=lambda s, x: s + jnp.nan), episodes=200)
@@ -183,7 +183,7 @@ def test_systems_that_never_or_always_fail(key):
 
 def test_under_jit_and_vmap(key):
     thresholds = jnp.array([2.0, 3.0, 50.0])
-    search = lambda sim: monte_carlo(key, sim, episodes=1000)
+    search = lambda sim: monte_carlo(key, sim, episodes=1000, refine=0)
     loop = [search(jast.simulators.walk1d(threshold=float(t), horizon=6)) for t in thresholds]
     traced = jax.jit(jax.vmap(lambda t: search(jast.simulators.walk1d(threshold=t, horizon=6))))(
         thresholds

@@ -232,7 +232,7 @@ def test_weights_of_any_kind():
 
 
 def test_a_fan_of_an_archive_and_its_labels():
-    archive = jast.search.monte_carlo(jax.random.key(0), WALK, episodes=5000, top=8)
+    archive = jast.search.monte_carlo(jax.random.key(0), WALK, episodes=5000, refine=0, top=8)
     for found in (archive, archive.failures):
         ax = drawn(plot.failure_fan(found, WALK, label="offset (m)"))
         assert legend(ax) == [f"{len(archive.failures)} failures"] and len(archive.failures) > 1

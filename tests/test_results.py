@@ -35,7 +35,7 @@ def validation():
 
 
 def importance():
-    e = jast.search.monte_carlo(KEY, WALK, episodes=2000).best
+    e = jast.search.monte_carlo(KEY, WALK, episodes=2000, refine=0).best
     return jast.estimate.importance(KEY, WALK, jast.estimate.trace_proposal(WALK, e), 200)
 
 
@@ -50,7 +50,7 @@ def ce():
 
 
 MAKERS = {
-    "monte_carlo": lambda: jast.search.monte_carlo(KEY, WALK, episodes=2000, record=True),
+    "monte_carlo": lambda: jast.search.monte_carlo(KEY, WALK, episodes=2000, refine=0, record=True),
     "forest": small_forest,
     "cem": lambda: jast.search.cem(KEY, WALK, samples=50, elites=5, iterations=3),
     "crude": lambda: jast.estimate.monte_carlo(KEY, WALK, 500),

@@ -23,6 +23,7 @@ from jast.incidents import hosted, incidents, since
 from jast.outline import outline
 from jast.search import lockstep as E
 from jast.search import proposals as P
+from jast.search.ending import ended, planned, usual
 from jast.search.pilot import joined
 from jast.search.prepare import default_actions, prepare
 
@@ -71,6 +72,7 @@ def cem(
     floor=0.05,
     fresh=0.1,
     trees=1,
+    refine=None,
     top=64,
     record=False,
     progress=False,
@@ -95,6 +97,8 @@ def cem(
     ``trees``: independent searches, side by side; tree k is the same whatever their number.
     Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
     ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed.
+    ``refine``: as in `jast.search.forest`, the share that pulls the failures to where they are
+    likeliest.
     ``top``: distinct failures kept; ``record=True`` keeps the numbers of every episode
     (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
     after every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
@@ -103,8 +107,8 @@ def cem(
 
     A reward whose log p outweighs the distance, as `jast.rewards.standard` of many steps, has its
     best non-failing episode far from any failure, and the elites gather there. Raises ValueError
-    for a count below 1, more elites than samples, a setting outside its range, and where the
-    simulator's functions or the actions do not fit together.
+    for a count below 1, more elites than samples, a setting outside its range, a ``refine`` that
+    cannot be, and where the simulator's functions or the actions do not fit together.
     """
     samples, elites, iterations, trees, top = E.whole(
         "cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top
@@ -126,6 +130,7 @@ def cem(
     reward, actions, settings, pilot = prepare(
         "cem", key, sim, reward, actions, widen="blind", **counts, **real._asdict()
     )
+    settings = planned("cem", refine, sim, settings, usual(sim, reward))
     plan = Plan(samples, elites, P.kinds(sim, actions))
     search = partial(_iteration, tree_keys(key, trees), sim, reward, actions, real, plan)
     width = actions.width if isinstance(actions, choices.Wide) else 1.0
@@ -171,7 +176,7 @@ def cem(
         settings,
         top,
     )
-    found = joined(sim, reward, pilot, found, top)
+    found = ended(key, sim, reward, joined(sim, reward, pilot, found, top), top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 

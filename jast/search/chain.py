@@ -24,6 +24,7 @@ from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.search import tempering as T
+from jast.search.ending import SHARE, ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
@@ -42,6 +43,7 @@ def chain(
     *,
     episodes: int = 100_000,
     narrowest: float = 0.25,
+    refine: float | None = None,
     top: int = 64,
     progress: bool = False,
     callback: Callable | None = None,
@@ -59,6 +61,8 @@ def chain(
         episodes: moves of all chains, and the draws before.
         narrowest: width of the narrowest noise, above 0 and below 1. The narrower, the nearer to
             the likeliest failures, and the smaller the moves.
+        refine: evaluations of `jast.search.refine` at the end, on top of the episodes, as a share
+            of these; 0 for none. Default: 0.1.
         top: distinct failures kept.
         progress: show a bar.
         callback: called as ``callback(done, total, None)``, in episodes.
@@ -72,9 +76,9 @@ def chain(
         has.
 
     Raises:
-        ValueError: for a count below 1, ``narrowest`` outside its range, disturbances without a
-            quantile function, a simulator whose functions do not fit together, and inside of a
-            transformation of JAX.
+        ValueError: for a count below 1, ``narrowest`` or ``refine`` outside its range, disturbances
+            without a quantile function, a simulator whose functions do not fit together, and inside
+            of a transformation of JAX.
     """
     name = "chain"
     episodes, top = E.whole(name, episodes=episodes, top=top)
@@ -85,6 +89,7 @@ def chain(
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
     check(name, sim)
     settings = asked(name, key, episodes=episodes, narrowest=narrowest)
+    settings = planned(name, refine, sim, settings, SHARE)
     size = max(2 * LEVELS[0], min(LANES, 1 << max(0, (episodes // 16).bit_length())))
     steps = math.ceil(math.log(LOST / narrowest) * math.sqrt(dimension(sim)) / 2)
     levels = min(max(steps + 1, LEVELS[0]), LEVELS[1], size // 2)
@@ -111,6 +116,7 @@ def chain(
             widths=share(widths), accepted=share(chains.accepted), swapped=share(chains.swapped)
         )
     found = K.result(sim, search.reward, log, kept, settings, top)
+    found = ended(key, sim, search.reward, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 

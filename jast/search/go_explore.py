@@ -26,6 +26,7 @@ from jast.search import cells as C
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.search import phases as P
+from jast.search.ending import SHARE, ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
@@ -48,6 +49,7 @@ def go_explore(
     length: int | None = None,
     cell: Callable | None = None,
     backward: float = 0.5,
+    refine: float | None = None,
     top: int = 64,
     progress: bool = False,
     callback: Callable | None = None,
@@ -72,6 +74,8 @@ def go_explore(
             value are of one cell. Default: by the step, the rank of the miss distance and two
             random projections of ``observe``.
         backward: share of the runs, from 0 to below 1, that make known failures likelier.
+        refine: evaluations of `jast.search.refine` at the end, on top of the episodes, as a share
+            of these; 0 for none. Default: 0.1.
         top: distinct failures kept.
         progress: show a bar.
         callback: called as ``callback(done, total, None)``, in runs.
@@ -83,9 +87,9 @@ def go_explore(
         KeyboardInterrupt ends the search with what it has.
 
     Raises:
-        ValueError: for a count below 1, ``backward`` outside its range, a ``cell`` that is no
-            function, a simulator whose functions do not fit together, and inside of a
-            transformation of JAX.
+        ValueError: for a count below 1, ``backward`` or ``refine`` outside its range, a ``refine``
+            above 0 without quantile functions, a ``cell`` that is no function, a simulator whose
+            functions do not fit together, and inside of a transformation of JAX.
 
     A system whose miss distance means something only at its end (``episodic``) has no nearest
     states; there cells are told by the step and what is observed.
@@ -105,7 +109,7 @@ def go_explore(
     contract(sim, observed=False)
     cell = None if cell is None else _cell(name, sim, cell)
     numbers = dict(episodes=episodes, length=min(length, sim.horizon), backward=backward)
-    settings = asked(name, key, **numbers)
+    settings = planned(name, refine, sim, asked(name, key, **numbers), SHARE)
     size = HOSTED if hosted(sim) else LANES
     lanes = max(8, min(size, 1 << max(0, (episodes // 16).bit_length())))
     plan = P.Plan(lanes, min(length, sim.horizon), min(TRACES, lanes // 8))
@@ -126,6 +130,7 @@ def go_explore(
         name=name,
     )
     found = K.result(sim, search.reward, log, kept, settings, top)
+    found = ended(key, sim, search.reward, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 

@@ -17,7 +17,7 @@ from jast.limit_state import check, dimension, episodes, normal_numbers
 from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
-from jast.search.refinement import refine
+from jast.search.ending import ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
@@ -25,8 +25,8 @@ __all__ = ["gradient"]
 
 GRADIENT = 4
 """Evaluations that one with its gradient is counted as."""
-LEAST = 100
-"""Evaluations that the polish takes at least."""
+SHARE = 2.0
+"""Of the evaluations, for the refinement: descents are few, and end anywhere on the boundary."""
 LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3
 """How much farther out a point may be taken that is on the knife edge."""
 
@@ -36,7 +36,7 @@ def gradient(
     sim: Simulator,
     *,
     starts: int = 48,
-    polish: int = 10_000,
+    refine: float | None = None,
     top: int = 64,
     progress: bool = False,
     callback: Callable | None = None,
@@ -51,31 +51,27 @@ def gradient(
         key: consumed.
         sim: the simulator, written in JAX; its disturbances have quantile functions.
         starts: draws of the model to go from.
-        polish: evaluations of the polish, at least 100, or 0 for none.
+        refine: evaluations of the refinement, as a share of those of the descents; 0 for none.
+            Default: 2.
         top: distinct failures kept.
         progress: show a bar.
-        callback: called as ``callback(done, total, None)``, in evaluations: after the descents and
-            after the polish.
+        callback: called as ``callback(done, total, None)``, in evaluations, after the descents.
 
     Returns:
-        `SearchResult`: the ends of the descents and of the polish. Its reward is that of
-        `jast.rewards.standard` with the density relative to the mode (raw, where there is none).
-        ``episodes`` and ``steps`` are evaluations, one with its gradient counted as 4; the steps of
-        the polish are told from the mean length of what it ends with, and of its failures only
-        those ends are counted as failing. ``settings["useful_gradients"]`` is the share of the
-        gradients that were finite and not 0: where that is 0 the distance has none, and no failure
-        is found but by the draws themselves.
+        `SearchResult`: the ends of the descents, and what came of them (``refined``). Its reward is
+        that of `jast.rewards.standard` with the density relative to the mode (raw, where there is
+        none). ``episodes`` and ``steps`` are evaluations of the descents, one with its gradient
+        counted as 4. ``settings["useful_gradients"]`` is the share of the gradients that were
+        finite and not 0: where that is 0 the distance has none, and no failure is found but by the
+        draws themselves.
 
     Raises:
-        ValueError: for a count below 1, a ``polish`` from 1 to 99, a system that runs on the host,
+        ValueError: for a count below 1, a negative ``refine``, a system that runs on the host,
             disturbances without a quantile function, a simulator whose functions do not fit
             together, and inside of a transformation of JAX.
     """
     name = "gradient"
     starts, top = E.whole(name, starts=starts, top=top)
-    polish = _checks.whole(name, "polish", polish, 0)
-    if 0 < polish < LEAST:
-        raise ValueError(f"{name}: polish must be 0 or at least {LEAST}, received {polish}")
     _checks.random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
@@ -86,17 +82,18 @@ def gradient(
         )
     check(name, sim)
     search = _Search(key, sim, starts, top)
+    settings = planned(name, refine, sim, asked(name, key, starts=starts), SHARE)
     cost = starts * (B.STEPS * GRADIENT + B.EPISODES)
     found, log = E.drive(
         search.chunk,
         (None, None, 0.0),
-        [cost, cost + polish] if polish else [cost],
+        [cost],
         progress=progress,
         callback=callback,
         name=name,
     )
-    settings = asked(name, key, starts=starts, polish=polish)
-    return search.result(found, log, settings | dict(useful_gradients=round(found[2], 4)))
+    found = search.result(found, log, settings | dict(useful_gradients=round(found[2], 4)))
+    return ended(key, sim, search.reward, found, top)
 
 
 class _Search:
@@ -104,15 +101,12 @@ class _Search:
 
     def __init__(self, key, sim, starts, top):
         self.sim, self.reward, self.starts, self.top = sim, K.likelihood(sim), starts, top
-        self.draw, self.pull = jax.random.split(key)
+        self.draw, _ = jax.random.split(key)
 
-    def chunk(self, found, begin, end):
-        """The descents, and then the polish of what they found: ((failing episodes, the nearest
-        one, share of useful gradients), `E.Tally`, best reward, None).
+    def chunk(self, *_):
+        """The descents: ((failing episodes, the nearest one, share of useful gradients), `E.Tally`,
+        best reward, None).
         """
-        return self._descents() if begin == 0 else self._polish(found, end - begin)
-
-    def _descents(self):
         sim, n = self.sim, self.starts
         z = jax.random.normal(self.draw, (n, dimension(sim)), normal_numbers(sim))
         d = jax.device_get(B.descents(sim, z))
@@ -132,20 +126,6 @@ class _Search:
             order if first < B.STEPS else None,
         )
         found = failing, nearest, float(d.useful.sum()) / (n * B.STEPS)
-        return found, counted, self._best(found), None
-
-    def _polish(self, found, budget):
-        failing, nearest, useful = found
-        if failing is None:
-            return found, self._tally(0, 0, 0, 0, None), self._best(found), None
-        refined = refine(self.pull, self.sim, failing, budget=budget)
-        ends = refined.failures.episodes
-        if len(refined.failures):
-            failing = jax.tree.map(lambda a, b: np.concatenate([a, b]), failing, ends)
-        length = float(np.mean(ends.length)) if len(refined.failures) else self.sim.horizon
-        n = refined.episodes
-        counted = self._tally(n, round(n * length), len(refined.failures), refined.invalid, None)
-        found = failing, nearest, useful
         return found, counted, self._best(found), None
 
     def _failing(self, z):

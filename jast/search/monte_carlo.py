@@ -14,6 +14,7 @@ from jast.counter import tree_keys
 from jast.incidents import hosted, incidents, since
 from jast.outline import outline
 from jast.search import lockstep as E
+from jast.search.ending import ended, planned, usual
 from jast.search.prepare import prepare
 
 __all__ = ["monte_carlo"]
@@ -49,6 +50,7 @@ def monte_carlo(
     episodes=100_000,
     reward=None,
     actions=SAMPLES,
+    refine=None,
     top=64,
     record=False,
     progress=False,
@@ -56,13 +58,14 @@ def monte_carlo(
 ):
     """What are the likeliest failures that chance alone finds? Simulate ``episodes`` independent
     episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree.
-    Maximises ``reward``. The baseline of searches; `jast.nominal` only counts, and
-    `jast.estimate.monte_carlo` is the baseline of estimators.
+    Maximises ``reward``. The baseline of searches, with ``refine=0``; `jast.nominal` only counts,
+    and `jast.estimate.monte_carlo` is the baseline of estimators.
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up
     to chance. A random start is drawn likewise (from its own distribution where actions are a box).
     Default ``reward``: `jast.rewards.lexicographic`; its scales come from 128 plain episodes (10 of
-    a black box), the same for every key, which are not among those of the result.
+    a black box), the same for every key, which are not among those of the result. ``refine``: as in
+    `jast.search.forest`, the share that pulls the failures to where they are likeliest.
 
     The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``:
     distinct failures kept, static like ``episodes``. ``record=True`` keeps the numbers of every
@@ -72,7 +75,8 @@ def monte_carlo(
     search with the result of the whole chunks, and ``settings["interrupted"]``.
 
     Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError
-    for a count below 1 and where the simulator's functions or the actions do not fit together.
+    for a count below 1, a ``refine`` that cannot be, and where the simulator's functions or the
+    actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
     before = incidents(sim)
@@ -80,8 +84,9 @@ def monte_carlo(
     reward, actions, settings, _ = prepare(
         "monte_carlo", key, sim, reward, actions, episodes=episodes
     )
+    settings = planned("monte_carlo", refine, sim, settings, usual(sim, reward))
     lanes = HOSTED if hosted(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
-    key = tree_keys(key, 1)[0]
+    own, key = key, tree_keys(key, 1)[0]
     if settings is None:
         if episodes * sim.horizon >= 2**31:
             raise ValueError(
@@ -137,6 +142,7 @@ def monte_carlo(
         settings,
         top,
     )
+    found = ended(own, sim, reward, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 

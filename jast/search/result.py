@@ -9,6 +9,7 @@ import numpy as np
 from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
+from jast.search.refinement import Refined
 
 __all__ = ["History", "SearchResult", "Trials", "table"]
 
@@ -98,6 +99,11 @@ class SearchResult(NamedTuple):
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
     failing: Any = None
     """int: how many of the episodes failed."""
+    refined: Refined | None = None
+    """What came of the search's failures by `jast.search.refine`, scored by log p relative to the
+    mode; they are among ``failures`` too, as those of tree -2, and ``best`` may be one. All other
+    fields are of the search itself. None where nothing was refined.
+    """
 
     simulator_steps = results.alias("steps")
 
@@ -105,6 +111,11 @@ class SearchResult(NamedTuple):
     def failing_trees(self) -> Any:
         """Share of the trees that found a failure: the rate of Table 1 of the MCFS-AP paper."""
         return self.failing_per_tree.mean()
+
+    @property
+    def evaluations(self) -> Any:
+        """int: the episodes, and the evaluations of the refinement."""
+        return self.episodes + (0 if self.refined is None else self.refined.episodes)
 
     def __str__(self):
         return table({(self.settings or {}).get("method", "search"): self}) + "\n" + _words(self)
@@ -140,6 +151,8 @@ def _words(result):
             f" {float(result.best.distance):.4f}\nto find one: more episodes{_advice(result)};"
             "\n  jast.estimate.failure_probability, which looks for failures alone"
         )
+    if result.refined is not None:
+        text += "\n" + _refined(result.refined)
     if result.invalid:
         text += (
             f"\n{result.invalid} episodes were invalid: the simulator, a density or the reward"
@@ -160,6 +173,17 @@ def _words(result):
         )
     note = (result.settings or {}).get("interrupted")
     return text + (f"\ninterrupted: {note}" if note else "")
+
+
+def _refined(refined):
+    """What the refinement cost, and by how much the likeliest failure got likelier."""
+    asked = refined.settings
+    text = f"refined: {refined.episodes:,} evaluations"
+    if not len(refined.failures):
+        return text + ", nothing came of it"
+    density = "log p relative to the mode" if asked["density"] == "mode" else "log p"
+    best = float(refined.failures.best.reward)
+    return f"{text}, {density} {asked['likeliest']:.2f} -> {best:.2f}"
 
 
 def _advice(result):

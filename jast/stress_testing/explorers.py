@@ -94,7 +94,9 @@ def trees(key: jax.Array, sim: Simulator, budget: int) -> Haul:
     """A forest of search trees."""
     number = int(np.clip(budget // 2000, 1, 64))
     each = max(10, budget // (10 * number))
-    return _of_search(forest(key, sim, trees=number, prunes=10, simulations=each, top=KEPT))
+    return _of_search(
+        forest(key, sim, trees=number, prunes=10, simulations=each, refine=0, top=KEPT)
+    )
 
 
 EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {

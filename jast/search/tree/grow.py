@@ -18,6 +18,7 @@ from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import HeadSettings, checked
 from jast.incidents import hosted, incidents, since
 from jast.rewards import STANDARD, Lexicographic, lexicographic
+from jast.search.ending import ended, planned, usual
 from jast.search.lockstep import whole
 from jast.search.pilot import Pilot, joined
 from jast.search.prepare import default_actions, prepare
@@ -71,6 +72,7 @@ def grow_trees(
     actions: Any,
     exploration: Any,
     memoize: str,
+    refine: float | None,
     top: int,
     record: bool,
     threads: int | None,
@@ -91,6 +93,8 @@ def grow_trees(
     job = plan(
         method, key, sim, chosen, trees, prunes, simulations, reward, actions, exploration, memoize
     )
+    share = 0.0 if chosen["mode"] in PUBLISHED else usual(sim, job.problem.reward)
+    job = job._replace(settings=planned(method, refine, sim, job.settings, share))
     if heads is not None:
         job = enlist(job, key, heads, head_settings, chosen, memoize)
     if job.settings is None:
@@ -114,6 +118,7 @@ def grow_trees(
         raise KeyboardInterrupt
     found = result(sim, job.problem.reward, harvests, settings, top, school)
     found = joined(sim, job.problem.reward, job.pilot, found, top)
+    found = ended(key, sim, job.problem.reward, found, top)
     return found._replace(incidents=since(before, incidents(sim)))
 
 
