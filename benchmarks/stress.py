@@ -68,12 +68,13 @@ def run(cases, methods, budget, seeds):
     report = {}
     for name in cases:
         case, rows = CASES[name], {}
+        sim = case.make()  # once, so that all seeds share its programs
         for method in methods:
             begin, found = time.process_time(), []
             for seed in range(seeds):
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    found.append(METHODS[method](jax.random.key(seed), case.make(), budget))
+                    found.append(METHODS[method](jax.random.key(seed), sim, budget))
             best = [b for b, _, _ in found if b is not None]
             rows[method] = dict(
                 found=len(best),
