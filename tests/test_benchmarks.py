@@ -16,6 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SMALLEST = {  # beside each other what shares compiled programs
     "ferry": ["--smoke"],
+    "few_calls": ["--smoke"],
     "table1": ["--table1", "--smoke"],
     "engine": ["--smoke"],
     "blackbox": ["--smoke"],
@@ -38,6 +39,7 @@ QUICK = {
     "cross_entropy": ["--quick", "--seeds", "4"],
     "engine": ["--quick"],
     "ferry": ["--quick", "--trees", "10"],
+    "few_calls": ["--seeds", "1", "--budget", "50"],
     "fms": ["--quick", "--seeds", "1"],
     "limit_states": ["--seeds", "1"],
     "probability": ["--quick", "--seeds", "1"],

@@ -13,7 +13,7 @@ import numpy as np
 
 from jast.limit_state import Latent
 
-__all__ = ["Gaussians", "as_latent", "fit", "shrunk", "together", "unit"]
+__all__ = ["Gaussians", "as_latent", "fit", "log_density", "shrunk", "together", "unit"]
 
 COMPONENTS = (1, 2, 4, 8, 16)
 ITERATIONS = 10
@@ -122,6 +122,11 @@ def effective(log_weights):
     """(sum w)^2 / sum w^2."""
     w = np.exp(log_weights - log_weights.max())
     return w.sum() ** 2 / (w**2).sum()
+
+
+def log_density(g, z):
+    """log of the density of `Gaussians` at ``z`` [n, D]: [n]."""
+    return _log_sum(_log_joint(g, z))
 
 
 def shrunk(values, count):

@@ -1,0 +1,182 @@
+"""Failure probabilities from few calls of the system: ``python -m benchmarks.few_calls [--json]
+[--quick | --smoke] [--budget N] [--seeds N] [--systems NAME ...]``.
+
+`failure_probability` with 200 calls (999 for Booth) on limit states of known probability, over
+seeds: rms of estimate over truth less 1, how many are within 10 %, how many intervals cover, how
+many estimates are flagged, and the silent misses: unflagged, and off by more than 10 % or by 4
+standard errors. CPU seconds are of the method, the first of a system compiles.
+"""
+
+import argparse
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from jax.tree_util import Partial  # noqa: E402
+
+from benchmarks.limit_states import four_branch, four_branch_probability  # noqa: E402
+from benchmarks.sizes import options, size  # noqa: E402
+from jast.distributions import Joint, Normal, TruncatedNormal  # noqa: E402
+from jast.estimate import failure_probability  # noqa: E402
+from jast.simulator import Simulator  # noqa: E402
+from jast.simulators import limit_state  # noqa: E402
+
+__all__ = ["SYSTEMS", "System", "metaballs"]
+
+
+class System(NamedTuple):
+    """How to make a simulator, the probability that it fails, and the calls that it is given."""
+
+    make: Callable[[], Simulator]
+    truth: float
+    budget: int = 200
+
+
+def hyperplane(beta: float, x: Any) -> Any:
+    """beta less the mean direction."""
+    return beta - jnp.sum(x) / x.shape[0] ** 0.5
+
+
+def curved(x: Any) -> Any:
+    """A paraboloid that narrows the region of failure."""
+    return 4.5 - x[0] + 0.016 * jnp.sum(x[1:] ** 2)
+
+
+def _log_normal(z, mean, sd):
+    variance = math.log(1 + (sd / mean) ** 2)
+    return jnp.exp(math.log(mean) - variance / 2 + math.sqrt(variance) * z)
+
+
+def rp8(z: Any) -> Any:
+    """RP8 of the reliability benchmark: a plastic mechanism, six log-normal variables."""
+    moments = [(120, 12)] * 4 + [(50, 10), (40, 8)]
+    x = [_log_normal(z[i], mean, sd) for i, (mean, sd) in enumerate(moments)]
+    return x[0] + 2 * x[1] + 2 * x[2] + x[3] - 5 * x[4] - 5 * x[5]
+
+
+def oscillator(z: Any) -> Any:
+    """The nonlinear oscillator of the literature, mean force 0.6."""
+    moments = ((1, 0.05), (1, 0.1), (0.1, 0.01), (0.5, 0.05), (0.6, 0.1), (1, 0.2))
+    m, c1, c2, r, force, t = (mean + sd * z[i] for i, (mean, sd) in enumerate(moments))
+    w = jnp.sqrt((c1 + c2) / m)
+    return 3 * r - jnp.abs(2 * force / (m * w**2) * jnp.sin(w * t / 2))
+
+
+def metaballs(x: Any) -> Any:
+    """Fails away from two balls; the nearest failures lie in a gap between them."""
+    first = (4 * (x[0] + 2) ** 2 / 9 + x[1] ** 2 / 25) ** 2
+    second = ((x[0] - 2.5) ** 2 / 4 + (x[1] - 0.5) ** 2 / 25) ** 2
+    return 30 / (first + 1) + 20 / (second + 1) - 5
+
+
+def _booth(s):
+    value = (s[0] + 2 * s[1] - 7) ** 2 + (2 * s[0] + s[1] - 5) ** 2 - 200
+    return value <= 0, jnp.maximum(value, 0)
+
+
+def booth() -> Simulator:
+    """Booth's function <= 200 under a truncated normal x1 and a normal x2."""
+    noise = Joint((TruncatedNormal(-10.0, 1.5, -10.0, 5.0), Normal(-2.5, 1.0)))
+    return Simulator(
+        init=lambda x0: jnp.zeros(2),
+        step=lambda s, x: jnp.stack(x),
+        disturbance=lambda s: noise,
+        evaluate=_booth,
+        horizon=1,
+        episodic=True,
+    )
+
+
+def branches(p: float, k: float) -> Simulator:
+    """The four-branch series system."""
+    return limit_state(Partial(four_branch, jnp.asarray(p), jnp.asarray(k)), 2)
+
+
+# hyperplane and branches: closed form and quadrature; curved: quadrature over the chi density of
+# the nine others; Booth and metaballs: a grid of 4001 x 4001 points; RP8 and the oscillator: 4e6
+# points of an importance density at the design point, standard errors .16 and .14 %
+SYSTEMS = {
+    "four-branch": System(lambda: branches(7.0, 3.0), 2.2227950662e-3),
+    "RP8": System(lambda: limit_state(rp8, 6), 7.8995e-4),
+    "hyperplane 10": System(
+        lambda: limit_state(Partial(hyperplane, jnp.asarray(4.5)), 10), 3.3976731e-6
+    ),
+    "curved 10": System(lambda: limit_state(curved, 10), 1.7912043e-6),
+    "oscillator": System(lambda: limit_state(oscillator, 6), 9.136e-6),
+    "Booth": System(booth, 4.2964e-8, 999),
+    "metaballs": System(lambda: limit_state(metaballs, 2), 1.12795e-5),
+    "four-branch, far": System(lambda: branches(10.0, 5.0), four_branch_probability(10.0, 5.0)),
+}
+
+
+def measured(system: System, seeds: int, budget: int | None) -> dict:
+    """The report of some seeds."""
+    sim, runs, seconds = system.make(), [], []
+    for seed in range(seeds):
+        clock = time.process_time()
+        runs.append(failure_probability(jax.random.key(seed), sim, budget or system.budget))
+        seconds.append(time.process_time() - clock)
+    ratio = np.array([r.mean / system.truth for r in runs])
+    error = np.array([r.relative_error for r in runs])
+    reliable = np.array([r.reliable for r in runs])
+    covers = np.array([r.interval[0] <= system.truth <= r.interval[1] for r in runs])
+    near = np.abs(ratio - 1) < 0.1
+    silent = reliable & ~(near & (np.abs(ratio - 1) < 4 * error))
+    return {
+        "budget": budget or system.budget,
+        "seeds": seeds,
+        "rms": float(np.sqrt(np.nanmean((ratio - 1) ** 2))),
+        "within_10": int(near.sum()),
+        "covers": int(covers.sum()),
+        "flagged": int((~reliable).sum()),
+        "silent": int(silent.sum()),
+        "ratios": ratio.tolist(),
+        "relative_errors": error.tolist(),
+        "cpu_s": float(np.median(seconds)),
+        "cpu_s_first": seconds[0],
+    }
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.few_calls", description=__doc__.splitlines()[0]
+    )
+    options(parser, "3 seeds")
+    parser.add_argument("--seeds", type=int, help="20")
+    parser.add_argument("--budget", type=int, help="of each system; default 200, of Booth 999")
+    parser.add_argument(
+        "--systems",
+        nargs="+",
+        choices=SYSTEMS,
+        metavar="NAME",
+        help=", ".join(SYSTEMS),
+    )
+    args = parser.parse_args(argv)
+    seeds, report = args.seeds or size(args, 20, 3, 1), {}
+    names = args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["hyperplane 10"])
+    budget = args.budget or size(args, None, None, 50)
+    if not args.json:
+        print(f"{'system':18}calls      rms  within 10 %  covers  flagged  silent  CPU s (first)")
+    for name in names:
+        report[name] = r = measured(SYSTEMS[name], seeds, budget)
+        if not args.json:
+            print(
+                f"{name:18}{r['budget']:5d}{100 * r['rms']:8.1f} %{r['within_10']:8d} of"
+                f" {seeds:<2d}{r['covers']:7d}{r['flagged']:9d}{r['silent']:8d}"
+                f"{r['cpu_s']:8.1f} ({r['cpu_s_first']:.1f})",
+                flush=True,
+            )
+    if args.json:
+        print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""Failure probabilities from few calls: the surrogate against closed forms, its points of the
+model, and the estimate of slow systems.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from jax.tree_util import Partial
+
+import jast
+from benchmarks.few_calls import metaballs
+from jast.distributions import MultivariateNormalDiag
+from jast.estimate import active_learning, failure_probability, surrogate, surrogate_failures
+from jast.intervals import clopper_pearson
+from jast.simulators import limit_state
+from tests.blackboxes import branches
+
+norm = scipy.stats.norm
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Fewer points of the surrogate: a second for 50 calls."""
+    monkeypatch.setattr(active_learning, "POINTS", 20_000)
+    monkeypatch.setattr(active_learning, "CANDIDATES", 1000)
+    for name, value in (("POPULATION", 200), ("SAMPLE", 1000), ("FITTED", 300)):
+        monkeypatch.setattr(surrogate_failures, name, value)
+
+
+def _plane(beta, x):
+    return beta - jnp.sum(x) / x.shape[0] ** 0.5
+
+
+def _data(n=40, d=3, seed=0):
+    z = np.random.default_rng(seed).standard_normal((n, d)) * 1.5
+    g = 1.0 - z[:, 0] + 0.1 * z[:, 1] ** 2
+    return z, np.maximum(g, 0), g <= 0
+
+
+def test_the_surrogate_knows_a_linear_limit_state_from_its_safe_side():
+    z, _, _ = _data()
+    g = 1.0 - z[:, 0]
+    s = surrogate.fit(z, np.maximum(g, 0), g <= 0)
+    new = np.random.default_rng(1).standard_normal((200, 3)) * 2
+    mean, sd = surrogate.predict(s, new)
+    truth = (1.0 - new[:, 0]) / g[g > 0].std()
+    assert np.abs(mean - truth).max() < 0.1 and sd.max() < 0.2
+    assert (surrogate_failures.expected(s, new) > 0.5).tolist() == (truth < 0).tolist()
+
+
+def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
+    z, y, failing = _data()
+    logs = np.array([0.3, -1.0, -4.0, -0.5, -0.9, -1.2])
+    extra = np.linspace(0.1, 2.0, len(z))
+    value = lambda logs: surrogate._likelihood(z, y, extra, failing, logs)
+    step = 1e-5 * np.eye(6)
+    by_differences = [(value(logs + e)[0] - value(logs - e)[0]) / 2e-5 for e in step]
+    np.testing.assert_allclose(value(logs)[1], by_differences, rtol=1e-4, atol=1e-5)
+
+
+def test_the_sites_of_one_failure_match_the_moments_of_a_half_normal():
+    k, failing = np.array([[4.0]]), np.array([True])
+    tau, nu = surrogate._sites(k, np.array([1e-6]), np.zeros(1), failing, 0.0)
+    variance = 1 / (1 / 4 + tau[0])
+    assert variance == pytest.approx(4 * (1 - 2 / np.pi), rel=0.05)
+    assert variance * nu[0] == pytest.approx(-2 * np.sqrt(2 / np.pi), rel=0.05)
+    assert surrogate._evidence(k, tau, nu, failing, 0.0) == pytest.approx(np.log(0.5), rel=0.05)
+
+
+def test_points_of_the_pool_weigh_as_the_model_does(coarse):
+    z, y, failing = _data()
+    s = surrogate.fit(z, y, failing)
+    rng = np.random.default_rng(2)
+    found, _ = surrogate_failures.pool(rng, s, z[failing], None, 20_000)
+    w = found.weights * (found.z[:, 0] > 1.5)
+    error = w.std() / np.sqrt(len(w))
+    assert abs(w.mean() - norm.sf(1.5)) < 4 * error < 0.2 * norm.sf(1.5)
+
+
+def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
+    sim = limit_state(Partial(_plane, jnp.asarray(4.5)), 10)
+    r = failure_probability(jax.random.key(0), sim, 50)
+    truth = norm.sf(4.5)
+    assert abs(r.mean / truth - 1) < 4 * r.relative_error < 0.4
+    assert r.reliable and r.evaluations == 50 and r.samples == 50 - 32 and 0 < r.failing
+    assert r.proposal.means.dtype == dtype and "learning: 32 calls" in r.history[0]
+    assert r.settings["budget"] == 50 and "50 evaluations" in str(r)
+
+
+def test_a_key_gives_one_answer_and_another_budget_spends_all(coarse):
+    sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
+    a, b = (failure_probability(jax.random.key(0), sim, 53) for _ in range(2))
+    assert a.log_mean == b.log_mean and a.history == b.history and a.evaluations == 53
+
+
+def test_a_black_box_with_workers_is_called_as_often_as_said(coarse):
+    noise = MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2))
+    sim = jast.blackbox.from_python(branches, horizon=1, disturbance=noise, workers=2)
+    seen = []
+    tell = lambda done, total, result: seen.append((done, total, result))
+    r = failure_probability(jax.random.key(0), sim, 60, callback=tell)
+    assert jast.blackbox.calls(sim).rows == r.evaluations == 60
+    assert seen[-1] == (60, 60, None) and len(seen) > 10
+    assert not r.reliable or abs(r.mean / 2.2228e-3 - 1) < 4 * r.relative_error
+
+
+def test_far_modes_end_right_or_flagged(coarse):
+    r = failure_probability(jax.random.key(0), limit_state(metaballs, 2), 60)
+    assert not r.reliable or abs(r.mean / 1.128e-5 - 1) < 4 * r.relative_error
+
+
+def test_a_system_that_never_fails_has_an_upper_bound(coarse):
+    r = failure_probability(jax.random.key(0), limit_state(lambda x: 3.0 + jnp.sum(x**2), 2), 60)
+    n = r.samples
+    assert not r.reliable and np.isnan(r.mean) and n == 60 - 36
+    assert r.interval == clopper_pearson(0, n) and r.evaluations == 60
+    assert f"no failure in {n} episodes" in r.warnings[0]
+
+
+def test_invalid_episodes_are_counted_and_teach_nothing(coarse):
+    g = lambda x: jnp.where(x[1] > 1.2, jnp.nan, 2.5 - x[0])
+    r = failure_probability(jax.random.key(0), limit_state(g, 2), 60)
+    assert 0 < r.invalid < 30
+    truth = norm.sf(2.5) * norm.cdf(1.2)
+    assert not r.reliable or abs(r.mean / truth - 1) < 4 * r.relative_error
+
+
+def test_known_failures_join_what_is_learned(coarse):
+    sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
+    found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=4000).failures
+    r = failure_probability(jax.random.key(0), sim, 50, failures=found)
+    assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
+
+
+def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):
+    sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
+
+    def stop(at):
+        def tell(done, total, result):
+            if done >= at:
+                raise KeyboardInterrupt
+
+        return tell
+
+    r = failure_probability(jax.random.key(0), sim, 50, callback=stop(42))
+    assert not r.reliable and "interrupted after" in r.warnings[0] and r.evaluations < 50
+    with pytest.raises(KeyboardInterrupt):
+        failure_probability(jax.random.key(0), sim, 50, callback=stop(12))
+
+
+@pytest.mark.parametrize("budget", [49, 0, 60.5])
+def test_fewer_than_fifty_calls_are_refused(budget):
+    with pytest.raises(ValueError, match="budget"):
+        failure_probability(
+            jax.random.key(0), limit_state(Partial(_plane, jnp.asarray(3.0)), 2), budget
+        )
