@@ -21,6 +21,8 @@ __all__ = ["REFINED", "SHARE", "ended", "planned", "usual"]
 
 SHARE, LEAST = 0.1, 100
 """Evaluations of the refinement, as a share of the search's episodes; fewer are not worth it."""
+FEW = 16
+"""Failures of a system on the host that are refined at most: each has to run once more for that."""
 ADDRESS = 0x656E6421
 """Folded into the search's key, far from the numbers of trees."""
 REFINED = -2
@@ -101,7 +103,8 @@ def _refined(
     key: jax.Array, sim: Simulator, reward: Any, found: SearchResult, top: int, budget: int
 ) -> SearchResult:
     archive = found.failures
-    given = collect(sim, likelihood(sim), archive.episodes, top=len(archive))
+    first = archive[:FEW] if hosted(sim) else archive
+    given = collect(sim, likelihood(sim), first.episodes, top=len(first))
     # none where all are on a knife edge, or the density at the mode is infinite
     given = given[: int(np.isfinite(given.episodes.reward).sum())]
     if not len(given):
