@@ -47,7 +47,7 @@ def test_the_surrogate_knows_a_linear_limit_state_from_its_safe_side():
     mean, sd = surrogate.predict(s, new)
     truth = (1.0 - new[:, 0]) / g[g > 0].std()
     assert np.abs(mean - truth).max() < 0.1 and sd.max() < 0.2
-    assert (surrogate_failures.expected(s, new) > 0.5).tolist() == (truth < 0).tolist()
+    assert (surrogate_failures.expected(s, new)[0] > 0.5).tolist() == (truth < 0).tolist()
 
 
 def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
@@ -87,6 +87,7 @@ def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
     assert r.reliable and r.evaluations == 50 and r.samples == 50 - 32 and 0 < r.failing
     assert r.proposal.means.dtype == dtype and "learning: 32 calls" in r.history[0]
     assert r.settings["budget"] == 50 and "50 evaluations" in str(r)
+    assert r.unseen == pytest.approx(-np.log(0.05) / 6) and "unseen" in str(r)
 
 
 def test_a_key_gives_one_answer_and_another_budget_spends_all(coarse):
@@ -122,16 +123,21 @@ def test_a_system_that_never_fails_has_an_upper_bound(coarse):
 def test_invalid_episodes_are_counted_and_teach_nothing(coarse):
     g = lambda x: jnp.where(x[1] > 1.2, jnp.nan, 2.5 - x[0])
     r = failure_probability(jax.random.key(0), limit_state(g, 2), 60)
-    assert 0 < r.invalid < 30
+    assert 0 < r.invalid < 30 and "episodes are invalid" in str(r)
     truth = norm.sf(2.5) * norm.cdf(1.2)
     assert not r.reliable or abs(r.mean / truth - 1) < 4 * r.relative_error
 
 
-def test_known_failures_join_what_is_learned(coarse):
+def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
-    found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=4000).failures
-    r = failure_probability(jax.random.key(0), sim, 50, failures=found)
+    known = np.array([[2.2, 2.2], [2.5, 1.9]])
+    r = active_learning.few_calls(jax.random.key(0), sim, 50, 0.95, known)
     assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
+
+
+def test_an_error_above_the_mean_leaves_an_upper_end():
+    assert active_learning._interval(1e-7, 1e-5, 0.95) == pytest.approx((0, 1e-7 + 1.96e-5), 1e-4)
+    assert active_learning._interval(-1e-7, 1e-5, 0.95)[0] == 0
 
 
 def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):

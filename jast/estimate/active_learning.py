@@ -13,6 +13,7 @@ the sum is unbiased, however wrong the surrogate is.
 """
 
 import math
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from jast._jax import was_interrupted
 from jast.counter import generator
 from jast.estimate import sums
 from jast.estimate.design_points import distinct
-from jast.estimate.estimate import Estimate, of_counts
+from jast.estimate.estimate import INVALID, Estimate, of_counts
 from jast.estimate.gaussians import Gaussians, as_latent
 from jast.estimate.importance_sampling import Traces
 from jast.estimate.surrogate import Surrogate, covariance, fit, normal_cdf, predict
@@ -55,6 +56,7 @@ class Round(NamedTuple):
     weights: np.ndarray
     """[n]: p over the density that it was drawn from"""
     failing: np.ndarray
+    invalid: np.ndarray
     doubted: float
     """Variance of a correction if the surrogate's doubts are right"""
     sampled: float
@@ -69,7 +71,7 @@ class Learner:
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
-        self.steps, self.spent = 0, 0
+        self.steps, self.spent, self.plain = 0, 0, 0
         self.surrogate: Surrogate | None = None
         self.fitted: Gaussians | None = None
         self.pool: Pool | None = None
@@ -110,10 +112,10 @@ class Learner:
         tried = [fit(*data, self.surrogate, warp) for warp in warps]
         self.surrogate = max(tried, key=lambda s: s.evidence)
 
-    def look(self, n: int) -> None:
+    def look(self, n: int, anew: bool = True) -> None:
         """Draw ``n`` points of the model around the failures that the surrogate expects."""
         found = self.z[self.failing]
-        self.pool, self.fitted = pool(self.rng, self.surrogate, found, self.fitted, n)
+        self.pool, self.fitted = pool(self.rng, self.surrogate, found, self.fitted, n, anew)
 
 
 def few_calls(
@@ -138,8 +140,8 @@ def few_calls(
             _learn(s)
             if not s.failing.any():
                 return _counted(s, level)
-            for _ in range(2):
-                s.look(max(min(POINTS // s.dimension, 40_000), 4000))
+            s.look(CANDIDATES)
+            s.look(max(min(POINTS // s.dimension, 40_000), 4000))
             _correct(s, rounds)
         except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
             if not was_interrupted(error):
@@ -155,13 +157,14 @@ def _learn(s):
     first = min(max(12, 2 * s.dimension), calls // 3)
     first = -(-first // s.batch) * s.batch
     wide = np.where(np.arange(first) % 2, 2.0, 1.0)[:, None]
+    s.plain = (first + 1) // 2  # draws of the model itself
     s.call(wide * s.rng.standard_normal((first, s.dimension)))
     i = 0
     while True:
         s.fit(i % 4 == 0)
         if s.spent >= calls:
             break
-        s.look(CANDIDATES)
+        s.look(CANDIDATES, i % 2 == 0)
         far = s.batch // FAR if s.failing.any() else 0
         s.call(np.concatenate([_far(s, far), _chosen(s, s.batch - far)]))
         i += 1
@@ -191,8 +194,10 @@ def _far(s, n):
 
 def _chosen(s, n):
     """The ``n`` candidates [n, D] that leave the least doubt."""
-    p = expected(s.surrogate, s.pool.z, DOUBT)
+    _, p = expected(s.surrogate, s.pool.z)
     doubt = s.pool.weights * np.sqrt(p * (1 - p)) + 1e-300
+    if s.invalid.any():  # nothing is learned there
+        doubt = np.where(s.invalid[_nearest(s.pool.z, s.z)], 1e-300, doubt)
     rows = s.rng.choice(len(p), TRIED, p=doubt / doubt.sum())
     rows = np.unique(np.concatenate([rows, s.rng.choice(len(p), s.batch, replace=False)]))
     z = s.pool.z[rows]
@@ -213,6 +218,11 @@ def _chosen(s, n):
     return z[out]
 
 
+def _nearest(z, others):
+    """The number [n] of the nearest of ``others`` [m, D] to each of ``z`` [n, D]."""
+    return np.argmin((others**2).sum(axis=1) - 2 * z @ others.T, axis=1)
+
+
 def _correct(s, rounds):
     """Spend the rest on points of the pool, and append a `Round` for each batch of them."""
     left, n = s.budget - s.spent, len(s.pool.z)
@@ -222,14 +232,14 @@ def _correct(s, rounds):
         now = left if left < 2 * size else size
         if rounds:
             s.fit(len(rounds) == ROUNDS // 2)
-        w, p, doubt = s.pool.weights, *(expected(s.surrogate, s.pool.z, d) for d in (1.0, DOUBT))
+        w, (p, doubt) = s.pool.weights, expected(s.surrogate, s.pool.z)
         variance = doubt * (1 - doubt)
         shares = (w * np.sqrt(variance), w * doubt, np.ones(n))
         r = sum(
             a * v / max(v.sum(), 1e-300) for a, v in zip((0.6, 0.25, 0.15), shares, strict=True)
         )
         rows = s.rng.choice(n, now, p=r / r.sum())
-        failing, _ = s.call(s.pool.z[rows])
+        failing, invalid = s.call(s.pool.z[rows])
         over = w / (n * r / r.sum())
         rounds.append(
             Round(
@@ -237,6 +247,7 @@ def _correct(s, rounds):
                 over[rows] * (failing - p[rows]),
                 over[rows],
                 failing,
+                invalid,
                 float((w * over * variance).mean()),
                 float((w * p).var() / n),
             )
@@ -252,7 +263,7 @@ def _estimate(s, rounds, level):
     """The `Estimate` of the pool and its corrections."""
     sizes = np.array([len(r.corrections) for r in rounds])
     n, share = sizes.sum(), sizes / sizes.sum()
-    c, w, failing = (np.concatenate([r[i] for r in rounds]) for i in (1, 2, 3))
+    c, w, failing, invalid = (np.concatenate([r[i] for r in rounds]) for i in (1, 2, 3, 4))
     mean = float(share @ [r.expected for r in rounds] + c.mean())
     seen = float((c**2).sum() / n**2)
     doubted = float((share**2 / sizes) @ [r.doubted for r in rounds])
@@ -268,6 +279,11 @@ def _estimate(s, rounds, level):
         found.append(f"relative standard error {relative:.0%}")
     if mean > 0 and np.abs(c).max() / n > 0.05 * mean:
         found.append(f"one call changes the estimate by {np.abs(c).max() / n / mean:.0%}")
+    if w[invalid].sum() / n > INVALID * max(mean, 0.0):
+        found.append(
+            f"{int(s.invalid.sum())} episodes are invalid (a number that is not finite): if they"
+            " failed, the estimate would be another one"
+        )
     if s.failing.sum() < 10:
         found.append(f"{int(s.failing.sum())} failures are too few")
     v = w * failing
@@ -279,7 +295,7 @@ def _estimate(s, rounds, level):
         mean=mean if mean > 0 else math.nan,
         standard_error=error,
         relative_error=relative,
-        interval=log_normal(log_mean, relative, level) if mean > 0 else (0.0, 1.0),
+        interval=_interval(mean, error, level),
         level=level,
         ess=ess,
         k_hat=math.nan,
@@ -292,9 +308,17 @@ def _estimate(s, rounds, level):
         modes=None,
         reliable=not found,
         warnings=tuple(found),
+        unseen=-math.log1p(-level) / s.plain,
         proposal=as_latent([(1.0, s.pool.mixture)], s.dtype),
         history=tuple(s.history),
     )
+
+
+def _interval(mean, error, level):
+    """Log-normal; where the error is as large as the mean, only what lies above is known."""
+    if 0 < error < mean:
+        return log_normal(math.log(mean), error / mean, level)
+    return 0.0, min(max(mean, 0.0) + NormalDist().inv_cdf((1 + level) / 2) * error, 1.0)
 
 
 def _counted(s, level):

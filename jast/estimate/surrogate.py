@@ -17,7 +17,7 @@ __all__ = ["Surrogate", "covariance", "fit", "normal_cdf", "predict"]
 
 ROUNDS, ASCENTS, STEP = 2, 8, 0.15
 SWEEPS, DAMPING, SETTLED = 12, 0.8, 0.01
-JITTER, LEAST = 1e-8, 1e-12
+JITTER, LEAST, BLOCK = 1e-8, 1e-12, 500
 SHAPE = math.sqrt(5.0)
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
@@ -93,10 +93,14 @@ def fit(
 
 def predict(s: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation [m] of the scaled limit state at ``z`` [m, D]."""
-    k, _ = covariance(z, s.z, s.logs)
     constant, linear, _ = np.exp(s.logs[:3])
+    mean, known = np.empty(len(z)), np.empty(len(z))
+    for i in range(0, len(z), BLOCK):  # what fits a cache
+        k, _ = covariance(z[i : i + BLOCK], s.z, s.logs)
+        mean[i : i + BLOCK] = k @ s.weights
+        known[i : i + BLOCK] = ((k @ s.inverse) * k).sum(axis=1)
     own = constant + linear * (z**2).sum(axis=1) + 1.0
-    return k @ s.weights, np.sqrt(np.maximum(own - ((k @ s.inverse) * k).sum(axis=1), LEAST))
+    return mean, np.sqrt(np.maximum(own - known, LEAST))
 
 
 def covariance(a: np.ndarray, b: np.ndarray, logs: np.ndarray) -> tuple[np.ndarray, Any]:
@@ -106,7 +110,9 @@ def covariance(a: np.ndarray, b: np.ndarray, logs: np.ndarray) -> tuple[np.ndarr
     square = (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None] - 2 * x @ y.T
     r = SHAPE * np.sqrt(np.maximum(square, 0.0))
     e = np.exp(-r)
-    return constant + linear * (a @ b.T) + (1 + r + r**2 / 3) * e, (r, e)
+    k = (1 + r * (1 + r / 3)) * e
+    k += linear * (a @ b.T) + constant
+    return k, (r, e)
 
 
 def _with_noise(k, noise):

@@ -23,7 +23,7 @@ PLAUSIBLE = 2.5
 """Standard deviations within which a failure is plausible."""
 DOUBT = 2.0
 """By which those of the surrogate are multiplied where it is asked what it does not know."""
-SAMPLE, FITTED, DISTINCT = 3000, 1000, 12
+SAMPLE, FITTED, DISTINCT, COMPONENTS = 3000, 600, 12, 8
 
 
 class Pool(NamedTuple):
@@ -40,27 +40,30 @@ def pool(
     failures: np.ndarray,
     before: Gaussians | None,
     n: int,
+    anew: bool = True,
 ) -> tuple[Pool, Gaussians]:
-    """`Pool` of ``n`` points, and the `Gaussians` fitted on the way: ``before`` of the next one."""
+    """`Pool` of ``n`` points, and the `Gaussians` fitted on the way: ``before`` of the next one.
+    ``anew``: with a population.
+    """
     d = s.z.shape[1]
     origin = unit(np.zeros((1, d)))
     wide = origin._replace(values=origin.values * (2.25 if d <= 6 else 1.5))
     seen = [(0.2, unit(distinct(failures, DISTINCT)))] if len(failures) else []
     parts = [(0.1, wide), *seen, *([(0.5, before)] if before is not None else [])]
-    population = plausible(rng, s)
+    population = plausible(rng, s) if anew else None
     if population is not None:
         parts.append((0.4, _fitted(rng, population, np.full(len(population), 1.0))))
     z, w = drawn(rng, mixed(parts), SAMPLE)
-    p = expected(s, z, DOUBT)
+    _, p = expected(s, z)
     fitted = _fitted(rng, z, w * (np.sqrt(p * (1 - p)) + 0.3 * p))
     mixture = mixed([(0.7, fitted), (0.1, wide), *seen])
     return Pool(*drawn(rng, mixture, n), mixture), fitted
 
 
-def expected(s: Surrogate, z: np.ndarray, doubt: float = 1.0) -> np.ndarray:
-    """Probability [n] that the surrogate gives to a failure at ``z`` [n, D]."""
+def expected(s: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Probability [n] that the surrogate gives to a failure at ``z`` [n, D], and in `DOUBT`."""
     mean, sd = predict(s, z)
-    return normal_cdf(-mean / (doubt * sd))
+    return normal_cdf(-mean / sd), normal_cdf(-mean / (DOUBT * sd))
 
 
 def plausible(rng: np.random.Generator, s: Surrogate) -> np.ndarray | None:
@@ -113,7 +116,7 @@ def _fitted(rng, z, weights):
         weights = np.sqrt(weights) / np.sqrt(weights).sum()
     count = min(1 / (weights**2).sum(), FITTED)
     rows = rng.choice(len(z), FITTED, p=weights)
-    g = gaussians.fit(rng, z[rows], np.full(FITTED, 1 / FITTED), count, count / 3)
+    g = gaussians.fit(rng, z[rows], np.full(FITTED, 1 / FITTED), count, count / 3, COMPONENTS)
     return mixed(
         [
             (0.7, g._replace(values=np.maximum(g.values, 0.3))),
