@@ -13,6 +13,7 @@ import sys
 from typing import Any
 
 from jast.distributions import families as _families
+from jast.distributions import gammas as _gammas
 from jast.distributions import rows as _rows
 from jast.distributions.base import Distribution, is_distribution
 from jast.distributions.containers import Independent, Joint
@@ -101,7 +102,7 @@ __all__ = [
     "where",
 ]
 
-del _families, _rows  # imported for the rows that they register
+del _families, _gammas, _rows  # imported for the rows that they register
 
 
 def __dir__() -> list[str]:
