@@ -12,7 +12,13 @@ from jax.tree_util import Partial
 import jast
 from benchmarks.few_calls import metaballs
 from jast.distributions import MultivariateNormalDiag
-from jast.estimate import active_learning, failure_probability, surrogate, surrogate_failures
+from jast.estimate import (
+    active_learning,
+    failure_probability,
+    few_calls,
+    surrogate,
+    surrogate_failures,
+)
 from jast.intervals import clopper_pearson
 from jast.simulators import limit_state
 from tests.blackboxes import branches
@@ -23,8 +29,9 @@ norm = scipy.stats.norm
 @pytest.fixture
 def coarse(monkeypatch):
     """Fewer points of the surrogate: a second for 50 calls."""
-    monkeypatch.setattr(active_learning, "POINTS", 20_000)
-    monkeypatch.setattr(active_learning, "CANDIDATES", 1000)
+    monkeypatch.setattr(few_calls, "POINTS", 20_000)
+    for room in (few_calls, active_learning):
+        monkeypatch.setattr(room, "CANDIDATES", 1000)
     for name, value in (("POPULATION", 200), ("SAMPLE", 1000), ("FITTED", 300)):
         monkeypatch.setattr(surrogate_failures, name, value)
 
@@ -131,13 +138,13 @@ def test_invalid_episodes_are_counted_and_teach_nothing(coarse):
 def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
     known = np.array([[2.2, 2.2], [2.5, 1.9]])
-    r = active_learning.few_calls(jax.random.key(0), sim, 50, 0.95, known)
+    r = few_calls.few_calls(jax.random.key(0), sim, 50, 0.95, known)
     assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
 
 
 def test_an_error_above_the_mean_leaves_an_upper_end():
-    assert active_learning._interval(1e-7, 1e-5, 0.95) == pytest.approx((0, 1e-7 + 1.96e-5), 1e-4)
-    assert active_learning._interval(-1e-7, 1e-5, 0.95)[0] == 0
+    assert few_calls._interval(1e-7, 1e-5, 0.95) == pytest.approx((0, 1e-7 + 1.96e-5), 1e-4)
+    assert few_calls._interval(-1e-7, 1e-5, 0.95)[0] == 0
 
 
 def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):

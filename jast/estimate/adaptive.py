@@ -13,8 +13,7 @@ from jast import limit_state as latent
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
-from jast.estimate import active_learning, diagnostics, sums
-from jast.estimate.active_learning import few_calls
+from jast.estimate import diagnostics, few_calls, sums
 from jast.estimate.batches import balanced, drawn, numbers
 from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
@@ -96,13 +95,13 @@ def failure_probability(
     """
     name = "failure_probability"
     random_key(name, key)
-    budget = whole(name, "budget", budget, active_learning.LEAST)
+    budget = whole(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
     if budget < LEAST:
-        found = few_calls(key, sim, budget, level, known, progress, callback)
+        found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         return found._replace(settings=settings)
     for_search, key = jax.random.split(key)
     s = Seeker(for_search, sim, budget)
