@@ -134,7 +134,7 @@ def _fly(sim: Simulator, density: str, widths: int, blind: bool, lanes: int) -> 
         _median(jnp.where(plain.failure, 0, distance)),
         _median(jnp.where(jnp.isfinite(log_p), likely - log_p, 0)),
         likely,
-        table[jnp.where(enough, tried - 1, best)],
+        table[jnp.where(enough, tried - 1, best.astype(jnp.int32))],
         episodes,
         tally,
     )
