@@ -18,7 +18,7 @@ import numpy as np
 import jast
 from benchmarks.sizes import options, size
 from benchmarks.stress_systems import CASES, JUDGED
-from jast.search.moves import likelihood
+from jast.rewards import likelihood
 
 __all__ = ["METHODS", "run"]
 

@@ -15,11 +15,11 @@ from jast import actions, failures, nominal, plot, replay, rewards, save, simula
 from jast.actions import UniformBox
 from jast.contract import check
 from jast.intervals import clopper_pearson
+from jast.rewards import likelihood
 from jast.search.cem import cem
 from jast.search.forest import forest
 from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
-from jast.search.moves import likelihood
 from jast.search.result import table
 from jast.simulator import Simulator
 from jast.stress_testing import stress

@@ -28,16 +28,20 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._jax import is_traced
+from jast.outline import outline
+from jast.simulator import Simulator
 
 __all__ = [
     "Episodic",
     "Lexicographic",
+    "LogLikelihood",
     "Shaped",
     "Standard",
     "as_pytree",
     "density_of",
     "episodic",
     "lexicographic",
+    "likelihood",
     "log_likelihood",
     "once",
     "shaped",
@@ -97,6 +101,21 @@ class Shaped:
             + _like(self.scale, log_p) * approach
             + jnp.where(event, _like(self.event_bonus, log_p), 0)
         )
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LogLikelihood:
+    """The log density alone: likelihood where failures are all that is ranked, and a reward that
+    costs nothing where only the course of an episode is wanted.
+    """
+
+    density: str = field(**_density)
+
+    def __call__(
+        self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
+    ) -> Any:
+        return log_p
 
 
 @jax.tree_util.register_dataclass
@@ -213,13 +232,11 @@ def lexicographic(
     return Lexicographic(near, rare, likely, density)
 
 
-def log_likelihood(
-    log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
-) -> Any:
-    """The log density alone: a reward that costs nothing, where only the course of an episode is
-    wanted.
+def likelihood(sim: Simulator) -> LogLikelihood:
+    """The log density as a reward, free of units where it can be: relative to the mode where the
+    disturbances of ``sim`` have modes.
     """
-    return log_p
+    return LogLikelihood(outline(sim).density)
 
 
 def density_of(reward):
@@ -252,3 +269,4 @@ def _like(value, log_p):
 
 
 STANDARD = standard()
+log_likelihood = LogLikelihood()

@@ -1,6 +1,7 @@
 """refine and modes, against closed forms."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,18 @@ import pytest
 import jast
 from benchmarks.stress_systems import CASES, linear
 from jast import limit_state as latent
-from jast.distributions import Exponential, MultivariateNormalDiag, Normal
+from jast.distributions import (
+    Exponential,
+    Laplace,
+    MultivariateNormalDiag,
+    Normal,
+    tent,
+    where,
+)
 from jast.failures import collect
-from jast.search import moves as M
+from jast.rewards import likelihood
 from jast.search import refine, refinement
+from jast.search.centred import centred
 from jast.search.failure_modes import modes
 
 
@@ -21,7 +30,7 @@ def draws(sim, scale, n=300, seed=0):
     """Failures of wider noise: an archive, ranked by log p relative to the mode."""
     z = scale * np.random.default_rng(seed).standard_normal((n, latent.dimension(sim)))
     e = jax.device_get(latent.episodes(sim, jnp.asarray(z, latent.normal_numbers(sim))))
-    return collect(sim, M.likelihood(sim), e, top=200)
+    return collect(sim, likelihood(sim), e, top=200)
 
 
 @pytest.mark.parametrize("gradients", [True, False])
@@ -83,6 +92,52 @@ def test_disturbances_of_other_families(key):
     )
     result = refine(key, sim, draws(sim, 2.0), budget=3000)
     assert float(result.failures.best.reward) == pytest.approx(-12, abs=0.01)
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_a_kink_at_the_mode(gradients, key):
+    """Of Laplace noise the likeliest failure is one large number, in the step that counts most."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: 0.9 * s + x,
+        disturbance=lambda s: Laplace(0.0, 1.0),
+        evaluate=lambda s: (s >= 12, jnp.maximum(12 - s, 0.0)),
+        horizon=8,
+    )
+    result = refine(key, sim, draws(sim, 3.0), budget=6000, gradients=gradients)
+    assert float(result.failures.best.reward) == pytest.approx(-12, abs=0.05)
+
+
+def test_a_mode_that_moves_with_the_state(key):
+    """A random walk of tents, as of a seed that changes little: the failure is one jump, held."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.full(2, 0.5) * jnp.array([1.0, 0.0]),
+        step=lambda s, x: jnp.stack([x, s[1] + x]),
+        disturbance=lambda s: tent(s[0]),
+        evaluate=lambda s: (s[1] >= 5.6, jnp.maximum(5.6 - s[1], 0.0)),
+        horizon=8,
+    )
+    result = refine(key, sim, draws(sim, 1.5), budget=6000)
+    # 8 steps of 0.5 + j make 5.6
+    assert float(result.failures.best.reward) == pytest.approx(math.log(1 - 0.2), abs=0.005)
+
+
+def test_modes_are_the_origin_of_a_centred_simulator(key):
+    """Also one at the end of its support, which moves with the state; it has a slope."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.ones(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: where(s > 3, tent(s / 10), Exponential(1 / s)),
+        evaluate=lambda s: (s >= 12, jnp.maximum(12 - s, 0.0)),
+        horizon=4,
+    )
+    same = centred(sim)
+    drawn = jax.device_get(jax.vmap(partial(jast.rollout, sim=sim))(jax.random.split(key, 20)))
+    back = latent.episodes(same, latent.normal_of(same, drawn))
+    np.testing.assert_allclose(back.disturbances, drawn.disturbances, rtol=1e-3, atol=1e-5)
+    quiet = lambda v: jast.rollout(key, same, latent.policy_of(same, v), likelihood(sim)).reward
+    assert float(quiet(jnp.zeros(4))) == pytest.approx(0, abs=1e-5)
+    assert np.isfinite(jax.grad(quiet)(jnp.full(4, 0.5))).all()
 
 
 def test_a_random_start_is_refined_too(key):
@@ -161,7 +216,7 @@ def test_a_failure_at_another_time_is_of_the_same_mode(key):
         x = np.zeros(50, jnp.zeros(()).dtype)
         x[at : at + 4] = 2.0
         archive.append(jax.device_get(jast.replay(sim, x)._replace(states=None)))
-    found = collect(sim, M.likelihood(sim), jax.tree.map(lambda *a: np.stack(a), *archive))
+    found = collect(sim, likelihood(sim), jax.tree.map(lambda *a: np.stack(a), *archive))
     assert len(found) == 3
     assert len(modes(sim, found)) == 1
 

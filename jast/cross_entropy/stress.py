@@ -3,7 +3,7 @@ cross-entropy methods.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -20,21 +20,10 @@ from jast.cross_entropy.gaussian import normal
 from jast.cross_entropy.sequences import player
 from jast.episode import rollout
 from jast.outline import outline
-from jast.rewards import as_pytree
+from jast.rewards import LogLikelihood, as_pytree
 from jast.simulator import Simulator
 
 __all__ = ["Stress", "over"]
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class LogLikelihood:
-    """The reward of an episode's log density alone, per step that or less its value at the mode."""
-
-    density: str = field(metadata=dict(static=True))
-
-    def __call__(self, log_p, event, distance, terminal, approach=0.0):
-        return log_p
 
 
 @jax.tree_util.register_dataclass

@@ -11,8 +11,7 @@ from jast.episode import replay
 from jast.failures import collect, identity, merge
 from jast.incidents import hosted
 from jast.outline import outline
-from jast.rewards import Lexicographic
-from jast.search.moves import likelihood
+from jast.rewards import Lexicographic, likelihood
 from jast.search.refinement import refine as pull
 from jast.search.result import SearchResult
 from jast.simulator import Simulator

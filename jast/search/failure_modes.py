@@ -12,10 +12,9 @@ from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
 from jast.incidents import hosted
-from jast.limit_state import normal_numbers, normal_of
-from jast.outline import outline
-from jast.pytrees import count
-from jast.search import moves as M
+from jast.limit_state import normal_numbers, normal_of, outcomes
+from jast.search.centred import centred
+from jast.search.moves import moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
@@ -23,7 +22,7 @@ __all__ = ["Mode", "Modes", "modes"]
 PLACES = 7
 LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
 """Points of a path between two failures, and how much farther out than the line between them it may
-run: "by much" is a tenth of the way from the anchor. The least cosine between the two;
+run: "by much" is a tenth of the way from the origin. The least cosine between the two;
 the least of those that are alike.
 """
 
@@ -97,15 +96,15 @@ def modes(
         `Modes`. A further failure that has no path to any of ``likeliest`` counts for the mode
         whose likeliest failure it points most nearly to. Each share is of the members.
     """
-    home = np.asarray(M.anchor(sim), np.float64)
-    centre = lambda f: np.asarray(normal_of(sim, f.episodes), np.float64) - home
+    sim = centred(sim)
+    centre = lambda f: np.asarray(normal_of(sim, f.episodes), np.float64)
     v, n = centre(likeliest), len(likeliest)
     if not n:
         return Modes()
     ends = likeliest.episodes.length
     i, j = np.tril_indices(n, -1)
     pairs = list(zip(i, j, strict=True))
-    known = Paths(sim, home, budget)
+    known = Paths(sim, budget)
     joined = known.between((v[i], ends[i]), (v[j], ends[j]))
     owner = np.arange(n)
     for (i, j), one in zip(pairs, joined, strict=True):
@@ -144,25 +143,13 @@ def assigned(paths, many, known, owner):
     return out
 
 
-def moved_by(sim: Simulator, v: np.ndarray, steps: int) -> np.ndarray:
-    """``v`` [D], from the anchor, that many steps later; sooner where negative."""
-    size = len(v) - sim.horizon * count(outline(sim).x)
-    rows = v[size:].reshape(sim.horizon, -1)
-    out = np.zeros_like(rows)
-    if steps >= 0:
-        out[steps:] = rows[: sim.horizon - steps]
-    else:
-        out[:steps] = rows[-steps:]
-    return np.concatenate([v[:size], out.reshape(-1)])
-
-
 class Paths:
-    """Looks for paths of failures between points, all of them from ``home``, for at most ``budget``
-    evaluations.
+    """Looks for paths of failures between points of ``sim``, `jast.search.centred`, for at most
+    ``budget`` evaluations.
     """
 
-    def __init__(self, sim: Simulator, home: np.ndarray, budget: int):
-        self.sim, self.home, self.budget, self.spent = sim, home, budget, 0
+    def __init__(self, sim: Simulator, budget: int):
+        self.sim, self.budget, self.spent = sim, budget, 0
 
     def between(self, first, second):
         """Whether there is a path between each of the failures ``first`` and that of ``second``
@@ -173,8 +160,8 @@ class Paths:
         rows = np.flatnonzero(~joined & (v_ends != w_ends))
         if len(rows):
             steps = (w_ends - v_ends)[rows]
-            moved = [moved_by(self.sim, v[r], int(k)) for r, k in zip(rows, steps, strict=True)]
-            joined[rows] = self.straight(np.stack(moved), w[rows], of_both=True)
+            moved = jax.vmap(partial(moved_in_time, self.sim))(v[rows], steps)
+            joined[rows] = self.straight(np.asarray(moved), w[rows], of_both=True)
         return joined
 
     def straight(self, v, w, of_both=False):
@@ -193,17 +180,12 @@ class Paths:
         line = (1 - t) * v / norm(v) + t * w / norm(w)
         size = (1 - t) * norm(v) + t * norm(w)
         arc = np.where(norm(line) > 1e-3, line / norm(line) * size, 0)
-        points = self.home + arc[None] * np.array(LIFTS)[:, None, None, None]
+        points = arc[None] * np.array(LIFTS)[:, None, None, None]
         # few shapes are few programs; a system on the host has none
         rows = total if hosted(self.sim) else 1 << (total - 1).bit_length()
         flat = np.resize(points.reshape(-1, d), (rows, d))
-        fails = np.asarray(_fails(self.sim, jnp.asarray(flat, normal_numbers(self.sim))))
+        fails = np.asarray(outcomes(self.sim, jnp.asarray(flat, normal_numbers(self.sim))).failure)
         self.spent += rows
         fails = fails[:total].reshape(len(LIFTS), len(t), n)
         # no arc is meant between opposite points
         return fails.any(axis=0).all(axis=0) & (cosine > OPPOSITE)
-
-
-@jax.jit
-def _fails(sim, z):
-    return jax.vmap(partial(M.judge, sim))(z).failure

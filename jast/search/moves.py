@@ -1,87 +1,60 @@
-"""The moves of `jast.search.refine`: points of failing episodes in normal numbers, and one round
-that looks for likelier failures around each of them.
+"""The moves of `jast.search.refine`: where a round looks for likelier failures around a point.
 
-A point z [D] is an episode (`jast.limit_state`), and its cost is log p of the mode less
-log p, over the steps that it takes. A round tries, all at once and for every point:
+A point v [D] is an episode of a simulator whose modes are the origin (`jast.search.centred`), and
+its cost is log p of the mode less log p, over the steps that it takes. Candidates are:
 
-- *rays*: the point drawn towards the anchor, which is the episode of modes, by a little or by much;
+- *rays*: the point drawn towards the origin, by a little or by much;
 - *slopes*: steps along the boundary of failure that lower the cost, as the linearised constraint
   has them (a step of sequential quadratic programming whose Hessian is the identity; of whole
   length it is that of Hasofer and Lind 1974 and Rackwitz and Fiessler 1978);
-- *walks*: random steps at equal distance from the anchor, and once more the last step that paid;
-- *removals*: some of the numbers drawn to the anchor, wholly or partly;
-- *shifts*: the same disturbances some steps later or sooner, the first one drawn out.
+- *walks*: random steps at equal distance from the origin, and once more the last step that paid;
+- *removals*: some of the numbers drawn to 0, wholly or partly;
+- *exchanges*: one number drawn towards 0, and another raised by what keeps the miss distance as it
+  is, to first order: where log p has a kink at its mode, the likeliest failures have many numbers
+  at 0, and no slope tells which of them is to leave it;
+- *shifts*: the same disturbances some steps later or sooner, drawn in a little.
 
-It takes the cheapest that fails. Sizes of steps grow where they pay and shrink where they do not,
-for each point by itself.
+Sizes of steps grow where they pay and shrink where they do not, for each point by itself.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
-from jast import distributions as D
-from jast.episode import rollout
-from jast.limit_state import dimension, ended, normal_numbers, policy_of
 from jast.outline import outline
-from jast.progress import advance, begin
 from jast.pytrees import count
-from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = ["Noise", "Point", "anchor", "begun", "judge", "residuals", "round_of", "SIZE"]
+__all__ = ["Noise", "Point", "along", "around", "moved_in_time", "resized", "SIZE"]
 
-RAYS, LENGTHS, LIFTS, WALKS, REMOVALS, SHIFTS = 6, 3, 4, 8, 6, 4
-SIZE = RAYS + LENGTHS * LIFTS + WALKS + 1 + REMOVALS + SHIFTS
+RAYS, LENGTHS, LIFTS, WALKS, REMOVALS, EXCHANGES, SHIFTS = 6, 3, 4, 8, 6, 8, 4
+KINDS = RAYS, LENGTHS * LIFTS, WALKS + 1, REMOVALS, EXCHANGES, SHIFTS
+SIZE = sum(KINDS)
 """Candidates of a point in a round."""
 NEAREST, FARTHEST = 1e-6, 0.5
-EDGE = 0.05
-"""How far from the boundary differences are taken, as a share of the way to the anchor."""
-
-
-def likelihood(sim: Simulator) -> Callable:
-    """The log density as a reward: relative to the mode, and so free of units, where the
-    disturbances of ``sim`` have modes.
-    """
-    return of_mode if outline(sim).density == "mode" else log_likelihood
-
-
-def of_mode(log_p, event, distance, terminal, approach=0.0):
-    return log_p
-
-
-of_mode.density = "mode"
-
-
-class Verdict(NamedTuple):
-    """What episodes came to."""
-
-    failure: Any
-    cost: Any
-    """log p(mode) - log p; inf where invalid"""
-    distance: Any
-    invalid: Any
-    used: Any
-    """int32: how many of the numbers decided it"""
+"""The least and the largest gap."""
+ENTRANTS = 4
+"""Numbers among which an exchange takes the dearest, or the cheapest."""
+SHARES = 8, 4, 2, 1, 0.5, 0.25
+STRETCHES = 2.5, 1, 0.4
+"""Rays, as shares of the gap; slopes, as shares of the length."""
 
 
 class Point(NamedTuple):
     """A failing point on its way, and the sizes of its steps."""
 
-    z: Any
+    v: Any
     """[D]"""
     cost: Any
     used: Any
     gap: Any
-    """How far inside the failures it may be, as a share of its way from the anchor"""
+    """How far inside the failures it may be, as a share of its way from the origin"""
     length: Any
     """Of steps along the boundary; 1: to where the linearised problem has its optimum"""
     width: Any
-    """Of random steps, as a share of the distance from the anchor"""
+    """Of random steps, as a share of the distance from the origin"""
     last: Any
     """[D] the last step that paid"""
     slope: Any
@@ -92,194 +65,178 @@ class Point(NamedTuple):
 
 class Noise(NamedTuple):
     """Random numbers of a round: `walks` [WALKS, D] normal; uniform `masks` [REMOVALS, D], `rates`
-    and `shrinks` [REMOVALS]; `part` [k] int32, the numbers that differences are taken of; `shifts`
-    [SHIFTS] int32, steps.
+    and `shrinks` [REMOVALS], `pairs` [EXCHANGES, 2] and `sizes` [EXCHANGES]; `part` [k] int32, the
+    numbers that differences are taken of; `shifts` [SHIFTS] int32, steps, with normal `fills`
+    [SHIFTS].
     """
 
     walks: Any
     masks: Any
     rates: Any
     shrinks: Any
+    pairs: Any
+    sizes: Any
     part: Any
     shifts: Any
+    fills: Any
 
 
-def judge(sim: Simulator, z: jax.Array) -> Verdict:
-    """The `Verdict` of the episode of ``z`` [D]."""
-    end, length = ended(sim, z, likelihood(sim))
-    about = outline(sim)
-    used = count(about.x0) + length * count(about.x)
-    cost = jnp.where(end.invalid, jnp.inf, -end.reward)
-    return Verdict(end.failure, cost.astype(z.dtype), end.distance, end.invalid, used)
-
-
-@jax.jit
-def anchor(sim: Simulator) -> jax.Array:
-    """The point [D] of the episode in which every disturbance is at its mode; 0 where there is
-    none, and no number beyond +-5.
+def around(sim: Simulator, point: Point, slope: Any, rise: Any, noise: Noise) -> jax.Array:
+    """The candidates [SIZE, D] around ``point``, by the slope of the distance and the rise of the
+    cost there [D]; both are 0 where they are not known.
     """
-    about, dtype = outline(sim), normal_numbers(sim)
-    row = lambda z: jnp.concatenate(
-        [jnp.ravel(a).astype(dtype) for a in jax.tree.leaves(z)] or [jnp.zeros(0, dtype)]
+    return jnp.concatenate(
+        [
+            _rays(point),
+            _slid(point, slope, rise),
+            _walked(point, noise.walks),
+            _removed(point, noise),
+            _exchanged(point, slope, rise, noise),
+            jax.vmap(partial(_shifted, sim, point.v))(noise.shifts, noise.fills),
+        ]
     )
-    start = sim.start()
-    x0 = D.mode(start) if about.start.mode else D.sample(start, jax.random.key(0))
-    first = row(D.to_normal(start, x0)) if about.random_start and about.start.mode else None
-    first = jnp.zeros(count(about.x0), dtype) if first is None else first
-    if not about.disturbance.mode:
-        return jnp.concatenate([first, jnp.zeros(dimension(sim) - len(first), dtype)])
-
-    reward = likelihood(sim)
-
-    def step(progress, t):
-        dist = sim.disturbance(progress.state)
-        x = D.mode(dist)
-        after = advance(sim, reward, progress, x, t + 1 >= sim.horizon)
-        kept = jax.tree.map(lambda a, b: jnp.where(progress.done, a, b), progress, after)
-        return kept, row(D.to_normal(dist, x))
-
-    _, rows = lax.scan(step, begin(sim, reward, x0), jnp.arange(sim.horizon, dtype=jnp.int32))
-    z = jnp.concatenate([first, rows.reshape(-1)])
-    return jnp.clip(jnp.where(jnp.isfinite(z), z, jnp.where(z > 0, 5.0, -5.0)), -5, 5)
 
 
-@jax.jit
-def begun(sim: Simulator, z: jax.Array) -> tuple[Point, Verdict]:
-    """The `Point` of each of ``z`` [n, D], and the `Verdict`."""
-    v = jax.vmap(partial(judge, sim))(z)
-    full = lambda value: jnp.full(len(z), value, z.dtype)
-    zero = jnp.zeros_like(z)
-    return Point(z, v.cost, v.used, full(0.3), full(1), full(0.5), zero, zero, zero), v
-
-
-@partial(jax.jit, static_argnums=4)
-def round_of(
-    sim: Simulator, home: jax.Array, points: Point, noise: Noise, gradients: bool
-) -> tuple[Point, jax.Array]:
-    """One round of all ``points`` [n] with their ``noise`` [n], and how many of the candidates were
-    invalid. ``home`` [D]: the `anchor`.
+def resized(point: Point, i: Any, better: Any, failing: Any) -> Point:
+    """The point with the sizes of its steps after candidate ``i`` was the best of its round;
+    ``failing`` [RAYS]: which rays failed.
     """
-    step = partial(_round, sim, gradients, home)
-    points, invalid = jax.vmap(step)(points, noise)
-    return points, jnp.sum(invalid, dtype=jnp.int32)
+    rays, slopes, walks = (sum(KINDS[:k]) for k in (1, 2, 3))
+    took = lambda low, high: better & (i >= low) & (i < high)
+    shares, lengths, widths = jnp.asarray(SHARES, point.v.dtype), _lengths(point), _widths(point)
+    paid = shares[jnp.minimum(i, rays - 1)]
+    missed = jnp.min(jnp.where(failing, 2 * shares[0], shares))
+    gap = point.gap * jnp.where(better, 2 * missed, 0.25)
+    gap = jnp.where(took(0, rays), point.gap * jnp.where(paid <= 1, 0.5, paid), gap)
+    length = point.length * jnp.where(better, 1, 0.5)
+    grown = lengths[jnp.clip((i - rays) // LIFTS, 0, LENGTHS - 1)]
+    length = jnp.where(took(rays, slopes), grown, length)
+    wide = widths[jnp.clip(i - slopes, 0, WALKS - 1)] * 1.5
+    width = jnp.where(took(slopes, walks - 1), wide, point.width * 0.93)
+    return point._replace(
+        gap=jnp.clip(gap, NEAREST, FARTHEST),
+        length=jnp.clip(length, 1e-3, 1),
+        width=jnp.clip(width, 1e-3, 1),
+    )
 
 
-def _round(sim, gradients, home, point, noise):
-    v, radius = point.z - home, jnp.linalg.norm(point.z - home)
-    if gradients:
-        edge = home + (1 - point.gap) * v
-        slope, rise = _slopes(sim, edge)
-    else:
-        slope, rise = _differences(sim, home, v, radius, point, noise.part)
-    along, usable = _along(slope, rise)
-    dtype = v.dtype
+def _lengths(point):
+    return jnp.minimum(point.length * jnp.asarray(STRETCHES, point.v.dtype), 1.5)
 
-    shares = jnp.asarray([8, 4, 2, 1, 0.5, 0.25], dtype)  # rays
-    rays = v[None] * (1 - jnp.minimum(shares * point.gap, 1))[:, None]
-    lengths = point.length * jnp.asarray([2.5, 1, 0.4], dtype)  # slopes
-    lengths = jnp.minimum(lengths, 1.5)
-    angle = lengths * jnp.sum(along**2) / jnp.maximum(radius, NEAREST) ** 2
-    lifts = 1e-5 + jnp.asarray([0, 0.1, 0.3, 0.6], dtype)[None] * jnp.minimum(angle, 1)[:, None]
-    steps = jnp.where(usable, lengths, 0)[:, None] * along[None]
-    slid = (v[None] + steps)[:, None] * (1 + lifts)[:, :, None]
-    widths = point.width * jnp.asarray([3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1], dtype)  # walks
-    live = jnp.arange(len(v), dtype=jnp.int32) < point.used
-    count_live = jnp.maximum(jnp.sum(live, dtype=jnp.int32), 1).astype(dtype)
-    strides = jnp.where(live[None], noise.walks, 0) / jnp.sqrt(count_live)
-    walks = v[None] + widths[:, None] * radius * strides
-    walks = jnp.concatenate([walks, (v + point.last)[None]])
+
+def _widths(point):
+    return point.width * jnp.asarray([3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1], point.v.dtype)
+
+
+def _live(point):
+    """Which numbers decide something [D], and how many."""
+    live = jnp.arange(len(point.v), dtype=jnp.int32) < point.used
+    return live, jnp.maximum(jnp.sum(live, dtype=jnp.int32), 1).astype(point.v.dtype)
+
+
+def _rays(point):
+    shares = jnp.asarray(SHARES, point.v.dtype)
+    return point.v[None] * (1 - jnp.minimum(shares * point.gap, 1))[:, None]
+
+
+def _slid(point, slope, rise):
+    """Steps along the boundary, each lifted a little, for a boundary that bends. No number crosses
+    0 to the side where the distance grows.
+    """
+    lengths, radius, way = _lengths(point), jnp.linalg.norm(point.v), along(point, slope, rise)
+    angle = lengths * jnp.sum(way**2) / jnp.maximum(radius, NEAREST) ** 2
+    lifts = jnp.asarray([0, 0.1, 0.3, 0.6], point.v.dtype)
+    lifts = 1e-5 + lifts[None] * jnp.minimum(angle, 1)[:, None]
+    slid = point.v[None] + lengths[:, None] * way[None]
+    slid = jnp.where((point.v * slope < 0)[None] & (slid * slope[None] > 0), 0, slid)
+    slid = slid[:, None] * (1 + lifts)[:, :, None]
+    return slid.reshape(-1, len(point.v))
+
+
+def _walked(point, normals):
+    """Random steps, and the last one that paid, at equal distance from the origin or a little
+    nearer.
+    """
+    live, count_live = _live(point)
+    radius, widths = jnp.linalg.norm(point.v), _widths(point)
+    strides = jnp.where(live[None], normals, 0) / jnp.sqrt(count_live)
+    walks = point.v[None] + widths[:, None] * radius * strides
+    walks = jnp.concatenate([walks, (point.v + point.last)[None]])
     drop = 1 - 0.3 * jnp.concatenate([widths, point.width[None]]) ** 2 / count_live
     size = jnp.linalg.norm(walks, axis=1)
-    walks = walks * (radius * jnp.minimum(drop, 1) / jnp.maximum(size, NEAREST))[:, None]
-    hit = noise.masks < jnp.maximum(noise.rates, 1 / count_live)[:, None]  # removals
-    removed = v[None] * jnp.where(hit, 1 - noise.shrinks[:, None], 1)
-
-    shifted = jax.vmap(partial(_shifted, sim, v))(noise.shifts)
-    sizes = jnp.linalg.norm(shifted, axis=1)
-    shifted = shifted * (radius * (1 - 1e-5) / jnp.maximum(sizes, NEAREST))[:, None]
-
-    moves = jnp.concatenate([rays, slid.reshape(-1, len(v)), walks, removed, shifted])
-    verdict = jax.vmap(partial(judge, sim))(home[None] + moves)
-    cost = jnp.where(verdict.failure, verdict.cost, jnp.inf)
-    i = jnp.argmin(cost).astype(jnp.int32)
-    better = cost[i] < point.cost
-    took = lambda low, high: better & (i >= low) & (i < high)
-    a, b, c = RAYS, RAYS + LENGTHS * LIFTS, RAYS + LENGTHS * LIFTS + WALKS
-    paid, grown = shares[jnp.minimum(i, a - 1)], jnp.clip((i - a) // LIFTS, 0, LENGTHS - 1)
-    gap = jnp.where(took(0, a), point.gap * paid, jnp.where(better, point.gap * 2, point.gap / 4))
-    gap = jnp.where(took(0, a) & (paid <= 1), point.gap / 2, gap)
-    length = jnp.where(took(a, b), lengths[grown], point.length * jnp.where(better, 1, 0.5))
-    width = jnp.where(took(b, c), widths[jnp.clip(i - b, 0, WALKS - 1)] * 1.5, point.width * 0.93)
-    # numbers that decide nothing stay at the anchor
-    step = jnp.where(jnp.arange(len(v), dtype=jnp.int32) < verdict.used[i], moves[i], 0)
-    new = Point(
-        jnp.where(better, home + step, point.z),
-        jnp.where(better, cost[i], point.cost),
-        jnp.where(better, verdict.used[i], point.used),
-        jnp.clip(gap, NEAREST, FARTHEST),
-        jnp.clip(length, 1e-3, 1),
-        jnp.clip(width, 1e-3, 1),
-        jnp.where(better, step - v, point.last),
-        slope,
-        rise,
-    )
-    return new, jnp.sum(verdict.invalid, dtype=jnp.int32)
+    return walks * (radius * jnp.minimum(drop, 1) / jnp.maximum(size, NEAREST))[:, None]
 
 
-def _shifted(sim, v, k):
-    """``v`` [D] with its steps ``k`` later, or sooner where negative; the first is drawn out."""
+def along(point: Point, slope: jax.Array, rise: jax.Array) -> jax.Array:
+    """The way along the boundary that lowers the cost [D]. A number at 0 leaves it for the side
+    where the distance falls or not at all: the other is dearer and of no use.
+    """
+    size, rise, free = jnp.abs(slope), _helpful(slope) * rise, jnp.ones(slope.shape, bool)
+    for _ in range(3):
+        square = jnp.sum(jnp.where(free, size**2, 0))
+        price = jnp.sum(jnp.where(free, size * rise, 0)) / jnp.where(square > 0, square, 1)
+        way = jnp.where(free, price * size - rise, 0)
+        free &= (point.v != 0) | (way > 0)
+    return jnp.where(free, _helpful(slope) * way, 0)
+
+
+def _helpful(slope):
+    """The side, +-1, to which a number moves where the distance falls [D]."""
+    return jnp.where(slope > 0, -1, 1).astype(slope.dtype)
+
+
+def _removed(point, noise):
+    _, count_live = _live(point)
+    hit = noise.masks < jnp.maximum(noise.rates, 1 / count_live)[:, None]
+    return point.v[None] * jnp.where(hit, 1 - noise.shrinks[:, None], 1)
+
+
+def _exchanged(point, slope, rise, noise):
+    """Of each pair of numbers one is drawn towards 0 by the share ``sizes``, and the other makes up
+    for it. In the first half the number drawn in is, of a few, the one whose part in the failure is
+    the dearest, and the other that of which more is the cheapest.
+    """
+    live, _ = _live(point)
+    price = jnp.where(slope != 0, _helpful(slope) * rise / jnp.abs(slope), 0)
+    dear = jnp.where(point.v * slope < 0, -price, jnp.inf)
+    lowered = _picked(live & (point.v != 0), noise.pairs[:, 0], dear)
+    raised = _picked(live & (slope != 0), noise.pairs[:, 1], price)
+    drop = noise.sizes * point.v[lowered]
+    # by a little more than to first order, for a boundary that bends
+    back = drop * (1 + 0.1 * noise.sizes) * slope[lowered] / slope[raised]
+    back = jnp.where((raised != lowered) & jnp.isfinite(back), back, 0)
+    rows = jnp.arange(len(drop), dtype=jnp.int32)
+    moved = point.v[None].repeat(len(rows), 0).at[rows, lowered].add(-drop)
+    return moved.at[rows, raised].add(back)
+
+
+def _picked(among, uniform, worth):
+    """For each of ``uniform`` [n, k] one of the numbers that are ``among`` [D]: in the first half
+    the one least in ``worth`` [D] of k, else any.
+    """
+    ranks = jnp.cumsum(among.astype(jnp.int32), dtype=jnp.int32)
+    at = jnp.floor(uniform * ranks[-1].astype(uniform.dtype)).astype(jnp.int32) + 1
+    picked = jnp.minimum(jnp.searchsorted(ranks, at), len(among) - 1).astype(jnp.int32)
+    best = jnp.argmin(worth[picked], axis=1, keepdims=True)
+    n = len(uniform)
+    column = jnp.where(jnp.arange(n, dtype=jnp.int32)[:, None] * 2 < n, best, 0)
+    return jnp.take_along_axis(picked, column, axis=1)[:, 0]
+
+
+def _shifted(sim, v, steps, fill):
+    """``v`` moved in time, at equal distance from the origin or a little nearer."""
+    moved = moved_in_time(sim, v, steps, fill)
+    size = jnp.maximum(jnp.linalg.norm(moved), NEAREST)
+    return moved * (jnp.linalg.norm(v) * (1 - 1e-5) / size)
+
+
+def moved_in_time(sim: Simulator, v: jax.Array, steps: Any, fill: Any = 0) -> jax.Array:
+    """``v`` [D] with its disturbances that many ``steps`` later, sooner where negative. What comes
+    in is the first of them times ``fill``, at the end modes.
+    """
     first = count(outline(sim).x0)
     rows = v[first:].reshape(sim.horizon, -1)
-    t = jnp.arange(sim.horizon, dtype=jnp.int32) - k
-    rows = jnp.where((t < sim.horizon)[:, None], rows[jnp.clip(t, 0, sim.horizon - 1)], 0)
+    t = jnp.arange(sim.horizon, dtype=jnp.int32) - steps
+    share = jnp.where(t < 0, fill, jnp.where(t < sim.horizon, 1, 0)).astype(v.dtype)
+    rows = rows[jnp.clip(t, 0, sim.horizon - 1)] * share[:, None]
     return jnp.concatenate([v[:first], rows.reshape(-1)])
-
-
-def _along(slope, rise):
-    """The way along the boundary that lowers the cost, and whether there is one."""
-    square = jnp.sum(slope**2)
-    usable = jnp.isfinite(square) & (square > 0) & jnp.all(jnp.isfinite(rise))
-    slope, rise = (jnp.where(usable, a, 0) for a in (slope, rise))
-    return slope * jnp.dot(slope, rise) / jnp.where(usable, square, 1) - rise, usable
-
-
-def _slopes(sim, z):
-    """The gradients of the distance and of the cost at ``z``."""
-
-    def both(z):
-        e = rollout(jax.random.key(0), sim, policy_of(sim, z), likelihood(sim))
-        return e.distance, -e.reward
-
-    (distance, _), back = jax.vjp(both, z)
-    one, zero = jnp.ones_like(distance), jnp.zeros_like(distance)
-    return back((one, zero))[0], back((zero, one))[0]
-
-
-def _differences(sim, home, v, radius, point, part):
-    """Both slopes with the numbers ``part`` told anew, from differences outside the failures."""
-    gap = jnp.maximum(EDGE, point.gap)
-    edge, h = home + (1 - gap) * v, 0.2 * EDGE * jnp.maximum(radius, 1e-3)
-    shifted = (
-        edge[None].repeat(len(part), 0).at[jnp.arange(len(part), dtype=jnp.int32), part].add(h)
-    )
-    there = judge(sim, edge)
-    moved = jax.vmap(partial(judge, sim))(shifted)
-    good = jnp.isfinite(moved.distance) & jnp.isfinite(moved.cost)
-    told = lambda a, b: jnp.where(good, (a - b) / h, 0)
-    slope = point.slope.at[part].set(told(moved.distance, there.distance))
-    return slope, point.rise.at[part].set(told(moved.cost, there.cost))
-
-
-@jax.jit
-def residuals(sim: Simulator, home: jax.Array, points: Point) -> jax.Array:
-    """How far each of ``points`` [n] is from the conditions of Karush, Kuhn and Tucker: the slope
-    of its cost along the boundary, as a share of the whole slope; NaN where the distance has none.
-    """
-
-    def one(point):
-        slope, rise = _slopes(sim, home + (1 - point.gap) * (point.z - home))
-        along, usable = _along(slope, rise)
-        share = jnp.linalg.norm(along) / jnp.maximum(jnp.linalg.norm(rise), NEAREST)
-        return jnp.where(usable, share, jnp.nan)
-
-    return jax.vmap(one)(points)

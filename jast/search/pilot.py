@@ -21,6 +21,7 @@ from jast.counter import tree_keys
 from jast.episode import Episode, play_back
 from jast.incidents import hosted
 from jast.outline import outline
+from jast.rewards import LogLikelihood
 from jast.search import lockstep as E
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
@@ -52,16 +53,6 @@ class Pilot(NamedTuple):
     tally: E.Tally
 
 
-class _LogP:
-    """A reward: log p in the density that is asked for."""
-
-    def __init__(self, density: str):
-        self.density = density
-
-    def __call__(self, log_p: Any, *_: Any) -> Any:
-        return log_p
-
-
 def fly(sim: Simulator, density: str, widen: str) -> Pilot:
     """Run plain episodes of ``sim``, and wider ones till enough of them fail.
 
@@ -80,7 +71,7 @@ def fly(sim: Simulator, density: str, widen: str) -> Pilot:
 @partial(jax.jit, static_argnames=("density", "widths", "blind", "lanes"))
 def _fly(sim: Simulator, density: str, widths: int, blind: bool, lanes: int) -> Pilot:
     key, like = tree_keys(jax.random.key(0), 1)[0], outline(sim)
-    reward = _LogP(density)
+    reward = LogLikelihood(density)
     live, number = jnp.ones((lanes,), bool), jnp.arange(lanes, dtype=jnp.int32)
     table = jnp.asarray(WIDTHS[:widths], like.dtype)
 

@@ -13,7 +13,10 @@ from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
 from jast.limit_state import check, episodes, normal_of
 from jast.results import asked
+from jast.rewards import likelihood
 from jast.search import moves as M
+from jast.search.centred import centred
+from jast.search.rounds import begun, residuals, round_of
 from jast.simulator import Simulator
 
 __all__ = ["Refined", "refine"]
@@ -24,7 +27,7 @@ gradient of distance and log p is counted as.
 """
 LOOK, LIKE, STILL, STILL_FOR, ENOUGH, FILLING, ALIKE = 5, 0.02, 1e-6, 6, 15, 0.5, 0.7
 """Rounds between two looks at the points; those nearer to one another than this share of their way
-from the anchor go on as one; a point has arrived where so many looks gained less than this share of
+from the origin go on as one; a point has arrived where so many looks gained less than this share of
 its cost; further failures are started with where there are so many rounds for each, in this share
 of the budget. In the rest, of points with a cosine above the last number only the likeliest goes
 on.
@@ -132,13 +135,13 @@ class _Work:
 
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
-        self.home, z = M.anchor(sim), normal_of(sim, given)
-        self.v = z - np.asarray(self.home)
+        self.centred = centred(sim)
+        self.v = normal_of(self.centred, given)
         self.value = np.asarray(given.reward, np.float64)
         self.left = list(np.argsort(-self.value, kind="stable"))
-        self.seen = np.zeros((0, z.shape[1]))
+        self.seen = np.zeros((0, self.v.shape[1]))
         self.live, self.arrived, self.done = [], [], []
-        self.cost = M.SIZE + (GRADIENT if gradients else min(DIFFERENCES, z.shape[1]))
+        self.cost = M.SIZE + (GRADIENT if gradients else min(DIFFERENCES, self.v.shape[1]))
         self.spent = self.invalid = self.turn = 0
 
     def run(self, budget):
@@ -171,11 +174,10 @@ class _Work:
         rows = self._next(room - len(self.live))
         if not len(rows):
             return
-        home = np.asarray(self.home)
-        lifted = home + self.v[rows] * (1 + np.array(LIFTS))[:, None, None]
+        lifted = self.v[rows] * (1 + np.array(LIFTS))[:, None, None]
         n, d = len(rows), lifted.shape[-1]
         flat = np.resize(lifted.reshape(-1, d), (len(LIFTS) << (n - 1).bit_length(), d))
-        points, verdict = jax.device_get(M.begun(self.sim, jnp.asarray(flat, self.v.dtype)))
+        points, verdict = jax.device_get(begun(self.centred, jnp.asarray(flat, self.v.dtype)))
         self.spent += len(flat)
         fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
         for k, row in enumerate(rows):
@@ -188,7 +190,7 @@ class _Work:
         """At most ``n`` of the failures not yet tried: the likeliest; then by turns the likeliest
         for how far it points away from all that were tried and found, the farthest, and the next.
         """
-        found = [t.point.z - np.asarray(self.home) for t in self.live + self.arrived]
+        found = [t.point.v for t in self.live + self.arrived]
         known = _unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
         unit, rows = _unit(self.v), []
         worth = np.exp(-2 * (self.value.max(initial=-np.inf) - self.value) / self._scale())
@@ -209,18 +211,22 @@ class _Work:
     def _round(self, size):
         tracks = [self.live[k % len(self.live)] for k in range(size)]
         points = jax.tree.map(lambda *a: jnp.asarray(np.stack(a)), *(t.point for t in tracks))
-        d, real = len(self.home), points.z.dtype
+        d, real = self.v.shape[1], points.v.dtype
         part = min(DIFFERENCES, d)
         uniform = lambda *shape: jnp.asarray(self.rng.random(shape), real)
+        powers = lambda *shape: jnp.asarray(10.0 ** -self.rng.integers(0, 5, shape), real)
         noise = M.Noise(
             jnp.asarray(self.rng.standard_normal((size, M.WALKS, d)), real),
             uniform(size, M.REMOVALS, d),
             uniform(size, M.REMOVALS) ** 2,
-            jnp.asarray(10.0 ** -self.rng.integers(0, 5, (size, M.REMOVALS)), real),
+            powers(size, M.REMOVALS),
+            uniform(size, M.EXCHANGES, 2, M.ENTRANTS),
+            powers(size, M.EXCHANGES),
             jnp.asarray(np.tile((part * self.turn + np.arange(part)) % d, (size, 1)), jnp.int32),
             jnp.asarray(self._shifts(size), jnp.int32),
+            jnp.asarray(self.rng.standard_normal((size, M.SHIFTS)), real),
         )
-        points, invalid = M.round_of(self.sim, self.home, points, noise, self.gradients)
+        points, invalid = round_of(self.centred, points, noise, self.gradients)
         points = jax.device_get(points)
         for k, track in enumerate(self.live):
             track.point = jax.tree.map(lambda a, k=k: a[k], points)
@@ -229,16 +235,19 @@ class _Work:
         self.spent += size * self.cost
 
     def _shifts(self, size):
-        far = self.rng.integers(2, max(3, self.sim.horizon // 3), (size, 1))
-        return np.concatenate([np.ones_like(far), -np.ones_like(far), far, -far], axis=1)
+        """One step later, twice, as more steps are more ways; one sooner; many, either way."""
+        far = self.rng.integers(2, max(3, self.sim.horizon // 3), size)
+        far *= self.rng.choice([-1, 1], size)
+        steps = np.stack([np.ones(size), np.ones(size), -np.ones(size), far], axis=1)
+        most = self.sim.horizon - 1  # one of the steps at least stays
+        return np.clip(steps, -most, most)
 
     def _merge(self):
         """Of points of one place the likeliest goes on."""
-        away = lambda t: t.point.z - np.asarray(self.home)
         kept = []
         for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
-            size = LIKE * max(float(np.linalg.norm(away(t))), 1e-12)
-            if all(np.linalg.norm(away(t) - away(other)) > size for other in kept):
+            size = LIKE * max(float(np.linalg.norm(t.point.v)), 1e-12)
+            if all(np.linalg.norm(t.point.v - other.point.v) > size for other in kept):
                 kept.append(t)
         self.arrived = [t for t in self.arrived if t in kept]
         self.live = [t for t in self.live if t in kept]
@@ -247,9 +256,9 @@ class _Work:
         """Points that are like a likelier one end here: what is left of the budget is for those.
         One that had arrived goes on, as it may have been unlucky.
         """
-        kept, units = [], np.zeros((0, len(self.home)))
+        kept, units = [], np.zeros((0, self.v.shape[1]))
         for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
-            unit = _unit((t.point.z - np.asarray(self.home))[None])
+            unit = _unit(t.point.v[None])
             if not len(kept) or (units @ unit[0]).max() < ALIKE:
                 kept.append(t)
                 units = np.concatenate([units, unit])
@@ -268,16 +277,14 @@ class _Work:
         origin, residual = np.array([t.origin for t in tracks], np.int64), np.full(n, np.nan)
         if n:
             points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
-            z = points.z
             if self.gradients:
                 padded = np.arange(1 << (n - 1).bit_length()) % n
                 rows = jax.tree.map(lambda a: jnp.asarray(a[padded]), points)
-                residual = np.asarray(M.residuals(self.sim, self.home, rows), np.float64)[:n]
-        reward, kept = M.likelihood(self.sim), []
-        home = np.asarray(self.home)
+                residual = np.asarray(residuals(self.centred, rows), np.float64)[:n]
+        reward, kept = likelihood(self.sim), []
         for i in range(n):
-            tries = home + (z[i] - home) * (1 + np.array(LIFTS))[:, None]
-            tries = jax.device_get(episodes(self.sim, jnp.asarray(tries, z.dtype)))
+            tries = points.v[i] * (1 + np.array(LIFTS))[:, None]
+            tries = jax.device_get(episodes(self.centred, jnp.asarray(tries, points.v.dtype)))
             own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
             tries = [jax.tree.map(lambda a, k=k: a[k], tries) for k in range(len(LIFTS))]
             for e in [*tries, own]:

@@ -16,13 +16,13 @@ from jast.estimate.populations import cool, explore
 from jast.failures import empty
 from jast.incidents import hosted
 from jast.outline import outline
+from jast.rewards import likelihood
 from jast.search.cem import cem
 from jast.search.forest import forest
 from jast.search.monte_carlo import monte_carlo
-from jast.search.moves import likelihood
 from jast.simulator import Simulator
 
-__all__ = ["EXPLORERS", "Haul", "explorers_of", "ranked"]
+__all__ = ["EXPLORERS", "Haul", "explorers_of"]
 
 KEPT = 128
 """Failures that an explorer hands over, the most."""
@@ -37,25 +37,6 @@ class Haul(NamedTuple):
     failing: int
     """Failing episodes among those simulated, where they were counted; else m"""
     invalid: int
-
-
-def ranked(sim: Simulator) -> Callable:
-    """The reward of searches that rank failures first themselves: of a failure log p, relative to
-    the mode where the disturbances of ``sim`` have modes, and of the rest the nearness.
-    """
-    return by_mode if outline(sim).density == "mode" else by_density
-
-
-def by_mode(log_p, event, distance, terminal, approach=0.0):
-    return jnp.where(event, log_p, -distance)
-
-
-def by_density(log_p, event, distance, terminal, approach=0.0):
-    return jnp.where(event, log_p, -distance)
-
-
-by_mode.once = by_density.once = True
-by_mode.density = "mode"
 
 
 def plain(key: jax.Array, sim: Simulator, budget: int) -> Haul:
@@ -81,12 +62,11 @@ def slopes(key: jax.Array, sim: Simulator, budget: int) -> Haul:
 
 
 def likest(key: jax.Array, sim: Simulator, budget: int) -> Haul:
-    """The cross-entropy method, on the rank of a failure."""
+    """The cross-entropy method."""
     samples = max(10, budget // 15)
     elites = max(2, samples // 10)
-    reward = ranked(sim)
     return _of_search(
-        cem(key, sim, samples=samples, elites=elites, iterations=15, reward=reward, top=KEPT)
+        cem(key, sim, samples=samples, elites=elites, iterations=15, refine=0, top=KEPT)
     )
 
 

@@ -15,8 +15,9 @@ from jast.estimate.batches import drawn, numbers
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked
+from jast.rewards import likelihood
+from jast.search.centred import centred
 from jast.search.failure_modes import Mode, Modes, Paths, assigned, modes
-from jast.search.moves import anchor, likelihood
 from jast.search.refinement import refine
 from jast.simulator import Simulator
 from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of
@@ -236,15 +237,13 @@ class _Work:
         w = np.exp(log_w - log_w.max())
         at = (np.arange(SAMPLES) + 0.5) / SAMPLES
         rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
-        home = np.asarray(anchor(self.sim), np.float64)
-        bests = [m.failure for m in self.modes]
+        bests = [m.failure._replace(states=None) for m in self.modes]
         stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests)
-        stacked = stacked._replace(states=None)
-        v = latent.normal_of(self.sim, stacked).astype(np.float64) - home
-        used = np.arange(z.shape[1])[None] < o.used[rows][:, None]
-        points = np.where(used, z[rows].astype(np.float64) - home, 0)
-        many, known = (points, o.length[rows]), (v, stacked.length)
-        paths = Paths(self.sim, home, int(PATHS * self.budget))
+        drawn_ones = latent.episodes(self.sim, z[rows])
+        sim = centred(self.sim)
+        place = lambda e: (latent.normal_of(sim, e).astype(np.float64), np.asarray(e.length))
+        many, known = place(drawn_ones), place(stacked)
+        paths = Paths(sim, int(PATHS * self.budget))
         owner = assigned(paths, many, known, np.arange(len(self.modes)))
         self.note("telling modes apart", paths.spent)
         shares = np.bincount(owner, minlength=len(self.modes)) / SAMPLES

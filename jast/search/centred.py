@@ -1,0 +1,94 @@
+"""A simulator whose modes are the origin: the normal numbers of `jast.limit_state`, each less that
+of the mode of the distribution it is drawn from.
+
+Where the mode moves with the state, as of a random walk's next step, the number of a step that is
+as likely as can be changes with all that came before. Counted from the mode it is 0 whatever came
+before: so a search can change one step and leave the others as likely as they were.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast.distributions import Distribution
+from jast.outline import outline
+from jast.simulator import Simulator
+
+__all__ = ["Centred", "centred"]
+
+MOST = 5.0
+"""How far from 0 a mode may be; one at the end of its support is infinitely far."""
+
+
+class Centred(Distribution):
+    """The same distribution, with its mode at the normal number 0."""
+
+    def __init__(self, distribution: Any):
+        self._distribution = distribution
+
+    @property
+    def event_shape(self) -> Any:
+        return self._distribution.event_shape
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return self._distribution.batch_shape
+
+    def _sample_n(self, key: jax.Array, n: int) -> Any:
+        return jax.vmap(lambda k: D.sample(self._distribution, k))(jax.random.split(key, n))
+
+    def log_prob(self, value: Any) -> jax.Array:
+        return self._distribution.log_prob(value)
+
+    def log_prob_from_mode(self, value: Any) -> jax.Array:
+        return D.log_density(self._distribution, value, "mode")
+
+    def mode(self) -> Any:
+        return D.mode(self._distribution)
+
+    def quantile(self, u: Any) -> Any:
+        return D.quantile(self._distribution, u)
+
+    def from_normal(self, z: Any) -> Any:
+        moved = jax.tree.map(lambda a, b: a + b.astype(a.dtype), z, _centre(self._distribution))
+        return D.from_normal(self._distribution, moved)
+
+    def to_normal(self, x: Any) -> Any:
+        z = D.to_normal(self._distribution, x)
+        return jax.tree.map(lambda a, b: a - b.astype(a.dtype), z, _centre(self._distribution))
+
+
+def centred(sim: Simulator) -> Simulator:
+    """``sim`` with `Centred` distributions: the same episodes, told by other numbers. One whose
+    distributions have no mode stays as it is.
+    """
+    about = outline(sim)
+    changes = {}
+    if about.disturbance.mode:
+        changes["disturbance"] = Partial(_of_state, sim.disturbance)
+    if about.random_start and about.start.mode:
+        changes["start"] = Partial(_of_start, sim.start)
+    return replace(sim, **changes)
+
+
+def _of_state(disturbance: Any, state: Any) -> Centred:
+    return Centred(disturbance(state))
+
+
+def _of_start(start: Any) -> Centred:
+    return Centred(start())
+
+
+def _centre(d: Any) -> Any:
+    """The normal number of the mode, differentiable also where it is cut at `MOST`."""
+    mode = D.mode(d)
+    first = jax.lax.stop_gradient(D.to_normal(d, mode))
+    fine = jax.tree.map(lambda z: jnp.abs(z) < MOST, first)  # false where it is NaN
+    half = jax.lax.stop_gradient(D.from_normal(d, jax.tree.map(jnp.zeros_like, first)))
+    safe = jax.tree.map(jnp.where, fine, mode, half)  # an infinite number has no slope
+    cut = lambda ok, z, z0: jnp.where(ok, z, jnp.where(z0 > 0, MOST, -MOST).astype(z.dtype))
+    return jax.tree.map(cut, fine, D.to_normal(d, safe), first)
