@@ -143,8 +143,8 @@ def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
 
 
 def test_an_error_above_the_mean_leaves_an_upper_end():
-    assert few_calls._interval(1e-7, 1e-5, 0.95) == pytest.approx((0, 1e-7 + 1.96e-5), 1e-4)
-    assert few_calls._interval(-1e-7, 1e-5, 0.95)[0] == 0
+    assert few_calls._interval(1e-7, 1e-5, 0.95, 1e-6) == pytest.approx((0, 1.97e-5), 1e-2)
+    assert few_calls._interval(-1e-7, 1e-5, 0.95, 0.3) == (0.0, 0.3)
 
 
 def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):

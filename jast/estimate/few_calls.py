@@ -131,6 +131,7 @@ def _estimate(s, rounds, level):
     doubted = float((share**2 / sizes) @ [r.doubted for r in rounds])
     sampled = float(share @ [r.sampled for r in rounds])
     error = math.sqrt(max(seen, doubted) + sampled)
+    unseen = -math.log1p(-level) / s.plain
     found = []
     if s.spent < s.budget:
         found.append(f"interrupted after {s.spent} of {s.budget} calls")
@@ -157,7 +158,7 @@ def _estimate(s, rounds, level):
         mean=mean if mean > 0 else math.nan,
         standard_error=error,
         relative_error=relative,
-        interval=_interval(mean, error, level),
+        interval=_interval(mean, error, level, unseen),
         level=level,
         ess=ess,
         k_hat=math.nan,
@@ -170,19 +171,22 @@ def _estimate(s, rounds, level):
         modes=None,
         reliable=not found,
         warnings=tuple(found),
-        unseen=-math.log1p(-level) / s.plain,
+        unseen=unseen,
         proposal=as_latent([(1.0, s.pool.mixture)], s.dtype),
         history=tuple(s.history),
     )
 
 
-def _interval(mean, error, level):
-    """Log-normal; where the error is as large as the mean, only what lies above is known."""
+def _interval(mean, error, level, unseen):
+    """Log-normal; where the error is as large as the mean only an upper end is known, and not below
+    what draws of the model say.
+    """
     if 0 < error < mean:
         return log_normal(math.log(mean), error / mean, level)
     from statistics import NormalDist  # here: slow to import
 
-    return 0.0, min(max(mean, 0.0) + NormalDist().inv_cdf((1 + level) / 2) * error, 1.0)
+    above = max(mean, 0.0) + NormalDist().inv_cdf((1 + level) / 2) * error
+    return 0.0, min(max(above, unseen), 1.0)
 
 
 def _counted(s, level):
