@@ -313,14 +313,14 @@ def test_action_shapes(function):
         function(walk1d(), actions.uniform(jnp.zeros(3), 1.0))
     with pytest.raises(ValueError, match=r"actions\.uniform: high has shape \(2,\).*\(5,\)"):
         function(limit_state(lambda x: x.sum(), 5), actions.uniform(0.0, jnp.ones(2)))
-    gamma = line(disturbance=lambda s: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
+    lacking = line(disturbance=lambda s: D.VonMises(jnp.asarray(2.0), jnp.asarray(1.0)))
     with pytest.raises(
-        ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"
+        ValueError, match=r"actions\.quantiles: .*quantile: VonMises has no quantile function"
     ):
-        function(gamma, actions.quantiles())
-    started = line(start=lambda: D.Gamma(jnp.asarray(2.0), jnp.asarray(1.0)))
+        function(lacking, actions.quantiles())
+    started = line(start=lambda: D.VonMises(jnp.asarray(2.0), jnp.asarray(1.0)))
     with pytest.raises(
-        ValueError, match=r"actions\.quantiles: .*quantile: Gamma has no quantile function"
+        ValueError, match=r"actions\.quantiles: .*quantile: VonMises has no quantile function"
     ):
         function(started, actions.quantiles())
     with pytest.raises(

@@ -15,7 +15,7 @@ import jast
 from benchmarks.stress_systems import linear
 from jast import actions, rewards
 from jast.distributions import Normal, Weibull
-from jast.search import cem, chain, ending, forest, go_explore, mcts, monte_carlo, moves
+from jast.search import cem, chain, ending, forest, go_explore, mcts, monte_carlo
 
 SIM = linear(10, beta=3.0)
 SEARCHES = {
@@ -34,7 +34,7 @@ COUNTS = "episodes", "steps", "failing_share", "first_failure", "failing", "inva
 def likeliest(sim, result):
     """log p relative to the mode of the likeliest failure that was archived."""
     return max(
-        float(jast.replay(sim, e, reward=moves.likelihood(sim)).reward) for e in result.failures
+        float(jast.replay(sim, e, reward=rewards.likelihood(sim)).reward) for e in result.failures
     )
 
 

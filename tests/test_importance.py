@@ -602,23 +602,23 @@ def test_a_bad_level_is_told_before_anything_is_simulated(key):
 
 @pytest.mark.parametrize("mixing", ["step", "trace"])
 def test_disturbances_that_cannot_be_moved_are_named(mixing):
-    """A Beta has no quantile function here."""
+    """A VonMises has no quantile function here."""
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x,
-        lambda s: D.Beta(jnp.asarray(2.0), jnp.asarray(3.0)),
+        lambda s: D.VonMises(jnp.asarray(2.0), jnp.asarray(3.0)),
         lambda s: (s > 1, 1 - s),
         2,
     )
     e = jast.replay(sim, jnp.full(2, 0.6))
-    with pytest.raises(ValueError, match="trace_proposal: disturbance: .*Beta"):
+    with pytest.raises(ValueError, match="trace_proposal: disturbance: .*VonMises"):
         trace_proposal(sim, e, mixing=mixing)
-    with pytest.raises(ValueError, match="policy_proposal: disturbance: .*Beta"):
+    with pytest.raises(ValueError, match="policy_proposal: disturbance: .*VonMises"):
         policy_proposal(sim, recorded(jnp.full(2, 0.6)), mixing=mixing)
 
 
 def _beta_start():
-    return D.Beta(jnp.asarray(2.0), jnp.asarray(2.0))
+    return D.VonMises(jnp.asarray(2.0), jnp.asarray(2.0))
 
 
 def test_a_start_that_cannot_be_moved(key):
@@ -626,7 +626,7 @@ def test_a_start_that_cannot_be_moved(key):
     sim = walk(lambda x0: x0, start=_beta_start)
     e = jast.replay(sim, jnp.full(2, 1.5), x0=jnp.asarray(0.5))
     q = trace_proposal(sim, e, tilt_start=False)
-    assert isinstance(jax.tree.map(lambda a: a[0], q.policies).start(), D.Beta)
+    assert isinstance(jax.tree.map(lambda a: a[0], q.policies).start(), D.VonMises)
 
 
 def test_a_start_of_one_value(key):

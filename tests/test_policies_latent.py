@@ -83,11 +83,11 @@ def test_sizes_count_floats_and_name_what_cannot_be_tilted():
     beta = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x,
-        lambda s: D.Beta(2.0, 2.0),
+        lambda s: D.VonMises(2.0, 2.0),
         lambda s: (s > 3, 3 - s),
         4,
     )
-    with pytest.raises(ValueError, match="sac: disturbance: Beta cannot be tilted"):
+    with pytest.raises(ValueError, match="sac: disturbance: VonMises cannot be tilted"):
         sizes(beta, "sac")
 
 

@@ -108,6 +108,7 @@ def test_a_kink_at_the_mode(gradients, key):
     assert float(result.failures.best.reward) == pytest.approx(-12, abs=0.05)
 
 
+@pytest.mark.long
 def test_a_mode_that_moves_with_the_state(key):
     """A random walk of tents, as of a seed that changes little: the failure is one jump, held."""
     sim = jast.Simulator(

@@ -211,7 +211,7 @@ def test_latent_is_finite(dtype):
 
 
 def test_latent_names_what_has_none(dtype):
-    with pytest.raises(ValueError, match="Gamma"):
+    with pytest.raises(ValueError, match="VonMises"):
         D.to_normal(
-            D.Gamma(jnp.asarray(2.0, dtype), jnp.asarray(1.0, dtype)), jnp.asarray(0.3, dtype)
+            D.VonMises(jnp.asarray(2.0, dtype), jnp.asarray(1.0, dtype)), jnp.asarray(0.3, dtype)
         )

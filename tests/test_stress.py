@@ -225,11 +225,11 @@ def test_bad_input():
         ),
     ):
         over(walk(), actions=actions.samples())
-    beta = lambda s=None: D.Beta(jnp.asarray(2.0), jnp.asarray(3.0))
+    lacking = lambda s=None: D.VonMises(jnp.asarray(2.0), jnp.asarray(3.0))
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x,
-        lambda s: D.Joint((D.Normal(s, 1.0), beta())),
+        lambda s: D.Joint((D.Normal(s, 1.0), lacking())),
         lambda s: (s > 1, s),
         2,
     )
@@ -238,13 +238,13 @@ def test_bad_input():
     sim = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x[0],
-        lambda s: D.Joint((D.Normal(s, 1.0), beta())),
+        lambda s: D.Joint((D.Normal(s, 1.0), lacking())),
         lambda s: (s > 1, s),
         2,
     )
     with pytest.raises(
         ValueError,
-        match="over: disturbance: Beta has no quantile function; give actions=jast.actions.uniform",
+        match="over: disturbance: VonMises has no quantile function; give actions=jast.actions.uni",
     ):
         over(sim)
     assert over(sim, actions=actions.uniform(0.0, 1.0)).proposal.mean.shape == (4,)
@@ -254,9 +254,9 @@ def test_bad_input():
         lambda s: D.Normal(jnp.zeros(()), 1.0),
         lambda s: (s > 1, s),
         2,
-        start=beta,
+        start=lacking,
     )
-    with pytest.raises(ValueError, match="over: start: Beta has no quantile function"):
+    with pytest.raises(ValueError, match="over: start: VonMises has no quantile function"):
         over(sim, actions=actions.uniform(0.0, 1.0))
     with pytest.raises(ValueError, match="actions.uniform: low"):
         over(walk(), actions=actions.uniform(jnp.zeros(3), 1.0))
