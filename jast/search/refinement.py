@@ -1,6 +1,8 @@
 """refine: from failures to the likeliest failures near them."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +23,9 @@ from jast.simulator import Simulator
 
 __all__ = ["Refined", "refine"]
 
-POINTS, DIFFERENCES, GRADIENT = 16, 64, 4
-"""Failures that are pulled side by side; differences of a point in a round; evaluations that a
-gradient of distance and log p is counted as.
+POINTS, GROUP, DIFFERENCES, GRADIENT = 16, 4, 64, 4
+"""Failures that are pulled side by side, and in one program; differences of a point in a round;
+evaluations that a gradient of distance and log p is counted as.
 """
 LOOK, LIKE, STILL, STILL_FOR, ENOUGH, FILLING, ALIKE = 5, 0.02, 1e-6, 6, 15, 0.5, 0.7
 """Rounds between two looks at the points; those nearer to one another than this share of their way
@@ -145,6 +147,8 @@ class _Work:
         self.spent = self.invalid = self.turn = 0
 
     def run(self, budget):
+        # programs of two sizes only, as each is compiled
+        self.lanes = GROUP if budget >= GROUP * ENOUGH * self.cost else 1
         thinned = False
         while True:
             if self.spent < FILLING * budget or not self.live + self.arrived:
@@ -154,7 +158,7 @@ class _Work:
                 thinned = True
             if not self.live:
                 return
-            size = 1 << (len(self.live) - 1).bit_length()
+            size = -(-len(self.live) // self.lanes) * self.lanes
             for _ in range(LOOK):
                 if self.spent + size * self.cost > budget:
                     return
@@ -176,8 +180,10 @@ class _Work:
             return
         lifted = self.v[rows] * (1 + np.array(LIFTS))[:, None, None]
         n, d = len(rows), lifted.shape[-1]
-        flat = np.resize(lifted.reshape(-1, d), (len(LIFTS) << (n - 1).bit_length(), d))
-        points, verdict = jax.device_get(begun(self.centred, jnp.asarray(flat, self.v.dtype)))
+        rows_of = len(LIFTS) * self.lanes
+        flat = np.resize(lifted.reshape(-1, d), (-(-n // self.lanes) * rows_of, d))
+        flat = flat.astype(self.v.dtype)
+        points, verdict = _in_parts(rows_of, partial(begun, self.centred), flat)
         self.spent += len(flat)
         fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
         for k, row in enumerate(rows):
@@ -210,27 +216,27 @@ class _Work:
 
     def _round(self, size):
         tracks = [self.live[k % len(self.live)] for k in range(size)]
-        points = jax.tree.map(lambda *a: jnp.asarray(np.stack(a)), *(t.point for t in tracks))
+        points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
         d, real = self.v.shape[1], points.v.dtype
         part = min(DIFFERENCES, d)
-        uniform = lambda *shape: jnp.asarray(self.rng.random(shape), real)
-        powers = lambda *shape: jnp.asarray(10.0 ** -self.rng.integers(0, 5, shape), real)
+        uniform = lambda *shape: self.rng.random(shape).astype(real)
+        powers = lambda *shape: (10.0 ** -self.rng.integers(0, 5, shape)).astype(real)
         noise = M.Noise(
-            jnp.asarray(self.rng.standard_normal((size, M.WALKS, d)), real),
+            self.rng.standard_normal((size, M.WALKS, d)).astype(real),
             uniform(size, M.REMOVALS, d),
             uniform(size, M.REMOVALS) ** 2,
             powers(size, M.REMOVALS),
             uniform(size, M.EXCHANGES, 2, M.ENTRANTS),
             powers(size, M.EXCHANGES),
-            jnp.asarray(np.tile((part * self.turn + np.arange(part)) % d, (size, 1)), jnp.int32),
-            jnp.asarray(self._shifts(size), jnp.int32),
-            jnp.asarray(self.rng.standard_normal((size, M.SHIFTS)), real),
+            np.tile((part * self.turn + np.arange(part)) % d, (size, 1)).astype(np.int32),
+            self._shifts(size).astype(np.int32),
+            self.rng.standard_normal((size, M.SHIFTS)).astype(real),
         )
-        points, invalid = round_of(self.centred, points, noise, self.gradients)
-        points = jax.device_get(points)
+        step = lambda points, noise: round_of(self.centred, points, noise, self.gradients)
+        points, invalid = _in_parts(self.lanes, step, points, noise)
         for k, track in enumerate(self.live):
             track.point = jax.tree.map(lambda a, k=k: a[k], points)
-        self.invalid += int(invalid)
+        self.invalid += int(invalid.sum())
         self.turn += 1
         self.spent += size * self.cost
 
@@ -278,9 +284,10 @@ class _Work:
         if n:
             points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
             if self.gradients:
-                padded = np.arange(1 << (n - 1).bit_length()) % n
-                rows = jax.tree.map(lambda a: jnp.asarray(a[padded]), points)
-                residual = np.asarray(residuals(self.centred, rows), np.float64)[:n]
+                padded = np.arange(-(-n // self.lanes) * self.lanes) % n
+                rows = jax.tree.map(lambda a: a[padded], points)
+                residual = _in_parts(self.lanes, residuals, rows)
+                residual = residual[:n].astype(np.float64)
         reward, kept = likelihood(self.sim), []
         for i in range(n):
             tries = points.v[i] * (1 + np.array(LIFTS))[:, None]
@@ -303,6 +310,18 @@ class _Work:
         return Refined(
             found, origin[i], residual[i], gain[i], late[i], self.spent, self.invalid, settings
         )
+
+
+def _in_parts(size: int, function: Callable, *trees: Any) -> Any:
+    """``function`` of arrays [n, ...], which goes on them row by row, ``size`` rows at a time; n is
+    a multiple of that. On the host.
+    """
+    n = len(jax.tree.leaves(trees)[0])
+    parts = [
+        function(*jax.tree.map(lambda a, k=k: jnp.asarray(a[k : k + size]), trees))
+        for k in range(0, n, size)
+    ]
+    return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
 
 
 def _unit(v):

@@ -60,11 +60,10 @@ def begun(sim: Simulator, v: jax.Array) -> tuple[M.Point, Verdict]:
 def round_of(
     sim: Simulator, points: M.Point, noise: M.Noise, gradients: bool
 ) -> tuple[M.Point, jax.Array]:
-    """One round of all ``points`` [n] with their ``noise`` [n], and how many of the candidates were
-    invalid.
+    """One round of all ``points`` [n] with their ``noise`` [n], and how many of the candidates of
+    each were invalid [n].
     """
-    points, invalid = jax.vmap(partial(_round, sim, gradients))(points, noise)
-    return points, jnp.sum(invalid, dtype=jnp.int32)
+    return jax.vmap(partial(_round, sim, gradients))(points, noise)
 
 
 def _round(sim, gradients, point, noise):
@@ -125,15 +124,16 @@ def _differences(sim, point, part):
 
 
 @jax.jit
-def residuals(sim: Simulator, points: M.Point) -> jax.Array:
-    """How far each of ``points`` [n] is from the conditions of Karush, Kuhn and Tucker: the slope
-    of its cost along the boundary, as a share of the whole slope; NaN where the distance has none.
+def residuals(points: M.Point) -> jax.Array:
+    """How far each of ``points`` [n] was, at its last round, from the conditions of Karush, Kuhn
+    and Tucker: the slope of its cost along the boundary, as a share of the whole slope; NaN where
+    the distance has none.
     """
 
     def one(point):
-        slope, rise = _slopes(sim, point, None)
-        usable, along = _usable(slope, rise), M.along(point, slope, rise)
-        share = jnp.linalg.norm(along) / jnp.maximum(jnp.linalg.norm(rise), M.NEAREST)
+        usable = _usable(point.slope, point.rise)
+        along = M.along(point, point.slope, point.rise)
+        share = jnp.linalg.norm(along) / jnp.maximum(jnp.linalg.norm(point.rise), M.NEAREST)
         return jnp.where(usable, share, jnp.nan)
 
     return jax.vmap(one)(points)
