@@ -60,7 +60,7 @@ class Point(NamedTuple):
     slope: Any
     """[D] of the distance, and"""
     rise: Any
-    """[D] of the cost, where both are told from differences"""
+    """[D] of the cost, both at the last round"""
 
 
 class Noise(NamedTuple):
