@@ -64,7 +64,7 @@ class Modes(tuple):
         ]
         for i, mode in enumerate(self, 1):
             e = mode.failure
-            share = "-" if np.isnan(mode.share) else f"{100 * mode.share:.1f} %"
+            share = "-" if np.isnan(mode.share) else f"{100 * mode.share:.0f} %"
             lines.append(
                 f"{i:4d} {float(e.reward):11.4f} {float(e.log_prob):11.4f} {int(e.length):6d}"
                 f" {mode.members:8d} {share:>7}"
