@@ -16,11 +16,9 @@ from jast import distributions as D
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
-__all__ = ["EPISODES", "rounded"]
+__all__ = ["rounded"]
 
 PAIRS, STEPS = 16, 500
-EPISODES = 3 * PAIRS
-"""Episodes, at most, that `rounded` takes."""
 UNITS, SHARE = 32.0, 0.02
 """A disturbance that moves a number by fewer units of its last place is rounded; it matters where
 rounding moves the miss distance by more than this share of what the disturbances do. A random walk
@@ -30,7 +28,7 @@ whose steps have a standard deviation of 10 units is off by 1 % at 4.5 standard 
 
 def rounded(sim: Simulator) -> str | None:
     """A text that says so where the dtype of the state rounds what the disturbances do; None where
-    it does not, and for a system on the host.
+    it does not, and for a system on the host. Runs 48 episodes at most.
 
     Three paths share their random numbers: one as it is, one with a disturbance drawn anew, whose
     effect is told in units of the last place, and one whose state is moved by such a unit at every

@@ -171,17 +171,20 @@ def _astray(s, n):
     """Whether ``n`` draws of the proposal would not tell the probability."""
     if s.log_mean is None or s.lost > LOST:
         return True
+    return _promised(s, n) < diagnostics.ESS
+
+
+def _promised(s, n):
+    """The effective sample size of ``n`` draws of the proposal, by its last batch."""
     b = s.batches[-1]
-    return effective(b.log_weight[b.failure]) / len(b.z) * n < diagnostics.ESS
+    return effective(b.log_weight[b.failure]) / len(b.z) * n
 
 
 def _of_the_model(s, n):
     """The share of the last ``n`` draws that are the model's own: as great as leaves a standard
     error of `EXACT`. They bound what nothing led to.
     """
-    b = s.batches[-1]
-    ess = effective(b.log_weight[b.failure]) / len(b.z) * n
-    return float(np.clip(1 - 1 / (EXACT**2 * ess), *MODEL))
+    return float(np.clip(1 - 1 / (EXACT**2 * _promised(s, n)), *MODEL))
 
 
 def _of_the_search(s, level):
