@@ -27,6 +27,7 @@ def traces(log_w, failure=None, log_shares=None, invalid=None, length=None):
         full(failure, True, bool),
         full(invalid, False, bool),
         full(length, 3, np.int32),
+        np.zeros(n),
     )
 
 

@@ -12,7 +12,7 @@ from pictures import drawn, legend, plt, words
 
 import jast
 from jast import plot
-from jast.estimate import FailureSamples, Traces, pareto_k
+from jast.estimate import Exceedance, FailureSamples, Traces, pareto_k
 from jast.estimate.estimate import Estimate
 from jast.plot.style import BLUE, VERMILION
 
@@ -247,3 +247,34 @@ def test_a_fan_of_an_archive_and_its_labels():
     assert unnamed.get_ylabel() == "number of the state"
     with pytest.warns(DeprecationWarning, match="failure_fan: the order is"):
         plot.failure_fan(WALK, archive)
+
+
+def curve(u, p, reliable=True):
+    u, p = np.asarray(u, float), np.asarray(p, float)
+    good = np.broadcast_to(reliable, u.shape)
+    return Exceedance(u, p, p / 2, 2 * p, 0 * u + 500, good, 0.95, "made")
+
+
+def test_the_exceedance_curve_and_its_band():
+    c = curve([-0.5, 0.0, 0.5, 1.0], [1e-9, 1e-8, 1e-7, np.nan], [True, True, False, False])
+    ax = drawn(plot.exceedance(c, truth=lambda u: 1e-8 * 10 ** (2 * u)))
+    failure, good, doubted, truth = ax.lines
+    assert ax.get_yscale() == "log" and list(failure.get_xdata()) == [0, 0]
+    np.testing.assert_array_equal(good.get_ydata(), [1e-9, 1e-8, np.nan, np.nan])
+    np.testing.assert_array_equal(doubted.get_ydata(), [np.nan, np.nan, 1e-7, np.nan])
+    assert len(truth.get_xdata()) == 4
+    assert legend(ax) == ["failure", "made, 0.95 interval", "UNRELIABLE", "truth"]
+    (band,) = ax.collections
+    assert band.get_datalim(ax.transData).ymax == pytest.approx(2e-7)
+
+
+def test_exceedance_of_estimates_and_what_it_refuses():
+    ax = drawn(plot.exceedance({"plain": jast.estimate.monte_carlo(jax.random.key(0), WALK, 2000)}))
+    assert legend(ax)[1] == "plain, 0.95 interval"
+    for wrong in ({}, 3.0, {"a": "b"}):
+        with pytest.raises(ValueError, match="plot.exceedance: curves must be an Exceedance"):
+            plot.exceedance(wrong)
+    with pytest.raises(ValueError, match="curves must hold a probability"):
+        plot.exceedance(curve([0.0], [np.nan]))
+    with pytest.raises(ValueError, match="exceedance: estimate must hold weighted draws"):
+        plot.exceedance(made())

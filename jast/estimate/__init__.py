@@ -8,8 +8,17 @@ from jast.estimate.adaptive import (
     failure_probability,
     monte_carlo,
 )
+from jast.estimate.answers import (
+    Exceedance,
+    FailureTimes,
+    distance_quantile,
+    exceedance,
+    failure_times,
+)
 from jast.estimate.diagnostics import pareto_k
+from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
+from jast.estimate.events import Event, GivenStart, events, given_start
 from jast.estimate.failure_samples import FailureSamples, failure_samples
 from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
@@ -18,17 +27,27 @@ from jast.estimate.subset import subset_simulation
 from jast.intervals import chernoff, clopper_pearson, jeffreys
 
 __all__ = [
+    "Draws",
     "Estimate",
+    "Event",
+    "Exceedance",
     "FailureProposal",
     "FailureSamples",
+    "FailureTimes",
+    "GivenStart",
     "Proposal",
     "Traces",
     "adaptive_cross_entropy",
     "chernoff",
     "clopper_pearson",
+    "distance_quantile",
+    "events",
+    "exceedance",
     "failure_probability",
     "failure_proposal",
     "failure_samples",
+    "failure_times",
+    "given_start",
     "importance",
     "jeffreys",
     "log_weights",

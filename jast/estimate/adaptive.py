@@ -14,7 +14,8 @@ from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import diagnostics, few_calls, sums
-from jast.estimate.batches import balanced, drawn, numbers
+from jast.estimate.batches import balanced, drawn, numbers, plain_numbers
+from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
@@ -140,15 +141,18 @@ def _with_the_rest(key, s, level, progress, callback):
         simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
         about["reasons"] = s.coarse  # the others are about the proposal
-        return of_counts(
+        found = of_counts(
             name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
         )
+        return found._replace(draws=drawn_by(found.draws, key, lanes, "model"))
     share = _of_the_model(s, n)
     q = together(s.q, s.model(), share)
-    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, q, lanes)
+    modes = _by_direction(q)
+    member = jnp.asarray(np.eye(len(q.means))[_owner(modes, len(q.means))], s.dtype)
+    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, q, member, lanes)
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
-    groups = _groups(q, total) if total.first > 0 else []
-    return estimate(
+    groups = _groups(q, modes, total) if total.first > 0 else []
+    found = estimate(
         name,
         total,
         notes=notes,
@@ -158,6 +162,7 @@ def _with_the_rest(key, s, level, progress, callback):
         control=int(share * total.samples) + s.batch,
         **about,
     )
+    return found._replace(draws=drawn_by(found.draws, key, lanes, q))
 
 
 def _about(s):
@@ -228,7 +233,9 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes)
     total, notes = chunks(simulate, lanes, samples, progress=progress, callback=callback, name=name)
     settings = asked(name, key, samples=samples, level=level)
-    return of_counts(name, total, level=level, notes=notes)._replace(settings=settings)
+    found = of_counts(name, total, level=level, notes=notes)
+    draws = drawn_by(found.draws, key, lanes, "policy")
+    return found._replace(settings=settings, draws=draws)
 
 
 def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
@@ -269,15 +276,26 @@ def _plain_is_better(s):
     return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
 
 
-def _groups(q, total):
-    """The components of ``q`` by failure mode; what the model's own draws carry is one of its own
-    where it matters, and else counts with the greatest.
+def _groups(q, modes, total):
+    """The ``modes`` as `estimate` has them, by number; what the model's own draws carry is one of
+    its own where it matters, and else counts with the greatest.
     """
-    groups, share = _by_direction(q), lambda g: total.by_component[g].sum() / total.first
-    central = lambda g: not np.asarray(q.means)[g].any()
+    groups, share = (
+        [[i] for i in range(len(modes))],
+        lambda g: total.by_component[g[0]] / total.first,
+    )
+    central = lambda g: not np.asarray(q.means)[modes[g[0]]].any()
     plain = [g for g in groups if central(g) and share(g) < diagnostics.MATTERS]
     others = sorted((g for g in groups if g not in plain), key=share)
     return [*others[:-1], sum(plain, others[-1])] if others else groups
+
+
+def _owner(modes, components):
+    """[K] number of the mode of each component; those that are not used have the last place."""
+    owner = np.full(components, components - 1)
+    for i, group in enumerate(modes):
+        owner[group] = i
+    return owner
 
 
 def _by_direction(q):
@@ -304,13 +322,19 @@ def _by_direction(q):
     return out
 
 
-def _traces(key, sim, q, n):
+def _traces(key, sim, q, member, n):
+    """`Traces` [n] of ``q``; ``member`` [K, K]: the mode of each component, of which are shares."""
     _, o, log_w, shares = drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
-    return Traces(log_w, shares, o.failure, o.invalid, o.length)
+    return Traces(log_w, _of_modes(shares, member), o.failure, o.invalid, o.length, o.distance)
+
+
+@jax.jit
+def _of_modes(log_shares, member):
+    return jnp.log(jnp.exp(log_shares) @ member)
 
 
 @partial(jax.jit, static_argnums=2)
 def _plain(key, sim, n):
-    z = jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))
-    o = latent.outcomes(sim, z)
-    return Traces(jnp.zeros(n, z.dtype), jnp.zeros((n, 1), z.dtype), o.failure, o.invalid, o.length)
+    z = plain_numbers(key, sim, n)
+    o, none = latent.outcomes(sim, z), jnp.zeros(n, z.dtype)
+    return Traces(none, none[:, None], o.failure, o.invalid, o.length, o.distance)

@@ -69,3 +69,9 @@ def numbers(key, n, d, dtype):
     return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(
         for_noise, (n, d), dtype
     )
+
+
+@partial(jax.jit, static_argnums=2)
+def plain_numbers(key, sim, n):
+    """Points [n, D] of the model itself."""
+    return jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))

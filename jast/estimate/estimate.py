@@ -80,6 +80,12 @@ class Estimate(NamedTuple):
     """How that was found, a text a line"""
     settings: dict | None = None
     """What was asked for: ``method`` and numbers"""
+    mode_intervals: Any = None
+    """[K, 2] intervals of the probability of each of ``modes``"""
+    draws: Any = None
+    """`jast.estimate.Draws`: the weighted draws, for `jast.estimate.exceedance`, `failure_times`
+    and `events`; None where there are none
+    """
 
     failures_seen = results.alias("failing")
     evaluations = results.alias("episodes")
@@ -190,10 +196,11 @@ def estimate(
     found += (
         diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
     )
-    modes = None
+    modes = mode_intervals = None
     if seen:
         groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
         modes, sizes = diagnostics.by_mode(sums, groups)
+        mode_intervals = _of_modes(log_mean, modes, sizes, n, level)
         found += diagnostics.thin_modes(modes, sizes)
     mean = math.exp(log_mean) if seen else math.nan
     if seen and mean > 1 + 4 * mean * relative:
@@ -220,6 +227,8 @@ def estimate(
         unseen=-math.log1p(-level) / control if control else None,
         proposal=proposal,
         history=history,
+        mode_intervals=mode_intervals,
+        draws=sums.draws,
     )
 
 
@@ -259,7 +268,18 @@ def of_counts(
         jeffreys=jeffreys(k, n, level),
         proposal=proposal,
         history=history,
+        mode_intervals=np.array([clopper_pearson(k, n, level)]) if k else None,
+        draws=sums.draws,
     )
+
+
+def _of_modes(log_mean, modes, sizes, n, level):
+    """[K, 2] intervals of parts of the estimate, by their shares and effective sample sizes."""
+    out = []
+    for v, size in zip(modes, sizes, strict=True):
+        relative = math.sqrt(max(n / size - 1, 0) / max(n - 1, 1)) if size > 0 else math.inf
+        out.append(log_normal(log_mean + math.log(v), relative, level) if size > 0 else (0.0, 1.0))
+    return np.array(out)
 
 
 def _tail(k_hat):

@@ -21,6 +21,7 @@ from jast._checks import random_key, whole
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
+from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
@@ -51,6 +52,8 @@ class Traces(NamedTuple):
     """bool: the simulator or a density returned NaN; no failure then"""
     length: Any
     """int32: steps taken"""
+    distance: Any = None
+    """Miss distance; inf where invalid"""
 
 
 def log_weights(key, sim, proposal, samples, *, mode="default"):
@@ -115,7 +118,8 @@ def importance(
     simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
     total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
     found = estimate("importance", total, level=level, reasons=reasons, notes=stopped)
-    return found._replace(settings=settings)
+    draws = drawn_by(found.draws, key, lanes, "policy")
+    return found._replace(settings=settings, draws=draws)
 
 
 def even(samples):
@@ -152,15 +156,8 @@ def traces(key, sim, proposal, n, to_horizon=False):
 
 def _trace(key, sim, proposal, to_horizon, drawn=None):
     """One `Traces` row; ``drawn``: another policy that draws it."""
-    for_component, for_start, for_steps = jax.random.split(key, 3)
-    own = drawn
-    if drawn is None:
-        k = (
-            jax.random.categorical(for_component, proposal.log_weights)
-            if len(proposal.log_weights) > 1
-            else 0
-        )
-        own = jax.tree.map(lambda a: a[k], proposal.policies)
+    own, for_start, for_steps = component(key, proposal)
+    own = own if drawn is None else drawn
     dtype, (components,) = outline(sim).dtype, proposal.log_weights.shape
 
     def weigh(ratio, p, make, x):  # of log q_k - log p [K], and whether p is 0
@@ -207,7 +204,19 @@ def _trace(key, sim, proposal, to_horizon, drawn=None):
         last.failure,
         last.invalid,
         length,
+        last.distance,
     )
+
+
+def component(key, proposal):
+    """The policy that draws the trace of ``key``, and the keys of its start and of its steps."""
+    for_component, for_start, for_steps = jax.random.split(key, 3)
+    k = (
+        jax.random.categorical(for_component, proposal.log_weights)
+        if len(proposal.log_weights) > 1
+        else 0
+    )
+    return jax.tree.map(lambda a: a[k], proposal.policies), for_start, for_steps
 
 
 @partial(jax.jit, static_argnames="n")

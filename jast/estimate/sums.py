@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast.estimate import draws
+
 __all__ = ["add", "nothing", "skewness"]
 
 
@@ -39,12 +41,28 @@ class Sums(NamedTuple):
     tail: Any
     """The greatest log weights, at most ``keep``, falling"""
     keep: int
+    draws: Any = None
+    """`jast.estimate.draws.Draws` of the traces that have a miss distance"""
 
 
 def nothing(samples):
     """The `Sums` before the first of ``samples`` episodes."""
     return Sums(
-        0, 0, 0, 0, 0.0, 0, -np.inf, 0.0, 0.0, 0.0, None, None, np.zeros(0), tail_size(samples)
+        0,
+        0,
+        0,
+        0,
+        0.0,
+        0,
+        -np.inf,
+        0.0,
+        0.0,
+        0.0,
+        None,
+        None,
+        np.zeros(0),
+        tail_size(samples),
+        draws.nothing(),
     )
 
 
@@ -86,6 +104,7 @@ def add(total, traces):
         squares=squares if total.squares is None else total.squares * rescale**2 + squares,
         tail=np.sort(tail)[::-1],
         keep=total.keep,
+        draws=draws.add(total.draws, traces),
     )
 
 

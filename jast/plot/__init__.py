@@ -8,13 +8,14 @@ Okabe and Ito's, told apart by colour-blind readers; what matters is told by sha
 Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one
 simulator: `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
 `convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`,
-`failure_fan`, `weights`, `levels`. Of failure policies: `training`. Of weakness recognition:
-`failures_found`, `roc`, `failure_grid`, `influence`.
+`exceedance`, `failure_fan`, `weights`, `levels`. Of failure policies: `training`. Of weakness
+recognition: `failures_found`, `roc`, `failure_grid`, `influence`.
 """
 
 from jast._doors import listed
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
+from jast.plot.exceedance import exceedance
 from jast.plot.failing_inputs import failure_grid, influence
 from jast.plot.ferry import ferry
 from jast.plot.fms import fms
@@ -34,6 +35,7 @@ __all__ = [
     "convergence",
     "disturbances",
     "distances",
+    "exceedance",
     "failure_fan",
     "failure_grid",
     "failures_found",

@@ -1,0 +1,277 @@
+"""Named events on the failures of one estimate: how probable each is, alone and given a failure.
+
+The failing draws are made again from their key, and the system is run to where each ended; nothing
+is judged again, so that the weights stay what they were.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import distributions as D
+from jast import results, rewards
+from jast._checks import random_key, whole
+from jast.episode import play_back
+from jast.estimate import diagnostics
+from jast.estimate.answers import asked
+from jast.estimate.batches import drawn, numbers, plain_numbers
+from jast.estimate.draws import interval, key_of, of_weights, share, shares
+from jast.estimate.importance_sampling import component
+from jast.estimate.proposals import as_proposal
+from jast.intervals import clopper_pearson, log_normal
+from jast.limit_state import Latent, dimension, policy_of
+from jast.policy import nominal_policy
+from jast.pytrees import clear, select, strong
+
+__all__ = ["Event", "GivenStart", "events", "given_start"]
+
+BLOCK = 1024
+OF = ("state", "start", "episode")
+
+
+@results.shown()
+class Event(NamedTuple):
+    """An event among the failures. Python numbers."""
+
+    probability: float
+    """That an episode fails and the event happens in it"""
+    interval: tuple
+    """(low, high) at ``level``"""
+    given_failure: float
+    """Probability of the event given a failure"""
+    given_interval: tuple
+    """(low, high) at ``level``"""
+    ess: float
+    """Effective sample size of the failures in which it happened"""
+    failing: int
+    """How many these are"""
+    reliable: bool
+    """The estimate is, and the weights of these failures speak for a number"""
+    warnings: tuple
+    """Why not"""
+    level: float
+
+
+@results.shown()
+class GivenStart(NamedTuple):
+    """A failure given where the episode starts. Python numbers."""
+
+    probability: float
+    """Of a failure, given a start in the set"""
+    interval: tuple
+    """(low, high) at ``level``"""
+    start: float
+    """Probability of a start in the set"""
+    start_interval: tuple
+    """(low, high) at ``level``"""
+    together: Event
+    """The failures that start there"""
+    reliable: bool
+    warnings: tuple
+    level: float
+
+
+def events(sim, estimate, named, *, of="state", proposal=None, level=None):
+    """How probable are several events among the failures of one ``estimate``: dict of name ->
+    `Event`, all from the same draws, so that events and their complements add up.
+
+    The failing draws are made again and the system run to the end of each: one run a failing draw,
+    whatever the number of events, none of those that did not fail. A black box that is judged at
+    its end is not called, unless an event looks at the whole episode; one that is looked at after
+    each step is.
+
+    Args:
+        sim: the simulator of the estimate, the same.
+        estimate: of `failure_probability` from 5000 episodes on, `monte_carlo` or `importance`.
+        named: name -> function in JAX that returns a bool scalar.
+        of: what it is called with: "state", the last one of the episode; "start", the first state;
+            "episode", a `jast.Episode` with its states.
+        proposal: of an estimate by `importance`, the one that it was given.
+        level: of the intervals (default: the estimate's).
+
+    Raises:
+        ValueError: for an estimate without draws or without a failure, of another simulator, an
+            event that is no function or returns no bool, another ``of``, and a missing proposal.
+    """
+    name = "events"
+    draws, level = asked(name, estimate, level)
+    if of not in OF:
+        raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
+    functions = _functions(name, named)
+    happened = _happened(name, sim, estimate, draws, functions, of, proposal)
+    log_w = draws.log_weight[draws.failure]
+    return {k: _event(estimate, draws, log_w, v, level) for k, v in happened.items()}
+
+
+def given_start(key, sim, estimate, named, *, draws=1_000_000, proposal=None, level=None):
+    """How probable is a failure given that the episode starts in a set: dict of name ->
+    `GivenStart`, P(failure and start in the set) / P(start in the set).
+
+    Args:
+        key: consumed.
+        sim, estimate, proposal, level: as in `events`.
+        named: name -> function in JAX of the first state that returns a bool scalar.
+        draws: of the start alone, from the model, for the probability of the set; no step is taken.
+
+    Raises:
+        ValueError: as `events`, and for draws below 1.
+    """
+    name = "given_start"
+    random_key(name, key)
+    kept, level = asked(name, estimate, level)
+    functions = _functions(name, named)
+    happened = _happened(name, sim, estimate, kept, functions, "start", proposal)
+    n, log_w = whole(name, "draws", draws), kept.log_weight[kept.failure]
+    count, done = dict.fromkeys(functions, 0), 0
+    for i in range(-(-n // 2**16)):
+        rows = min(2**16, n - done)
+        seen = _starts(jax.random.fold_in(key, i), sim, functions, 2**16)
+        for k, v in seen.items():
+            count[k] += int(np.asarray(v)[:rows].sum())
+        done += rows
+    out = {}
+    for k, v in happened.items():
+        event, m = _event(estimate, kept, log_w, v, level), count[k]
+        reasons = list(event.warnings)
+        if m < diagnostics.ESS:
+            reasons.append(f"{m} of {n} starts are in the set: too few")
+        p, ends = np.nan, (0.0, 1.0)
+        if m and event.failing:
+            of_both = of_weights(log_w[v], kept.samples)
+            # of a ratio of two independent means, to first order
+            relative = float(np.hypot(of_both.relative, np.sqrt((1 - m / n) / m)))
+            log_p = float(of_both.log_mean) - np.log(m / n)
+            p, ends = float(np.exp(log_p)), log_normal(log_p, relative, level)
+        elif m:
+            p, ends = 0.0, (0.0, min(event.interval[1] * n / m, 1.0))
+        good = event.reliable and m >= diagnostics.ESS
+        out[k] = GivenStart(
+            p, ends, m / n, clopper_pearson(m, n, level), event, good, tuple(reasons), level
+        )
+    return out
+
+
+def _event(estimate, draws, log_w, happened, level):
+    """The `Event` of the failing draws in which it ``happened`` [m]."""
+    w, whole_ = shares(log_w, draws.counted)
+    chosen = w[happened]
+    k, n = len(chosen), draws.samples
+    given = share(whole_, chosen.sum(), (chosen**2).sum(), k, level)
+    reasons = [] if estimate.reliable else ["the estimate is UNRELIABLE"]
+    if not k:
+        # above by what is not excluded among the failures
+        high = given[1][1] * float(np.exp(of_weights(log_w, n).log_mean))
+        reasons.append("no failure shows it")
+        return Event(0.0, (0.0, high), *given, 0.0, 0, False, tuple(reasons), level)
+    m = of_weights(log_w[happened], n)
+    if not draws.counted:
+        k_hat = diagnostics.pareto_k(log_w[happened], n, k)
+        reasons += diagnostics.reasons(k, float(m.ess), k_hat, float(chosen.max() / chosen.sum()))
+    ends = interval(m, level, k if draws.counted else None, n)
+    p = float(np.exp(m.log_mean))
+    return Event(p, ends, *given, float(m.ess), k, not reasons, tuple(reasons), level)
+
+
+def _functions(name: str, named: Any) -> dict[str, Callable]:
+    good = isinstance(named, Mapping) and named
+    if not good or not all(isinstance(k, str) and callable(f) for k, f in named.items()):
+        raise ValueError(f"{name}: named must be a dict of name -> function, received {named!r}")
+    return {
+        k: f if isinstance(f, jax.tree_util.Partial) else jax.tree_util.Partial(f)
+        for k, f in named.items()
+    }
+
+
+def _happened(name, sim, estimate, draws, functions, of, proposal):
+    """Name -> [m] bool, in which of the failing draws each event happened."""
+    rows, length = draws.row[draws.failure], draws.length[draws.failure]
+    if not len(rows):
+        raise ValueError(f"{name}: estimate must hold a failure, received one without")
+    if isinstance(draws.source, Latent):
+        if (received := draws.source.means.shape[1]) != dimension(sim):
+            raise ValueError(
+                f"{name}: sim must be the simulator of the estimate, of {received} numbers,"
+                f" received one of {dimension(sim)}"
+            )
+    if draws.source == "policy":
+        if estimate.method != "monte_carlo" and proposal is None:
+            raise ValueError(f"{name}: proposal must be the one that the estimate was made with")
+        proposal = as_proposal(name, sim, nominal_policy(sim) if proposal is None else proposal)
+    key, out = key_of(draws), {k: [] for k in functions}
+    for i in np.unique(rows // draws.lanes):
+        mine = rows // draws.lanes == i
+        lanes, steps = rows[mine] % draws.lanes, length[mine]
+        chunk = jax.random.fold_in(key, i)
+        if draws.source == "policy":
+            made = jax.random.split(chunk, draws.lanes)
+        else:
+            made = _points(chunk, sim, draws.source, draws.lanes)
+        for a in range(0, len(lanes), BLOCK):
+            part = np.arange(a, a + BLOCK).clip(max=len(lanes) - 1)
+            seen = _judged(
+                sim, functions, proposal, made[lanes[part]], jnp.asarray(steps[part]), of
+            )
+            for k, v in seen.items():
+                if v.shape != (BLOCK,) or v.dtype != bool:
+                    raise ValueError(
+                        f"{name}: {k} must return a bool scalar, received"
+                        f" {v.dtype}{list(v.shape[1:])}"
+                    )
+                out[k].append(np.asarray(v)[: len(lanes) - a])
+    return {k: np.concatenate(v) for k, v in out.items()}
+
+
+def _points(key, sim, q, n):
+    """The points [n, D] of a chunk."""
+    if isinstance(q, str):
+        return plain_numbers(key, sim, n)
+    return _placed(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
+
+
+@jax.jit
+def _placed(sim, q, u, e):
+    # what they come to is left out of the program
+    return drawn(sim, q, u, e)[0]
+
+
+@partial(jax.jit, static_argnums=5)
+def _judged(sim, functions, proposal, made, length, of):
+    """Name -> what it returns for each of the draws ``made``, points or keys, of known length."""
+
+    def one(made, length):
+        if proposal is None:
+            player = policy_of(sim, made)
+            x0, choose = D.mode(player.start()), lambda s, t: D.mode(player.disturbance(s, t))
+        else:
+            own, for_start, for_steps = component(made, proposal)
+            x0 = D.sample(own.start(), for_start)
+            choose = lambda s, t: D.sample(own.disturbance(s, t), jax.random.fold_in(for_steps, t))
+        first = strong(sim.init(x0))
+
+        def step(state, t):
+            x = choose(state, t)
+            after = select(t < length, strong(sim.step(state, x)), state)
+            return after, clear(t >= length, x)
+
+        last, xs = lax.scan(step, first, jnp.arange(sim.horizon, dtype=jnp.int32))
+        if of == "episode":
+            shown = play_back(sim, rewards.STANDARD, x0, xs, length)
+        else:
+            shown = last if of == "state" else first
+        return {k: jnp.asarray(f(shown)) for k, f in functions.items()}
+
+    return jax.vmap(one)(made, length)
+
+
+@partial(jax.jit, static_argnums=3)
+def _starts(key, sim, functions, n):
+    def one(key):
+        first = strong(sim.init(D.sample(sim.start(), key)))
+        return {k: jnp.asarray(f(first)) for k, f in functions.items()}
+
+    return jax.vmap(one)(jax.random.split(key, n))

@@ -1,0 +1,71 @@
+"""The exceedance curve of an estimate: how probable it is that an episode comes so near."""
+
+from typing import Any
+
+import numpy as np
+
+from jast.estimate import Estimate, Exceedance
+from jast.estimate import exceedance as curve_of
+from jast.plot import style
+
+__all__ = ["exceedance"]
+
+
+def exceedance(curves: Any, truth: Any = None, ax: Any = None) -> Any:
+    """The probability that an episode comes as near to a failure as a threshold of the miss
+    distance, with its band, on a logarithmic axis; dashed where it must not be believed, a gap
+    where it is not known, a vertical line at the failure.
+
+    Args:
+        curves: a `jast.estimate.Exceedance`, an `Estimate` that holds draws, or a dict of name ->
+            either.
+        truth: threshold -> probability, of an array, where it is known: dots.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for anything else, an estimate without draws, and where nothing is known.
+    """
+    caller = "plot.exceedance"
+    named = curves if isinstance(curves, dict) else {None: curves}
+    if not named or not all(isinstance(c, Exceedance | Estimate) for c in named.values()):
+        received = sorted({type(c).__name__ for c in named.values()}) or "none"
+        raise ValueError(
+            f"{caller}: curves must be an Exceedance, an Estimate or a dict of name -> either,"
+            f" received {received}"
+        )
+    named = {k: curve_of(c) if isinstance(c, Estimate) else c for k, c in named.items()}
+    if not all(np.isfinite(c.probability).any() for c in named.values()):
+        raise ValueError(f"{caller}: curves must hold a probability, received NaN alone")
+    with style.axes(ax, (6.8, 3.8)) as ax:
+        ax.axvline(0.0, color=style.INK, linewidth=1.0, linestyle=(0, (1, 1.5)), label="failure")
+        for i, (name, c) in enumerate(named.items()):
+            colour = style.COLOURS[i % len(style.COLOURS)]
+            good = np.where(c.reliable, c.probability, np.nan)
+            label = f"{c.level:.4g} interval"
+            ax.fill_between(
+                c.thresholds,
+                np.maximum(c.low, np.finfo(float).tiny),
+                c.high,
+                color=colour,
+                alpha=0.2,
+                linewidth=0,
+            )
+            ax.plot(c.thresholds, good, color=colour, label=f"{name or c.method}, {label}")
+            if (~c.reliable & np.isfinite(c.probability)).any():
+                doubted = np.where(c.reliable, np.nan, c.probability)
+                look = dict(color=style.VERMILION, linestyle=(0, (2, 1.5)), zorder=3)
+                ax.plot(c.thresholds, doubted, label="UNRELIABLE", **look)
+        if truth is not None:
+            u = np.unique(np.concatenate([c.thresholds for c in named.values()]))
+            u = u[:: max(len(u) // 16, 1)]
+            look = dict(color=style.INK, linestyle="", marker="o", markersize=3, zorder=4)
+            ax.plot(u, np.asarray(truth(u), float), label="truth", **look)
+        ax.set(
+            yscale="log",
+            xlabel="threshold of the miss distance",
+            ylabel="probability of coming so near",
+        )
+        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
+    return ax
