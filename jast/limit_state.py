@@ -109,6 +109,11 @@ def ended(sim: Simulator, z: jax.Array, reward: Callable) -> tuple[Progress, jax
     return conclude(sim, reward, end), length
 
 
+def unit(z: np.ndarray) -> np.ndarray:
+    """The directions of points ``z`` [..., D]; that of 0 is 0. On the host."""
+    return z / np.maximum(np.linalg.norm(z, axis=-1, keepdims=True), 1e-12)
+
+
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
     end, length = ended(sim, z, log_likelihood)

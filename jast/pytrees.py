@@ -1,10 +1,12 @@
 """Small functions of pytrees of arrays that several rooms need."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 __all__ = ["count"]
@@ -30,6 +32,18 @@ def padded(rows: Any, length: int) -> Any:
     return jax.tree.map(
         lambda a: jnp.zeros((length, *a.shape[1:]), a.dtype).at[: a.shape[0]].set(a), rows
     )
+
+
+def in_parts(size: int, function: Callable, *trees: Any) -> Any:
+    """``function`` of arrays [n, ...], which goes on them row by row, ``size`` rows at a time; n is
+    a multiple of that. On the host.
+    """
+    n = len(jax.tree.leaves(trees)[0])
+    parts = [
+        function(*jax.tree.map(lambda a, k=k: jnp.asarray(a[k : k + size]), trees))
+        for k in range(0, n, size)
+    ]
+    return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
 
 
 def count(like: Any) -> int:

@@ -113,19 +113,27 @@ def test_seeds_of_unknown_density_make_one_mode(key):
     assert report.probability.mean == pytest.approx(math.erfc(1) / 2, rel=0.5)
 
 
-def test_a_black_box_takes_the_same_call(key):
-    """300 calls; every one is counted."""
+@pytest.mark.parametrize("limit", [6.0, 10.0])
+def test_a_black_box_takes_the_same_call(key, limit):
+    """300 calls in all tell the likeliest failure, log p = -limit^2 / 8, and how likely failure is,
+    Phi(-limit / 2): the interval is of 95 %, so twice its half width is about 4 standard errors.
+    The farther failure is found by the estimate alone.
+    """
     calls = []
 
     def run(x):
         calls.append(1)
-        total = float(np.cumsum(x).max())
-        return total >= 4, max(4 - total, 0.0)
+        total = float(np.sum(x))
+        return total >= limit, max(limit - total, 0.0)
 
     sim = jast.blackbox.from_python(run, horizon=4, disturbance=Normal(0.0, 1.0))
     report = jast.stress(key, sim, 300)
-    assert len(report.failures)
-    assert float(report.failures.best.reward) > -8
+    assert report.episodes < 330
+    assert float(report.failures.best.reward) == pytest.approx(-(limit**2) / 8, rel=0.1)
+    p, truth = report.probability, math.erfc(limit / 2 / math.sqrt(2)) / 2
+    assert p.reliable
+    low, high = (abs(math.log(end / p.mean)) for end in p.interval)
+    assert abs(math.log(p.mean / truth)) < 2 * max(low, high)
 
 
 def test_bad_input_and_interrupts(key):

@@ -143,6 +143,8 @@ def _chosen(s, n):
     noise, out = s.surrogate.noise + 1e-6 * float(np.exp(s.surrogate.logs[:2]).sum() + 1), []
     for _ in range(n):
         v = np.maximum(np.diagonal(c), 0.0) + noise
+        most = np.sqrt(np.outer(v, v))  # of a covariance; rounding may have left more
+        c = np.clip(c, -most, most)
         p = normal_cdf(-mean / (DOUBT * np.sqrt(v)))
         gain = (np.sqrt(p * (1 - p)) / v) @ c**2 / v
         gain[out] = -1.0

@@ -307,14 +307,14 @@ def _by_direction(q):
         list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))),
         [],
     )
-    unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    ways = latent.unit(means)
     while left:
         group, grown = {left[0]}, True
         while grown:
             new = {
                 j
                 for j in left
-                if j not in group and max(float(unit[i] @ unit[j]) for i in group) > APART
+                if j not in group and max(float(ways[i] @ ways[j]) for i in group) > APART
             }
             group, grown = group | new, bool(new)
         out.append(sorted(group))

@@ -75,3 +75,12 @@ def numbers(key, n, d, dtype):
 def plain_numbers(key, sim, n):
     """Points [n, D] of the model itself."""
     return jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))
+
+
+def resampled(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
+    """Rows [size], each as often as its weight asks, by the comb of ``shift`` in [0, 1)
+    (systematic resampling). On the host.
+    """
+    w = np.exp(log_w - log_w.max())
+    at = (np.arange(size) + shift) / size
+    return np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=len(w) - 1)

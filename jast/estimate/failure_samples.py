@@ -13,7 +13,7 @@ from jast import limit_state as latent
 from jast import results
 from jast._checks import random_key, whole
 from jast.episode import Episode
-from jast.estimate.batches import drawn, numbers
+from jast.estimate.batches import drawn, numbers, resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
@@ -96,9 +96,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
             f"{name}: source gave no failure in {n} episodes: expected a proposal under which"
             " failures are frequent"
         )
-    w = np.exp(log_w - log_w.max())
-    at = (np.arange(samples) + float(jax.random.uniform(for_rows))) / samples
-    rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
+    rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
     chain = Chain(key, sim, samples)
     people = chain.judge(jnp.asarray(z[rows], chain.dtype))
     people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)

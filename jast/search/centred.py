@@ -84,11 +84,27 @@ def _of_start(start: Any) -> Centred:
 
 
 def _centre(d: Any) -> Any:
-    """The normal number of the mode, differentiable also where it is cut at `MOST`."""
-    mode = D.mode(d)
-    first = jax.lax.stop_gradient(D.to_normal(d, mode))
-    fine = jax.tree.map(lambda z: jnp.abs(z) < MOST, first)  # false where it is NaN
-    half = jax.lax.stop_gradient(D.from_normal(d, jax.tree.map(jnp.zeros_like, first)))
-    safe = jax.tree.map(jnp.where, fine, mode, half)  # an infinite number has no slope
-    cut = lambda ok, z, z0: jnp.where(ok, z, jnp.where(z0 > 0, MOST, -MOST).astype(z.dtype))
-    return jax.tree.map(cut, fine, D.to_normal(d, safe), first)
+    """The normal number of the mode, cut at `MOST`."""
+    z = _number_of_mode(d)
+    return jax.tree.map(lambda a: jnp.where(jnp.isnan(a), 0, jnp.clip(a, -MOST, MOST)), z)
+
+
+@jax.custom_vjp
+def _number_of_mode(d: Any) -> Any:
+    """It has slopes where it is finite, and else 0."""
+    return D.to_normal(d, D.mode(d))
+
+
+def _forward(d: Any) -> Any:
+    return jax.vjp(lambda d: D.to_normal(d, D.mode(d)), d)
+
+
+def _backward(pull: Any, slopes: Any) -> Any:
+    return (jax.tree.map(_finite, *pull(slopes)),)
+
+
+def _finite(a: Any) -> Any:
+    return a if a.dtype == jax.dtypes.float0 else jnp.where(jnp.isfinite(a), a, 0)
+
+
+_number_of_mode.defvjp(_forward, _backward)

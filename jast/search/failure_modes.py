@@ -5,25 +5,25 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
 from jast.incidents import hosted
-from jast.limit_state import normal_numbers, normal_of, outcomes
+from jast.limit_state import normal_numbers, normal_of, outcomes, unit
+from jast.pytrees import in_parts
 from jast.search.centred import centred
 from jast.search.moves import moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
 
-PLACES = 7
+PLACES, LANES = 7, (32, 256)
 LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
-"""Points of a path between two failures, and how much farther out than the line between them it may
-run: "by much" is a tenth of the way from the origin. The least cosine between the two;
-the least of those that are alike.
+"""Points of a path between two failures, episodes simulated at once, and how much farther out than
+the line between the two a path may run: "by much" is a tenth of the way from the origin. The least
+cosine between the two; the least of those that are alike.
 """
 
 
@@ -37,7 +37,8 @@ class Mode(NamedTuple):
     members: int
     """How many of the failures found are of it."""
     share: float
-    """Of the probability of failure, where there is an estimate; else of the failures found."""
+    """Of the probability of failure, where there is an estimate, or NaN where that is too small to
+    be divided; else of the failures found."""
 
 
 class Modes(tuple):
@@ -81,7 +82,7 @@ def modes(
 
     Two failures are of one mode where a path between them never leaves the failures by much: the
     great arc between their normal numbers, each point of it failing at most a tenth farther from
-    the anchor (the episode of modes) than the arc itself. The same failure some steps sooner or
+    the origin (the episode of modes) than the arc itself. The same failure some steps sooner or
     later is of the same mode: where there is no path, one is looked for once more from the first
     of the two moved in time, so that both end together.
 
@@ -127,9 +128,7 @@ def assigned(paths, many, known, owner):
     (points [n, D], steps [n]).
     """
     (w, ends), (v, known_ends) = many, known
-    unit = lambda a: a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12)
-    near = unit(w) @ unit(v).T
-    order = np.argsort(-near, axis=1)
+    order = np.argsort(-unit(w) @ unit(v).T, axis=1)
     out = owner[order[:, 0]]
     left = np.ones(len(w), bool)
     for k in range(min(order.shape[1], 8)):
@@ -141,6 +140,13 @@ def assigned(paths, many, known, owner):
         out[rows[joined]] = owner[order[rows[joined], k]]
         left[rows[joined]] = False
     return out
+
+
+def nearest(w, v):
+    """Of each of the points ``w`` [m, D] the index of that of ``v`` [n, D] in whose direction it
+    lies most nearly: [m].
+    """
+    return np.argmax(unit(w) @ unit(v).T, axis=1)
 
 
 class Paths:
@@ -172,20 +178,25 @@ class Paths:
         if not n:
             return np.zeros(0, bool)
         t = (np.arange(0 if of_both else 1, PLACES + 1) / (PLACES + 1))[:, None, None]
-        norm = lambda a: np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-12)
-        cosine = np.sum(v / norm(v) * w / norm(w), axis=1)
+        cosine = np.sum(unit(v) * unit(w), axis=1)
+        norm = partial(np.linalg.norm, axis=-1, keepdims=True)
         total = n * len(t) * len(LIFTS)
         if self.spent + total > self.budget:
             return cosine > ALIKE
-        line = (1 - t) * v / norm(v) + t * w / norm(w)
+        line = (1 - t) * unit(v) + t * unit(w)
         size = (1 - t) * norm(v) + t * norm(w)
-        arc = np.where(norm(line) > 1e-3, line / norm(line) * size, 0)
+        arc = np.where(norm(line) > 1e-3, unit(line) * size, 0)
         points = arc[None] * np.array(LIFTS)[:, None, None, None]
-        # few shapes are few programs; a system on the host has none
-        rows = total if hosted(self.sim) else 1 << (total - 1).bit_length()
-        flat = np.resize(points.reshape(-1, d), (rows, d))
-        fails = np.asarray(outcomes(self.sim, jnp.asarray(flat, normal_numbers(self.sim))).failure)
-        self.spent += rows
-        fails = fails[:total].reshape(len(LIFTS), len(t), n)
+        fails = self.fail(points.reshape(-1, d)).reshape(len(LIFTS), len(t), n)
         # no arc is meant between opposite points
         return fails.any(axis=0).all(axis=0) & (cosine > OPPOSITE)
+
+    def fail(self, points):
+        """Whether the episode of each of ``points`` [m, D] fails: [m]."""
+        m, d = points.shape
+        # chunks of two sizes are two programs; a system on the host has none
+        size = m if hosted(self.sim) else LANES[m > LANES[0]]
+        rows = -(-m // size) * size
+        self.spent += rows
+        padded = np.resize(points, (rows, d)).astype(normal_numbers(self.sim))
+        return in_parts(size, partial(outcomes, self.sim), padded).failure[:m]

@@ -1,8 +1,7 @@
 """refine: from failures to the likeliest failures near them."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,8 @@ from jast.counter import generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
-from jast.limit_state import check, episodes, normal_of
+from jast.limit_state import check, episodes, normal_of, unit
+from jast.pytrees import in_parts
 from jast.results import asked
 from jast.rewards import likelihood
 from jast.search import moves as M
@@ -183,7 +183,7 @@ class _Work:
         rows_of = len(LIFTS) * self.lanes
         flat = np.resize(lifted.reshape(-1, d), (-(-n // self.lanes) * rows_of, d))
         flat = flat.astype(self.v.dtype)
-        points, verdict = _in_parts(rows_of, partial(begun, self.centred), flat)
+        points, verdict = in_parts(rows_of, partial(begun, self.centred), flat)
         self.spent += len(flat)
         fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
         for k, row in enumerate(rows):
@@ -197,18 +197,18 @@ class _Work:
         for how far it points away from all that were tried and found, the farthest, and the next.
         """
         found = [t.point.v for t in self.live + self.arrived]
-        known = _unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
-        unit, rows = _unit(self.v), []
+        known = unit(np.concatenate([self.seen, np.reshape(found, (-1, self.v.shape[1]))]))
+        ways, rows = unit(self.v), []
         worth = np.exp(-2 * (self.value.max(initial=-np.inf) - self.value) / self._scale())
         while self.left and len(rows) < n:
             i, turn = 0, len(self.seen) % 4
             if len(known) and turn != 3:
-                apart = 1 - (unit[self.left] @ known.T).max(axis=1)
+                apart = 1 - (ways[self.left] @ known.T).max(axis=1)
                 i = int(np.argmax(apart * worth[self.left] if turn == 1 else apart))
             row = self.left.pop(i)
             rows.append(row)
             self.seen = np.concatenate([self.seen, self.v[row : row + 1]])
-            known = np.concatenate([known, unit[row : row + 1]])
+            known = np.concatenate([known, ways[row : row + 1]])
         return rows
 
     def _scale(self):
@@ -233,7 +233,7 @@ class _Work:
             self.rng.standard_normal((size, M.SHIFTS)).astype(real),
         )
         step = lambda points, noise: round_of(self.centred, points, noise, self.gradients)
-        points, invalid = _in_parts(self.lanes, step, points, noise)
+        points, invalid = in_parts(self.lanes, step, points, noise)
         for k, track in enumerate(self.live):
             track.point = jax.tree.map(lambda a, k=k: a[k], points)
         self.invalid += int(invalid.sum())
@@ -264,10 +264,10 @@ class _Work:
         """
         kept, units = [], np.zeros((0, self.v.shape[1]))
         for t in sorted(self.arrived + self.live, key=lambda t: t.point.cost):
-            unit = _unit(t.point.v[None])
-            if not len(kept) or (units @ unit[0]).max() < ALIKE:
+            way = unit(t.point.v[None])
+            if not len(kept) or (units @ way[0]).max() < ALIKE:
                 kept.append(t)
-                units = np.concatenate([units, unit])
+                units = np.concatenate([units, way])
         self.done = [t for t in self.arrived + self.live if t not in kept]
         for t in kept:
             t.log = t.log[-1:] if t in self.arrived else t.log
@@ -286,7 +286,7 @@ class _Work:
             if self.gradients:
                 padded = np.arange(-(-n // self.lanes) * self.lanes) % n
                 rows = jax.tree.map(lambda a: a[padded], points)
-                residual = _in_parts(self.lanes, residuals, rows)
+                residual = in_parts(self.lanes, residuals, rows)
                 residual = residual[:n].astype(np.float64)
         reward, kept = likelihood(self.sim), []
         for i in range(n):
@@ -310,19 +310,3 @@ class _Work:
         return Refined(
             found, origin[i], residual[i], gain[i], late[i], self.spent, self.invalid, settings
         )
-
-
-def _in_parts(size: int, function: Callable, *trees: Any) -> Any:
-    """``function`` of arrays [n, ...], which goes on them row by row, ``size`` rows at a time; n is
-    a multiple of that. On the host.
-    """
-    n = len(jax.tree.leaves(trees)[0])
-    parts = [
-        function(*jax.tree.map(lambda a, k=k: jnp.asarray(a[k : k + size]), trees))
-        for k in range(0, n, size)
-    ]
-    return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
-
-
-def _unit(v):
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12)

@@ -120,11 +120,16 @@ def _of_search(result: Any) -> Haul:
 
 
 def _of_points(sim: Simulator, found: Any) -> Haul:
-    """The `Haul` of failing points [m, D] of normal numbers."""
-    points = np.asarray(found.points)[:KEPT]
-    invalid = int(getattr(found, "invalid", 0))
+    """The `Haul` of an explorer that ends with points."""
+    haul = of_points(sim, np.asarray(found.points))
+    return haul._replace(evaluations=found.evaluations, invalid=int(getattr(found, "invalid", 0)))
+
+
+def of_points(sim: Simulator, points: np.ndarray) -> Haul:
+    """The `Haul` of points [m, D] of normal numbers: those of the first that fail."""
+    points = points[:KEPT]
     if not len(points):
-        return Haul(empty(sim).episodes, found.evaluations, 0, invalid)
+        return Haul(empty(sim).episodes, 0, 0, 0)
     e = jax.device_get(latent.episodes(sim, jnp.asarray(points, latent.normal_numbers(sim))))
     e = jax.tree.map(lambda a: a[e.failure], e)
-    return Haul(e, found.evaluations, len(e.length), invalid)
+    return Haul(e, len(points), len(e.length), 0)

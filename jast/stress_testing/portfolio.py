@@ -10,35 +10,37 @@ from jast import _checks
 from jast import limit_state as latent
 from jast.contract import check
 from jast.crude import nominal
-from jast.estimate import adaptive
-from jast.estimate.batches import drawn, numbers
+from jast.estimate import adaptive, few_calls
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked
 from jast.rewards import likelihood
-from jast.search.centred import centred
-from jast.search.failure_modes import Mode, Modes, Paths, assigned, modes
+from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.refinement import refine
 from jast.simulator import Simulator
-from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of
+from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points
 from jast.stress_testing.report import Report, Tried
+from jast.stress_testing.shares import cost as shares_cost
+from jast.stress_testing.shares import shares
 from jast.watch import Watch
 
 __all__ = ["stress"]
 
-LEAST, ESTIMABLE = 300, 5000
-"""Evaluations of a call, and of an estimate that finds its own proposal."""
+LEAST, ESTIMABLE, SMALL = 300, 5000, 20
+"""Evaluations of a call, and of an estimate that finds its own proposal; numbers of an episode up
+to which a surrogate does with fewer.
+"""
 NOMINAL, SEARCH, REFINE, PATHS = 0.05, 0.2, 0.15, 0.05
 """Shares of the budget; the last is the most that a look at the modes may cost. What is left is for
 the probability. Without an estimate of its own all is divided between the first three.
 """
+SEARCH_OF_FEW, FIRST_EXPLORER = 0.3, 100
+"""Of a small budget the share that the search may have until it has so many evaluations."""
 FIRST, CALLS, FADING, FEW = 0.5, 6, 0.1, 2000
 """Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
 of its last gain is expected of one that gained nothing since; evaluations below which each explorer
 is called once, and what was found is pulled once.
 """
-SAMPLES = 128
-"""Failures of the estimate that are told apart by mode."""
 
 
 def stress(
@@ -62,7 +64,8 @@ def stress(
         key: consumed.
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Below 8,334 the probability is told from the plain draws alone.
+            least 300. Below 8,334 the probability is a surrogate's (`failure_probability` with few
+            calls), and with more than 20 numbers an episode that of the plain draws alone.
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
         callback: called as ``callback(done, total, None)`` after every piece of the work.
@@ -106,7 +109,9 @@ class _Work:
         self.pool = self.failures = self.known = empty(sim)
         self.modes, self.tried, self.spent, self.invalid = Modes(), [], 0, 0
         self.residual = self.late = np.nan
-        self.estimable = self.latent and (1 - NOMINAL - SEARCH - REFINE) * budget >= ESTIMABLE
+        self.estimable = self.latent and (
+            latent.dimension(sim) <= SMALL or (1 - NOMINAL - SEARCH - REFINE) * budget >= ESTIMABLE
+        )
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
@@ -136,7 +141,7 @@ class _Work:
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
-        total = self.share(SEARCH)
+        total = max(self.share(SEARCH), min(int(SEARCH_OF_FEW * self.budget), FIRST_EXPLORER))
         end, few = self.spent + total, total < FEW
         first = explorers_of(self.sim, total if few else int(FIRST * total))
         gains = {name: self.explore(name, each) for name, each in first.items()}
@@ -210,46 +215,39 @@ class _Work:
             self.probability = more
             return
         known = self.known if len(self.known) else None
-        rest = max(rest - self.counted(), ESTIMABLE)
+        if not len(self.pool):  # the estimate may find what the search did not
+            rest -= self.share(REFINE)
+        rest = max(rest - self.counted(), few_calls.LEAST)
         p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
         self.probability = p
         self.note("probability", p.episodes, p.failing, invalid=p.invalid)
-        if self.modes and p.proposal is not None and p.reliable:
+        if p.proposal is None:
+            return
+        if not len(self.pool):
+            self.take(p.proposal)
+        if self.modes and p.reliable:
             self.tell_shares(p.proposal)
+
+    def take(self, q):
+        """Failures of which the estimate has made its proposal, where the search found none."""
+        points = np.asarray(q.means)[np.isfinite(np.asarray(q.log_weights))]
+        haul = of_points(self.sim, points)
+        self.pool = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
+        best = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        self.note("the estimate's failures", len(points), haul.failing, best)
+        self.refine()
 
     def counted(self):
         """What telling the shares of modes will take."""
-        return 16 * SAMPLES + int(PATHS * self.budget) if len(self.modes) > 1 else 0
+        return shares_cost(self.budget) if len(self.modes) > 1 else 0
 
     def tell_shares(self, q):
         """The share of the probability that each mode has, of failures drawn from the proposal."""
-        if len(self.modes) == 1:
-            self.modes = Modes([self.modes[0]._replace(share=1.0)])
-            return
-        n = 16 * SAMPLES
-        z, o, log_w, _ = jax.device_get(
-            drawn(self.sim, q, *numbers(self.next_key(), n, q.means.shape[1], q.means.dtype))
-        )
-        log_w = np.where(o.failure, log_w.astype(np.float64), -np.inf)
-        self.note("shares of modes", n, int(o.failure.sum()))
-        if not o.failure.any():
-            return
-        w = np.exp(log_w - log_w.max())
-        at = (np.arange(SAMPLES) + 0.5) / SAMPLES
-        rows = np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=n - 1)
-        bests = [m.failure._replace(states=None) for m in self.modes]
-        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests)
-        drawn_ones = latent.episodes(self.sim, z[rows])
-        sim = centred(self.sim)
-        place = lambda e: (latent.normal_of(sim, e).astype(np.float64), np.asarray(e.length))
-        many, known = place(drawn_ones), place(stacked)
-        paths = Paths(sim, int(PATHS * self.budget))
-        owner = assigned(paths, many, known, np.arange(len(self.modes)))
-        self.note("telling modes apart", paths.spent)
-        shares = np.bincount(owner, minlength=len(self.modes)) / SAMPLES
-        self.modes = Modes(
-            m._replace(share=float(s)) for m, s in zip(self.modes, shares, strict=True)
-        )
+        found, failing, cost = shares(self.next_key(), self.sim, q, self.modes, self.budget)
+        if cost:
+            self.note("shares of modes", cost, failing)
+        pairs = zip(self.modes, found, strict=True)
+        self.modes = Modes(m._replace(share=float(s)) for m, s in pairs)
 
     def report(self, settings):
         return Report(
