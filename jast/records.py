@@ -35,6 +35,8 @@ RECORDS = {
     "FailureTimes": "jast.estimate.answers:FailureTimes",
     "GivenStart": "jast.estimate.events:GivenStart",
     "Latent": "jast.limit_state:Latent",
+    "Tilts": "jast.estimate.markov_tilts:Tilts",
+    "TiltFrame": "jast.estimate.markov_tilts:Frame",
     "FailureSamples": "jast.estimate.failure_samples:FailureSamples",
     "FailureProposal": "jast.estimate.multilevel:FailureProposal",
     "Traces": "jast.estimate.importance_sampling:Traces",

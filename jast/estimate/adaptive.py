@@ -13,7 +13,7 @@ from jast import limit_state as latent
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
-from jast.estimate import diagnostics, few_calls, sums
+from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
 from jast.estimate.batches import balanced, drawn, numbers, plain_numbers
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate, of_counts
@@ -37,6 +37,8 @@ SEEN, LOST = 100, 2.0
 of what was found, from which the proposal is given up.
 """
 ASTRAY = "no proposal was found that draws failures by their weights"
+TILTS = 0.2
+"""Of the budget, what must be left for tilts to be tried after Gaussians."""
 EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
@@ -62,14 +64,17 @@ def failure_probability(
     depends on them) and from noise that is wide first and then cooled; a population from subset
     simulation where gradients did not help. Mixtures of Gaussians are fitted to weighted failures
     of a few batches. A guard, a population that is kept out of what the proposal covers, looks for
-    lost failure modes, which are taken in, or else the estimate is UNRELIABLE. What is left of the
-    budget, about half, is drawn from the proposal as it then stands: the estimate and its interval
-    are of these episodes alone. A tenth of them or more, up to two fifths where the standard error
-    stays below 1 %, are the model's own draws, which meet what no explorer was led to; ``unseen``
-    bounds what they did not meet. Where plain Monte Carlo would be more exact, or the proposal is
-    given up and the model fails often enough, all are drawn from the model; where it does not, the
-    answer is subset simulation's, and UNRELIABLE. So is one of a system whose floats are too coarse
-    (`jast.rounding`).
+    lost failure modes, which are taken in, or else the estimate is UNRELIABLE. Systems of 30 steps
+    or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with tilts
+    of each step's own disturbance by the state and the time, fitted by cross-entropy, of choices
+    by their odds; others where the Gaussians promise a standard error above 1 %. What is left of
+    the budget, about half, is drawn from the proposal as it then stands: the estimate and its
+    interval are of these episodes alone. A tenth of them or more, up to two fifths where the
+    standard error stays below 1 %, are the model's own draws, which meet what no explorer was led
+    to; ``unseen`` bounds what they did not meet. Where plain Monte Carlo would be more exact, or
+    the proposal is given up and the model fails often enough, all are drawn from the model; where
+    it does not, the answer is subset simulation's, and UNRELIABLE. So is one of a system whose
+    floats are too coarse (`jast.rounding`).
 
     With fewer than 5000 episodes (50 at least), for systems that cost a second each, a Gaussian
     process learns the limit state from two thirds of them, 240 at most: the miss distance of the
@@ -113,8 +118,11 @@ def failure_probability(
     if known is not None:
         s.known = known
     try:
-        seek(s, gradients)
-        found = _with_the_rest(key, s, level, progress, callback)
+        t = tilt_estimate.first(s)
+        if t is None or not t.serves(tilt_estimate.SERVES):
+            seek(s, gradients)
+            t = _tilts_after(s, t)
+        found = _with_the_rest(key, s, t, level, progress, callback)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
             raise
@@ -124,8 +132,26 @@ def failure_probability(
     return found._replace(settings=settings)
 
 
-def _with_the_rest(key, s, level, progress, callback):
-    """The `Estimate` of what is left of the budget, by the proposal that was found."""
+def _tilts_after(s, t):
+    """The `TiltSeeker` that serves better than the Gaussians and than plain draws, else None;
+    ``t``: one that has been sought.
+    """
+    n, known = s.budget - s.spent, s.log_mean is not None
+    poor = _astray(s, n) or 1 / math.sqrt(_promised(s, n)) > EXACT
+    if t is None and poor and n > TILTS * s.budget and not (known and _plain_is_better(s)):
+        t = tilt_estimate.after(s)
+    gaussian = 0.0 if not known or s.lost > LOST else _promised(s, 1)
+    return t if t is not None and t.serves(gaussian) else None
+
+
+def _with_the_rest(key, s, t, level, progress, callback):
+    """The `Estimate` of what is left of the budget, by the proposal that was found: that of the
+    `TiltSeeker` ``t`` where there is one.
+    """
+    if t is not None and t.promised * (s.budget - s.spent) > diagnostics.ESS:
+        tilt_estimate.guarded(s, t)
+        share = _of_the_model(t.promised * (s.budget - s.spent))
+        return tilt_estimate.estimated(key, s, t, share, level, progress, callback)
     name, sim, n = "failure_probability", s.sim, s.budget - s.spent
     lanes = s.batch  # one program for the search and for this
     about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
@@ -145,7 +171,7 @@ def _with_the_rest(key, s, level, progress, callback):
             name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
         )
         return found._replace(draws=drawn_by(found.draws, key, lanes, "model"))
-    share = _of_the_model(s, n)
+    share = _of_the_model(_promised(s, n))
     q = together(s.q, s.model(), share)
     modes = _by_direction(q)
     member = jnp.asarray(np.eye(len(q.means))[_owner(modes, len(q.means))], s.dtype)
@@ -185,11 +211,11 @@ def _promised(s, n):
     return effective(b.log_weight[b.failure]) / len(b.z) * n
 
 
-def _of_the_model(s, n):
-    """The share of the last ``n`` draws that are the model's own: as great as leaves a standard
-    error of `EXACT`. They bound what nothing led to.
+def _of_the_model(promised):
+    """The share of the last draws, of ``promised`` effective ones, that are the model's own: as
+    great as leaves a standard error of `EXACT`. They bound what nothing led to.
     """
-    return float(np.clip(1 - 1 / (EXACT**2 * _promised(s, n)), *MODEL))
+    return float(np.clip(1 - 1 / (EXACT**2 * promised), *MODEL))
 
 
 def _of_the_search(s, level):

@@ -22,7 +22,9 @@ from jast.estimate.answers import asked
 from jast.estimate.batches import drawn, numbers, plain_numbers
 from jast.estimate.draws import interval, key_of, of_weights, share, shares
 from jast.estimate.importance_sampling import component
+from jast.estimate.markov_tilts import Tilts
 from jast.estimate.proposals import as_proposal
+from jast.estimate.redrawn import redrawn
 from jast.intervals import clopper_pearson, log_normal
 from jast.limit_state import Latent, dimension, policy_of
 from jast.policy import nominal_policy
@@ -230,6 +232,8 @@ def _points(key, sim, q, n):
     """The points [n, D] of a chunk."""
     if isinstance(q, str):
         return plain_numbers(key, sim, n)
+    if isinstance(q, Tilts):
+        return jnp.asarray(redrawn(key, sim, q, n)[0])
     return _placed(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
 
 

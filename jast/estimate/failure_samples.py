@@ -13,12 +13,14 @@ from jast import limit_state as latent
 from jast import results
 from jast._checks import random_key, whole
 from jast.episode import Episode
-from jast.estimate.batches import drawn, numbers, resampled
+from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
+from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal
+from jast.estimate.redrawn import redrawn
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -82,9 +84,15 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
                 f"{name}: source must be of this simulator, of {latent.dimension(sim)} numbers,"
                 f" received one of {received}"
             )
-        z, o, log_w, _ = jax.device_get(
-            drawn(sim, q, *numbers(for_draws, n, latent.dimension(sim), q.means.dtype))
-        )
+        z, o, log_w = redrawn(for_draws, sim, q, n)
+        failure = o.failure
+    elif isinstance(q, Tilts):
+        if (received := q.frame.centre.shape[0]) != (expected := shape(sim).seen):
+            raise ValueError(
+                f"{name}: source must be of this simulator, of whose states {expected} numbers are"
+                f" seen, received one of {received}"
+            )
+        z, o, log_w = redrawn(for_draws, sim, q, n)
         failure = o.failure
     else:
         e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)

@@ -16,6 +16,8 @@ import numpy as np
 from jax.scipy.special import logsumexp
 
 from jast.counter import generator
+from jast.estimate import markov_tilts
+from jast.estimate.markov_tilts import Tilts, of_the_model, shape
 from jast.limit_state import dimension, log_ratios, normal_numbers, outcomes
 from jast.markov import WIDTHS, proposed
 
@@ -65,6 +67,8 @@ class Chain:
         self.rng, self.sim, self.size, self.covered = generator(key), sim, size, covered
         self.scale, self.accepted, self.evaluations, self.invalid = 0.7, math.nan, 0, 0
         self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
+        if covered is not None and isinstance(covered[0], Tilts):
+            self.dimension = markov_tilts.dimension(shape(sim), sim.horizon)
 
     def noise(self):
         return jnp.asarray(self.rng.standard_normal((self.size, self.dimension)), self.dtype)
@@ -128,8 +132,9 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
     """Subset simulation: take a population of ``size`` points down the levels of the miss distance
     to the failures of ``sim``: `Explored`.
 
-    ``covered``: (`Latent` q, log threshold): points with log q - log p above it are left out, so
-    that the population looks for failures that q does not draw, and the estimate is of those alone.
+    ``covered``: (`Latent` or `Tilts` q, log threshold): points with log q - log p above it are left
+    out, so that the population looks for failures that q does not draw, and the estimate is of
+    those alone. Points are what q has them to be.
     It gives up below the log probability ``least``, where it would take more than ``most``
     evaluations, or where no level falls further.
     """
@@ -199,13 +204,16 @@ def _next(score, last):
 
 @jax.jit
 def _judge(sim, z, covered):
-    o = outcomes(sim, z)
-    score = o.score
-    if covered is not None:
-        q, threshold = covered
-        inside = logsumexp(log_ratios(q, z, o.used) + q.log_weights[None], axis=1) > threshold
-        score = jnp.where(inside, jnp.inf, score)
-    return Population(z, score, o.used, o.invalid)
+    if covered is None:
+        o = outcomes(sim, z)
+        return Population(z, o.score, o.used, o.invalid)
+    q, threshold = covered
+    if isinstance(q, Tilts):
+        o, log_q, _ = of_the_model(sim, q, z)
+    else:
+        o = outcomes(sim, z)
+        log_q = logsumexp(log_ratios(q, z, o.used) + q.log_weights[None], axis=1)
+    return Population(z, jnp.where(log_q > threshold, jnp.inf, o.score), o.used, o.invalid)
 
 
 @jax.jit

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.estimate.batches import drawn, numbers, resampled
+from jast.estimate.batches import resampled
+from jast.estimate.redrawn import redrawn
 from jast.search.centred import centred
 from jast.search.failure_modes import Modes, Paths, assigned, nearest
 from jast.simulator import Simulator
@@ -45,9 +46,7 @@ def shares(
         return np.ones(1), 0, 0
     if not n:
         return np.full(k, np.nan), 0, 0
-    z, o, log_w, _ = jax.device_get(
-        drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
-    )
+    z, o, log_w = redrawn(key, sim, q, n)
     if not o.failure.any():
         return np.full(k, np.nan), 0, n
     rows = resampled(np.where(o.failure, log_w.astype(np.float64), -np.inf), n // PART, 0.5)

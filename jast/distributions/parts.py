@@ -1,0 +1,111 @@
+"""A distribution as its independent parts: numbers that have normal ones behind them, and choices
+among few categories, each with its probabilities.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jast.distributions.base import is_distribution
+from jast.distributions.kinds import Where
+from jast.distributions.verbs import event_like, from_normal
+from jast.pytrees import count
+
+__all__ = ["Parts", "parts"]
+
+
+class Parts(NamedTuple):
+    """What `parts` makes of a distribution. Lives in one trace: it holds a function."""
+
+    normals: int
+    """How many of the numbers have normal ones behind them"""
+    choices: tuple[jax.Array, ...]
+    """Log probabilities [B, C] of each batch of choices"""
+    value: Callable[[jax.Array, tuple[jax.Array, ...]], Any]
+    """(z [normals], (category [B], ...)) -> the value"""
+
+
+def parts(d: Any) -> Parts:
+    """The independent parts of ``d``, through joints, independent axes, one of two and mixtures of
+    one family: of these the component is a choice of its own.
+
+    A Bernoulli or Categorical is a choice; all else has normal numbers behind it (`from_normal`).
+    """
+    if hasattr(d, "distributions"):
+        return _joint(d)
+    if hasattr(d, "reinterpreted_batch_ndims"):
+        return parts(d.distribution)
+    if isinstance(d, Where):
+        return _either(d)
+    if type(d).__name__ == "MixtureSameFamily" and d.components_distribution.event_shape == ():
+        return _mixture(d)
+    if type(d).__name__ in ("Bernoulli", "Categorical"):
+        return _choice(d)
+    return _numbers(d)
+
+
+def _numbers(d: Any) -> Parts:
+    like = event_like(d)
+    return Parts(count(like), (), lambda z, _: from_normal(d, _shaped(z, like)))
+
+
+def _shaped(z: jax.Array, like: Any) -> Any:
+    leaves, treedef = jax.tree.flatten(like)
+    out, at = [], 0
+    for leaf in leaves:
+        size = count(leaf)
+        out.append(z[at : at + size].reshape(leaf.shape))
+        at += size
+    return treedef.unflatten(out)
+
+
+def _choice(d: Any) -> Parts:
+    like = event_like(d)
+    logits = d.logits
+    if type(d).__name__ == "Bernoulli":
+        logits = jnp.stack([-jax.nn.softplus(logits), -jax.nn.softplus(-logits)], axis=-1)
+    else:
+        logits = jax.nn.log_softmax(logits, axis=-1)
+    log_p = logits.reshape(-1, logits.shape[-1])
+    return Parts(0, (log_p,), lambda _, i: i[0].reshape(like.shape).astype(like.dtype))
+
+
+def _joint(d: Any) -> Parts:
+    leaves, treedef = jax.tree.flatten(d.distributions, is_leaf=is_distribution)
+    each = [parts(leaf) for leaf in leaves]
+
+    def value(z: jax.Array, i: tuple[jax.Array, ...]) -> Any:
+        values, at, of = [], 0, 0
+        for p in each:
+            values.append(p.value(z[at : at + p.normals], i[of : of + len(p.choices)]))
+            at, of = at + p.normals, of + len(p.choices)
+        return treedef.unflatten(values)
+
+    choices = tuple(log_p for p in each for log_p in p.choices)
+    return Parts(sum(p.normals for p in each), choices, value)
+
+
+def _either(d: Where) -> Parts:
+    a, b = (parts(part) for part in d.parts)
+    alike = a.normals == b.normals and [c.shape for c in a.choices] == [c.shape for c in b.choices]
+    if not alike:  # by the normal numbers that both have behind them
+        return _numbers(d)
+    choices = tuple(jnp.where(d.pred, p, q) for p, q in zip(a.choices, b.choices, strict=True))
+    return Parts(a.normals, choices, lambda z, i: d.select(a.value(z, i), b.value(z, i)))
+
+
+def _mixture(d: Any) -> Parts:
+    """Of each number a choice of its component, and the normal number of that one."""
+    like, components = event_like(d), d.components_distribution
+    log_w = jax.nn.log_softmax(d.mixture_distribution.logits, axis=-1)
+    lead = (None,) * (len(components.batch_shape) - log_w.ndim)
+    log_p = jnp.broadcast_to(log_w[lead], components.batch_shape).reshape(count(like), -1)
+
+    def value(z: jax.Array, i: tuple[jax.Array, ...]) -> Any:
+        own = jnp.broadcast_to(z.reshape(*like.shape, 1), components.batch_shape)
+        each, k = from_normal(components, own), i[0].reshape(*like.shape, 1)
+        return jnp.take_along_axis(each, k, axis=-1)[..., 0]
+
+    return Parts(count(like), (log_p,), value)

@@ -1,0 +1,123 @@
+"""Tilts as a part of `failure_probability`: when they are tried, whether they serve better than the
+Gaussians, what they may have lost, and the estimate by them.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast.estimate import diagnostics
+from jast.estimate.draws import drawn_by
+from jast.estimate.estimate import Estimate, estimate
+from jast.estimate.guard import LOST
+from jast.estimate.importance_sampling import Traces, chunks
+from jast.estimate.markov_tilts import Tilts, log_weight, numbers, played
+from jast.estimate.populations import LAST, QUANTILE, explore
+from jast.estimate.tilt_search import TiltSeeker, seek_tilts
+
+__all__ = ["estimated", "first"]
+
+LONG, LARGE = 30, 2e7
+"""Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
+SHARE, REST = 0.35, 0.5
+"""Of the budget for their search; where Gaussians went before, of what is left."""
+SERVES = 0.02
+"""Effective draws of a draw with which nothing else is tried."""
+COVERED, GUARD = 50.0, 0.15
+"""As in `jast.estimate.seek`; what the search for lost failures may cost, of the budget."""
+
+
+def first(s: Any) -> TiltSeeker | None:
+    """The `TiltSeeker` of a system of many steps or with choices, after its search; None for
+    another system. ``s``: the `Seeker`, which pays.
+    """
+    t = TiltSeeker(s.next_key(), s.sim, 0)
+    if not (t.about.choices or t.about.choices0 or s.sim.horizon >= LONG):
+        return None
+    return _sought(s, t, SHARE * s.budget)
+
+
+def after(s: Any) -> TiltSeeker:
+    """The `TiltSeeker` after its search with a part of what is left to the `Seeker` ``s``."""
+    return _sought(s, TiltSeeker(s.next_key(), s.sim, 0), REST * (s.budget - s.spent))
+
+
+def _sought(s, t, most):
+    about = t.about
+    a_step = about.seen + about.normals + about.choices * (1 + about.categories)
+    t.batch = int(min(max(s.budget // 50, 200), LARGE / (a_step * s.sim.horizon) + 100))
+    t.room = int(most)
+    seek_tilts(t, int(most))
+    s.spent += t.spent
+    s.history += t.history
+    return t
+
+
+def guarded(s: Any, t: TiltSeeker) -> None:
+    """Look for failures that the tilts hardly draw: a population that is kept out of what they
+    cover. What is found becomes a reason against the estimate.
+    """
+    s.reasons = []  # others are about the Gaussians
+    least = t.log_mean + math.log(LOST)
+    room = int(min(GUARD * s.budget, (s.budget - s.spent) / 2))
+    size = min(s.size, int(room / (least / math.log(QUANTILE) + LAST + 4)) // 50 * 50)
+    if not size:
+        s.reasons.append("the budget did not last to look for lost failure modes")
+        return
+    threshold = jnp.asarray(-t.log_mean - math.log(COVERED), s.dtype)
+    p = explore(
+        s.next_key(), s.sim, size, covered=(t.tilts(t.q), threshold), least=least, most=room
+    )
+    share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
+    thin = t.thin(math.log(COVERED))
+    s.note(
+        f"guard (tilts): {share:.2%} of the probability is not covered, {thin:.2%} by its batches",
+        p.evaluations,
+    )
+    if not p.complete:
+        s.reasons.append("the budget did not last to look for lost failure modes")
+    if share > 2 * (thin + LOST) + LOST:
+        s.reasons.append(
+            f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
+        )
+
+
+def estimated(
+    key: Any, s: Any, t: TiltSeeker, share: float, level: float, progress: Any, callback: Any
+) -> Estimate:
+    """The `Estimate` of what is left of the budget, ``share`` of it the model's own draws."""
+    name, n = "failure_probability", s.budget - s.spent
+    tilts, weights, frame = t.q
+    weights = np.asarray(weights) * (1 - share) / (1 - weights[0])
+    weights[0] = share
+    q = t.tilts((tilts, weights, frame))
+    simulate = lambda i: _traces(jax.random.fold_in(key, i), s.sim, q, t)
+    total, notes = chunks(simulate, t.batch, n, progress=progress, callback=callback, name=name)
+    groups = [list(range(1, len(tilts)))] if total.first > 0 else []
+    if groups and total.by_component[0] / total.first >= diagnostics.MATTERS:
+        groups.append([0])
+    elif groups:
+        groups[0].append(0)
+    found = estimate(
+        name,
+        total,
+        level=level,
+        reasons=[*s.coarse, *s.reasons],
+        notes=notes,
+        evaluations=s.spent + total.samples,
+        groups=groups,
+        proposal=q,
+        history=tuple(s.history),
+        control=int(share * total.samples),
+    )
+    return found._replace(draws=drawn_by(found.draws, key, t.batch, q))
+
+
+def _traces(key, sim, q: Tilts, t: TiltSeeker):
+    drawn = numbers(key, t.batch, t.about, sim.horizon, t.dtype)
+    o, ratio, _ = played(sim, q, *drawn)
+    log_w, shares = log_weight(q, ratio)
+    return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)

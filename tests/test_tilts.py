@@ -1,0 +1,207 @@
+"""Tilts of each step's own disturbance: the parts of distributions, weights of whole traces, fits
+to known tilts, closed forms with their standard errors.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import jast
+from benchmarks.limit_states import autoregression_probability, ruin_probability
+from jast import distributions as D
+from jast.distributions.parts import parts
+from jast.estimate import failure_probability, failure_samples
+from jast.estimate.markov_tilts import assembled, log_weight, numbers, played, shape, stacked
+from jast.estimate.tilt_fit import as_tilts, fit, frame_of, ratios, steps_of
+from jast.estimate.tilt_search import TiltSeeker
+from jast.simulators import autoregression, ruin
+
+BUDGET = 10_000
+
+
+class Mixed(NamedTuple):
+    level: jax.Array
+    open: jax.Array
+
+
+def _disturbance(rate, s):
+    coin = D.Bernoulli(probs=jnp.where(s.open, 0.5, rate), dtype=jnp.int32)
+    kind = D.Categorical(probs=jnp.stack([1 - rate, rate / 2, rate / 2]), dtype=jnp.int32)
+    return D.Joint({"coin": coin, "kind": kind, "noise": D.Normal(s.level * 0.1, 1.0 + rate)})
+
+
+def _step(s, x):
+    return Mixed(0.8 * s.level + x["noise"] + x["kind"].astype(jnp.float32), x["coin"] == 1)
+
+
+def _evaluate(s):
+    return s.open & (s.level > 4), jnp.maximum(4 - s.level, 0) + jnp.where(s.open, 0.0, 1.0)
+
+
+def _init(x0):
+    return Mixed(x0["noise"], x0["coin"] == 1)
+
+
+def _start(rate):
+    return D.Joint(
+        {"coin": D.Bernoulli(probs=rate, dtype=jnp.int32), "noise": D.Normal(0.0 * rate, 1.0)}
+    )
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """A system of coins, choices and numbers, with a random start, of 5 steps."""
+    rate = jnp.asarray(0.1, jnp.float32)
+    return jast.Simulator(
+        _init,
+        _step,
+        Partial(_disturbance, rate),
+        _evaluate,
+        5,
+        start=Partial(_start, rate),
+    )
+
+
+def joint():
+    return D.Joint(
+        {
+            "b": D.Independent(D.Bernoulli(probs=jnp.asarray([0.1, 0.7])), 1),
+            "c": D.Categorical(probs=jnp.asarray([0.2, 0.3, 0.5])),
+            "n": D.Normal(1.0, 2.0),
+            "v": D.MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)),
+            "w": D.where(jnp.asarray(True), D.Normal(5.0, 1.0), D.Normal(0.0, 1.0)),
+        }
+    )
+
+
+def test_parts_of_a_joint():
+    d = joint()
+    p = parts(d)
+    assert p.normals == 4 and [c.shape for c in p.choices] == [(2, 2), (1, 3)]
+    np.testing.assert_allclose(
+        np.exp(stacked(p)), [[0.9, 0.1, 0], [0.3, 0.7, 0], [0.2, 0.3, 0.5]], rtol=1e-6
+    )
+    z, i = jnp.asarray([0.5, 1.0, -1.0, 2.0]), jnp.asarray([1, 0, 2], jnp.int32)
+    x = assembled(p, z, i)
+    assert x["b"].tolist() == [1, 0] and x["c"] == 2 and x["n"] == 2 and x["w"] == 7
+    assert x["v"].tolist() == [1, -1]
+    like = D.sample(d, jax.random.key(0))
+    assert jax.tree.map(lambda a: (a.shape, a.dtype), x) == jax.tree.map(
+        lambda a: (a.shape, a.dtype), like
+    )
+
+
+def test_parts_of_a_mixture(key):
+    """The component is a choice; with its number it makes draws of the mixture."""
+    d = D.MixtureSameFamily(
+        D.Categorical(probs=jnp.asarray([0.9, 0.1])),
+        D.Normal(jnp.asarray([0.0, 1.0]), jnp.asarray([1.0, 5.0])),
+    )
+    p, n = parts(d), 20_000
+    a, b = jax.random.split(key)
+    z = jax.random.normal(a, (n, 1))
+    i = jax.random.categorical(b, stacked(p)[0], shape=(n, 1)).astype(jnp.int32)
+    x = np.sort(jax.vmap(lambda z, i: assembled(p, z, i))(z, i))
+    at = jnp.asarray(x[:: n // 20], jnp.float32)
+    gaps = np.searchsorted(x, at) / n - np.asarray(jax.vmap(lambda v: D.cdf(d, v))(at))
+    assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
+
+
+def test_weights_average_to_one(mixed, key):
+    """E[p / q] = 1, under tilts of any coefficients, and the host's densities are those of the
+    rollout.
+    """
+    n = 4000
+    s = TiltSeeker(jax.random.key(1), mixed, 500)
+    pilot = s.draw()
+    frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(500))
+    rng = np.random.default_rng(0)
+    one = s.model._replace(
+        **{
+            name: 0.15 * rng.standard_normal(getattr(s.model, name).shape)
+            for name in ("first_means", "first_shifts", "means", "shifts")
+        }
+    )
+    tilts = [s.model, one, s.model._replace(floor=np.log(0.3))]
+    q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, s.dtype)
+    drawn = numbers(key, n, shape(mixed), mixed.horizon, s.dtype)
+    o, ratio, trace = jax.device_get(played(mixed, q, *drawn))
+    log_w, shares = log_weight(q, ratio)
+    w = np.exp(np.asarray(log_w, np.float64))
+    assert abs(w.mean() - 1) < 4 * w.std() / np.sqrt(n) and w.std() > 0.1
+    assert not o.invalid.any() and np.isclose(np.exp(shares).sum(axis=1), 1, atol=1e-4).all()
+    on_host = ratios(tilts, steps_of(frame, trace, o.length), trace[:3], n)
+    np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
+
+
+def test_a_known_tilt_is_found(mixed):
+    """Traces of one tilt, of equal weights, give its means and odds back."""
+    s = TiltSeeker(jax.random.key(2), mixed, 4000)
+    pilot = s.draw()
+    frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(4000))
+    one = s.model._replace(means=s.model.means.copy(), shifts=s.model.shifts.copy())
+    one.means[0], one.means[1] = 0.8, 0.3
+    one.shifts[0, 0, 1] = 1.5
+    s.mixture = ([s.model, one], [0.001, 0.999], frame)
+    b = s.draw()
+    steps = steps_of(frame, b.trace, b.length)
+    found = fit(steps, b.trace[:3], np.ones(4000), 4000.0)
+    means = np.abs(steps.x @ (found.means - one.means))
+    odds = (steps.x @ (found.shifts - one.shifts)[:, 0]) @ [-1, 1, 0]
+    assert np.median(means) < 0.1 and np.median(np.abs(odds)) < 0.3
+    assert np.abs(found.first_means).max() < 0.1
+
+
+def good(found, truth, most=0.05):
+    """Within 4 of its standard errors, which are small; believed."""
+    return (
+        abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
+        and found.relative_error < most
+        and found.reliable
+    )
+
+
+@pytest.fixture(scope="module")
+def gambler():
+    sim = ruin(goal=15, horizon=100)
+    return sim, failure_probability(jax.random.key(0), sim, BUDGET)
+
+
+def test_ruin(gambler):
+    found = gambler[1]
+    assert good(found, ruin_probability(0.4, 1, 15, 100), 0.02), str(found)
+    assert found.evaluations <= BUDGET and any("tilts" in line for line in found.history)
+
+
+def test_samples_of_tilts(gambler, tmp_path):
+    """Failures of the gambler end at his goal; the estimate survives its file."""
+    sim, found = gambler
+    seen = failure_samples(jax.random.key(1), sim, found, 100)
+    assert seen.failures.failure.all()
+    won = np.asarray(seen.failures.disturbances).sum(axis=1)
+    assert (2 * won - seen.failures.length == 14).all()
+    named = {"won": lambda s: s >= 15, "slow": lambda s: s < 0}
+    told = jast.estimate.events(sim, found, named)
+    assert told["won"].given_failure == 1 and told["slow"].given_failure == 0
+    jast.save(tmp_path / "found", found)
+    again = jast.load(tmp_path / "found")
+    for a, b in zip(jax.tree.leaves(found.proposal), jax.tree.leaves(again.proposal), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_first_passage():
+    sim = autoregression(threshold=4.5, horizon=40)
+    found = failure_probability(jax.random.key(0), sim, BUDGET)
+    assert good(found, autoregression_probability(0.1, 4.5, 40)), str(found)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("horizon", [100, 1000])
+def test_long_first_passage(horizon):
+    sim = autoregression(horizon=horizon)
+    found = failure_probability(jax.random.key(0), sim, 30_000)
+    assert good(found, autoregression_probability(0.1, 5.0, horizon)), str(found)
