@@ -35,7 +35,7 @@ def _disturbance(rate, s):
 
 
 def _step(s, x):
-    return Mixed(0.8 * s.level + x["noise"] + x["kind"].astype(jnp.float32), x["coin"] == 1)
+    return Mixed(0.8 * s.level + x["noise"] + x["kind"].astype(s.level.dtype), x["coin"] == 1)
 
 
 def _evaluate(s):
@@ -55,7 +55,7 @@ def _start(rate):
 @pytest.fixture(scope="module")
 def mixed():
     """A system of coins, choices and numbers, with a random start, of 5 steps."""
-    rate = jnp.asarray(0.1, jnp.float32)
+    rate = jnp.asarray(0.1, jnp.zeros(()).dtype)
     return jast.Simulator(
         _init,
         _step,
@@ -106,7 +106,7 @@ def test_parts_of_a_mixture(key):
     z = jax.random.normal(a, (n, 1))
     i = jax.random.categorical(b, stacked(p)[0], shape=(n, 1)).astype(jnp.int32)
     x = np.sort(jax.vmap(lambda z, i: assembled(p, z, i))(z, i))
-    at = jnp.asarray(x[:: n // 20], jnp.float32)
+    at = jnp.asarray(x[:: n // 20], jnp.zeros(()).dtype)
     gaps = np.searchsorted(x, at) / n - np.asarray(jax.vmap(lambda v: D.cdf(d, v))(at))
     assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
 
