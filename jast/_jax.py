@@ -2,6 +2,7 @@
 of it is followed here, and ``tests/test_jax_shim.py`` says which part broke.
 
  - `is_traced`, `is_tracing`: whether values are known yet (`jax.core.Tracer`);
+ - `quick`: options of the compiler for programs that run once (`compiler_options`);
  - `was_interrupted`: whether an error was Ctrl-C (how a callback's error comes out);
  - `host_call`: NumPy on the host inside of compiled programs (a primitive with lowerings of its
    own, `jax.interpreters`);
@@ -30,6 +31,7 @@ __all__ = [
     "host_call",
     "is_traced",
     "is_tracing",
+    "quick",
     "was_interrupted",
 ]
 
@@ -46,6 +48,27 @@ def is_tracing() -> bool:
     no value.
     """
     return isinstance(jnp.zeros(()) + 0, Tracer)
+
+
+_QUICKLY = {
+    "xla_backend_optimization_level": "0",
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
+
+
+def quick(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.jit` for a program that runs once: on a CPU it is compiled without optimisation, in a
+    fraction of the time, and runs slower.
+    """
+
+    @functools.cache
+    def jitted():
+        # not earlier: this asks for the devices
+        cpu = jax.default_backend() == "cpu"
+        return jax.jit(function, compiler_options=_QUICKLY if cpu else None)
+
+    return functools.wraps(function)(lambda *args: jitted()(*args))
 
 
 def was_interrupted(error: BaseException) -> bool:

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jast.episode import rollout
+from jast import distributions as D
+from jast.episode import played
 from jast.limit_state import outcome, policy_of
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
@@ -55,12 +56,21 @@ def descents(sim: Simulator, starts: jax.Array) -> Descents:
     return jax.vmap(partial(_one, sim))(starts)
 
 
+def _differentiable(sim, z):
+    """The `Episode` of ``z`` [D]: of constant length, so that it can be differentiated backwards,
+    and without a random number.
+    """
+    policy = policy_of(sim, z)
+    choose = lambda state, t, _: D.mode(policy.disturbance(state, t))
+    return played(sim, log_likelihood, D.mode(policy.start()), choose, (), sim.horizon)
+
+
 def _one(sim, start):
     def step(carry, i):
         z, best, found, nearest, least, counts = carry
 
         def distance(z):
-            e = rollout(jax.random.key(0), sim, policy_of(sim, z), log_likelihood)
+            e = _differentiable(sim, z)
             return e.distance, e
 
         (g, e), slope = jax.value_and_grad(distance, has_aux=True)(z)
@@ -80,22 +90,24 @@ def _one(sim, start):
             * jnp.asarray(1.0 + 1e-4, z.dtype)
         )
 
-        def halve(ends, _):
+        def halve(ends, i):
             outside, inside = ends
-            middle = (outside + inside) / 2
-            there = outcome(sim, middle)
+            here = jnp.where(i == 0, inside, (outside + inside) / 2)
+            there = outcome(sim, here)
+            halves = i > 0
             ends = (
-                jnp.where(there.failure, outside, middle),
-                jnp.where(there.failure, middle, inside),
+                jnp.where(there.failure | ~halves, outside, here),
+                jnp.where(there.failure & halves, here, inside),
             )
             return ends, (there.failure, there.length)
 
-        there = outcome(sim, aim)
-        fails = there.failure
-        (outside, inside), halved = jax.lax.scan(halve, (z, aim), length=HALVINGS)
+        # one program for the aim and for the halves of the way to it
+        number = jnp.arange(HALVINGS + 1, dtype=jnp.int32)
+        (outside, inside), (failures_there, lengths) = jax.lax.scan(halve, (z, aim), number)
+        fails = failures_there[0]
         better = fails & (~found | (jnp.sum(inside**2) < jnp.sum(best**2)))
         whole = lambda v: jnp.sum(v, dtype=jnp.int32)
-        failing = whole(e.failure) + whole(fails) + whole(halved[0])
+        failing = whole(e.failure) + whole(failures_there)
         useful, failures, invalid, first, slopes, steps = counts
         counts = (
             useful + whole(usable),
@@ -103,7 +115,7 @@ def _one(sim, start):
             invalid + whole(~jnp.isfinite(g)),
             jnp.where((failing > 0) & (first == STEPS), i, first),
             slopes + e.length,
-            steps + there.length + whole(halved[1]),
+            steps + whole(lengths),
         )
         nearer = jnp.isfinite(g) & (g < least)
         return (

@@ -89,8 +89,11 @@ def tree_keys(key, n):
     return jax.random.wrap_key_data(words, impl=COUNTER)
 
 
-def generator(key):
-    """A NumPy generator from a JAX key of any kind, for work on the host."""
-    return np.random.default_rng(
-        np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist()
-    )
+def generator(key, *numbers):
+    """A NumPy generator from a JAX key of any kind, for work on the host; another one for each
+    ``numbers``, whole and not all 0. A generator is returned as it is.
+    """
+    if isinstance(key, np.random.Generator):
+        return key
+    words = np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist()
+    return np.random.default_rng([*words, *numbers])

@@ -81,7 +81,7 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
     keys = jax.random.split(key, sim.horizon + 1)
     x0 = D.sample(policy.start(), keys[0])
 
-    return _play(
+    return played(
         sim,
         reward,
         x0,
@@ -131,10 +131,10 @@ def play_back(
     """`replay` without its checks: ``disturbances`` [horizon, ...], of which at most ``steps`` rows
     are played; may be vmapped.
     """
-    return _play(sim, reward, x0, lambda state, t, x: x, disturbances, steps)
+    return played(sim, reward, x0, lambda state, t, x: x, disturbances, steps)
 
 
-def _play(
+def played(
     sim: Simulator, reward: Callable, x0: Any, choose: Callable, rows: Any, steps: Any
 ) -> Episode:
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the

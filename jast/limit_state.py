@@ -31,6 +31,9 @@ from jast.simulator import Simulator
 
 __all__ = ["log_ratios", "outcomes", "place"]
 
+ROWS = 2**18
+"""Numbers that densities are worked out for at a time."""
+
 
 class Outcomes(NamedTuple):
     """What episodes [n] came to."""
@@ -51,7 +54,9 @@ class Outcomes(NamedTuple):
         """What a search minimises: the miss distance, -inf for a failure, inf for an invalid
         episode.
         """
-        return jnp.where(self.failure, -jnp.inf, jnp.where(self.invalid, jnp.inf, self.distance))
+        on_host = isinstance(self.failure, np.ndarray)
+        where = np.where if on_host else jnp.where
+        return where(self.failure, -np.inf, where(self.invalid, np.inf, self.distance))
 
 
 class Latent(NamedTuple):
@@ -136,38 +141,45 @@ def episodes(sim, z):
     )(z)
 
 
-def place(q, u, e):
+def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and
-    normal ones ``e`` [n, D].
+    normal ones ``e`` [n, D]. On the host.
     """
-    live = _live(q)
-    k = jnp.minimum(
-        jnp.sum(u[:, None] >= jnp.cumsum(jnp.exp(q.log_weights))[None], axis=1, dtype=jnp.int32),
-        live - 1,
-    )
-
-    def component(i, z):
-        return jnp.where((k == i)[:, None], q.means[i][None] + e @ q.factors[i].T, z)
-
-    return lax.fori_loop(0, live, component, e)
+    edges = np.cumsum(np.exp(np.asarray(q.log_weights)))
+    k = np.minimum(np.searchsorted(edges, u, side="right"), _live(q) - 1)
+    z = np.empty_like(e)
+    for i in np.unique(k):
+        rows = k == i
+        z[rows] = np.asarray(q.means[i]) + e[rows] @ np.asarray(q.factors[i]).T
+    return z
 
 
-def log_ratios(q, z, used):
-    """log q_k - log p [n, K] over the first ``used`` [n] numbers of each of ``z`` [n, D]."""
-
-    def component(mean, inverse):
-        e = (z - mean[None]) @ inverse.T
-        each = 0.5 * (z - e) * (z + e) + jnp.log(jnp.diagonal(inverse))[None]
-        kept = jnp.arange(z.shape[1], dtype=jnp.int32)[None] < used[:, None]
-        return jnp.sum(jnp.where(kept, each, 0), axis=1)
-
-    one = lambda i, out: out.at[:, i].set(component(q.means[i], q.inverses[i]))
-    return lax.fori_loop(0, _live(q), one, jnp.zeros((len(z), len(q.means)), z.dtype))
+def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """log q_k - log p [n, K] over the first ``used`` [n] numbers of each of ``z`` [n, D], 0 for
+    components that are not used. On the host.
+    """
+    live, (n, d) = _live(q), z.shape
+    means, inverses = (np.asarray(a)[:live].astype(z.dtype) for a in (q.means, q.inverses))
+    shift = np.einsum("kij,kj->ki", inverses, means).reshape(-1)
+    diagonals = np.log(np.diagonal(inverses, axis1=1, axis2=2).astype(np.float64))
+    volumes = np.concatenate([np.zeros((live, 1)), np.cumsum(diagonals, axis=1)], axis=1)
+    out = np.zeros((n, len(q.log_weights)))
+    flat = inverses.reshape(-1, d).T
+    rows = max(ROWS // (live * d), 1)
+    for i in range(0, n, rows):
+        part, m = z[i : i + rows, None], used[i : i + rows]
+        e = (part[:, 0] @ flat - shift).reshape(-1, live, d)
+        # the squares differ by (z - e)(z + e): no cancellation of two large sums
+        gap = part - e
+        if (m < d).any():
+            gap *= (np.arange(d) < m[:, None])[:, None]
+        out[i : i + rows, :live] = 0.5 * np.einsum("nkd,nkd->nk", gap, part + e) + volumes[:, m].T
+    return out
 
 
 def _live(q):
     """How many components are used: they come first."""
-    return jnp.sum(jnp.isfinite(q.log_weights), dtype=jnp.int32)
+    return int(np.isfinite(np.asarray(q.log_weights)).sum())
 
 
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:

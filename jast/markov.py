@@ -1,5 +1,6 @@
 """Markov moves over normal numbers, which keep N(0, width^2 I): what all chains share."""
 
+import math
 from typing import Any
 
 import jax
@@ -22,4 +23,5 @@ def proposed(z: jax.Array, noise: jax.Array, scale: Any, width: Any) -> jax.Arra
         scale: from 0, no move, to 1, an independent draw.
         width: of the normal numbers.
     """
-    return jnp.sqrt(1 - scale**2) * z + scale * width * noise
+    root = jnp.sqrt if isinstance(scale, jax.Array) else math.sqrt
+    return root(1 - scale**2) * z + scale * width * noise

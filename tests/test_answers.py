@@ -1,7 +1,5 @@
 """More answers from the draws of one estimate, against closed forms within standard errors."""
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,14 +23,11 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.batches import numbers
 from jast.estimate.draws import of_weights, share, shares
-from jast.estimate.gaussians import as_latent, unit
 from jast.estimate.importance_sampling import Traces
 from jast.simulators import walk1d
 
 norm = scipy.stats.norm
-events_room = sys.modules["jast.estimate.events"]  # the function has its name
 BETA = 4.0
 UP, DOWN = 1.0, -1.0
 
@@ -211,9 +206,6 @@ def test_a_black_box_is_not_called_again(key):
     assert jast.blackbox.calls(sim) == before
     assert out.failing == e.failing and out.interval == pytest.approx(e.interval)
     assert exceedance(e, [1.0]).probability[0] == pytest.approx(norm.sf(1.5), abs=0.03)
-    q = as_latent([(1.0, unit(np.ones((1, 4))))], jnp.zeros(()).dtype)
-    z = events_room._placed(sim, q, *numbers(key, 50, 4, q.means.dtype))
-    assert abs(z.mean() - 1) < 4 / np.sqrt(200) and jast.blackbox.calls(sim) == before
 
 
 def test_memory_is_bounded(monkeypatch):

@@ -28,7 +28,7 @@ from jast.estimate import (
     trace_proposal,
 )
 from jast.estimate.adaptive import LEAST
-from jast.estimate.batches import Batch, drawn, numbers
+from jast.estimate.batches import Batch, drawn, log_ratio, numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, fit, shrunk, together, unit
 from jast.estimate.populations import cool, explore
@@ -297,8 +297,7 @@ def test_the_guard_looks_for_failures_away_from_the_known_modes(key, monkeypatch
     with pytest.raises(Seen) as seen:
         guard.guarded(s, 0, 1)
     q, threshold = seen.value.args[0]
-    way = jnp.asarray(np.array([0.0, 0.6, 0.7, 1.0])[:, None] * mean, s.dtype)
-    ratios = logsumexp(L.log_ratios(q, way, jnp.full(4, 4)) + q.log_weights[None], axis=1)
+    ratios = log_ratio(q, np.array([0.0, 0.6, 0.7, 1.0])[:, None] * mean, np.full(4, 4))
     assert (ratios > threshold).tolist() == [False, False, True, True]
 
 
@@ -561,7 +560,7 @@ def test_log_ratios(key):
     )
     z, used = jnp.asarray(z, q.means.dtype), jnp.asarray(used, jnp.int32)
     np.testing.assert_allclose(
-        jax.jit(L.log_ratios)(q, z, used)[:, :2], expected, rtol=1e-3, atol=1e-3
+        L.log_ratios(q, np.asarray(z), np.asarray(used))[:, :2], expected, rtol=1e-3, atol=1e-3
     )
     np.testing.assert_allclose(np.exp(q.log_weights[:2]), [0.7, 0.3], rtol=1e-5)
 
@@ -577,7 +576,7 @@ def test_draws_of_a_mixture(key):
     q = together(
         as_latent([(1.0, unit(np.full((1, 4), -20.0)))], dtype), as_latent([(1.0, g)], dtype), 0.25
     )
-    z = np.asarray(jax.jit(L.place)(q, *numbers(key, n, 4, dtype)), float)
+    z = np.asarray(L.place(q, *numbers(key, n, 4, dtype)), float)
     near = z.sum(axis=1) < -40
     assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n) and logsumexp(
         q.log_weights
@@ -769,4 +768,5 @@ def test_a_proposal_that_lost_failures_is_given_up(key, monkeypatch):
     levels = failure_probability(key, planes(4.0), BUDGET)
     assert not levels.reliable and levels.warnings[0] == "lost"
     assert "answer of subset simulation" in levels.warnings[1]
-    assert levels.evaluations <= BUDGET and levels.interval[0] < norm.sf(4) < levels.interval[1]
+    assert levels.evaluations <= BUDGET
+    assert abs(levels.log_mean - np.log(norm.sf(4))) < 4 * levels.relative_error

@@ -3,10 +3,8 @@ methods beside it.
 """
 
 import math
-from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
@@ -14,7 +12,7 @@ from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
-from jast.estimate.batches import balanced, drawn, numbers, plain_numbers
+from jast.estimate.batches import balanced, drawn, judged, of_chunk, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
@@ -111,8 +109,7 @@ def failure_probability(
     if budget < LEAST:
         found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         return found._replace(settings=settings)
-    for_search, key = jax.random.split(key)
-    s = Seeker(for_search, sim, budget)
+    s = Seeker(key, sim, budget)
     if (coarse := rounded(sim)) is not None:
         s.coarse.append(coarse)
     if known is not None:
@@ -153,7 +150,7 @@ def _with_the_rest(key, s, t, level, progress, callback):
         share = _of_the_model(t.promised * (s.budget - s.spent))
         return tilt_estimate.estimated(key, s, t, share, level, progress, callback)
     name, sim, n = "failure_probability", s.sim, s.budget - s.spent
-    lanes = s.batch  # one program for the search and for this
+    lanes = s.batch
     about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
     astray, log_p = _astray(s, n), _about(s)
     enough = math.exp(min(log_p, 0.0)) * n >= SEEN
@@ -164,7 +161,7 @@ def _with_the_rest(key, s, t, level, progress, callback):
                 episodes=s.spent + found.episodes, history=(*about["history"], *found.history)
             )
     if s.log_mean is None or (astray and enough) or _plain_is_better(s):
-        simulate = lambda i: _plain(jax.random.fold_in(key, i), sim, lanes)
+        simulate = lambda i: _plain(key, sim, i, min(lanes, n - i * lanes))
         total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
         about["reasons"] = s.coarse  # the others are about the proposal
         found = of_counts(
@@ -174,8 +171,8 @@ def _with_the_rest(key, s, t, level, progress, callback):
     share = _of_the_model(_promised(s, n))
     q = together(s.q, s.model(), share)
     modes = _by_direction(q)
-    member = jnp.asarray(np.eye(len(q.means))[_owner(modes, len(q.means))], s.dtype)
-    simulate = lambda i: _traces(jax.random.fold_in(key, i), sim, q, member, lanes)
+    member = np.eye(len(q.means))[_owner(modes, len(q.means))]
+    simulate = lambda i: _traces(key, sim, q, member, i, min(lanes, n - i * lanes))
     total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
     groups = _groups(q, modes, total) if total.first > 0 else []
     found = estimate(
@@ -348,19 +345,17 @@ def _by_direction(q):
     return out
 
 
-def _traces(key, sim, q, member, n):
-    """`Traces` [n] of ``q``; ``member`` [K, K]: the mode of each component, of which are shares."""
-    _, o, log_w, shares = drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
-    return Traces(log_w, _of_modes(shares, member), o.failure, o.invalid, o.length, o.distance)
+def _traces(key, sim, q, member, i, n):
+    """`Traces` [n] of chunk ``i`` of ``q``; ``member`` [K, K]: the mode of each component, of which
+    are shares.
+    """
+    _, o, log_w, shares = drawn(sim, q, *of_chunk(key, i, n, q))
+    with np.errstate(divide="ignore"):
+        shares = np.log(np.exp(shares) @ member)
+    return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
 
 
-@jax.jit
-def _of_modes(log_shares, member):
-    return jnp.log(jnp.exp(log_shares) @ member)
-
-
-@partial(jax.jit, static_argnums=2)
-def _plain(key, sim, n):
-    z = plain_numbers(key, sim, n)
-    o, none = latent.outcomes(sim, z), jnp.zeros(n, z.dtype)
+def _plain(key, sim, i, n):
+    """`Traces` [n] of chunk ``i`` of the model itself."""
+    o, none = judged(sim, plain_chunk(key, i, n, sim)), np.zeros(n)
     return Traces(none, none[:, None], o.failure, o.invalid, o.length, o.distance)

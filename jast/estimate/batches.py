@@ -1,17 +1,25 @@
 """Batches of a search: points drawn from a proposal, and their weights by the proposals of all
-batches.
+batches. Only the system runs on the device, in one program whatever the number of points.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
+from jax import lax
 
 from jast import limit_state as latent
+from jast.counter import generator
+from jast.estimate.gaussians import log_sum
+from jast.incidents import hosted
+from jast.simulator import Simulator
 
-__all__ = ["numbers"]
+__all__ = ["judged", "numbers"]
+
+LANES, BLOCK, HELD = 4096, 128, 2**20
+"""Points of a call at most, those that run side by side, and numbers that a call may take."""
 
 
 class Batch(NamedTuple):
@@ -22,6 +30,8 @@ class Batch(NamedTuple):
     used: np.ndarray
     failure: np.ndarray
     log_weight: np.ndarray
+    known: Any = None
+    """dict of number of a batch -> (its proposal, log q - log p of the failing points by it)"""
 
 
 def balanced(batches):
@@ -29,52 +39,68 @@ def balanced(batches):
     balance heuristic), and which points those are.
     """
     failing = np.concatenate([b.failure for b in batches])
-    logs = np.stack([over_batches(c.q, batches)[failing] for c in batches])
+    logs = np.stack([over_batches(c.q, batches, i) for i, c in enumerate(batches)])
     top = logs.max(axis=0)
     return -top - np.log(np.exp(logs - top).mean(axis=0)), failing
 
 
-def over_batches(q, batches):
-    """log q - log p of the points of all ``batches``."""
-    return np.concatenate(
-        [
-            -b.log_weight if b.q is q else np.asarray(log_ratio(q, b.z, b.used), np.float64)
-            for b in batches
-        ]
-    )
+def over_batches(q, batches, number=None):
+    """log q - log p of the failing points of all ``batches``; ``number``: of the batch that ``q``
+    drew, whose answers are kept.
+    """
+    return np.concatenate([_of_batch(q, b, number) for b in batches])
 
 
-@jax.jit
+def _of_batch(q, b, number):
+    if b.q is q:
+        return -b.log_weight[b.failure]
+    if number is None or b.known is None:
+        return log_ratio(q, b.z[b.failure], b.used[b.failure])
+    kept = b.known.get(number)
+    if kept is None or kept[0] is not q:
+        kept = b.known[number] = q, log_ratio(q, b.z[b.failure], b.used[b.failure])
+    return kept[1]
+
+
 def log_ratio(q, z, used):
     """log q - log p [n] of points ``z`` [n, D] over their first ``used`` numbers."""
-    return logsumexp(latent.log_ratios(q, z, used) + q.log_weights[None], axis=1)
+    return log_sum(log_joint(q, z, used)) if len(z) else np.zeros(0)
 
 
-@jax.jit
+def log_joint(q, z, used):
+    """log of weight_k q_k over p [n, K]."""
+    z = np.asarray(z, q.means.dtype)
+    return latent.log_ratios(q, z, np.asarray(used)) + np.asarray(q.log_weights, np.float64)
+
+
 def drawn(sim, q, u, e):
     """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`,
-    log p - log q, log shares of the components [n, K].
+    log p - log q, log shares of the components [n, K]. On the host.
     """
     z = latent.place(q, u, e)
-    o = latent.outcomes(sim, z)
-    joint = latent.log_ratios(q, z, o.used) + q.log_weights[None]
-    log_q = logsumexp(joint, axis=1)
+    o = judged(sim, z)
+    joint = log_joint(q, z, o.used)
+    log_q = log_sum(joint)
     return z, o, -log_q, joint - log_q[:, None]
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
 def numbers(key, n, d, dtype):
-    """Uniform [n] and normal [n, d] numbers for `drawn`."""
-    for_component, for_noise = jax.random.split(key)
-    return jax.random.uniform(for_component, (n,), dtype), jax.random.normal(
-        for_noise, (n, d), dtype
-    )
+    """Uniform [n] and normal [n, d] numbers for `drawn`; ``key``: of JAX, or a NumPy generator."""
+    rng = generator(key)
+    return rng.random(n).astype(dtype), rng.standard_normal((n, d)).astype(dtype)
 
 
-@partial(jax.jit, static_argnums=2)
-def plain_numbers(key, sim, n):
-    """Points [n, D] of the model itself."""
-    return jax.random.normal(key, (n, latent.dimension(sim)), latent.normal_numbers(sim))
+def of_chunk(key, i, n, q):
+    """The `numbers` of the first ``n`` draws of chunk ``i`` of an estimate by ``q``."""
+    u, e = generator(key, 2, i), generator(key, 3, i)
+    d, dtype = q.means.shape[1], q.means.dtype
+    return u.random(n).astype(dtype), e.standard_normal((n, d)).astype(dtype)
+
+
+def plain_chunk(key, i, n, sim):
+    """The first ``n`` points [n, D] of chunk ``i`` of the model itself."""
+    z = generator(key, 3, i).standard_normal((n, latent.dimension(sim)))
+    return z.astype(latent.normal_numbers(sim))
 
 
 def resampled(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
@@ -84,3 +110,36 @@ def resampled(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
     w = np.exp(log_w - log_w.max())
     at = (np.arange(size) + shift) / size
     return np.searchsorted(np.cumsum(w) / w.sum(), at).clip(max=len(w) - 1)
+
+
+def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
+    """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
+    box runs once a point, in batches of ``n``.
+    """
+    if hosted(sim):
+        return jax.device_get(latent.outcomes(sim, jnp.asarray(z)))
+    n, d = z.shape
+    lanes = max(min(LANES, HELD // d // BLOCK * BLOCK), BLOCK)
+    out = []
+    for i in range(0, n, lanes):
+        part = z[i : i + lanes]
+        padded = np.zeros((lanes, d), z.dtype)
+        padded[: len(part)] = part
+        o = jax.device_get(_in_blocks(sim, padded, np.int32(len(part))))
+        out.append(latent.Outcomes(*(a[: len(part)] for a in o)))
+    return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+
+
+@jax.jit
+def _in_blocks(sim, z, n):
+    """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
+    run = jax.vmap(partial(latent.outcome, sim))
+    like = jax.eval_shape(run, z)
+
+    def block(i, out):
+        new = run(lax.dynamic_slice_in_dim(z, i * BLOCK, BLOCK))
+        place = partial(lax.dynamic_update_slice_in_dim, start_index=i * BLOCK, axis=0)
+        return jax.tree.map(place, out, new)
+
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)

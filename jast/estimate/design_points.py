@@ -2,18 +2,25 @@
 from many starts (`jast.boundary`).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
+from jast._jax import quick
 from jast.boundary import EPISODES, STEPS, descents
+from jast.counter import generator
 from jast.limit_state import dimension, normal_numbers
 
 __all__ = ["design_points", "distinct"]
 
 APART = 0.5
 """Points nearer to one another than so much of their norm are one."""
+MOST, BLOCK = 48, 12
+"""Descents of a call, those that run side by side."""
 GRADIENT = 3
 """Evaluations that a value with its gradient is counted as."""
 
@@ -26,14 +33,31 @@ class DesignPoints(NamedTuple):
     evaluations: int
 
 
-def design_points(key, sim, starts=48, limit=16):
+def design_points(key, sim, starts=MOST, limit=16):
     """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
     where the miss distance has no useful gradient.
     """
-    z = jax.random.normal(key, (starts, dimension(sim)), normal_numbers(sim))
-    points, failing = jax.device_get(descents(sim, z)[:2])
+    z = np.zeros((-(-starts // MOST) * MOST, dimension(sim)), normal_numbers(sim))
+    z[:starts] = generator(key).standard_normal((starts, z.shape[1]))
+    found = jax.device_get(_in_blocks(sim, z, np.int32(starts)))
+    points, failing = (a[:starts] for a in found)
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
     return DesignPoints(distinct(points, limit), starts * (STEPS * GRADIENT + EPISODES))
+
+
+@quick
+def _in_blocks(sim, starts, n):
+    """(points, whether there is one) of the descents from the first ``n`` of ``starts``, a block at
+    a time, so that one program serves every number of them.
+    """
+
+    def block(i, out):
+        d = descents(sim, lax.dynamic_slice_in_dim(starts, i * BLOCK, BLOCK))
+        place = partial(lax.dynamic_update_slice_in_dim, start_index=i * BLOCK, axis=0)
+        return tuple(place(a, b) for a, b in zip(out, (d.point, d.found), strict=True))
+
+    nothing = jnp.zeros_like(starts), jnp.zeros(len(starts), bool)
+    return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)
 
 
 def distinct(points, limit):

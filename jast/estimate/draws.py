@@ -39,7 +39,7 @@ class Draws(NamedTuple):
     every: int = 1
     reach: float = math.inf
     key: Any = None
-    """Words of the key, with which chunk i was drawn by ``jax.random.fold_in(key, i)``"""
+    """Words of the key, from which each chunk was drawn by its number"""
     impl: str | None = None
     """Of the key"""
     lanes: int = 0

@@ -19,14 +19,14 @@ from jast._checks import random_key, whole
 from jast.episode import play_back
 from jast.estimate import diagnostics
 from jast.estimate.answers import asked
-from jast.estimate.batches import drawn, numbers, plain_numbers
+from jast.estimate.batches import of_chunk, plain_chunk
 from jast.estimate.draws import interval, key_of, of_weights, share, shares
 from jast.estimate.importance_sampling import component
 from jast.estimate.markov_tilts import Tilts
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
 from jast.intervals import clopper_pearson, log_normal
-from jast.limit_state import Latent, dimension, policy_of
+from jast.limit_state import Latent, dimension, place, policy_of
 from jast.policy import nominal_policy
 from jast.pytrees import clear, select, strong
 
@@ -208,11 +208,10 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
     for i in np.unique(rows // draws.lanes):
         mine = rows // draws.lanes == i
         lanes, steps = rows[mine] % draws.lanes, length[mine]
-        chunk = jax.random.fold_in(key, i)
         if draws.source == "policy":
-            made = jax.random.split(chunk, draws.lanes)
+            made = jax.random.split(jax.random.fold_in(key, i), draws.lanes)
         else:
-            made = _points(chunk, sim, draws.source, draws.lanes)
+            made = _points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
         for a in range(0, len(lanes), BLOCK):
             part = np.arange(a, a + BLOCK).clip(max=len(lanes) - 1)
             seen = _judged(
@@ -228,19 +227,13 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
     return {k: np.concatenate(v) for k, v in out.items()}
 
 
-def _points(key, sim, q, n):
-    """The points [n, D] of a chunk."""
+def _points(key, i, sim, q, n, lanes):
+    """The first ``n`` points, or more, of the ``lanes`` of a chunk."""
     if isinstance(q, str):
-        return plain_numbers(key, sim, n)
+        return plain_chunk(key, i, n, sim)
     if isinstance(q, Tilts):
-        return jnp.asarray(redrawn(key, sim, q, n)[0])
-    return _placed(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
-
-
-@jax.jit
-def _placed(sim, q, u, e):
-    # what they come to is left out of the program
-    return drawn(sim, q, u, e)[0]
+        return redrawn(jax.random.fold_in(key, i), sim, q, lanes)[0]
+    return place(q, *of_chunk(key, i, n, q))
 
 
 @partial(jax.jit, static_argnums=5)

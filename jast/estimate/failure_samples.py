@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
@@ -106,7 +105,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
     chain = Chain(key, sim, samples)
-    people = chain.judge(jnp.asarray(z[rows], chain.dtype))
+    people = chain.judge(np.asarray(z[rows], chain.dtype))
     people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
     episodes = jax.device_get(latent.episodes(sim, people.z))
     # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other

@@ -8,15 +8,15 @@ one that the other half of the sample likes best.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jast.limit_state import Latent
 
-__all__ = ["Gaussians", "as_latent", "fit", "log_density", "shrunk", "together", "unit"]
+__all__ = ["Gaussians", "as_latent", "fit", "log_density", "log_sum", "shrunk", "together", "unit"]
 
 COMPONENTS = (1, 2, 4, 8, 16)
-ITERATIONS = 10
+ITERATIONS, GAIN = 10, 1e-3
+"""Rounds of expectation maximisation, at most, and what each must gain: nats a point."""
 MOST = 4000
 SIZE = 40
 """Components of a `Latent`, unused ones included."""
@@ -70,7 +70,7 @@ def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
                 value = -np.inf
                 break
             g = _em(rng, points[part], w[part] / w.sum(), known / 2, k, anchors)
-            value += v[~part] @ _log_sum(_log_joint(g, points[~part])) / v.sum()
+            value += v[~part] @ log_sum(_log_joint(g, points[~part])) / v.sum()
         if value > score + 0.02:
             best, score = k, value
         elif k > 2 * best:
@@ -99,7 +99,7 @@ def as_latent(parts, dtype):
         pad(factors, np.eye(d)),
         pad(np.tril(np.linalg.inv(factors)), np.eye(d)),
     )
-    return Latent(*(jnp.asarray(a, dtype) for a in arrays))
+    return Latent(*(np.asarray(a, dtype) for a in arrays))
 
 
 def together(a, b, share):
@@ -113,8 +113,8 @@ def together(a, b, share):
     with np.errstate(divide="ignore"):
         log_weights = np.log(weights[kept] / weights[kept].sum())
     return Latent(
-        jnp.asarray(log_weights, a.means.dtype),
-        *(jnp.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)),
+        np.asarray(log_weights, a.means.dtype),
+        *(np.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)),
     )
 
 
@@ -126,7 +126,7 @@ def effective(log_weights):
 
 def log_density(g, z):
     """log of the density of `Gaussians` at ``z`` [n, D]: [n]."""
-    return _log_sum(_log_joint(g, z))
+    return log_sum(_log_joint(g, z))
 
 
 def shrunk(values, count):
@@ -158,23 +158,28 @@ def _em(rng, z, w, count, k, anchors):
     z, w = z[live], w[live]
     g = _start(rng, z, w, k)
     one = len(g.weights) == 1
+    last = -np.inf
     for _ in range(1 if one else ITERATIONS):
         joint = np.zeros((len(z), 1)) if one else _log_joint(g, z)
-        r = np.exp(joint - _log_sum(joint)[:, None]) * w[:, None]
+        total = log_sum(joint)
+        r = np.exp(joint - total[:, None]) * w[:, None]
         g = _maximise(z, r, count, anchors)
+        if w @ total - last < GAIN:
+            break
+        last = w @ total
     return g
 
 
 def _start(rng, z, w, k):
     """Centres by the rule of k-means++ (Arthur and Vassilvitskii 2007), unit covariances."""
     centres = z[rng.choice(len(z), 1, p=w)]
+    nearest = ((z - centres[0]) ** 2).sum(axis=1)
     for _ in range(1, k):
-        gap = ((z[:, None] - centres[None]) ** 2).sum(-1).min(axis=1) * w
-        centres = (
-            np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]])
-            if gap.sum() > 0
-            else centres
-        )
+        gap = nearest * w
+        if not gap.sum() > 0:
+            break
+        centres = np.concatenate([centres, z[rng.choice(len(z), 1, p=gap / gap.sum())]])
+        nearest = np.minimum(nearest, ((z - centres[-1]) ** 2).sum(axis=1))
     return unit(centres)
 
 
@@ -204,24 +209,23 @@ def _maximise(z, r, count, anchors):
                 else mean
             )
         e = z - mean
-        values, vectors = np.linalg.eigh((e * r[:, i : i + 1]).T @ e / total[i])
+        values, vectors = np.linalg.eigh((e.T * r[:, i]) @ e / total[i])
         parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))
     weights, means, values, vectors = (np.stack(a) for a in zip(*parts, strict=True))
     return Gaussians(weights / weights.sum(), means, values, vectors)
 
 
 def _log_joint(g, z):
-    out = []
-    for weight, mean, values, vectors in zip(*g, strict=True):
-        e = (z - mean) @ vectors
-        out.append(
-            np.log(weight)
-            - 0.5 * (e**2 / values).sum(axis=1)
-            - 0.5 * np.log(2 * np.pi * values).sum()
-        )
-    return np.stack(out, axis=1)
+    out = np.empty((len(g.weights), len(z)))
+    for row, weight, mean, values, vectors in zip(out, *g, strict=True):
+        e = z @ vectors - mean @ vectors
+        np.matmul(np.square(e, out=e), -0.5 / values, out=row)
+        row += np.log(weight) - 0.5 * np.log(2 * np.pi * values).sum()
+    # sums over components run along columns
+    return out.T
 
 
-def _log_sum(a):
+def log_sum(a):
+    """log of the sums of exp(a) [n, K]: [n]."""
     top = a.max(axis=1)
     return top + np.log(np.exp(a - top[:, None]).sum(axis=1))

@@ -4,7 +4,6 @@ failure modes that it lost.
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
@@ -43,7 +42,7 @@ def guarded(s, i, last):
                 s.next_key(),
                 s.sim,
                 size,
-                covered=(q, jnp.asarray(threshold, s.dtype)),
+                covered=(q, threshold),
                 least=least,
                 most=int(room),
             )
@@ -98,7 +97,7 @@ def _share(share):
 
 def _bare(s, points, used):
     """Which points the proposal does not cover: [n] bool."""
-    return np.asarray(log_ratio(s.q, points, used)) < s.thin() if len(points) else np.zeros(0, bool)
+    return log_ratio(s.q, points, used) < s.thin()
 
 
 def _forgotten(s):
@@ -107,7 +106,7 @@ def _forgotten(s):
     """
     chain = Chain(s.next_key(), s.sim, len(s.seeds))
     people = chain.move(
-        chain.judge(jnp.asarray(s.seeds, s.dtype)), np.arange(len(s.seeds)), -math.inf, 1.0, MOVES
+        chain.judge(s.seeds.astype(s.dtype)), np.arange(len(s.seeds)), -math.inf, 1.0, MOVES
     )
     z, used = np.asarray(people.z), np.asarray(people.used)
     rows = _bare(s, z, used) & (np.asarray(people.score) == -np.inf)

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp
 
 from jast.counter import generator
 from jast.estimate import markov_tilts
+from jast.estimate.batches import judged, log_ratio
 from jast.estimate.markov_tilts import Tilts, of_the_model, shape
-from jast.limit_state import dimension, log_ratios, normal_numbers, outcomes
+from jast.limit_state import dimension, normal_numbers
 from jast.markov import WIDTHS, proposed
 
 __all__ = ["cool", "explore"]
@@ -59,8 +59,7 @@ class Population(NamedTuple):
 class Chain:
     """A population on its way: the moves, their size and the counts, which all explorers share.
 
-    Random numbers are NumPy's, from the key: programs without a generator compile in a third of the
-    time, and nothing of it enters an estimate's own draws.
+    Random numbers and moves are NumPy's: only the system runs on the device.
     """
 
     def __init__(self, key, sim, size, covered=None):
@@ -71,11 +70,11 @@ class Chain:
             self.dimension = markov_tilts.dimension(shape(sim), sim.horizon)
 
     def noise(self):
-        return jnp.asarray(self.rng.standard_normal((self.size, self.dimension)), self.dtype)
+        return self.rng.standard_normal((self.size, self.dimension)).astype(self.dtype)
 
     def draw(self, width):
         """A new population N(0, width^2 I)."""
-        return self.judge(jnp.asarray(width, self.dtype) * self.noise())
+        return self.judge(float(width) * self.noise())
 
     def judge(self, z):
         """The population of these points."""
@@ -84,19 +83,19 @@ class Chain:
     def move(self, people, rows, level, width, times):
         """``people[rows]`` after Markov moves that keep N(0, width^2 I) given score <= level."""
         for _ in range(times):
-            numbers = (
-                jnp.asarray(v, d)
-                for v, d in (
-                    (level, people.score.dtype),
-                    (self.scale, self.dtype),
-                    (width, self.dtype),
+            before = Population(*(a[rows] for a in people))
+            new = _judge(
+                self.sim, proposed(before.z, self.noise(), self.scale, float(width)), self.covered
+            )
+            good = new.score <= level
+            self.count(new)
+            people = Population(
+                *(
+                    np.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+                    for a, b in zip(new, before, strict=True)
                 )
             )
-            people, accepted = _move(
-                self.sim, people, jnp.asarray(rows, jnp.int32), self.noise(), *numbers, self.covered
-            )
-            self.count(people)
-            self.accepted = float(accepted)
+            self.accepted = float(good.mean())
             self.scale = float(
                 np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0)
             )
@@ -178,14 +177,15 @@ def cool(key, sim, chains):
     chain = Chain(key, sim, chains)
     for width in WIDTHS:
         drawn = [chain.draw(width) for _ in range(DRAWS)]
-        people = jax.tree.map(lambda *parts: jnp.concatenate(parts), *drawn)
+        people = Population(*map(np.concatenate, zip(*drawn, strict=True)))
         failing = np.flatnonzero(np.asarray(people.score) == -np.inf)
         if len(failing) >= FAILING * DRAWS * chains or (width == WIDTHS[-1] and len(failing)):
             break
     else:
         return chain.end(None, -math.inf, (width,))
     rows = failing[np.arange(chains) % len(failing)]
-    people, widths = jax.tree.map(lambda a: a[rows], people), np.geomspace(width, COLD, COOLING)
+    people = Population(*(a[rows] for a in people))
+    widths = np.geomspace(width, COLD, COOLING)
     for width in widths:
         people = chain.move(people, np.arange(chains), -math.inf, width, 1)
     return chain.end(people, math.nan, widths)
@@ -202,29 +202,16 @@ def _next(score, last):
     return float(below.max()) if below.size else None
 
 
-@jax.jit
 def _judge(sim, z, covered):
     if covered is None:
-        o = outcomes(sim, z)
+        o = judged(sim, z)
         return Population(z, o.score, o.used, o.invalid)
     q, threshold = covered
     if isinstance(q, Tilts):
-        o, log_q, _ = of_the_model(sim, q, z)
+        o, log_q, _ = of_the_model(sim, q, jnp.asarray(z))
+        o, log_q = jax.device_get((o, log_q))
     else:
-        o = outcomes(sim, z)
-        log_q = logsumexp(log_ratios(q, z, o.used) + q.log_weights[None], axis=1)
-    return Population(z, jnp.where(log_q > threshold, jnp.inf, o.score), o.used, o.invalid)
-
-
-@jax.jit
-def _move(sim, people, rows, noise, level, scale, width, covered):
-    """One Markov move of ``people[rows]``: (`Population`, with the invalid ones of the candidates,
-    accepted share).
-    """
-    people = jax.tree.map(lambda a: a[rows], people)
-    new = _judge(sim, proposed(people.z, noise, scale, width), covered)
-    good = new.score <= level
-    kept = jax.tree.map(
-        lambda a, b: jnp.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, people
-    )
-    return kept._replace(invalid=new.invalid), jnp.mean(good, dtype=scale.dtype)
+        o = judged(sim, z)
+        log_q = log_ratio(q, z, o.used)
+    score = np.where(log_q > float(threshold), np.inf, o.score)
+    return Population(z, score, o.used, o.invalid)

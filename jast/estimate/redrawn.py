@@ -23,8 +23,7 @@ def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.nda
     A choice that was made without a normal number has the middle of its interval as one.
     """
     if isinstance(q, latent.Latent):
-        z, o, log_w, _ = drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))
-        return jax.device_get((z, o, log_w))
+        return drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
     about, dtype = tilts.shape(sim), latent.normal_numbers(sim)
     chance = tilts.numbers(key, n, about, sim.horizon, dtype)
     o, ratio, trace = tilts.played(sim, q, *chance)

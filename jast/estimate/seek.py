@@ -9,12 +9,11 @@ estimate, which is made with the proposal as it stands at the end.
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
 from jast.counter import generator
-from jast.estimate.batches import Batch, balanced, drawn, over_batches
+from jast.estimate.batches import Batch, balanced, drawn, numbers, over_batches
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, effective, fit, together, unit
 from jast.estimate.guard import guarded
@@ -39,7 +38,7 @@ class Seeker:
     """
 
     def __init__(self, key, sim, budget):
-        self.key, self.sim, self.budget = key, sim, budget
+        self.root, self.sim, self.budget = generator(key, 1), sim, budget
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.size, self.batch = max(budget // 100, 100), budget // 25
         self.rng = generator(self.next_key())
@@ -53,8 +52,8 @@ class Seeker:
         self.coarse = []  # what is wrong with the system's floats
 
     def next_key(self):
-        self.key, key = jax.random.split(self.key)
-        return key
+        words = self.root.integers(2**32, size=2, dtype=np.uint32)
+        return jax.random.wrap_key_data(words, impl="threefry2x32")
 
     def note(self, text, evaluations=0):
         self.spent += evaluations
@@ -175,12 +174,8 @@ def _look(s):
 
 def _drawn(s, q):
     """A `Batch` of ``q``."""
-    numbers = (
-        jnp.asarray(a, s.dtype)
-        for a in (s.rng.random(s.batch), s.rng.standard_normal((s.batch, s.dimension)))
-    )
-    z, o, log_w, _ = jax.device_get(drawn(s.sim, q, *numbers))
-    return Batch(q, z, o.used, o.failure, log_w.astype(np.float64))
+    z, o, log_w, _ = drawn(s.sim, q, *numbers(s.rng, s.batch, s.dimension, s.dtype))
+    return Batch(q, z, o.used, o.failure, log_w, {})
 
 
 def _refine(s, most):
@@ -209,7 +204,7 @@ def _fit(s):
     """The proposal becomes what promises the least variance: a mixture for all failures, one with
     parts for each mode, a sphere, or itself.
     """
-    log_w, failing = balanced(s.batches)
+    log_w, _ = balanced(s.batches)
     w = np.exp(log_w - log_w.max())
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
     s.rare = s.log_mean < RARE
@@ -218,7 +213,7 @@ def _fit(s):
     many = np.bincount(owner, minlength=len(centres)) >= FEW
     owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
     # the second moment of the weights under another proposal, by the points at hand: sum of w p / q
-    variance = lambda q: np.logaddexp.reduce(log_w - over_batches(q, s.batches)[failing])
+    variance = lambda q: np.logaddexp.reduce(log_w - over_batches(q, s.batches))
     choices = {"as it was": s.q, "modes": _by_owner(s, points, log_w, owner)}
     if owner.any():
         choices["one"] = _by_owner(s, points, log_w, np.zeros_like(owner))
