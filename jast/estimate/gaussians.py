@@ -17,7 +17,8 @@ __all__ = ["Gaussians", "as_latent", "fit", "log_density", "log_sum", "shrunk", 
 COMPONENTS = (1, 2, 4, 8, 16)
 ITERATIONS, GAIN = 10, 1e-3
 """Rounds of expectation maximisation, at most, and what each must gain: nats a point."""
-MOST = 4000
+MOST, FULL = 4000, 30
+"""Points that are looked at; dimensions above which a mixture is fitted in a few of them."""
 SIZE = 40
 """Components of a `Latent`, unused ones included."""
 
@@ -38,6 +39,46 @@ class Gaussians(NamedTuple):
 
 
 def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
+    """`Gaussians` as of `_fit`, in the few directions in which the points differ from noise where
+    there are many: what is fitted to the others is noise (Uribe et al. 2021 find such a subspace by
+    gradients).
+    """
+    known_count = count if known is None else known
+    d = points.shape[1]
+    basis, r = _subspace(points, weights, known_count, anchors) if d > FULL else (None, d)
+    if r > d // 2:
+        return _fit(rng, points, weights, count, known, limit, anchors)
+    q, rest = basis[:, :r], basis[:, r:]
+    of_q = None if anchors is None or not len(anchors) else anchors @ q
+    g = _fit(rng, points @ q, weights, count, known, limit, of_q)
+    k, other = len(g.weights), weights @ ((points @ rest) ** 2).mean(axis=1)
+    return Gaussians(
+        g.weights,
+        g.means @ q.T,
+        np.concatenate([g.values, np.full((k, d - r), other)], axis=1),
+        np.stack([np.concatenate([q @ v, rest], axis=1) for v in g.vectors]),
+    )
+
+
+def _subspace(points, weights, count, anchors):
+    """An orthonormal basis [D, D], and how many of its first columns span the directions of the
+    mean, of the anchors near to points, and those in which the points do not vary like noise.
+    """
+    mean = weights @ points
+    e = points - mean
+    values, vectors = np.linalg.eigh((e * weights[:, None]).T @ e)
+    inside = _like_noise(values, count)
+    own = vectors[:, ~inside].T
+    if anchors is not None and len(anchors):
+        nearest = np.argmax(points @ anchors.T - 0.5 * (anchors**2).sum(axis=1), axis=1)
+        share = np.bincount(nearest, weights, len(anchors))
+        own = np.concatenate([anchors[share > 0.01], own])
+    spanning = np.concatenate([mean[None], own])
+    basis, size, _ = np.linalg.svd(spanning.T)
+    return basis, int((size > 1e-6 * size[0]).sum())
+
+
+def _fit(rng, points, weights, count, known=None, limit=16, anchors=None):
     """`Gaussians` for ``points`` [n, D] of ``weights`` [n] (sum 1), which count as ``count``
     independent ones; of at most ``limit`` components.
 
@@ -136,18 +177,24 @@ def shrunk(values, count):
     Those within the band that a covariance s I would show (Marchenko and Pastur 1967) are set to
     their mean s, found by repetition; the others are kept.
     """
+    inside = _like_noise(values, count)
+    return np.where(inside, values[inside].mean(), values) if inside.any() else values
+
+
+def _like_noise(values, count):
+    """Which of the eigenvalues [D] may be noise."""
     d = len(values)
-    ratio = np.sqrt(min(d / max(count, 1.0), 1.0))
+    ratio = np.sqrt(d / max(count, 1.0))
+    # fewer points than dimensions leave values of 0
+    low, high = (1 - ratio) ** 2 * 0.9 if ratio < 1 else -np.inf, (1 + ratio) ** 2 * 1.1
     inside = np.ones(d, bool)
     for _ in range(20):
         s = values[inside].mean()
-        now = (values > s * (1 - ratio) ** 2 * 0.9) & (values < s * (1 + ratio) ** 2 * 1.1)
-        if not now.any():
-            return values
-        if (now == inside).all():
-            break
+        now = (values > s * low) & (values < s * high)
+        if not now.any() or (now == inside).all():
+            return now
         inside = now
-    return np.where(inside, values[inside].mean(), values)
+    return inside
 
 
 def _em(rng, z, w, count, k, anchors):
