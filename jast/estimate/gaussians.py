@@ -16,7 +16,9 @@ __all__ = ["Gaussians", "as_latent", "fit", "log_density", "log_sum", "shrunk", 
 
 COMPONENTS = (1, 2, 4, 8, 16)
 ITERATIONS, GAIN = 10, 1e-3
-"""Rounds of expectation maximisation, at most, and what each must gain: nats a point."""
+"""Rounds of expectation maximisation; what each must gain while numbers of components are compared,
+in nats a point.
+"""
 MOST, FULL = 4000, 30
 """Points that are looked at; dimensions above which a mixture is fitted in a few of them."""
 SIZE = 40
@@ -110,7 +112,7 @@ def _fit(rng, points, weights, count, known=None, limit=16, anchors=None):
             if not (w.sum() > 0 and v.sum() > 0):
                 value = -np.inf
                 break
-            g = _em(rng, points[part], w[part] / w.sum(), known / 2, k, anchors)
+            g = _em(rng, points[part], w[part] / w.sum(), known / 2, k, anchors, GAIN)
             value += v[~part] @ log_sum(_log_joint(g, points[~part])) / v.sum()
         if value > score + 0.02:
             best, score = k, value
@@ -197,7 +199,7 @@ def _like_noise(values, count):
     return inside
 
 
-def _em(rng, z, w, count, k, anchors):
+def _em(rng, z, w, count, k, anchors, gain=-np.inf):
     """Expectation maximisation from far-apart points on; components that almost nothing belongs to
     end.
     """
@@ -211,7 +213,7 @@ def _em(rng, z, w, count, k, anchors):
         total = log_sum(joint)
         r = np.exp(joint - total[:, None]) * w[:, None]
         g = _maximise(z, r, count, anchors)
-        if w @ total - last < GAIN:
+        if w @ total - last < gain:
             break
         last = w @ total
     return g
