@@ -37,6 +37,7 @@ RECORDS = {
     "Latent": "jast.limit_state:Latent",
     "Tilts": "jast.estimate.markov_tilts:Tilts",
     "TiltFrame": "jast.estimate.markov_tilts:Frame",
+    "TiltBlock": "jast.estimate.markov_tilts:Block",
     "FailureSamples": "jast.estimate.failure_samples:FailureSamples",
     "FailureProposal": "jast.estimate.multilevel:FailureProposal",
     "Traces": "jast.estimate.importance_sampling:Traces",

@@ -111,21 +111,18 @@ def test_parts_of_a_mixture(key):
     assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
 
 
-def test_weights_average_to_one(mixed, key):
+@pytest.mark.parametrize("gates", [1, 3])
+def test_weights_average_to_one(mixed, key, gates):
     """E[p / q] = 1, under tilts of any coefficients, and the host's densities are those of the
     rollout.
     """
     n = 4000
-    s = TiltSeeker(jax.random.key(1), mixed, 500)
+    s = TiltSeeker(jax.random.key(1), mixed, 500, gates)
     pilot = s.draw()
     frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(500))
     rng = np.random.default_rng(0)
-    one = s.model._replace(
-        **{
-            name: 0.15 * rng.standard_normal(getattr(s.model, name).shape)
-            for name in ("first_means", "first_shifts", "means", "shifts")
-        }
-    )
+    one = jax.tree.map(lambda a: 0.15 * rng.standard_normal(np.shape(a)), s.model)
+    one = one._replace(floor=-np.inf)
     tilts = [s.model, one, s.model._replace(floor=np.log(0.3))]
     q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, s.dtype)
     drawn = numbers(key, n, shape(mixed), mixed.horizon, s.dtype)
@@ -134,7 +131,7 @@ def test_weights_average_to_one(mixed, key):
     w = np.exp(np.asarray(log_w, np.float64))
     assert abs(w.mean() - 1) < 4 * w.std() / np.sqrt(n) and w.std() > 0.1
     assert not o.invalid.any() and np.isclose(np.exp(shares).sum(axis=1), 1, atol=1e-4).all()
-    on_host = ratios(tilts, steps_of(frame, trace, o.length), trace[:3], n)
+    on_host = ratios(tilts, steps_of(s.about, frame, trace, o.length), n)
     np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
 
 
@@ -143,17 +140,18 @@ def test_a_known_tilt_is_found(mixed):
     s = TiltSeeker(jax.random.key(2), mixed, 4000)
     pilot = s.draw()
     frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(4000))
-    one = s.model._replace(means=s.model.means.copy(), shifts=s.model.shifts.copy())
-    one.means[0], one.means[1] = 0.8, 0.3
-    one.shifts[0, 0, 1] = 1.5
+    one = jax.tree.map(np.copy, s.model)
+    one.steps.means[0], one.steps.means[1] = 0.8, 0.3
+    one.steps.shifts[0, 0, 1] = 1.5
     s.mixture = ([s.model, one], [0.001, 0.999], frame)
     b = s.draw()
-    steps = steps_of(frame, b.trace, b.length)
-    found = fit(steps, b.trace[:3], np.ones(4000), 4000.0)
-    means = np.abs(steps.x @ (found.means - one.means))
-    odds = (steps.x @ (found.shifts - one.shifts)[:, 0]) @ [-1, 1, 0]
-    assert np.median(means) < 0.1 and np.median(np.abs(odds)) < 0.3
-    assert np.abs(found.first_means).max() < 0.1
+    rows = steps_of(s.about, frame, b.trace, b.length)
+    found = fit(rows, np.ones(4000), 4000.0, s.model)
+    x = rows[1].x
+    means = x @ (found.steps.means - one.steps.means)[:, 0, 0, 0]
+    odds = x @ (found.steps.shifts - one.steps.shifts)[: x.shape[1], 0] @ [-1, 1, 0]
+    assert np.median(np.abs(means)) < 0.1 and np.median(np.abs(odds)) < 0.3
+    assert np.abs(found.first.means).max() < 0.1
 
 
 def good(found, truth, most=0.05):

@@ -25,6 +25,8 @@ class Parts(NamedTuple):
     """Log probabilities [B, C] of each batch of choices"""
     value: Callable[[jax.Array, tuple[jax.Array, ...]], Any]
     """(z [normals], (category [B], ...)) -> the value"""
+    owners: tuple[int, ...] = ()
+    """[normals] which of all choices, in their order, a number belongs to; -1: none"""
 
 
 def parts(d: Any) -> Parts:
@@ -48,7 +50,8 @@ def parts(d: Any) -> Parts:
 
 def _numbers(d: Any) -> Parts:
     like = event_like(d)
-    return Parts(count(like), (), lambda z, _: from_normal(d, _shaped(z, like)))
+    n = count(like)
+    return Parts(n, (), lambda z, _: from_normal(d, _shaped(z, like)), (-1,) * n)
 
 
 def _shaped(z: jax.Array, like: Any) -> Any:
@@ -84,16 +87,21 @@ def _joint(d: Any) -> Parts:
         return treedef.unflatten(values)
 
     choices = tuple(log_p for p in each for log_p in p.choices)
-    return Parts(sum(p.normals for p in each), choices, value)
+    owners, before = [], 0
+    for p in each:
+        owners += [o if o < 0 else o + before for o in p.owners]
+        before += sum(len(c) for c in p.choices)
+    return Parts(sum(p.normals for p in each), choices, value, tuple(owners))
 
 
 def _either(d: Where) -> Parts:
     a, b = (parts(part) for part in d.parts)
-    alike = a.normals == b.normals and [c.shape for c in a.choices] == [c.shape for c in b.choices]
+    shapes = lambda p: (p.normals, p.owners, [c.shape for c in p.choices])
+    alike = shapes(a) == shapes(b)
     if not alike:  # by the normal numbers that both have behind them
         return _numbers(d)
     choices = tuple(jnp.where(d.pred, p, q) for p, q in zip(a.choices, b.choices, strict=True))
-    return Parts(a.normals, choices, lambda z, i: d.select(a.value(z, i), b.value(z, i)))
+    return Parts(a.normals, choices, lambda z, i: d.select(a.value(z, i), b.value(z, i)), a.owners)
 
 
 def _mixture(d: Any) -> Parts:
@@ -108,4 +116,4 @@ def _mixture(d: Any) -> Parts:
         each, k = from_normal(components, own), i[0].reshape(*like.shape, 1)
         return jnp.take_along_axis(each, k, axis=-1)[..., 0]
 
-    return Parts(count(like), (log_p,), value)
+    return Parts(count(like), (log_p,), value, tuple(range(count(like))))

@@ -8,6 +8,7 @@ its own odds change, and its weight is that of the outcome. A trace is its norma
 choices; the density of each tilt on it accumulates step by step.
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,8 +26,11 @@ from jast.rewards import log_likelihood
 
 __all__ = ["Frame", "Tilts", "features", "of_the_model", "played", "shape"]
 
-SEEN = 16
-"""Numbers of an observation that a tilt looks at, at most."""
+SEEN, RARE = 16, 0.0917
+"""Numbers of an observation that a tilt looks at, at most; probability below which a category is a
+rare one."""
+Y = 3
+"""Which feature is the first that is no time."""
 
 
 class Frame(NamedTuple):
@@ -44,6 +48,22 @@ class Frame(NamedTuple):
     """[M]"""
 
 
+class Block(NamedTuple):
+    """What features do to the disturbance of one step, or to x0, under K tilts.
+
+    A normal number is drawn from one of G unit Gaussians. One that belongs to a choice (a mixture's
+    component) has numbers of its own for each category.
+    """
+
+    means: Any
+    """[K, F, C', A, G] by which features give the means"""
+    gates: Any
+    """[K, F, C', A, G] and the log weights of these Gaussians"""
+    shifts: Any
+    """[K, F + 3, B, C] by which features, and those of `surprise`, give what is added to the log
+    probabilities of choices"""
+
+
 class Tilts(NamedTuple):
     """A mixture of K tilts, one drawn a trace; the first is the model, whose numbers are 0."""
 
@@ -51,26 +71,25 @@ class Tilts(NamedTuple):
     """[K], of sum 1 as probabilities; -inf for one that is not used"""
     floors: Any
     """[K] log probabilities below which no possible category is left"""
-    first_means: Any
-    """[K, A0] of the normal numbers of x0"""
-    first_shifts: Any
-    """[K, B0, C0] of the log probabilities of its choices"""
-    means: Any
-    """[K, F, A] by which features give the means of a step's normal numbers"""
-    shifts: Any
-    """[K, F, B, C] by which they give what is added to the log probabilities of its choices"""
+    first: Block
+    """Of x0, by one feature that is 1"""
+    steps: Block
     frame: Frame
 
 
 class Shape(NamedTuple):
-    """How many numbers a start and a step have: normals, choices, categories; and what is seen."""
+    """How many numbers a start and a step have: normals, choices, categories, and the choices that
+    normals belong to; and what is seen.
+    """
 
     normals0: int
     choices0: int
     categories0: int
+    owners0: tuple[int, ...]
     normals: int
     choices: int
     categories: int
+    owners: tuple[int, ...]
     seen: int
 
 
@@ -99,7 +118,9 @@ def shape(sim: Any) -> Shape:
     def sizes(start: Any, state: Any, dist: Any) -> Shape:
         a, b = parts(start), parts(dist)
         return Shape(
-            *(a.normals, *stacked(a).shape), *(b.normals, *stacked(b).shape), len(look(sim, state))
+            *(a.normals, *stacked(a).shape, a.owners),
+            *(b.normals, *stacked(b).shape, b.owners),
+            len(look(sim, state)),
         )
 
     return ask(sim, sizes)
@@ -179,26 +200,89 @@ def tilted_log(log_p: jax.Array, shifts: jax.Array, floors: jax.Array) -> jax.Ar
     return jax.nn.log_softmax(lifted + shifts, axis=-1)
 
 
-def _drawn(p, k, means, shifts, floors, e, v):
+def surprise(x: Any, y: Any, rare: Any, np: Any = jnp) -> Any:
+    """Features [..., F + 3] of a choice: those of its step ``x`` [..., F], and how many of the
+    choices before it came out ``rare`` [...]; ``y``: the second feature of ``x`` that is no time.
+
+    So choices of one step lean on each other: three parts that fail at once are no accident.
+    """
+    r = rare[..., None]
+    return np.concatenate([x, r, r * r, r * y[..., None]], axis=-1)
+
+
+def rarity(log_p: Any, i: Any, np: Any = jnp) -> Any:
+    """How many of the choices [..., B] before each one came out as a category of a probability
+    below `RARE`.
+    """
+    p = np.take_along_axis(log_p, i[..., None], axis=-1)[..., 0]
+    each = np.where(p < math.log(RARE), 1.0, 0.0)
+    return np.cumsum(each, axis=-1) - each
+
+
+def owned(owners: tuple[int, ...], size: int, i: Any, np: Any = jnp) -> Any:
+    """Which category [..., A, C'] each normal number is of, as 0 and 1; all of the first where it
+    belongs to no choice.
+    """
+    none = np.zeros((*i.shape[:-1], 1), i.dtype)
+    at = np.concatenate([i, none], axis=-1)[..., np.asarray(owners, np.int32)]
+    return np.where(at[..., None] == np.arange(size, dtype=np.int32), 1.0, 0.0)
+
+
+def _drawn(p, k, f, block, floors, chance):
     """(x, z [A], i [B], log probabilities [B, C], log q_k - log p [K]) of one draw of tilt k."""
-    log_p = stacked(p)
-    z = means[k] + e
-    ratio = jnp.sum(means * (z[None] - means / 2), axis=1)
-    if not p.choices:
-        none = jnp.zeros((0,), jnp.int32)
-        return assembled(p, z, none), z, none, log_p, ratio
-    log_p = log_p.astype(e.dtype)
-    log_q = tilted_log(log_p, shifts, floors)
-    i = chosen(log_q[k], v)
-    at = lambda a: jnp.take_along_axis(a, i[..., None], axis=-1)[..., 0]
-    gain = jax.vmap(at)(log_q) - at(log_p)[None]
-    return assembled(p, z, i), z, i, log_p, ratio + jnp.sum(gain, axis=1)
+    e, h, v = chance
+    dtype = e.dtype
+    log_p = stacked(p).astype(dtype)
+    ratio = jnp.zeros(len(floors), dtype)
+    i = jnp.zeros((0,), jnp.int32)
+    y = f[Y] if len(f) > Y else f[0]
+    if p.choices:
+        base = jnp.einsum("f,kfbc->kbc", f, block.shifts[:, : len(f)])
+        extra = block.shifts[:, len(f) :]
+
+        def choose(r, row):
+            b_log_p, b_base, b_extra, b_v = row
+            three = jnp.stack([r, r * r, r * y])
+            log_q = tilted_log(
+                b_log_p[None], (b_base + three @ b_extra)[None, None], floors[k][None]
+            )
+            c = chosen(log_q[0], b_v[None])[0]
+            return r + jnp.where(b_log_p[c] < math.log(RARE), 1.0, 0.0).astype(dtype), c
+
+        rows = (log_p, base[k], jnp.moveaxis(extra[k], 1, 0), v)
+        _, i = lax.scan(choose, jnp.zeros((), dtype), rows, unroll=len(v) <= 4)
+        r = rarity(log_p, i).astype(dtype)
+        three = jnp.stack([r, r * r, r * y])
+        log_q = tilted_log(log_p, base + jnp.einsum("xb,kxbc->kbc", three, extra), floors)
+        at = lambda a: jnp.take_along_axis(a, i[..., None], axis=-1)[..., 0]
+        ratio = ratio + jnp.sum(jax.vmap(at)(log_q) - at(log_p)[None], axis=1)
+    z = e
+    if p.normals:
+        size = block.means.shape[2]
+        if size > 1:
+            own = owned(p.owners, size, i).astype(dtype)
+            of = lambda a: jnp.einsum("f,kfcag,ac->kag", f, a, own)
+        else:
+            of = lambda a: jnp.einsum("f,kfag->kag", f, a[:, :, 0])
+        means = of(block.means)
+        if means.shape[2] == 1:
+            z = means[k, :, 0] + e
+            ratio = ratio + jnp.sum(means[..., 0] * (z[None] - means[..., 0] / 2), axis=1)
+        else:
+            log_g = jax.nn.log_softmax(of(block.gates), axis=-1)
+            edges = jnp.cumsum(jnp.exp(log_g[k]), axis=-1)[:, :-1]
+            g = jnp.sum(h[:, None] >= edges, axis=-1, dtype=jnp.int32)
+            z = jnp.take_along_axis(means[k], g[:, None], axis=-1)[:, 0] + e
+            each = log_g + means * (z[None, :, None] - means / 2)
+            ratio = ratio + jnp.sum(logsumexp(each, axis=-1), axis=1)
+    return assembled(p, z, i), z, i, log_p, ratio
 
 
 @jax.jit
 def played(sim, q, u, first, noise):
     """Episodes [n] of the `Tilts` ``q`` by uniform numbers ``u`` [n]; ``first``, ``noise``: normal
-    and uniform numbers of x0 [n, A0], [n, B0] and of the steps [T, n, A], [T, n, B].
+    numbers, uniform ones of their Gaussians and uniform ones of choices, of x0 [n, A0], [n, A0],
+    [n, B0] and of the steps [T, n, A], [T, n, A], [T, n, B].
 
     (`Outcomes`, log q_k - log p [n, K], `Trace`).
     """
@@ -207,20 +291,16 @@ def played(sim, q, u, first, noise):
     k = jnp.minimum(jnp.sum(u[:, None] >= edges[None], axis=1), live - 1)
     length_of = sim.horizon
 
-    def start(k, e, v):
-        x0, z, i, log_p, ratio = _drawn(
-            parts(sim.start()), k, q.first_means, q.first_shifts, q.floors, e, v
-        )
+    def start(k, *chance):
+        one = jnp.ones(1, u.dtype)
+        x0, z, i, log_p, ratio = _drawn(parts(sim.start()), k, one, q.first, q.floors, chance)
         return begin(sim, log_likelihood, x0), ratio, (z, i, log_p)
 
-    def one(progress, ratio, length, k, e, v, t):
+    def one(progress, ratio, length, k, chance, t):
         seen = look(sim, progress.state)
-        f = features(q.frame, seen, t.astype(e.dtype) / length_of)
-        means = jnp.einsum("f,kfa->ka", f, q.means)
-        shifts = jnp.einsum("f,kfbc->kbc", f, q.shifts)
-        x, z, i, log_p, gain = _drawn(
-            parts(sim.disturbance(progress.state)), k, means, shifts, q.floors, e, v
-        )
+        f = features(q.frame, seen, t.astype(u.dtype) / length_of)
+        p = parts(sim.disturbance(progress.state))
+        x, z, i, log_p, gain = _drawn(p, k, f, q.steps, q.floors, chance)
         after = advance(sim, log_likelihood, progress, x, t + 1 >= length_of)
         done = progress.done
         keep = lambda a, b: jnp.where(done, a, b)
@@ -239,8 +319,8 @@ def played(sim, q, u, first, noise):
 
     def body(carry):
         progress, ratio, length, t, rows = carry
-        progress, ratio, length, row = jax.vmap(one, (0, 0, 0, 0, 0, 0, None))(
-            progress, ratio, length, k, noise[0][t], noise[1][t], t
+        progress, ratio, length, row = jax.vmap(one, (0, 0, 0, 0, 0, None))(
+            progress, ratio, length, k, tuple(a[t] for a in noise), t
         )
         rows = tuple(a.at[t].set(b) for a, b in zip(rows, row, strict=True))
         return progress, ratio, length, t + 1, rows
@@ -261,15 +341,19 @@ def played(sim, q, u, first, noise):
 @partial(jax.jit, static_argnums=(1, 2, 3, 4))
 def numbers(key, n, about, horizon, dtype):
     """What `played` needs of chance for ``n`` episodes: (u, first, noise)."""
-    keys = jax.random.split(key, 5)
-    normal = lambda k, *size: jax.random.normal(k, size, dtype)
+    keys = jax.random.split(key, 7)
+
+    def of(keys, a, b, *size):
+        return (
+            jax.random.normal(keys[0], (*size, a), dtype),
+            jax.random.uniform(keys[1], (*size, a), dtype),
+            _fine(keys[2], (*size, b), dtype),
+        )
+
     return (
         jax.random.uniform(keys[0], (n,), dtype),
-        (normal(keys[1], n, about.normals0), _fine(keys[2], (n, about.choices0), dtype)),
-        (
-            normal(keys[3], horizon, n, about.normals),
-            _fine(keys[4], (horizon, n, about.choices), dtype),
-        ),
+        of(keys[1:4], about.normals0, about.choices0, n),
+        of(keys[4:], about.normals, about.choices, horizon, n),
     )
 
 
@@ -291,9 +375,10 @@ def of_the_model(sim, q, z):
     """
     about, n = shape(sim), len(z)
     a, b = about.normals0, about.choices0
-    first = z[:, :a], ndtr(z[:, a : a + b])
+    first = z[:, :a], jnp.zeros_like(z[:, :a]), ndtr(z[:, a : a + b])
     rest = jnp.moveaxis(z[:, a + b :].reshape(n, sim.horizon, -1), 0, 1)
-    noise = rest[..., : about.normals], ndtr(rest[..., about.normals :])
+    e = rest[..., : about.normals]
+    noise = e, jnp.zeros_like(e), ndtr(rest[..., about.normals :])
     o, ratio, trace = played(sim, q, jnp.zeros(n, z.dtype), first, noise)
     return o, logsumexp(ratio + q.log_weights[None], axis=1), trace
 

@@ -14,7 +14,7 @@ from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.guard import LOST
 from jast.estimate.importance_sampling import Traces, chunks
-from jast.estimate.markov_tilts import Tilts, log_weight, numbers, played
+from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
 from jast.estimate.populations import LAST, QUANTILE, explore
 from jast.estimate.tilt_search import TiltSeeker, seek_tilts
 
@@ -24,6 +24,8 @@ LONG, LARGE = 30, 2e7
 """Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
 SHARE, REST = 0.35, 0.5
 """Of the budget for their search; where Gaussians went before, of what is left."""
+GATES = 3
+"""Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
 COVERED, GUARD = 50.0, 0.15
@@ -42,13 +44,13 @@ def first(s: Any) -> TiltSeeker | None:
 
 def after(s: Any) -> TiltSeeker:
     """The `TiltSeeker` after its search with a part of what is left to the `Seeker` ``s``."""
-    return _sought(s, TiltSeeker(s.next_key(), s.sim, 0), REST * (s.budget - s.spent))
+    return _sought(s, TiltSeeker(s.next_key(), s.sim, 0, GATES), REST * (s.budget - s.spent))
 
 
 def _sought(s, t, most):
     about = t.about
     a_step = about.seen + about.normals + about.choices * (1 + about.categories)
-    t.batch = int(min(max(s.budget // 50, 200), LARGE / (a_step * s.sim.horizon) + 100))
+    t.batch = int(min(max(s.budget // 50, 500), LARGE / (a_step * s.sim.horizon) + 100))
     t.room = int(most)
     seek_tilts(t, int(most))
     s.spent += t.spent
@@ -58,19 +60,23 @@ def _sought(s, t, most):
 
 def guarded(s: Any, t: TiltSeeker) -> None:
     """Look for failures that the tilts hardly draw: a population that is kept out of what they
-    cover. What is found becomes a reason against the estimate.
+    cover. What is found is taken in, and else becomes a reason against the estimate.
     """
     s.reasons = []  # others are about the Gaussians
+    if _lost(s, t, True):
+        _lost(s, t, False)
+
+
+def _lost(s, t, takes):
+    """Whether something was lost and taken in, if it is to be."""
     least = t.log_mean + math.log(LOST)
     room = int(min(GUARD * s.budget, (s.budget - s.spent) / 2))
     size = min(s.size, int(room / (least / math.log(QUANTILE) + LAST + 4)) // 50 * 50)
     if not size:
         s.reasons.append("the budget did not last to look for lost failure modes")
-        return
-    threshold = jnp.asarray(-t.log_mean - math.log(COVERED), s.dtype)
-    p = explore(
-        s.next_key(), s.sim, size, covered=(t.tilts(t.q), threshold), least=least, most=room
-    )
+        return False
+    q, threshold = t.tilts(t.q), jnp.asarray(-t.log_mean - math.log(COVERED), s.dtype)
+    p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=room)
     share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
     thin = t.thin(math.log(COVERED))
     s.note(
@@ -79,10 +85,20 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     )
     if not p.complete:
         s.reasons.append("the budget did not last to look for lost failure modes")
-    if share > 2 * (thin + LOST) + LOST:
+    if share <= 2 * (thin + LOST) + LOST:
+        return False
+    most = int(0.15 * s.budget)
+    if not takes or s.budget - s.spent < 2 * most:
         s.reasons.append(
             f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
         )
+        return False
+    o, _, trace = jax.device_get(of_the_model(s.sim, q, jnp.asarray(p.points, s.dtype)))
+    before, told = t.spent, len(t.history)
+    t.widen(trace, np.asarray(o.length), share, t.spent + most)
+    s.spent += t.spent - before
+    s.history += t.history[told:]
+    return True
 
 
 def estimated(

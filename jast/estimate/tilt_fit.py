@@ -12,7 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast.estimate.markov_tilts import Frame, Shape, Tilts, Trace, features
+from jast.estimate.markov_tilts import (
+    Block,
+    Frame,
+    Shape,
+    Tilts,
+    Trace,
+    Y,
+    features,
+    rarity,
+    surprise,
+)
 
 __all__ = ["Tilt", "as_tilts", "fit", "frame_of", "ratios"]
 
@@ -20,21 +30,21 @@ PROJECTED, WITHIN = 6, 0.05
 RIDGE, FREE = 1.0, 0.02
 """Of a normal prior on the coefficients, in steps; of the constant's."""
 ITERATIONS, STEP = 25, 4.0
+ROUNDS, BEYOND = 8, 1.5
+"""Of expectation maximisation; the normal numbers that the outer Gaussians start from."""
 ROWS = 60_000
 
 
 class Tilt(NamedTuple):
     """One tilt, on the host: as in `Tilts`."""
 
-    first_means: np.ndarray
-    first_shifts: np.ndarray
-    means: np.ndarray
-    shifts: np.ndarray
+    first: Block
+    steps: Block
     floor: float = -np.inf
 
 
-class Steps(NamedTuple):
-    """The steps of traces, one a row."""
+class Rows(NamedTuple):
+    """Draws of steps, or of x0, one a row."""
 
     x: np.ndarray
     """[N, F] features"""
@@ -43,6 +53,10 @@ class Steps(NamedTuple):
     normals: np.ndarray
     choices: np.ndarray
     log_p: np.ndarray
+    rare: np.ndarray
+    """[N, B] as `rarity` has it"""
+    own: np.ndarray
+    """[N, A] the category that a normal number is of"""
 
 
 def columns(about: Shape) -> int:
@@ -95,65 +109,117 @@ def frame_of(about: Shape, trace: Trace, length: np.ndarray, w: np.ndarray) -> F
     return Frame(centre, project, y.min(axis=0) - WITHIN * span, y.max(axis=0) + WITHIN * span)
 
 
-def steps_of(frame: Frame, trace: Trace, length: np.ndarray) -> Steps:
-    """The `Steps` of traces of these lengths."""
-    horizon = len(trace.seen)
+def steps_of(about: Shape, frame: Frame, trace: Trace, length: np.ndarray) -> tuple[Rows, Rows]:
+    """The `Rows` of x0 and of the steps of traces of these lengths."""
+    n, horizon = len(length), len(trace.seen)
     live = np.arange(horizon)[:, None] < length[None]
     t, at = np.nonzero(live)
     x = features(frame, trace.seen[live].astype(np.float64), t / horizon, np)
-    return Steps(
-        x,
-        at,
-        trace.normals[live].astype(np.float64),
-        trace.choices[live],
-        trace.log_p[live].astype(np.float64),
+    first = np.ones((n, 1)), np.arange(n), *trace[:3]
+    steps = x, at, trace.normals[live], trace.choices[live], trace.log_p[live]
+    return _rows(about.owners0, *first), _rows(about.owners, *steps)
+
+
+def _rows(owners, x, trace, normals, choices, log_p):
+    log_p = log_p.astype(np.float64)
+    rare = rarity(log_p, choices, np) if choices.shape[1] else np.zeros(choices.shape)
+    none = np.zeros((len(x), 1), choices.dtype)
+    own = np.concatenate([choices, none], axis=1)[:, np.asarray(owners, int)]
+    return Rows(x, trace, normals.astype(np.float64), choices, log_p, rare, own)
+
+
+def fit(rows: tuple[Rows, Rows], w: np.ndarray, count: float, like: Tilt) -> Tilt:
+    """The `Tilt` of traces of the weights ``w`` [n], which count as ``count`` independent ones; of
+    the shapes of ``like``.
+    """
+    w = w / w.sum() * count
+    return Tilt(*(_fitted(r, w[r.trace], b) for r, b in zip(rows, like[:2], strict=True)))
+
+
+def _fitted(rows, w, like):
+    if len(w) > ROWS:
+        chosen = np.linspace(0, len(w) - 1, ROWS).astype(int)
+        w, rows = w[chosen] * (len(w) / ROWS), Rows(*(a[chosen] for a in rows))
+    means, gates, shifts = (np.zeros(a.shape) for a in like)
+    for a in range(means.shape[2]):
+        for c in range(means.shape[1]):
+            mine = (rows.own[:, a] == c) & (w > 0)
+            if mine.any():
+                means[:, c, a], gates[:, c, a] = _gated(
+                    rows.x[mine], rows.normals[mine, a], w[mine], means.shape[3]
+                )
+    for j in range(shifts.shape[1]):
+        x = _with_surprise(rows, j)
+        shifts[:, j] = _logits(x, _one_of(rows, j), rows.log_p[:, j], w, _ridge(x.shape[1]))
+    return Block(means, gates, shifts)
+
+
+def _ridge(size):
+    ridge = np.full(size, RIDGE)
+    ridge[0] = FREE
+    return ridge
+
+
+def _with_surprise(rows, j):
+    y = rows.x[:, Y if rows.x.shape[1] > Y else 0]
+    return surprise(rows.x, y, rows.rare[:, j], np)
+
+
+def _one_of(rows, j):
+    return np.eye(rows.log_p.shape[2])[rows.choices[:, j]]
+
+
+def _gated(x, z, w, gates):
+    """(means, log weights) [F, G] of G unit Gaussians, by expectation maximisation from the middle,
+    the upper and the lower numbers on.
+    """
+    f = x.shape[1]
+    if gates == 1:
+        return _lines(x, z[:, None], w[:, None]), np.zeros((f, 1))
+    edge = BEYOND * np.ones(len(z))
+    r = np.stack([np.abs(z) < edge, z >= edge, z <= -edge], axis=1)[:, :gates].astype(float)
+    log_g = np.zeros((f, gates))
+    none = np.zeros((len(z), gates))
+    for _ in range(ROUNDS):
+        means = _lines(x, np.repeat(z[:, None], gates, axis=1), w[:, None] * r)
+        log_g = _logits(x, r, none, w, _ridge(f), log_g)
+        m = x @ means
+        joint = x @ log_g + m * (z[:, None] - m / 2)
+        joint -= joint.max(axis=1, keepdims=True)
+        r = np.exp(joint)
+        r /= r.sum(axis=1, keepdims=True)
+    return means, log_g
+
+
+def _lines(x, z, w):
+    """Least squares [F, G] of ``z`` [N, G] by ``x`` with the weights ``w`` [N, G]."""
+    ridge = np.diag(_ridge(x.shape[1]))
+    return np.stack(
+        [
+            np.linalg.solve(x.T @ (x * v[:, None]) + ridge, x.T @ (y * v))
+            for y, v in zip(z.T, w.T, strict=True)
+        ],
+        axis=1,
     )
 
 
-def fit(steps: Steps, first: tuple, w: np.ndarray, count: float) -> Tilt:
-    """The `Tilt` of traces of the weights ``w`` [n], which count as ``count`` independent ones;
-    ``first``: their normals, choices and log probabilities of x0.
-    """
-    w = w / w.sum() * count
-    each = w[steps.trace]
-    if len(each) > ROWS:
-        rows = np.linspace(0, len(each) - 1, ROWS).astype(int)
-        each, steps = each[rows] * (len(each) / ROWS), Steps(*(a[rows] for a in steps))
-    x = steps.x
-    ridge = np.full(x.shape[1], RIDGE)
-    ridge[0] = FREE
-    gram = x.T @ (x * each[:, None])
-    means = np.linalg.solve(gram + np.diag(ridge), x.T @ (steps.normals * each[:, None]))
-    b, c = steps.log_p.shape[1:]
-    shifts = np.zeros((x.shape[1], b, c))
-    for j in range(b):
-        shifts[:, j] = _logits(x, steps.choices[:, j], steps.log_p[:, j], each, ridge)
-    z0, i0, log_p0 = first
-    first_means = w @ z0 / (count + 1)
-    first_shifts = np.zeros(log_p0.shape[1:])
-    for j in range(log_p0.shape[1]):
-        one = np.ones((len(w), 1))
-        first_shifts[j] = _logits(one, i0[:, j], log_p0[:, j], w, np.array([FREE]))[0]
-    return Tilt(first_means, first_shifts, means, shifts)
-
-
-def _logits(x, chosen, log_p, w, ridge):
+def _logits(x, target, log_p, w, ridge, start=None):
     """Coefficients [F, C] of what is added to ``log_p`` [N, C], by Newton's steps for each category
     in turn against the others; the commonest category is the one that nothing is added to.
+    ``target`` [N, C]: the parts of the categories in each row.
     """
     c = log_p.shape[1]
-    out = np.zeros((x.shape[1], c))
-    with np.errstate(divide="ignore", over="ignore"):
-        base = np.argmax((np.exp(log_p) * w[:, None]).sum(axis=0))
+    out = np.zeros((x.shape[1], c)) if start is None else start.copy()
+    base = 0 if start is not None else np.argmax((np.exp(log_p) * w[:, None]).sum(axis=0))
     others = [k for k in range(c) if k != base and np.isfinite(log_p[:, k]).any()]
-    for _ in range(ITERATIONS if len(others) == 1 else ITERATIONS * 2):
+    turns = 3 if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)
+    for _ in range(turns):
         greatest = 0.0
         for k in others:
             log_q = log_p + x @ out
-            top = log_q.max(axis=1, keepdims=True)
-            q = np.exp(log_q - top)
+            q = np.exp(log_q - log_q.max(axis=1, keepdims=True))
             p = q[:, k] / q.sum(axis=1)
-            slope = x.T @ (w * ((chosen == k) - p)) - ridge * out[:, k]
+            slope = x.T @ (w * (target[:, k] - p)) - ridge * out[:, k]
             bend = x.T @ (x * (w * p * (1 - p))[:, None]) + np.diag(ridge)
             step = np.linalg.solve(bend, slope)
             size = np.abs(x @ step).max()
@@ -165,42 +231,56 @@ def _logits(x, chosen, log_p, w, ridge):
     return out
 
 
-def ratios(tilts: list[Tilt], steps: Steps, first: tuple, n: int) -> np.ndarray:
+def ratios(tilts: list[Tilt], rows: tuple[Rows, Rows], n: int) -> np.ndarray:
     """log q_k - log p [n, K] of ``n`` traces under each of ``tilts``."""
-    return np.stack([_ratio(t, steps, first, n) for t in tilts], axis=1)
-
-
-def _ratio(t, steps, first, n):
-    each = np.zeros(len(steps.x))
-    means = steps.x @ t.means
-    each += (means * (steps.normals - means / 2)).sum(axis=1)
-    if steps.log_p.shape[1]:
-        shifts = np.einsum("nf,fbc->nbc", steps.x, t.shifts)
-        each += _gain(steps.log_p, shifts, steps.choices, t.floor)
-    z0, i0, log_p0 = first
-    start = (t.first_means * (z0 - t.first_means / 2)).sum(axis=1)
-    if log_p0.shape[1]:
-        start = start + _gain(log_p0, t.first_shifts[None], i0, t.floor)
-    return np.bincount(steps.trace, each, minlength=n) + start
-
-
-def _gain(log_p, shifts, chosen, floor):
-    """What tilted choices add to log q - log p: [N]."""
-    log_q = np.where(log_p > -np.inf, np.maximum(log_p, floor), -np.inf) + shifts
-    top = log_q.max(axis=-1, keepdims=True)
-    log_q = log_q - top - np.log(np.exp(log_q - top).sum(axis=-1, keepdims=True))
-    at = lambda a: np.take_along_axis(a, chosen[..., None], axis=-1)[..., 0]
-    return (at(log_q) - at(log_p)).sum(axis=1)
-
-
-def nothing(about: Shape, count: int) -> Tilt:
-    """The model as a `Tilt` of ``count`` features."""
-    return Tilt(
-        np.zeros(about.normals0),
-        np.zeros((about.choices0, about.categories0)),
-        np.zeros((count, about.normals)),
-        np.zeros((count, about.choices, about.categories)),
+    each = lambda t: sum(
+        np.bincount(r.trace, _ratio(b, r, t.floor), minlength=n)
+        for r, b in zip(rows, t[:2], strict=True)
     )
+    return np.stack([each(t) for t in tilts], axis=1)
+
+
+def _ratio(block, rows, floor):
+    out = np.zeros(len(rows.x))
+    for a in range(rows.normals.shape[1]):
+        for c in range(block.means.shape[1]):
+            mine = rows.own[:, a] == c
+            x, z = rows.x[mine], rows.normals[mine, a, None]
+            m, log_g = x @ block.means[:, c, a], x @ block.gates[:, c, a]
+            joint = log_g + m * (z - m / 2)
+            out[mine] += _log_sum(joint) - _log_sum(log_g)
+    for j in range(rows.choices.shape[1]):
+        log_p = rows.log_p[:, j]
+        log_q = np.where(log_p > -np.inf, np.maximum(log_p, floor), -np.inf)
+        log_q = log_q + _with_surprise(rows, j) @ block.shifts[:, j]
+        at = lambda a: np.take_along_axis(a, rows.choices[:, j, None], axis=1)[:, 0]  # noqa: B023
+        out += at(log_q) - _log_sum(log_q) - at(log_p)
+    return out
+
+
+def _log_sum(a):
+    top = a.max(axis=1)
+    return top + np.log(np.exp(a - top[:, None]).sum(axis=1))
+
+
+def nothing(about: Shape, count: int, gates: int) -> Tilt:
+    """The model as a `Tilt` of ``count`` features."""
+
+    def block(f, normals, choices, categories, owners):
+        owned = categories if any(o >= 0 for o in owners) else 1
+        numbers = np.zeros((f, owned, normals, gates))
+        return Block(numbers, numbers, np.zeros((f + 3, choices, categories)))
+
+    return Tilt(
+        block(1, about.normals0, about.choices0, about.categories0, about.owners0),
+        block(count, about.normals, about.choices, about.categories, about.owners),
+    )
+
+
+def scaled(tilt: Tilt, by: float) -> Tilt:
+    """A tilt that moves ``by`` of the way."""
+    some = lambda b: Block(by * b.means, b.gates, by * b.shifts)
+    return Tilt(some(tilt.first), some(tilt.steps))
 
 
 def as_tilts(tilts: list[Tilt], weights: Any, frame: Frame, size: int, dtype: Any) -> Tilts:
@@ -211,14 +291,12 @@ def as_tilts(tilts: list[Tilt], weights: Any, frame: Frame, size: int, dtype: An
     tilts = [*tilts, *[tilts[0]] * spare]
     with np.errstate(divide="ignore"):
         log_weights = np.log(np.concatenate([np.asarray(weights, float), np.zeros(spare)]))
-    stack = lambda name: np.stack([np.asarray(getattr(t, name)) for t in tilts])
+    stack = lambda *a: np.stack(a)
     arrays = (
         log_weights,
-        stack("floor"),
-        stack("first_means"),
-        stack("first_shifts"),
-        stack("means"),
-        stack("shifts"),
+        stack(*(t.floor for t in tilts)),
+        jax.tree.map(stack, *(t.first for t in tilts)),
+        jax.tree.map(stack, *(t.steps for t in tilts)),
         frame,
     )
     return Tilts(*jax.tree.map(lambda a: jnp.asarray(a, dtype), arrays))

@@ -17,12 +17,12 @@ from jast.counter import generator
 from jast.estimate.gaussians import effective
 from jast.estimate.markov_tilts import Tilts, Trace, features, played, shape
 from jast.estimate.tilt_fit import (
-    Tilt,
     as_tilts,
     fit,
     frame_of,
     nothing,
     ratios,
+    scaled,
     steps_of,
     unseen,
 )
@@ -30,9 +30,9 @@ from jast.limit_state import normal_numbers
 
 __all__ = ["TiltSeeker", "seek_tilts"]
 
-COMPONENTS = 4
+COMPONENTS = (3, 5)
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
-LEVELS, REFITS, KEPT = 20, 5, 600
+REFITS, KEPT = 8, 600
 
 
 class Drawn(NamedTuple):
@@ -51,12 +51,12 @@ class Drawn(NamedTuple):
 class TiltSeeker:
     """What the search for tilts knows: the mixture, the batches behind it, how it went."""
 
-    def __init__(self, key: Any, sim: Any, batch: int):
+    def __init__(self, key: Any, sim: Any, batch: int, gates: int = 1):
         self.sim, self.rng, self.batch = sim, generator(key), batch
         self.about, self.dtype = shape(sim), normal_numbers(sim)
         frame = unseen(self.about, sim.horizon)
         zeros = np.zeros((1, self.about.seen))
-        self.model = nothing(self.about, features(frame, zeros, 0.0, np).shape[1])
+        self.model = nothing(self.about, features(frame, zeros, 0.0, np).shape[1], gates)
         self.mixture = ([self.model], [1.0], frame)
         self.batches, self.history, self.spent = [], [], 0
         self.promised, self.log_mean, self.q = 0.0, None, None
@@ -64,18 +64,21 @@ class TiltSeeker:
 
     def tilts(self, mixture: tuple) -> Tilts:
         tilts, weights, frame = mixture
-        return as_tilts(tilts, weights, frame, COMPONENTS, self.dtype)
+        size = COMPONENTS[len(tilts) > COMPONENTS[0]]
+        return as_tilts(tilts, weights, frame, size, self.dtype)
 
     def draw(self) -> Drawn:
         """A batch of the mixture; what is near to failure is kept."""
         n, a, horizon = self.batch, self.about, self.sim.horizon
         of = lambda v: jnp.asarray(v, self.dtype)
         normal, uniform = self.rng.standard_normal, self.rng.random
-        first = of(normal((n, a.normals0))), of(uniform((n, a.choices0)))
-        noise = (
-            of(normal((horizon, n, a.normals), np.float32)),
-            of(uniform((horizon, n, a.choices))),
+        chance = lambda a, b, *size: (
+            of(normal((*size, a), np.float32)),
+            of(uniform((*size, a), np.float32)),
+            of(uniform((*size, b))),
         )
+        first = chance(a.normals0, a.choices0, n)
+        noise = chance(a.normals, a.choices, horizon, n)
         q = self.tilts(self.mixture)
         o, ratio, trace = jax.device_get(played(self.sim, q, of(uniform(n)), first, noise))
         joint = ratio.astype(np.float64) + np.asarray(q.log_weights, np.float64)[None]
@@ -88,14 +91,73 @@ class TiltSeeker:
         """log q - log p of the mixture of batch ``i`` on the episodes of batch ``j``."""
         if (i, j) not in self.ratios:
             b = self.batches[j]
-            self.ratios[i, j] = (
-                -b.log_weight if i == j else log_ratio(self.batches[i].mixture, b.trace, b.length)
-            )
+            other = self.batches[i].mixture
+            self.ratios[i, j] = -b.log_weight if i == j else self.log_ratio(other, b)
         return self.ratios[i, j]
 
     def serves(self, other: float) -> bool:
         """Whether a draw has more effective ones than ``other``, and than one of the model has."""
         return self.q is not None and self.promised > max(other, math.exp(min(self.log_mean, 0.0)))
+
+    def note(self, b: Drawn, text: str, log_w: np.ndarray) -> None:
+        failing = np.mean(b.score == -np.inf)
+        self.history.append(
+            f"tilts: {text}, {failing:.1%} fail, ESS {effective(log_w):.4g} of {len(log_w)}"
+        )
+
+    def take(self, b: Drawn) -> float:
+        """Take in the failures of a batch; the next mixture is fitted to those of all. How many
+        effective ones the batch has.
+        """
+        own = effective(b.log_weight[b.score == -np.inf])
+        self.promised, self.q = own / self.batch, self.mixture
+        self.batches.append(rows_of(b, -np.inf))
+        used = together(self)
+        w = np.exp(used.log_weight - used.log_weight.max())
+        self.log_mean = used.log_weight.max() + math.log(w.sum() / used.size)
+        self.note(b, f"log p {self.log_mean:.3f}, own ESS {own:.4g}", used.log_weight)
+        self.mixture = mixture_of(self, used, used.log_weight, self.groups(used))
+        return own
+
+    def refit(self, most: int, times: int) -> None:
+        """Batches, at most ``times``, for as long as they get better."""
+        best = self.promised * self.batch
+        for _ in range(times):
+            if not self.batches or self.spent + self.batch > most:
+                return
+            b = self.draw()
+            if not (b.score == -np.inf).any():
+                return
+            own = self.take(b)
+            if own < 1.1 * best and own > 0.05 * self.batch:
+                return
+            best = max(own, best)
+
+    def groups(self, used: Drawn) -> np.ndarray | None:
+        """Which part [n, M] of each episode belongs to each group of the mixture's tilts."""
+        tilts, weights, frame = self.mixture
+        if len(tilts) <= 3:
+            return None
+        rows = steps_of(self.about, frame, used.trace, used.length)
+        joint = (ratios(tilts, rows, len(used.length)) + np.log(weights)[None])[:, 1:]
+        r = np.exp(joint - joint.max(axis=1, keepdims=True))
+        r = r.reshape(len(r), -1, 2).sum(axis=2)
+        return r / r.sum(axis=1, keepdims=True)
+
+    def widen(self, trace: Trace, length: np.ndarray, share: float, most: int) -> None:
+        """Take in failures that the mixture hardly draws, which carry ``share`` of what it found,
+        as a tilt of their own.
+        """
+        used, n = together(self), len(length)
+        w = used.log_weight - np.logaddexp.reduce(used.log_weight)
+        both = used._replace(
+            trace=joined([used.trace, trace]), length=np.concatenate([used.length, length])
+        )
+        log_w = np.concatenate([w, np.full(n, math.log(share / n))])
+        of = np.repeat(np.eye(2), [len(w), n], axis=0)
+        if len(self.mixture[0]) <= 3:
+            self.mixture = mixture_of(self, both, log_w, of)
+        self.refit(most, 3)
 
     def thin(self, covered: float) -> float:
         """The part of the probability that lies where log q - log p is ``covered`` below what it is
@@ -107,6 +169,14 @@ class TiltSeeker:
         w = np.exp(used.log_weight - used.log_weight.max())
         return float(w[log_q < -self.log_mean - covered].sum() / w.sum())
 
+    def log_ratio(self, mixture: tuple, b: Drawn) -> np.ndarray:
+        """log q - log p [n] of the episodes of ``b``."""
+        tilts, weights, frame = mixture
+        rows = steps_of(self.about, frame, b.trace, b.length)
+        with np.errstate(divide="ignore"):
+            joint = ratios(tilts, rows, len(b.length)) + np.log(weights)[None]
+        return _log_sum(joint, 1)
+
     def until(self, b: Drawn, level: float) -> Drawn:
         """The episodes up to where they first reach ``level``: what comes after has no part in
         that.
@@ -116,23 +186,33 @@ class TiltSeeker:
         reached = b.trace.seen[:, :, 0] <= level
         at = np.where(reached.any(axis=0), reached.argmax(axis=0), self.sim.horizon)
         length = np.minimum(b.length, at)
-        return b._replace(length=length, log_weight=-log_ratio(b.mixture, b.trace, length))
+        return b._replace(
+            length=length, log_weight=-self.log_ratio(b.mixture, b._replace(length=length))
+        )
 
 
-def rows_of(b: Drawn, rows: np.ndarray) -> Drawn:
-    first = Trace(*(a[rows] for a in b.trace[:3]), *(a[:, rows] for a in b.trace[3:]))
-    return Drawn(b.mixture, first, b.score[rows], b.length[rows], b.log_weight[rows], b.size)
+def rows_of(b: Drawn, level: float) -> Drawn:
+    """Those of the episodes that come to ``level``, at most `KEPT`."""
+    near = np.flatnonzero(b.score <= level)
+    rows = near[:KEPT]
+    trace = Trace(*(a[rows] for a in b.trace[:3]), *(a[:, rows] for a in b.trace[3:]))
+    size = b.size * len(rows) // max(len(near), 1)
+    return Drawn(b.mixture, trace, b.score[rows], b.length[rows], b.log_weight[rows], size)
+
+
+def joined(traces: list[Trace]) -> Trace:
+    """The traces of all."""
+    join = lambda axis, *a: np.concatenate(a, axis=axis)
+    return Trace(
+        *(join(0, *a) for a in zip(*(t[:3] for t in traces), strict=True)),
+        *(join(1, *a) for a in zip(*(t[3:] for t in traces), strict=True)),
+    )
 
 
 def together(s: TiltSeeker) -> Drawn:
     """The failures of all batches, and their weights by the balance heuristic."""
     batches = s.batches
-    join = lambda axis, *a: np.concatenate(a, axis=axis)
-    traces = [b.trace for b in batches]
-    trace = Trace(
-        *(join(0, *a) for a in zip(*(t[:3] for t in traces), strict=True)),
-        *(join(1, *a) for a in zip(*(t[3:] for t in traces), strict=True)),
-    )
+    trace = joined([b.trace for b in batches])
     length = np.concatenate([b.length for b in batches])
     total = sum(b.size for b in batches)
     logs = np.stack(
@@ -151,15 +231,6 @@ def together(s: TiltSeeker) -> Drawn:
     )
 
 
-def log_ratio(mixture: tuple, trace: Trace, length: np.ndarray) -> np.ndarray:
-    """log q - log p [n] of traces."""
-    tilts, weights, frame = mixture
-    steps = steps_of(frame, trace, length)
-    with np.errstate(divide="ignore"):
-        joint = ratios(tilts, steps, trace[:3], len(length)) + np.log(weights)[None]
-    return _log_sum(joint, 1)
-
-
 def _log_sum(a, axis):
     top = a.max(axis=axis, keepdims=True)
     return (top + np.log(np.exp(a - top).sum(axis=axis, keepdims=True))).squeeze(axis)
@@ -170,7 +241,7 @@ def seek_tilts(s: TiltSeeker, most: int) -> None:
     if s.about.choices or s.about.choices0:
         floor = math.log(min(2.0 / s.sim.horizon, 0.25))
         s.mixture = ([s.model, s.model._replace(floor=floor)], [0.5, 0.5], s.mixture[2])
-    level, refits, best = math.inf, 0, 0.0
+    level = math.inf
     while s.spent + s.batch <= most:
         b = s.draw()
         share = np.mean(b.score == -np.inf)
@@ -185,43 +256,34 @@ def seek_tilts(s: TiltSeeker, most: int) -> None:
                 return
             new = below[min(len(below) - 1, int(ELITE * s.batch))]
         level = min(new, level)
-        kept = np.flatnonzero(b.score <= level)[:KEPT]
-        b_kept = rows_of(b, kept)._replace(
-            size=s.batch * len(kept) // max((b.score <= level).sum(), 1)
-        )
-        if level > -np.inf:
-            used = s.until(b_kept, level)
-            log_w = used.log_weight
-        else:
-            own = effective(b.log_weight[b.score == -np.inf])
-            s.promised, s.q = own / s.batch, s.mixture
-            s.batches.append(b_kept)
-            used = together(s)
-            log_w = used.log_weight
-            w = np.exp(log_w - log_w.max())
-            s.log_mean = log_w.max() + math.log(w.sum() / used.size)
-        s.history.append(
-            f"tilts: level {level:.4g}, {share:.1%} fail, ESS {effective(log_w):.4g} of"
-            f" {len(log_w)}"
-            + (f", own {own:.4g} of {s.batch}, log p {s.log_mean:.3f}" if level == -np.inf else "")
-        )
         if level == -np.inf:
-            refits += 1
-            if refits > REFITS or own < 1.1 * best and own > 0.05 * s.batch:
-                return
-            best = max(own, best)
-        s.mixture = _fitted(s, used, log_w)
+            s.take(b)
+            break
+        used = s.until(rows_of(b, level), level)
+        s.note(b, f"level {level:.4g}", used.log_weight)
+        s.mixture = mixture_of(s, used, used.log_weight)
+    s.refit(most, REFITS)
 
 
-def _fitted(s, used, log_w):
-    """The mixture of the model and the tilt of weighted traces."""
-    power = _power(log_w, min(200, 0.3 * len(log_w)))
-    w = np.exp(power * (log_w - log_w.max()))
-    frame = frame_of(s.about, used.trace, used.length, w)
-    steps = steps_of(frame, used.trace, used.length)
-    one = fit(steps, used.trace[:3], w, effective(power * log_w))
-    half = Tilt(*(a * HALF for a in one[:4]))
-    return ([s.model, one, half], [MODEL, 1 - MODEL - WIDE, WIDE], frame)
+def mixture_of(s: TiltSeeker, used: Drawn, log_w: np.ndarray, of: Any = None) -> tuple:
+    """The mixture of the model and a tilt for each group of weighted traces; ``of`` [n, M]: what
+    part of each trace belongs to each group.
+    """
+    of = np.ones((len(log_w), 1)) if of is None else of
+    w = np.exp(log_w - log_w.max())
+    frame = frame_of(s.about, used.trace, used.length, np.sqrt(w))
+    rows = steps_of(s.about, frame, used.trace, used.length)
+    masses = np.maximum(w @ of / w.sum(), 0.1)
+    tilts, weights = [s.model], [MODEL]
+    for part, mass in zip(of.T, masses / masses.sum(), strict=True):
+        with np.errstate(divide="ignore"):
+            own = np.maximum(log_w + np.log(part), log_w.max() - 500)
+        power = _power(own, min(200, 0.3 * part.sum()))
+        v = np.exp(power * (own - own.max()))
+        one = fit(rows, v, effective(power * own), s.model)
+        tilts += [one, scaled(one, HALF)]
+        weights += [mass * (1 - MODEL - WIDE), mass * WIDE]
+    return tilts, weights, frame
 
 
 def _power(log_w, least):
