@@ -12,6 +12,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.limit_states import autoregression_probability, ruin_probability
+from benchmarks.markov_systems import CASES
 from jast import distributions as D
 from jast.distributions.parts import parts
 from jast.estimate import failure_probability, failure_samples
@@ -198,7 +199,15 @@ def test_first_passage():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("horizon", [100, 1000])
+@pytest.mark.parametrize("name", ["queue", "components", "dropout 1e-7", "contaminated", "bimodal"])
+def test_choices(name):
+    make, truth = CASES[name]
+    found = failure_probability(jax.random.key(0), make(), 50_000)
+    assert good(found, truth, 0.03), str(found)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("horizon", [100, 300])
 def test_long_first_passage(horizon):
     sim = autoregression(horizon=horizon)
     found = failure_probability(jax.random.key(0), sim, 30_000)

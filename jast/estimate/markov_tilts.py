@@ -225,7 +225,8 @@ def owned(owners: tuple[int, ...], size: int, i: Any, np: Any = jnp) -> Any:
     """
     none = np.zeros((*i.shape[:-1], 1), i.dtype)
     at = np.concatenate([i, none], axis=-1)[..., np.asarray(owners, np.int32)]
-    return np.where(at[..., None] == np.arange(size, dtype=np.int32), 1.0, 0.0)
+    each = np.arange(size, dtype=np.int32)[(None,) * at.ndim]
+    return np.where(at[..., None] == each, 1.0, 0.0)
 
 
 def _drawn(p, k, f, block, floors, chance):

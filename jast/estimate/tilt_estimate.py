@@ -50,7 +50,9 @@ def after(s: Any) -> TiltSeeker:
 def _sought(s, t, most):
     about = t.about
     a_step = about.seen + about.normals + about.choices * (1 + about.categories)
-    t.batch = int(min(max(s.budget // 50, 500), LARGE / (a_step * s.sim.horizon) + 100))
+    t.batch = int(
+        min(max(s.budget // 50, min(s.budget // 20, 2000)), LARGE / (a_step * s.sim.horizon) + 100)
+    )
     t.room = int(most)
     seek_tilts(t, int(most))
     s.spent += t.spent

@@ -26,7 +26,10 @@ from jast.estimate.markov_tilts import (
 
 __all__ = ["Tilt", "as_tilts", "fit", "frame_of", "ratios"]
 
-PROJECTED, WITHIN = 6, 0.05
+PROJECTED, WITHIN, FAR, LITTLE = 6, 0.05, 4.0, 0.01
+"""Numbers that features are made of, at most; how far beyond what was met, in parts of its span,
+and from the middle, in deviations, they go; the part of a variance that is left out.
+"""
 RIDGE, FREE = 1.0, 0.02
 """Of a normal prior on the coefficients, in steps; of the constant's."""
 ITERATIONS, STEP = 25, 4.0
@@ -94,7 +97,7 @@ def frame_of(about: Shape, trace: Trace, length: np.ndarray, w: np.ndarray) -> F
     values, vectors = np.linalg.eigh(correlation)
     at = int(first.any())
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        if at == m or value < 1e-4:
+        if at == m or value < LITTLE:
             break
         # the part of the direction that the distance does not explain
         full = (
@@ -106,7 +109,8 @@ def frame_of(about: Shape, trace: Trace, length: np.ndarray, w: np.ndarray) -> F
         at += 1
     y = gap @ project
     span = y.max(axis=0) - y.min(axis=0)
-    return Frame(centre, project, y.min(axis=0) - WITHIN * span, y.max(axis=0) + WITHIN * span)
+    low, high = y.min(axis=0) - WITHIN * span, y.max(axis=0) + WITHIN * span
+    return Frame(centre, project, np.maximum(low, -FAR), np.minimum(high, FAR))
 
 
 def steps_of(about: Shape, frame: Frame, trace: Trace, length: np.ndarray) -> tuple[Rows, Rows]:
@@ -212,21 +216,33 @@ def _logits(x, target, log_p, w, ridge, start=None):
     out = np.zeros((x.shape[1], c)) if start is None else start.copy()
     base = 0 if start is not None else np.argmax((np.exp(log_p) * w[:, None]).sum(axis=0))
     others = [k for k in range(c) if k != base and np.isfinite(log_p[:, k]).any()]
-    turns = 3 if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)
-    for _ in range(turns):
-        greatest = 0.0
+    if not others:
+        return out
+
+    def value(out):
+        log_q = log_p + x @ out
+        log_q = log_q - _log_sum(log_q)[:, None]
+        with np.errstate(invalid="ignore"):
+            each = np.where(target > 0, target * log_q, 0).sum(axis=1)
+        return w @ each - 0.5 * ridge @ (out**2).sum(axis=1), np.exp(log_q)
+
+    now, p = value(out)
+    for _ in range(3 if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)):
+        before = now
         for k in others:
-            log_q = log_p + x @ out
-            q = np.exp(log_q - log_q.max(axis=1, keepdims=True))
-            p = q[:, k] / q.sum(axis=1)
-            slope = x.T @ (w * (target[:, k] - p)) - ridge * out[:, k]
-            bend = x.T @ (x * (w * p * (1 - p))[:, None]) + np.diag(ridge)
+            slope = x.T @ (w * (target[:, k] - p[:, k])) - ridge * out[:, k]
+            bend = x.T @ (x * (w * p[:, k] * (1 - p[:, k]))[:, None]) + np.diag(ridge)
             step = np.linalg.solve(bend, slope)
-            size = np.abs(x @ step).max()
-            step *= min(1.0, STEP / max(size, 1e-12))
-            out[:, k] += step
-            greatest = max(greatest, size)
-        if greatest < 1e-3:
+            step *= min(1.0, STEP / max(np.abs(x @ step).max(), 1e-12))
+            for _ in range(8):  # Newton's step may go too far
+                tried = out.copy()
+                tried[:, k] += step
+                then, q = value(tried)
+                if then >= now:
+                    out, now, p = tried, then, q
+                    break
+                step /= 4
+        if now - before < 1e-3:
             break
     return out
 

@@ -33,6 +33,8 @@ __all__ = ["TiltSeeker", "seek_tilts"]
 COMPONENTS = (3, 5)
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
 REFITS, KEPT = 8, 600
+ENOUGH = 0.2
+"""Effective draws of a draw of which no better ones are looked for twice."""
 
 
 class Drawn(NamedTuple):
@@ -110,18 +112,22 @@ class TiltSeeker:
         effective ones the batch has.
         """
         own = effective(b.log_weight[b.score == -np.inf])
-        self.promised, self.q = own / self.batch, self.mixture
         self.batches.append(rows_of(b, -np.inf))
         used = together(self)
-        w = np.exp(used.log_weight - used.log_weight.max())
-        self.log_mean = used.log_weight.max() + math.log(w.sum() / used.size)
+        log_w = used.log_weight
+        self.log_mean = np.logaddexp.reduce(log_w) - math.log(used.size)
+        # what a draw of each mixture would be worth, by the second moment of its weights
+        second = [np.logaddexp.reduce(log_w - self.over(i)) for i in range(len(self.batches))]
+        best = int(np.argmin(second))
+        self.q = self.batches[best].mixture
+        self.promised = math.exp(2 * self.log_mean - second[best] + math.log(used.size))
         self.note(b, f"log p {self.log_mean:.3f}, own ESS {own:.4g}", used.log_weight)
         self.mixture = mixture_of(self, used, used.log_weight, self.groups(used))
         return own
 
     def refit(self, most: int, times: int) -> None:
         """Batches, at most ``times``, for as long as they get better."""
-        best = self.promised * self.batch
+        best, stalls = 0.0, 0
         for _ in range(times):
             if not self.batches or self.spent + self.batch > most:
                 return
@@ -129,7 +135,8 @@ class TiltSeeker:
             if not (b.score == -np.inf).any():
                 return
             own = self.take(b)
-            if own < 1.1 * best and own > 0.05 * self.batch:
+            stalls = 0 if own > 1.1 * best else stalls + 1
+            if stalls and (own > ENOUGH * self.batch or stalls == 2):
                 return
             best = max(own, best)
 
@@ -165,9 +172,13 @@ class TiltSeeker:
         """
         used = together(self)
         i = next(i for i, b in enumerate(self.batches) if b.mixture is self.q)
-        log_q = np.concatenate([self.ratio(i, j) for j in range(len(self.batches))])
+        log_q = self.over(i)
         w = np.exp(used.log_weight - used.log_weight.max())
         return float(w[log_q < -self.log_mean - covered].sum() / w.sum())
+
+    def over(self, i: int) -> np.ndarray:
+        """log q - log p of the mixture of batch ``i`` on the failures of all batches."""
+        return np.concatenate([self.ratio(i, j) for j in range(len(self.batches))])
 
     def log_ratio(self, mixture: tuple, b: Drawn) -> np.ndarray:
         """log q - log p [n] of the episodes of ``b``."""
@@ -215,12 +226,7 @@ def together(s: TiltSeeker) -> Drawn:
     trace = joined([b.trace for b in batches])
     length = np.concatenate([b.length for b in batches])
     total = sum(b.size for b in batches)
-    logs = np.stack(
-        [
-            np.concatenate([s.ratio(i, j) for j in range(len(batches))]) + math.log(b.size / total)
-            for i, b in enumerate(batches)
-        ]
-    )
+    logs = np.stack([s.over(i) + math.log(b.size / total) for i, b in enumerate(batches)])
     return Drawn(
         None,
         trace,
