@@ -179,7 +179,7 @@ def _loaded(parser, place):
 
 
 def _stress(options, own):
-    """The report of `jast.stress`, the likeliest failure, files."""
+    """The report of `jast.stress`, the likeliest failure, files, a page to hand on."""
     name = options.system or options.simulator
     sim = SYSTEMS[name][0]() if own is None else own
     key = jax.random.key(options.seed)
@@ -193,7 +193,9 @@ def _stress(options, own):
     save(path, report)
     archive = options.output / "failures.npz"
     failures.save(archive, report.failures, report.settings | dict(simulator=name))
-    print(f"saved {path}\nsaved {archive}")
+    page = options.output / "report.html"
+    report.html(page)
+    print(f"saved {path}\nsaved {archive}\nsaved {page}")
     if best is not None:
         _pictures(options, {"episode": lambda: _drawn(options, own, best, sim)})
     return 130 if "interrupted" in report.settings else 0

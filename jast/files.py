@@ -50,7 +50,11 @@ KINDS = {
     "jast result": Kind(1, "a result of jast", "", "jast.files"),
 }
 FORMATS = {kind.place: format for format, kind in KINDS.items() if kind.place}
-FUNCTIONS = ("jast.policy:Policy", "jast.estimate.proposals:Proposal")
+FUNCTIONS = (
+    "jast.policy:Policy",
+    "jast.estimate.proposals:Proposal",
+    "jast.simulator:Simulator",
+)
 """Made of functions, which are in no file."""
 
 
@@ -63,7 +67,7 @@ def save(path: str | os.PathLike, result: Any) -> None:
         result: of a search, an estimate, a cross-entropy method, `jast.nominal` or a validation; an
             archive of failures, an `jast.Episode`, `jast.heads.Heads`, a failure policy, or the
             state of a validation; also a batch of them, of `jax.vmap`. A proposal that is made of
-            functions is left out, and None after `load`.
+            functions and the simulator of a report are left out, and None after `load`.
 
     Raises:
         ValueError: that names what a file cannot hold.
@@ -152,6 +156,8 @@ def _result(path: Any, header: dict, arrays: dict[str, np.ndarray], sim: Any, he
     result = decode(header["result"], path, arrays, special, sim)
     if sim is not None:
         _check(path, result, sim)
+        if place_of(result) == "jast.stress_testing.report:Report":
+            result = result._replace(sim=sim)
         if place_of(result) == "jast.estimate.multilevel:FailureProposal":
             proposing = importlib.import_module("jast.estimate.multilevel").proposing
             result = result._replace(policy=proposing(sim, result.start, result.steps))

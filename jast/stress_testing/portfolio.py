@@ -261,4 +261,5 @@ class _Work:
             self.spent,
             self.invalid,
             settings,
+            self.sim,
         )

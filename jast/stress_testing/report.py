@@ -1,6 +1,8 @@
-"""What `jast.stress` says: one screen."""
+"""What `jast.stress` says: one screen, or a page to hand on."""
 
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,6 +11,7 @@ from jast.crude import Nominal
 from jast.estimate.estimate import Estimate
 from jast.failures import Failures
 from jast.search.failure_modes import Modes
+from jast.simulator import Simulator
 
 __all__ = ["Report", "Tried"]
 
@@ -48,6 +51,9 @@ class Report(NamedTuple):
     """Evaluations in all; one with its gradient counts for more."""
     invalid: int
     settings: dict
+    sim: Simulator | None = None
+    """The simulator, which plays failures again; None in a report from a file, as a file holds no
+    functions."""
 
     @property
     def spent(self) -> dict:
@@ -58,14 +64,47 @@ class Report(NamedTuple):
         return spent
 
     def __str__(self):
-        lines = [*_verdict(self), ""]
+        lines = [*(f"{name:<13}{text}" for name, text in _verdict(self)), ""]
         if self.modes:
             lines += [str(self.modes), ""]
         lines += [*_work(self), "", *_next(self)]
         return "\n".join(lines)
 
+    def html(
+        self,
+        path: str | os.PathLike,
+        sim: Simulator | None = None,
+        *,
+        draw: Callable[[Any], str] | None = None,
+        explanations: Sequence[Any] = (),
+    ) -> None:
+        """Write the report as one HTML file that needs no network and no Python, below 3 MB.
+
+        It has the verdict, the probability and whether to believe it, a card for each of the first
+        16 modes with its trace and a slider through its steps, what was tried, settings and
+        versions, and the exact disturbances to copy. All words are escaped.
+
+        Args:
+            path: of the file; an older one of that name stays whole until the new one is.
+            sim: plays the failures again, for their states; default: the report's own. Without
+                one (a report from `jast.load`) the page shows disturbances alone.
+            draw: one state -> an SVG or HTML fragment, which the page shows as it is, at the step
+                of the slider. Its state is a pytree of NumPy arrays.
+            explanations: for the card of each mode, in their order: anything whose ``str`` says
+                something of it, a list of such things, or None.
+
+        Raises:
+            ValueError: for ``draw`` without a simulator, a ``draw`` that returns no text or too
+                long a one, and more explanations than cards.
+        """
+        from jast.page.report import write_report
+
+        sim = self.sim if sim is None else sim
+        write_report(path, self, _verdict(self), "\n".join(_next(self)), sim, draw, explanations)
+
 
 def _verdict(r):
+    """Rows of a name and a text; a row without a name goes on with the one before."""
     quiet = r.nominal.undisturbed
     if quiet is None:
         alone = "not defined: a disturbance has neither a mode nor a median"
@@ -100,7 +139,7 @@ def _verdict(r):
         rows.append(("invalid", f"{r.invalid} episodes gave numbers that are not finite"))
     if "interrupted" in r.settings:
         rows.append(("interrupted", r.settings["interrupted"]))
-    return [f"{name:<13}{text}" for name, text in rows]
+    return rows
 
 
 def _work(r):

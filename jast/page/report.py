@@ -1,0 +1,253 @@
+"""The page of a report of `jast.stress`: for a colleague who has no Python."""
+
+import json
+import platform
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast.episode import Episode
+from jast.page.document import document, figure, plain, rows, table, text, write
+from jast.page.traces import exact, pictures, states_of, trace
+from jast.simulator import Simulator
+
+__all__ = ["write_report"]
+
+NUMBERS, EXACT, PICTURES = 80_000, 900_000, 1_000_000
+"""Shared by the modes: numbers of traces, bytes of exact disturbances, bytes of pictures. Together
+they keep a page below 3 MB.
+"""
+MODES = 16
+"""Cards; further modes are counted."""
+
+SNIPPET = """\
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import jast
+from jast.outline import outline
+
+# sim = ...  your jast.Simulator
+failure = json.loads(Path("failure-1.json").read_text())  # the button above downloads it
+whole = lambda arrays: [np.array(a["values"], a["dtype"]) for a in arrays]
+x0, x = (jax.tree.structure(part) for part in (outline(sim).x0, outline(sim).x))
+x0, x = x0.unflatten(whole(failure["x0"])), x.unflatten(whole(failure["disturbances"]))
+episode = jast.replay(sim, x, x0)
+print(episode.failure, episode.length, episode.distance)
+"""
+
+
+def write_report(
+    path: Any,
+    report: Any,
+    verdict: Sequence[tuple[str, str]],
+    advice: str,
+    sim: Simulator | None,
+    draw: Callable[[Any], str] | None,
+    explanations: Sequence[Any],
+) -> None:
+    """Write the page of ``report`` to the one file ``path``: `jast.stress_testing.Report.html`.
+
+    Args:
+        path: of the file.
+        report: a `jast.stress_testing.Report`.
+        verdict: its rows in words.
+        advice: what to do next, in words.
+        sim: plays the failures again, for their states; without one there are none.
+        draw: one state -> an SVG or HTML fragment.
+        explanations: of the modes, in their order.
+    """
+    if draw is not None and sim is None:
+        raise ValueError(
+            "Report.html: sim must be the simulator where draw is given, as a report from a file"
+            " has none: html(path, sim, draw=draw)"
+        )
+    failures = _shown(report)
+    if len(explanations) > len(failures):
+        raise ValueError(
+            f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
+            f" received {len(explanations)}"
+        )
+    data = {"modes": _data(report, failures, sim, draw)}
+    body = [
+        _head(report, verdict, advice),
+        _modes(report, failures, data["modes"], list(explanations), sim),
+        _work(report),
+        _settings(report),
+    ]
+    write(path, document(_title(report), "\n".join(body), data, "report.js"))
+
+
+def _shown(report: Any) -> list[Episode]:
+    """The failure of each card."""
+    return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
+
+
+def _data(report: Any, failures: list[Episode], sim: Any, draw: Any) -> list[dict]:
+    quiet, n, left, found = report.nominal.undisturbed, max(len(failures), 1), EXACT, []
+    for number, episode in enumerate(failures, 1):
+        card = trace(sim, episode, quiet, NUMBERS // n)
+        card["name"] = f"failure-{number}"
+        values = json.dumps(plain(exact(episode)))
+        size = len(values) + values.count('"')
+        card["exact"] = values if size <= left else None
+        left -= size if size <= left else 0
+        if draw is not None:
+            states = states_of(sim, episode)
+            card["pictures"] = pictures("Report.html", draw, states, card["steps"], PICTURES // n)
+        found.append(card)
+    return found
+
+
+def _title(report: Any) -> str:
+    words = "can fail" if len(report.failures) else "no failure was found"
+    if report.nominal.undisturbed is not None and bool(report.nominal.undisturbed.failure):
+        words = "fails undisturbed"
+    return f"jast: {words}"
+
+
+def _head(report: Any, verdict: Sequence[tuple[str, str]], advice: str) -> str:
+    """The verdict on one screen."""
+    quiet, n = report.nominal.undisturbed, len(report.modes)
+    if quiet is not None and bool(quiet.failure):
+        words, mood = "The system fails without any disturbance.", "bad"
+    elif len(report.failures):
+        e, ways = report.failures.best, f"{n} way{'s' * (n != 1)} to fail" if n else "A failure"
+        words = (
+            f"{ways} found. The likeliest takes {int(e.length)} steps and has log p"
+            f" {float(e.reward):.2f} relative to the mode of the disturbances."
+        )
+        mood = "bad"
+    else:
+        words, mood = f"No failure was found in {report.episodes:,} evaluations.", "good"
+    known = [(name or "", value) for name, value in verdict if name and name != "probability"]
+    return (
+        f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
+        f"</h1></header>\n<main>\n<section id=verdict>{_probability(report.probability)}"
+        f"{rows([*known, ('evaluations', f'{report.episodes:,}')])}"
+        f"<p class=advice>{text(advice)}</p></section>"
+    )
+
+
+def _probability(p: Any) -> str:
+    """The probability, its interval, and whether to believe it."""
+    if p is None:
+        return "<div id=probability><h2>Probability of failure</h2><p>not estimated</p></div>"
+    low, high = p.interval
+    if np.isnan(p.log_mean):
+        value = f"below {figure(high, 3)}"
+        more = f"no failure in {p.samples:,} draws of the model; at {p.level:.0%}"
+    else:
+        value = figure(p.mean, 4) if p.mean > 1e-300 else f"10^{p.log10_mean:.2f}"
+        more = f"{p.level:.0%} interval {figure(low, 4)} to {figure(high, 4)}"
+    facts = [("method", p.method), ("evaluations", f"{p.episodes:,}")]
+    if not np.isnan(p.relative_error):
+        facts.append(("relative standard error", f"{100 * p.relative_error:.3g} %"))
+    if p.unseen is not None:
+        facts.append(
+            (
+                "unseen",
+                f"failures that nothing led to: below {figure(p.unseen, 3)} at {p.level:.0%}",
+            )
+        )
+    reasons = "".join(f"<li>{text(words)}</li>" for words in p.warnings)
+    if p.reliable:
+        badge = "<p class='badge good'>reliable: no known reason against it</p>"
+        facts += [("remark", words) for words in p.warnings]
+    elif np.isnan(p.log_mean):
+        badge = f"<div class=badge>an upper bound is all that is known<ul>{reasons}</ul></div>"
+    else:
+        badge = f"<div class='badge bad'>UNRELIABLE: do not believe it<ul>{reasons}</ul></div>"
+    return (
+        f"<div id=probability><h2>Probability of failure</h2><p class=value>{text(value)}</p>"
+        f"<p>{text(more)}</p>{badge}{rows(facts)}</div>"
+    )
+
+
+def _modes(
+    report: Any, failures: list[Episode], data: list[dict], explanations: list, sim: Any
+) -> str:
+    if not failures:
+        return "<section id=modes><h2>Failure modes</h2><p>none</p></section>"
+    cards = []
+    for i, episode in enumerate(failures):
+        facts = [
+            ("log p relative to the mode", f"{float(episode.reward):.4f}"),
+            ("log p", f"{float(episode.log_prob):.4f}"),
+            ("miss distance", figure(episode.distance)),
+            ("steps", int(episode.length)),
+        ]
+        if i < len(report.modes):
+            mode = report.modes[i]
+            share = "not known" if np.isnan(mode.share) else f"{100 * mode.share:.1f} %"
+            facts += [("members", mode.members), ("share", share)]
+        given = explanations[i] if i < len(explanations) else None
+        cards.append(_card(i + 1, facts, data[i], given))
+    more = len(report.modes) - len(failures)
+    notes = [f"{more} more modes are not shown."] * (more > 0)
+    if sim is None:
+        notes.append("Without its simulator a report has no states: the disturbances are shown.")
+    words = "".join(f"<p class=note>{text(note)}</p>" for note in notes)
+    return f"<section id=modes><h2>Failure modes</h2>{words}{''.join(cards)}</section>"
+
+
+def _card(number: int, facts: list, data: dict, explanation: Any) -> str:
+    """One mode; the script fills the elements that have a class and no words."""
+    several = explanation if type(explanation) in (list, tuple) else [explanation]
+    words = "".join(f"<pre>{text(one)}</pre>" for one in several if one is not None)
+    held = (
+        "<p><button class=copy>Copy JSON</button> <button class=download>Download"
+        f" failure-{number}.json</button></p><pre class=json></pre>"
+        if data["exact"] is not None
+        else "<p>Too many for this page: they are in the saved report.</p>"
+    )
+    return (
+        f'<article class=card id="mode-{number}" data-mode="{number - 1}">'
+        f"<h3>Mode {number}</h3>{rows(facts, 'facts wide')}"
+        f'<div class="explanation"{"" if words else " hidden"}><h4>Explanation</h4>{words}</div>'
+        f"<div class=player><label>step <output class=step></output> <input type=range min=0"
+        f' max="{len(data["steps"]) - 1}" value="{len(data["steps"]) - 1}" class=slider'
+        f' aria-label="step of mode {number}"></label> <button class=play>Play</button></div>'
+        "<div class=stage><div class=picture hidden></div><div class=numbers></div></div>"
+        "<div class=traces></div>"
+        f"<details><summary>Exact disturbances</summary>{held}</details></article>"
+    )
+
+
+def _work(report: Any) -> str:
+    lines = []
+    for name, evaluations in report.spent.items():
+        parts = [part for part in report.tried if part.name == name]
+        best = max(part.best for part in parts)
+        failing = sum(part.failing for part in parts)
+        lines.append((name, len(parts), evaluations, failing, "" if best == -np.inf else best))
+    head = ("tried", "calls", "evaluations", "failing", "best log p relative to the mode")
+    return f"<section id=tried><h2>What was tried</h2>{table(head, lines)}</section>"
+
+
+def _settings(report: Any) -> str:
+    from jast import __version__
+
+    versions = [
+        ("jast", __version__),
+        ("jax", jax.__version__),
+        ("numpy", np.__version__),
+        ("python", platform.python_version()),
+        ("page written with", "float64" if jax.config.jax_enable_x64 else "float32"),
+    ]
+    asked = [
+        (k, v if isinstance(v, str) else json.dumps(v, default=str))
+        for k, v in report.settings.items()
+    ]
+    return (
+        "<section id=replay><h2>Replay failure 1</h2><p><button class=copy>Copy</button></p>"
+        f"<pre>{text(SNIPPET)}</pre></section>"
+        f"<section id=settings><h2>Settings and versions</h2>{rows([*asked, *versions])}"
+        f"<details><summary>The report as text</summary><pre>{text(report)}</pre></details>"
+        "</section>\n</main>"
+    )

@@ -1,0 +1,182 @@
+"""An episode as numbers by step, with the names that the user's pytrees have; and its disturbances
+to the last bit.
+"""
+
+from collections.abc import Callable
+from json import dumps
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast.episode import Episode, replay
+from jast.incidents import hosted
+from jast.simulator import Simulator
+
+__all__ = ["exact", "pictures", "trace"]
+
+ENTRIES = 24
+"""Numbers of one array that a page shows; the others are counted."""
+
+
+def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: int) -> dict:
+    """What a page shows of an episode.
+
+    Args:
+        sim: which plays it again for its states; None: disturbances alone.
+        episode: one.
+        quiet: the undisturbed episode, to compare with, or None.
+        most: numbers that it may have, nearly. Of a longer episode every second (third ...) step is
+            shown, and the last.
+
+    Returns:
+        ``steps`` (shown, 0 is the start), ``length``, ``x`` (groups of columns over the steps; that
+        of step t led to state t), and where there is a simulator ``states``, ``quiet`` (the same of
+        the undisturbed episode, None behind its end) and ``distance``.
+    """
+    whole = None if sim is None else states_of(sim, episode)
+    n = int(episode.length)
+    width = sum(min(ENTRIES, _size(a)) for a in jax.tree.leaves((whole, episode.disturbances)))
+    stride = max(1, -(-(n + 1) * 2 * max(width, 1) // most))
+    steps = sorted({*range(0, n + 1, stride), n})
+    found = {"steps": steps, "length": n, "x": groups(episode.disturbances, steps, "x", late=1)}
+    if sim is None:
+        return found
+    found["states"] = groups(whole, steps, "state")
+    found["distance"] = distances(sim, whole, steps)
+    if quiet is not None:
+        there = [t for t in steps if t <= int(quiet.length)]
+        calm = groups(states_of(sim, quiet), there, "state")
+        found["quiet"] = [group["columns"] for group in calm]
+    return found
+
+
+def states_of(sim: Simulator, episode: Episode) -> Any:
+    """[horizon + 1, ...] NumPy arrays."""
+    if episode.states is None:
+        episode = replay(sim, episode)
+    return jax.tree.map(np.asarray, jax.device_get(episode.states))
+
+
+def distances(sim: Simulator, states: Any, steps: list[int]) -> list[float] | None:
+    """Miss distance at each of ``steps``; None where that says nothing, or where it would call
+    a black box again.
+    """
+    if sim.episodic or hosted(sim):
+        return None
+    found = jax.jit(jax.vmap(lambda sim, s: sim.evaluate(s)[1], in_axes=(None, 0)))(sim, states)
+    return short(np.asarray(found, float)[steps])
+
+
+def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
+    """A group of columns for each array of the pytree ``tree`` [T, ...]: ``name``, the ``entries``
+    of the array that are shown, ``more``, how many are not, and ``columns``, each over ``steps``.
+
+    ``late``: row 0 is of step 1, and step 0 has none.
+    """
+    found = []
+    for path, a in jax.tree_util.tree_leaves_with_path(tree):
+        a = np.asarray(a)
+        if a.dtype.kind not in "fiub" and not np.can_cast(a.dtype, float, "same_kind"):
+            continue
+        flat = a.reshape(len(a), -1)
+        names = [str(list(index)) if index else "" for index in np.ndindex(a.shape[1:])]
+        column = lambda j, flat=flat: short(
+            [np.nan if t < late else float(flat[t - late, j]) for t in steps]
+        )
+        found.append(
+            {
+                "name": jax.tree_util.keystr(path, simple=True, separator=".") or name,
+                "entries": names[:ENTRIES],
+                "more": max(0, flat.shape[1] - ENTRIES),
+                "columns": [column(j) for j in range(min(flat.shape[1], ENTRIES))],
+            }
+        )
+    return found
+
+
+def short(values: Any) -> list[float]:
+    """Six digits are enough to be looked at."""
+    return [float(f"{v:.6g}") for v in values]
+
+
+def exact(episode: Episode) -> dict:
+    """x0 and the steps taken, to the last bit: of each array its name, dtype and values."""
+
+    def arrays(tree: Any) -> list[dict]:
+        return [
+            {
+                "name": jax.tree_util.keystr(path, simple=True, separator="."),
+                "dtype": np.asarray(a).dtype.name,
+                "values": np.asarray(a).tolist(),
+            }
+            for path, a in jax.tree_util.tree_leaves_with_path(tree)
+        ]
+
+    n = int(episode.length)
+    taken = jax.tree.map(lambda a: np.asarray(a)[:n], episode.disturbances)
+    return {
+        "length": n,
+        "log_prob": float(episode.log_prob),
+        "distance": float(episode.distance),
+        "x0": arrays(episode.x0),
+        "disturbances": arrays(taken),
+    }
+
+
+def pictures(
+    caller: str, draw: Callable[[Any], str], states: Any, steps: list[int], most: int
+) -> dict:
+    """What ``draw`` makes of the states of an episode.
+
+    Args:
+        caller: for messages.
+        draw: one state -> an SVG or HTML fragment.
+        states: [T, ...].
+        steps: at which there may be a picture.
+        most: characters that all of them may take. Where they would take more there are fewer
+            pictures, and a step shows the last one before it.
+
+    Returns:
+        ``fragments``, and ``at``: of each of ``steps`` the number of its fragment.
+
+    Raises:
+        ValueError: where ``draw`` returns no text, or one picture is too long.
+    """
+    found: dict[int, str] = {}
+
+    def drawn(t: int) -> str:
+        if t not in found:
+            found[t] = draw(jax.tree.map(lambda a: a[t], states))
+            if not isinstance(found[t], str):
+                raise ValueError(
+                    f"{caller}: draw must return a str, an SVG or HTML fragment, received"
+                    f" {type(found[t]).__name__}"
+                )
+        return found[t]
+
+    count = min(
+        len(steps), max(1, most // max(1, _length(drawn(steps[0])), _length(drawn(steps[-1]))))
+    )
+    while True:
+        places = np.unique(np.linspace(len(steps) - 1, 0, count).round().astype(int))
+        fragments = [drawn(steps[i]) for i in places]
+        if sum(map(_length, fragments)) <= most:
+            break
+        if count == 1:
+            raise ValueError(
+                f"{caller}: a picture of draw may have up to {most} characters here, received"
+                f" {_length(fragments[0])}"
+            )
+        count //= 2
+    at = np.maximum(np.searchsorted(places, np.arange(len(steps)), side="right") - 1, 0)
+    return {"fragments": fragments, "at": at.tolist()}
+
+
+def _length(fragment: str) -> int:
+    """In the file."""
+    return len(dumps(fragment, ensure_ascii=False).encode())
+
+
+def _size(a: Any) -> int:
+    return int(np.prod(np.shape(a)[1:]))

@@ -1,0 +1,269 @@
+"""Pages: what stands in the file, that nothing of a user's gets out of its place, and that what is
+copied from a page replays. In a browser, where one is installed.
+"""
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jast
+from jast.crude import Nominal
+from jast.distributions import Joint, Normal
+from jast.estimate.estimate import Estimate
+from jast.page import document, report, traces
+from jast.search.failure_modes import Mode, Modes
+from jast.stress_testing.report import Report, Tried
+
+EVIL = "</script><script>fail()</script><b>&\"'<!--"
+
+
+class Car(NamedTuple):
+    position: jax.Array
+    speed: jax.Array
+
+
+SIM = jast.Simulator(
+    init=lambda x0: Car(jnp.zeros(2), jnp.float32(1.0)),
+    step=lambda s, x: Car(s.position + s.speed, s.speed + x[EVIL]),
+    disturbance=lambda s: Joint({EVIL: Normal(jnp.float32(0.0), 0.5)}),
+    evaluate=lambda s: (s.speed > 4, jnp.maximum(4 - s.speed, 0)),
+    horizon=8,
+)
+
+
+def made(**changes):
+    """A report of two modes, by hand."""
+    pushes = ([1.1, np.float32(0.1), 2.5], [0.5, 3.0])
+    rows = [np.pad(np.asarray(p, np.float32), (0, 8 - len(p))) for p in pushes]
+    found = jast.failures.collect(
+        SIM,
+        jast.rewards.standard(),
+        jax.vmap(lambda x: jast.replay(SIM, {EVIL: x}))(jnp.asarray(np.stack(rows))),
+    )
+    assert len(found) == 2
+    quiet = jax.device_get(jast.replay(SIM, {EVIL: np.zeros(8, np.float32)}))
+    modes = Modes([Mode(found[0], 3, 0.75), Mode(found[1], 1, np.nan)])
+    nominal = Nominal(quiet, 0, 9, 0.0, (0.0, 0.3), 3.0, 0)
+    tried = (Tried(EVIL, 9, 0, -np.inf), Tried(EVIL, 5, 2, -1.5))
+    settings = dict(method="stress", seed=[0, 1], note=EVIL)
+    given = (nominal, found, modes, None, np.nan, np.nan, tried, 14, 0, settings, SIM)
+    return Report(*given)._replace(**changes)
+
+
+class Page(HTMLParser):
+    """What a browser would see: tags, their attributes, and the texts of scripts."""
+
+    def __init__(self, words):
+        super().__init__()
+        self.tags, self.scripts, self.inside = [], [], False
+        self.feed(words)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self.inside = tag == "script"
+        if self.inside:
+            self.scripts.append("")
+
+    def handle_endtag(self, tag):
+        self.inside = False
+
+    def handle_data(self, words):
+        if self.inside:
+            self.scripts[-1] += words
+
+    @property
+    def data(self):
+        return json.loads(self.scripts[0])
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    made().html(path, draw=lambda s: f"<svg>{float(s.speed)}|{EVIL}", explanations=[EVIL])
+    return path.read_text(encoding="utf-8")
+
+
+def test_a_page_stands_alone_and_lets_nothing_out(page):
+    """Two scripts, both our own; no address; what a user wrote is text."""
+    seen = Page(page)
+    names = [tag for tag, _ in seen.tags]
+    assert names.count("script") == 2 and "b" not in names and names.count("article") == 2
+    assert names.count("style") == 1 and "link" not in names and len(page) < 60_000
+    assert not any({"src", "href"} & set(attributes) for _, attributes in seen.tags)
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")  # the name of a language
+    assert page.count("&lt;script&gt;fail()&lt;/script&gt;") >= 3  # explanation, tried, settings
+    assert EVIL in seen.data["modes"][0]["pictures"]["fragments"][0]
+
+
+def test_traces_have_the_fields_and_numbers_of_the_system(page):
+    mode = Page(page).data["modes"][1]
+    states = {group["name"]: group for group in mode["states"]}
+    assert list(states) == ["position", "speed"] and states["position"]["entries"] == ["[0]", "[1]"]
+    speed = made().failures[1].disturbances[EVIL][:2].cumsum() + 1
+    assert states["speed"]["columns"][0] == pytest.approx([1, *speed], rel=1e-5)
+    assert mode["steps"] == [0, 1, 2] and mode["length"] == 2
+    assert mode["quiet"][1] == [[1.0, 1.0, 1.0]] and mode["distance"][-1] == 0
+    assert mode["x"][0]["name"] == EVIL and mode["x"][0]["columns"][0][0] == "NaN"
+    assert mode["pictures"]["at"] == [0, 1, 2] and len(mode["pictures"]["fragments"]) == 3
+
+
+def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):
+    (tmp_path / "failure-1.json").write_text(Page(page).data["modes"][0]["exact"])
+    monkeypatch.chdir(tmp_path)
+    room = {"sim": SIM}
+    exec(report.SNIPPET, room)
+    best = made().failures[0]
+    assert room["episode"].failure and int(room["episode"].length) == int(best.length)
+    assert (
+        np.asarray(room["episode"].disturbances[EVIL]).tobytes()
+        == best.disturbances[EVIL]
+        .astype(np.asarray(room["episode"].disturbances[EVIL]).dtype)
+        .tobytes()
+    )
+    assert capsys.readouterr().out.startswith("True")
+
+
+def test_numbers_that_json_does_not_have():
+    values = dict(
+        a=np.array([np.nan, -np.inf, -0.0, 0.1], np.float32), b=[np.inf], c=np.int64(2**60)
+    )
+    back = json.loads(document.embedded(values))
+    assert back["a"][:2] == ["NaN", "-Infinity"] and back["b"] == ["Infinity"]
+    assert np.array(back["a"], np.float32).tobytes() == values["a"].tobytes()
+    assert back["c"] == 2**60
+
+
+@pytest.mark.parametrize("steps, width", [(50_000, 3), (3, 5000)])
+def test_long_and_wide_episodes_are_thinned(steps, width):
+    x = np.random.default_rng(0).normal(size=(steps, width))
+    e = jast.Episode((), x, 0.0, 0.0, True, steps, 0.0)
+    found = traces.trace(None, e, None, 1000)
+    shown = found["x"][0]
+    assert sum(map(len, shown["columns"])) <= 1000 and found["steps"][-1] == steps
+    assert len(shown["columns"]) == min(width, 24) and shown["more"] == max(0, width - 24)
+    for t, v in zip(found["steps"][1:], shown["columns"][0][1:], strict=True):
+        assert v == pytest.approx(x[t - 1, 0], rel=1e-5)
+
+
+def test_pictures_keep_to_their_room():
+    states, steps = np.arange(40), list(range(0, 40, 2))
+    found = traces.pictures("html", lambda s: "x" * int(s), states, steps, 200)
+    assert sum(map(len, found["fragments"])) <= 200 and len(found["at"]) == len(steps)
+    assert len(found["fragments"]) > 3 and len(found["fragments"][-1]) == steps[-1]
+    assert found["at"] == sorted(found["at"])
+    for draw, match in (
+        (lambda s: 3, "must return a str.*int"),
+        (lambda s: "x" * 999, "up to 200"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            traces.pictures("html", draw, states, steps, 200)
+
+
+def test_a_report_from_a_file_has_a_page(tmp_path):
+    """Without its simulator there are no states; with it all is as before."""
+    whole = made(nominal=made().nominal._replace(undisturbed=None))
+    jast.save(tmp_path / "r.npz", whole)
+    bare = jast.load(tmp_path / "r.npz")
+    assert bare.sim is None and jast.load(tmp_path / "r.npz", SIM).sim is SIM
+    bare.html(tmp_path / "bare.html")
+    words = (tmp_path / "bare.html").read_text()
+    assert "has no states" in words and "states" not in Page(words).data["modes"][0]
+    bare.html(tmp_path / "given.html", SIM)
+    assert "states" in Page((tmp_path / "given.html").read_text()).data["modes"][0]
+    with pytest.raises(ValueError, match="Report.html: sim must be the simulator where draw"):
+        bare.html(tmp_path / "no.html", draw=str)
+    with pytest.raises(ValueError, match="Report.html: explanations must be at most 2"):
+        bare.html(tmp_path / "no.html", explanations=["a"] * 3)
+    assert not (tmp_path / "no.html").exists()
+
+
+def test_the_verdict_says_whether_to_believe_it(tmp_path):
+    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
+    p = Estimate("mine", *numbers, True, (EVIL,), unseen=0.02)
+    blank = p._replace(log_mean=np.nan, reliable=False, relative_error=np.nan, interval=(0, 0.003))
+    quiet = made().nominal.undisturbed._replace(failure=np.True_)
+    none = made(failures=jast.failures.empty(SIM), modes=Modes())
+    cases = {
+        "No failure was found in 14": none,
+        "fails without any disturbance": made(nominal=made().nominal._replace(undisturbed=quiet)),
+        "<p>not estimated</p>": made(),
+        "1e-05</p><p>95% interval 8e-06 to 2e-05</p><p class='badge good'>reliable": made(
+            probability=p
+        ),
+        "failures that nothing led to: below 0.02 at 95%": made(probability=p),
+        "UNRELIABLE: do not believe it<ul><li>&lt;/script": made(
+            probability=p._replace(reliable=False)
+        ),
+        "below 0.003</p><p>no failure in 99 draws": none._replace(probability=blank),
+    }
+    for words, case in cases.items():
+        case.html(tmp_path / "r.html")
+        assert words in (tmp_path / "r.html").read_text(), words
+
+
+PROBE = """
+<script>
+window.onerror = (message) => { document.title = "error: " + message; };
+setTimeout(() => {
+  const found = {};
+  try { CHECK } catch (error) { found.error = String(error); }
+  document.body.replaceChildren(document.createElement("pre"));
+  document.querySelector("pre").id = "found";
+  document.querySelector("pre").textContent = JSON.stringify(found);
+}, 50);
+</script></body>"""
+
+
+def browsed(page, check, tmp_path):
+    """What the JavaScript ``check`` puts into ``found`` in a headless browser, and its console."""
+    browser = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    )
+    if browser is None:
+        pytest.skip("no browser: chromium or google-chrome is not installed")
+    path = tmp_path / "probe.html"
+    path.write_text(page.replace("</body>", PROBE.replace("CHECK", check)), encoding="utf-8")
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000"]
+    done = subprocess.run(
+        [*command, "--dump-dom", path.as_uri()], capture_output=True, text=True, timeout=60
+    )
+    assert "CONSOLE" not in done.stderr and "<title>error" not in done.stdout, done.stderr
+    seen = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
+    return json.loads(Page(f"<script>{seen[1]}</script>").scripts[0])
+
+
+def test_the_slider_moves_in_a_browser(page, tmp_path):
+    check = """
+      const card = document.querySelector("#mode-1"), slider = card.querySelector(".slider");
+      const look = () => ({
+        step: card.querySelector(".step").textContent,
+        speed: [...card.querySelectorAll(".numbers tr")].filter(
+          (row) => row.cells[0].textContent === "speed").map((row) => row.cells[1].textContent)[0],
+        picture: card.querySelector(".picture").shadowRoot.textContent,
+        cursor: card.querySelector(".cursor").getAttribute("x1"),
+      });
+      found.last = look();
+      slider.value = 1;
+      slider.dispatchEvent(new Event("input"));
+      found.first = look();
+      found.panels = card.querySelectorAll(".traces svg").length;
+      found.json = JSON.parse(card.querySelector(".json").textContent).length;
+      card.querySelector(".play").click();
+      found.play = card.querySelector(".play").textContent;
+    """
+    found = browsed(page, check, tmp_path)
+    assert "error" not in found, found
+    assert found["last"]["step"] == "3 of 3" and found["first"]["step"] == "1 of 3"
+    assert float(found["first"]["speed"]) == pytest.approx(2.1, rel=1e-5)
+    assert float(found["first"]["picture"].split("|")[0]) == pytest.approx(2.1, rel=1e-5)
+    assert found["first"]["cursor"] != found["last"]["cursor"]
+    assert found["panels"] == 4 and found["json"] == 3 and found["play"] == "Stop"
