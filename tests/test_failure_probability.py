@@ -32,7 +32,7 @@ from jast.estimate.batches import Batch, drawn, log_ratio, numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
 from jast.estimate.populations import cool, explore
-from jast.simulators import landing
+from jast.simulators import landing, limit_state
 
 norm = scipy.stats.norm
 BUDGET, FAR = 50_000, 60.0
@@ -790,3 +790,31 @@ def test_a_proposal_that_lost_failures_is_given_up(key, monkeypatch):
     assert "answer of subset simulation" in levels.warnings[1]
     assert levels.evaluations <= BUDGET
     assert abs(levels.log_mean - np.log(norm.sf(4))) < 4 * levels.relative_error
+
+
+def _along(beta, x):
+    return beta - x.sum() / jnp.sqrt(jnp.asarray(x.shape[0], x.dtype))
+
+
+def test_another_budget_and_parameter_compile_nothing(key):
+    """Also where tilts are tried after the Gaussians, as with the least budget here."""
+    plane = lambda beta: limit_state(Partial(_along, jnp.asarray(beta, jnp.zeros(()).dtype)), 20)
+    seen = []
+
+    def listener(event, *_, **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    try:
+        failure_probability(key, plane(4.0), 30_000)
+        failure_probability(key, plane(4.0), 8000)
+        assert seen
+        for beta, budget in ((4.0, 20_001), (3.5, 30_000), (3.5, 9000)):
+            sim = plane(beta)
+            seen.clear()
+            found = failure_probability(key, sim, budget)
+            error = abs(found.log_mean - np.log(norm.sf(beta)))
+            assert not seen and error < 5 * found.relative_error
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listener)

@@ -16,6 +16,7 @@ from jax import lax
 from jast import distributions as D
 from jast import results, rewards
 from jast._checks import random_key, whole
+from jast.counter import generator
 from jast.episode import play_back
 from jast.estimate import diagnostics
 from jast.estimate.answers import asked
@@ -232,7 +233,7 @@ def _points(key, i, sim, q, n, lanes):
     if isinstance(q, str):
         return plain_chunk(key, i, n, sim)
     if isinstance(q, Tilts):
-        return redrawn(jax.random.fold_in(key, i), sim, q, lanes)[0]
+        return redrawn(generator(key, 2, i), sim, q, lanes)[0]
     return place(q, *of_chunk(key, i, n, q))
 
 

@@ -188,7 +188,7 @@ def _like_noise(values, count):
     d = len(values)
     ratio = np.sqrt(d / max(count, 1.0))
     # fewer points than dimensions leave values of 0
-    low, high = (1 - ratio) ** 2 * 0.9 if ratio < 1 else -np.inf, (1 + ratio) ** 2 * 1.1
+    low, high = (1 - ratio) ** 2 * 0.9 if ratio < 1 else -1.0, (1 + ratio) ** 2 * 1.1
     inside = np.ones(d, bool)
     for _ in range(20):
         s = values[inside].mean()

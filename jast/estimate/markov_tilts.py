@@ -9,15 +9,18 @@ choices; the density of each tilt on it accumulates step by step.
 """
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp, ndtr
 
+from jast.counter import generator
 from jast.distributions.parts import Parts, parts
+from jast.estimate.gaussians import log_sum
+from jast.incidents import hosted
 from jast.limit_state import Outcomes, normal_numbers
 from jast.outline import ask, outline
 from jast.progress import advance, begin, conclude
@@ -26,6 +29,8 @@ from jast.rewards import log_likelihood
 
 __all__ = ["Frame", "Tilts", "features", "of_the_model", "played", "shape"]
 
+LANES = 512
+"""Episodes that run side by side."""
 SEEN, RARE = 16, 0.0917
 """Numbers of an observation that a tilt looks at, at most; probability below which a category is a
 rare one."""
@@ -279,14 +284,41 @@ def _drawn(p, k, f, block, floors, chance):
     return assembled(p, z, i), z, i, log_p, ratio
 
 
-@jax.jit
 def played(sim, q, u, first, noise):
     """Episodes [n] of the `Tilts` ``q`` by uniform numbers ``u`` [n]; ``first``, ``noise``: normal
     numbers, uniform ones of their Gaussians and uniform ones of choices, of x0 [n, A0], [n, A0],
     [n, B0] and of the steps [T, n, A], [T, n, A], [T, n, B].
 
-    (`Outcomes`, log q_k - log p [n, K], `Trace`).
+    (`Outcomes`, log q_k - log p [n, K], `Trace`), on the host.
     """
+    u, first, noise = jax.device_get((u, first, noise))
+
+    def run(rows):
+        at = lambda a: a[rows]
+        of_steps = tuple(a[:, rows] for a in noise)
+        return _played(sim, q, at(u), tuple(map(at, first)), of_steps)
+
+    return _in_lanes(sim, len(u), run)
+
+
+def _in_lanes(sim, n, run):
+    """What ``run(rows)`` returns of all ``n`` rows, `LANES` at a time, so that one program serves
+    every n; of a black box, which no row may run in vain, all at once.
+    """
+    lanes, out = n if hosted(sim) else LANES, []
+    for i in range(0, n, lanes):
+        m = min(lanes, n - i)
+        o, x, trace = jax.device_get(run(np.minimum(np.arange(i, i + lanes), n - 1)))
+        of_steps = (a[:, :m] for a in trace[3:])
+        out.append(((*(a[:m] for a in o), x[:m], *(a[:m] for a in trace[:3])), (*of_steps,)))
+    rows = [np.concatenate(a) for a in zip(*(a for a, _ in out), strict=True)]
+    of_steps = (np.concatenate(a, axis=1) for a in zip(*(a for _, a in out), strict=True))
+    size = len(Outcomes._fields)
+    return Outcomes(*rows[:size]), rows[size], Trace(*rows[size + 1 :], *of_steps)
+
+
+@jax.jit
+def _played(sim, q, u, first, noise):
     edges = jnp.cumsum(jnp.exp(q.log_weights))
     live = jnp.sum(jnp.isfinite(q.log_weights))
     k = jnp.minimum(jnp.sum(u[:, None] >= edges[None], axis=1), live - 1)
@@ -339,29 +371,20 @@ def played(sim, q, u, first, noise):
     return outcome, ratio, Trace(z0, i0, log_p0, *rows)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3, 4))
 def numbers(key, n, about, horizon, dtype):
-    """What `played` needs of chance for ``n`` episodes: (u, first, noise)."""
-    keys = jax.random.split(key, 7)
+    """What `played` needs of chance for ``n`` episodes: (u, first, noise); ``key``: of JAX, or a
+    NumPy generator.
+    """
+    rng = generator(key)
 
-    def of(keys, a, b, *size):
-        return (
-            jax.random.normal(keys[0], (*size, a), dtype),
-            jax.random.uniform(keys[1], (*size, a), dtype),
-            _fine(keys[2], (*size, b), dtype),
-        )
+    # uniform numbers of 64 bits: fine near 0, where rare categories lie
+    def of(a, b, *size):
+        drawn = rng.standard_normal((*size, a)), rng.random((*size, a)), rng.random((*size, b))
+        return tuple(v.astype(dtype) for v in drawn)
 
-    return (
-        jax.random.uniform(keys[0], (n,), dtype),
-        of(keys[1:4], about.normals0, about.choices0, n),
-        of(keys[4:], about.normals, about.choices, horizon, n),
-    )
-
-
-def _fine(key, size, dtype):
-    """Uniform numbers whose grid is 2^-32 near 0."""
-    bits = jax.random.bits(key, size, jnp.uint32)
-    return (bits.astype(dtype) + 0.5) * 2.0**-32
+    u = rng.random(n).astype(dtype)
+    first = of(about.normals0, about.choices0, n)
+    return u, first, of(about.normals, about.choices, horizon, n)
 
 
 def dimension(about: Shape, horizon: int) -> int:
@@ -369,23 +392,28 @@ def dimension(about: Shape, horizon: int) -> int:
     return about.normals0 + about.choices0 + horizon * (about.normals + about.choices)
 
 
-@jax.jit
 def of_the_model(sim, q, z):
     """Episodes of the model by normal numbers ``z`` [n, `dimension`], those of choices too:
-    (`Outcomes`, log q - log p [n], `Trace`).
+    (`Outcomes`, log q - log p [n], `Trace`), on the host.
     """
+    z = np.asarray(z)
+    return _in_lanes(sim, len(z), lambda rows: _of_the_model(sim, q, z[rows]))
+
+
+@jax.jit
+def _of_the_model(sim, q, z):
     about, n = shape(sim), len(z)
     a, b = about.normals0, about.choices0
     first = z[:, :a], jnp.zeros_like(z[:, :a]), ndtr(z[:, a : a + b])
     rest = jnp.moveaxis(z[:, a + b :].reshape(n, sim.horizon, -1), 0, 1)
     e = rest[..., : about.normals]
     noise = e, jnp.zeros_like(e), ndtr(rest[..., about.normals :])
-    o, ratio, trace = played(sim, q, jnp.zeros(n, z.dtype), first, noise)
+    o, ratio, trace = _played(sim, q, jnp.zeros(n, z.dtype), first, noise)
     return o, logsumexp(ratio + q.log_weights[None], axis=1), trace
 
 
 def log_weight(q, ratio):
-    """log p - log q [n], and log shares of the components [n, K]."""
-    joint = ratio + q.log_weights[None]
-    log_q = logsumexp(joint, axis=1)
+    """log p - log q [n], and log shares of the components [n, K]. On the host."""
+    joint = ratio.astype(np.float64) + np.asarray(q.log_weights, np.float64)
+    log_q = log_sum(joint)
     return -log_q, joint - log_q[:, None]

@@ -10,8 +10,6 @@ already.
 import math
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast.counter import generator
@@ -208,8 +206,7 @@ def _judge(sim, z, covered):
         return Population(z, o.score, o.used, o.invalid)
     q, threshold = covered
     if isinstance(q, Tilts):
-        o, log_q, _ = of_the_model(sim, q, jnp.asarray(z))
-        o, log_q = jax.device_get((o, log_q))
+        o, log_q, _ = of_the_model(sim, q, z)
     else:
         o = judged(sim, z)
         log_q = log_ratio(q, z, o.used)

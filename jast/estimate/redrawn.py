@@ -28,7 +28,7 @@ def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.nda
     chance = tilts.numbers(key, n, about, sim.horizon, dtype)
     o, ratio, trace = tilts.played(sim, q, *chance)
     z = latent.normal_of(sim, _episodes(sim, trace))
-    return (z, *jax.device_get((o, tilts.log_weight(q, ratio)[0])))
+    return z, o, tilts.log_weight(q, ratio)[0]
 
 
 @jax.jit

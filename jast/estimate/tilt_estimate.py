@@ -5,10 +5,9 @@ Gaussians, what they may have lost, and the estimate by them.
 import math
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jast.counter import generator
 from jast.estimate import diagnostics
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
@@ -77,7 +76,7 @@ def _lost(s, t, takes):
     if not size:
         s.reasons.append("the budget did not last to look for lost failure modes")
         return False
-    q, threshold = t.tilts(t.q), jnp.asarray(-t.log_mean - math.log(COVERED), s.dtype)
+    q, threshold = t.tilts(t.q), -t.log_mean - math.log(COVERED)
     p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=room)
     share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
     thin = t.thin(math.log(COVERED))
@@ -95,7 +94,7 @@ def _lost(s, t, takes):
             f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
         )
         return False
-    o, _, trace = jax.device_get(of_the_model(s.sim, q, jnp.asarray(p.points, s.dtype)))
+    o, _, trace = of_the_model(s.sim, q, p.points.astype(s.dtype))
     before, told = t.spent, len(t.history)
     t.widen(trace, np.asarray(o.length), share, t.spent + most)
     s.spent += t.spent - before
@@ -112,7 +111,7 @@ def estimated(
     weights = np.asarray(weights) * (1 - share) / (1 - weights[0])
     weights[0] = share
     q = t.tilts((tilts, weights, frame))
-    simulate = lambda i: _traces(jax.random.fold_in(key, i), s.sim, q, t)
+    simulate = lambda i: _traces(generator(key, 2, i), s.sim, q, t)
     total, notes = chunks(simulate, t.batch, n, progress=progress, callback=callback, name=name)
     groups = [list(range(1, len(tilts)))] if total.first > 0 else []
     if groups and total.by_component[0] / total.first >= diagnostics.MATTERS:

@@ -9,7 +9,6 @@ the features of each step.
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast.estimate.markov_tilts import (
@@ -315,4 +314,4 @@ def as_tilts(tilts: list[Tilt], weights: Any, frame: Frame, size: int, dtype: An
         jax.tree.map(stack, *(t.steps for t in tilts)),
         frame,
     )
-    return Tilts(*jax.tree.map(lambda a: jnp.asarray(a, dtype), arrays))
+    return Tilts(*jax.tree.map(lambda a: np.asarray(a, dtype), arrays))

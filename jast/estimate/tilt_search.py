@@ -9,8 +9,6 @@ is of a model whose rare categories are raised (failure biasing, Shahabuddin 199
 import math
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast.counter import generator
@@ -72,7 +70,7 @@ class TiltSeeker:
     def draw(self) -> Drawn:
         """A batch of the mixture; what is near to failure is kept."""
         n, a, horizon = self.batch, self.about, self.sim.horizon
-        of = lambda v: jnp.asarray(v, self.dtype)
+        of = lambda v: np.asarray(v, self.dtype)
         normal, uniform = self.rng.standard_normal, self.rng.random
         chance = lambda a, b, *size: (
             of(normal((*size, a), np.float32)),
@@ -82,7 +80,7 @@ class TiltSeeker:
         first = chance(a.normals0, a.choices0, n)
         noise = chance(a.normals, a.choices, horizon, n)
         q = self.tilts(self.mixture)
-        o, ratio, trace = jax.device_get(played(self.sim, q, of(uniform(n)), first, noise))
+        o, ratio, trace = played(self.sim, q, of(uniform(n)), first, noise)
         joint = ratio.astype(np.float64) + np.asarray(q.log_weights, np.float64)[None]
         top = joint.max(axis=1)
         log_w = -top - np.log(np.exp(joint - top[:, None]).sum(axis=1))
