@@ -175,10 +175,9 @@ def features(frame: Frame, seen: Any, tau: Any, np: Any = jnp) -> Any:
     one = np.ones_like(t)
     if m == 0:
         return np.concatenate([one, t, t * t], axis=-1)
-    cross = [y[..., i : i + 1] * y[..., i:] for i in range(m if m <= 3 else 1)]
-    out = [one, t, t * t, y, t * y, *cross]
-    if m > 3:
-        out.append(y[..., 1:] ** 2)
+    if m > 3:  # what is many is looked at singly, and beside the first, the miss distance
+        return np.concatenate([one, t, t * t, y, t * y[..., :1], y[..., :1] * y], axis=-1)
+    out = [one, t, t * t, y, t * y, *(y[..., i : i + 1] * y[..., i:] for i in range(m))]
     if m <= 2:
         out += [y**3, t * y**2, t * t * y]
     return np.concatenate(out, axis=-1)

@@ -27,8 +27,10 @@ GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
-COVERED, GUARD = 50.0, 0.15
-"""As in `jast.estimate.seek`; what the search for lost failures may cost, of the budget."""
+COVERED, GUARD, THIN = 50.0, 0.15, 0.06
+"""As in `jast.estimate.seek`; what the search for lost failures may cost, of the budget; a part of
+the probability that may lie, by all batches, where the proposal does not cover it.
+"""
 
 
 def first(s: Any) -> TiltSeeker | None:
@@ -86,6 +88,8 @@ def _lost(s, t, takes):
     )
     if not p.complete:
         s.reasons.append("the budget did not last to look for lost failure modes")
+    if thin > THIN:
+        s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
     if share <= 2 * (thin + LOST) + LOST:
         return False
     most = int(0.15 * s.budget)
