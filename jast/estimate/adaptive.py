@@ -117,8 +117,7 @@ def failure_probability(
     try:
         t = tilt_estimate.first(s)
         if t is None or not t.serves(tilt_estimate.SERVES):
-            seek(s, gradients)
-            t = _tilts_after(s, t)
+            t = _beside_gaussians(s, t, gradients)
         found = _with_the_rest(key, s, t, level, progress, callback)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
@@ -129,15 +128,25 @@ def failure_probability(
     return found._replace(settings=settings)
 
 
-def _tilts_after(s, t):
-    """The `TiltSeeker` that serves better than the Gaussians and than plain draws, else None;
-    ``t``: one that has been sought.
+def _beside_gaussians(s, t, gradients):
+    """Seek Gaussians: the `TiltSeeker` that serves better than these and than plain draws, else
+    None; ``t``: one that has been sought.
     """
-    n, known = s.budget - s.spent, s.log_mean is not None
+    tried = [t]
+
+    def instead(s):
+        astray = _promised(s, 1) < tilt_estimate.SERVES or s.asked > LOST
+        if tried[0] is not None or not astray or _plain_is_better(s):
+            return False
+        tried[0] = tilt_estimate.after(s)
+        return tried[0].serves(tilt_estimate.SERVES)
+
+    seek(s, gradients, instead)
+    n, [t], known = s.budget - s.spent, tried, s.log_mean is not None
     poor = _astray(s, n) or 1 / math.sqrt(_promised(s, n)) > EXACT
     if t is None and poor and n > TILTS * s.budget and not (known and _plain_is_better(s)):
         t = tilt_estimate.after(s)
-    gaussian = 0.0 if not known or s.lost > LOST else _promised(s, 1)
+    gaussian = 0.0 if not known or max(s.lost, s.asked) > LOST else _promised(s, 1)
     return t if t is not None and t.serves(gaussian) else None
 
 

@@ -67,7 +67,7 @@ def guarded(s, i, last):
     log_w, _ = balanced(s.batches)
     w = np.exp(log_w - log_w.max())
     thin = w[log_w > -s.thin()].sum() / w.sum()
-    asked = max((share for share, *_ in found), default=0.0)
+    asked = s.asked = max((share for share, *_ in found), default=0.0)
     s.note(
         f"guard: {asked:.2%} of the probability where the proposal is thin, {thin:.2%} by its own"
         " batches"

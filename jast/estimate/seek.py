@@ -49,6 +49,7 @@ class Seeker:
         self.seeds = self.anchors  # failures of many places, whatever their probability
         self.spent, self.reasons, self.history = 0, [], []
         self.lost = 0.0  # a share that the proposal may have lost
+        self.asked = 0.0  # what the guard last saw of it, before it was taken in
         self.coarse = []  # what is wrong with the system's floats
 
     def next_key(self):
@@ -99,9 +100,9 @@ class Seeker:
         )
 
 
-def seek(s, gradients=True):
+def seek(s, gradients=True, instead=lambda s: False):
     """Take the `Seeker` ``s`` to the end of the search: its ``q`` is the proposal, None where no
-    failure was found.
+    failure was found. ``instead``: asked before each search for lost failures, ends it by True.
     """
     _look(s)
     parts = _explore(s, gradients and not hosted(s.sim))
@@ -113,7 +114,7 @@ def seek(s, gradients=True):
         s.add(g, 1 / i)
     _refine(s, REFITS)
     for i in range(GUARDS):
-        if s.log_mean is None or guarded(s, i, GUARDS - 1):
+        if s.log_mean is None or instead(s) or guarded(s, i, GUARDS - 1):
             break
         _refine(s, 2)
 

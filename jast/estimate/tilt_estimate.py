@@ -21,7 +21,7 @@ __all__ = ["estimated", "first"]
 
 LONG, LARGE = 30, 2e7
 """Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
-SHARE, REST = 0.35, 0.5
+SHARE, REST = 0.35, 0.3
 """Of the budget for their search; where Gaussians went before, of what is left."""
 GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""

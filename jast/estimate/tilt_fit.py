@@ -31,6 +31,8 @@ and from the middle, in deviations, they go; the part of a variance that is left
 """
 RIDGE, FREE = 1.0, 0.02
 """Of a normal prior on the coefficients, in steps; of the constant's."""
+TOGETHER = 10.0
+"""Of that of a number's own coefficients about those of all, where there are several Gaussians."""
 ITERATIONS, STEP = 25, 4.0
 ROUNDS, BEYOND = 8, 1.5
 """Of expectation maximisation; the normal numbers that the outer Gaussians start from."""
@@ -144,13 +146,14 @@ def _fitted(rows, w, like):
         chosen = np.linspace(0, len(w) - 1, ROWS).astype(int)
         w, rows = w[chosen] * (len(w) / ROWS), Rows(*(a[chosen] for a in rows))
     means, gates, shifts = (np.zeros(a.shape) for a in like)
-    for a in range(means.shape[2]):
-        for c in range(means.shape[1]):
-            mine = (rows.own[:, a] == c) & (w > 0)
-            if mine.any():
-                means[:, c, a], gates[:, c, a] = _gated(
-                    rows.x[mine], rows.normals[mine, a], w[mine], means.shape[3]
-                )
+    for c in range(means.shape[1]):
+        mine = (rows.own == c) & (w > 0)[:, None]
+        common = _common(rows, w, mine, means.shape[3])
+        for a in np.flatnonzero(mine.any(axis=0)):
+            of = mine[:, a]
+            means[:, c, a], gates[:, c, a] = _gated(
+                rows.x[of], rows.normals[of, a], w[of], means.shape[3], common
+            )
     for j in range(shifts.shape[1]):
         x = _with_surprise(rows, j)
         shifts[:, j] = _logits(x, _one_of(rows, j), rows.log_p[:, j], w, _ridge(x.shape[1]))
@@ -172,34 +175,56 @@ def _one_of(rows, j):
     return np.eye(rows.log_p.shape[2])[rows.choices[:, j]]
 
 
-def _gated(x, z, w, gates):
-    """(means, log weights) [F, G] of G unit Gaussians, by expectation maximisation from the middle,
-    the upper and the lower numbers on.
+def _common(rows, w, mine, gates):
+    """What `_gated` makes of all numbers alike, which those of each shrink to; none for one
+    Gaussian.
     """
+    f = rows.x.shape[1]
+    none = np.zeros((f, gates)), np.zeros((f, gates))
+    if gates == 1 or not mine.any():
+        return none
+    n, a = np.nonzero(mine)
+    if len(n) > ROWS:
+        chosen = np.linspace(0, len(n) - 1, ROWS).astype(int)
+        n, a, w = n[chosen], a[chosen], w * (len(n) / ROWS)
+    return _gated(rows.x[n], rows.normals[n, a], w[n], gates, none)
+
+
+def _gated(x, z, w, gates, common):
+    """(means, log weights) [F, G] of G unit Gaussians by expectation maximisation, from the middle,
+    the upper and the lower numbers on; they shrink to ``common`` ones.
+    """
+    means, log_g = common
     f = x.shape[1]
     if gates == 1:
-        return _lines(x, z[:, None], w[:, None]), np.zeros((f, 1))
-    edge = BEYOND * np.ones(len(z))
-    r = np.stack([np.abs(z) < edge, z >= edge, z <= -edge], axis=1)[:, :gates].astype(float)
-    log_g = np.zeros((f, gates))
-    none = np.zeros((len(z), gates))
+        return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g
+    given = means.any()
+    ridge = np.full(f, TOGETHER) if given else _ridge(f)
+    if given:
+        r = _parts(x, z, means, log_g)
+    else:
+        r = np.stack([np.abs(z) < BEYOND, z >= BEYOND, z <= -BEYOND], axis=1).astype(float)
     for _ in range(ROUNDS):
-        means = _lines(x, np.repeat(z[:, None], gates, axis=1), w[:, None] * r)
-        log_g = _logits(x, r, none, w, _ridge(f), log_g)
-        m = x @ means
-        joint = x @ log_g + m * (z[:, None] - m / 2)
-        joint -= joint.max(axis=1, keepdims=True)
-        r = np.exp(joint)
-        r /= r.sum(axis=1, keepdims=True)
+        gap = z[:, None] - x @ common[0]
+        means = common[0] + _lines(x, gap, w[:, None] * r, ridge)
+        log_g = common[1] + _logits(x, r, x @ common[1], w, ridge, log_g - common[1])
+        r = _parts(x, z, means, log_g)
     return means, log_g
 
 
-def _lines(x, z, w):
+def _parts(x, z, means, log_g):
+    """Which part [N, G] of each number is of which Gaussian."""
+    m = x @ means
+    joint = x @ log_g + m * (z[:, None] - m / 2)
+    r = np.exp(joint - joint.max(axis=1, keepdims=True))
+    return r / r.sum(axis=1, keepdims=True)
+
+
+def _lines(x, z, w, ridge):
     """Least squares [F, G] of ``z`` [N, G] by ``x`` with the weights ``w`` [N, G]."""
-    ridge = np.diag(_ridge(x.shape[1]))
     return np.stack(
         [
-            np.linalg.solve(x.T @ (x * v[:, None]) + ridge, x.T @ (y * v))
+            np.linalg.solve(x.T @ (x * v[:, None]) + np.diag(ridge), x.T @ (y * v))
             for y, v in zip(z.T, w.T, strict=True)
         ],
         axis=1,

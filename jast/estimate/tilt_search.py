@@ -134,7 +134,7 @@ class TiltSeeker:
                 return
             own = self.take(b)
             stalls = 0 if own > 1.1 * best else stalls + 1
-            if stalls and (own > ENOUGH * self.batch or stalls == 2):
+            if stalls and (own > ENOUGH * self.batch or stalls == 3):
                 return
             best = max(own, best)
 
