@@ -124,6 +124,8 @@ def test_weights_average_to_one(mixed, key, gates):
     rng = np.random.default_rng(0)
     one = jax.tree.map(lambda a: 0.15 * rng.standard_normal(np.shape(a)), s.model)
     one = one._replace(floor=-np.inf)
+    if gates == 1:
+        one.first.scales[:], one.steps.scales[:] = 0, 0
     tilts = [s.model, one, s.model._replace(floor=np.log(0.3))]
     q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, s.dtype)
     drawn = numbers(key, n, shape(mixed), mixed.horizon, s.dtype)

@@ -56,8 +56,8 @@ class Frame(NamedTuple):
 class Block(NamedTuple):
     """What features do to the disturbance of one step, or to x0, under K tilts.
 
-    A normal number is drawn from one of G unit Gaussians. One that belongs to a choice (a mixture's
-    component) has numbers of its own for each category.
+    A normal number is drawn from one of G Gaussians, a unit one if G is 1. One that belongs to a
+    choice (a mixture's component) has numbers of its own for each category.
     """
 
     means: Any
@@ -67,6 +67,8 @@ class Block(NamedTuple):
     shifts: Any
     """[K, F + 3, B, C] by which features, and those of `surprise`, give what is added to the log
     probabilities of choices"""
+    scales: Any
+    """[K, C', A, G] the logs of their deviations; where G is 1, of no effect"""
 
 
 class Tilts(NamedTuple):
@@ -267,8 +269,10 @@ def _drawn(p, k, f, block, floors, chance):
         if size > 1:
             own = owned(p.owners, size, i).astype(dtype)
             of = lambda a: jnp.einsum("f,kfcag,ac->kag", f, a, own)
+            scales = jnp.einsum("kcag,ac->kag", block.scales, own)
         else:
             of = lambda a: jnp.einsum("f,kfag->kag", f, a[:, :, 0])
+            scales = block.scales[:, 0]
         means = of(block.means)
         if means.shape[2] == 1:
             z = means[k, :, 0] + e
@@ -277,8 +281,10 @@ def _drawn(p, k, f, block, floors, chance):
             log_g = jax.nn.log_softmax(of(block.gates), axis=-1)
             edges = jnp.cumsum(jnp.exp(log_g[k]), axis=-1)[:, :-1]
             g = jnp.sum(h[:, None] >= edges, axis=-1, dtype=jnp.int32)
-            z = jnp.take_along_axis(means[k], g[:, None], axis=-1)[:, 0] + e
-            each = log_g + means * (z[None, :, None] - means / 2)
+            at = lambda a: jnp.take_along_axis(a[k], g[:, None], axis=-1)[:, 0]
+            z = at(means) + jnp.exp(at(scales)) * e
+            gap = (z[None, :, None] - means) * jnp.exp(-scales)
+            each = log_g - scales + (z[None, :, None] ** 2 - gap**2) / 2
             ratio = ratio + jnp.sum(logsumexp(each, axis=-1), axis=1)
     return assembled(p, z, i), z, i, log_p, ratio
 

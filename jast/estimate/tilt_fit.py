@@ -31,6 +31,7 @@ and from the middle, in deviations, they go; the part of a variance that is left
 """
 RIDGE, FREE = 1.0, 0.02
 """Of a normal prior on the coefficients, in steps; of the constant's."""
+DEVIATIONS = (0.4, 1.2)
 TOGETHER = 10.0
 """Of that of a number's own coefficients about those of all, where there are several Gaussians."""
 ITERATIONS, STEP = 25, 4.0
@@ -145,19 +146,19 @@ def _fitted(rows, w, like):
     if len(w) > ROWS:
         chosen = np.linspace(0, len(w) - 1, ROWS).astype(int)
         w, rows = w[chosen] * (len(w) / ROWS), Rows(*(a[chosen] for a in rows))
-    means, gates, shifts = (np.zeros(a.shape) for a in like)
+    means, gates, shifts, scales = (np.zeros(a.shape) for a in like)
     for c in range(means.shape[1]):
         mine = (rows.own == c) & (w > 0)[:, None]
         common = _common(rows, w, mine, means.shape[3])
         for a in np.flatnonzero(mine.any(axis=0)):
             of = mine[:, a]
-            means[:, c, a], gates[:, c, a] = _gated(
+            means[:, c, a], gates[:, c, a], scales[c, a] = _gated(
                 rows.x[of], rows.normals[of, a], w[of], means.shape[3], common
             )
     for j in range(shifts.shape[1]):
         x = _with_surprise(rows, j)
         shifts[:, j] = _logits(x, _one_of(rows, j), rows.log_p[:, j], w, _ridge(x.shape[1]))
-    return Block(means, gates, shifts)
+    return Block(means, gates, shifts, scales)
 
 
 def _ridge(size):
@@ -180,7 +181,7 @@ def _common(rows, w, mine, gates):
     Gaussian.
     """
     f = rows.x.shape[1]
-    none = np.zeros((f, gates)), np.zeros((f, gates))
+    none = np.zeros((f, gates)), np.zeros((f, gates)), np.zeros(gates)
     if gates == 1 or not mine.any():
         return none
     n, a = np.nonzero(mine)
@@ -191,31 +192,41 @@ def _common(rows, w, mine, gates):
 
 
 def _gated(x, z, w, gates, common):
-    """(means, log weights) [F, G] of G unit Gaussians by expectation maximisation, from the middle,
-    the upper and the lower numbers on; they shrink to ``common`` ones.
+    """(means [F, G], log weights [F, G], log deviations [G]) of G Gaussians by expectation
+    maximisation, from the middle, the upper and the lower numbers on; they shrink to ``common``
+    ones. The first is a unit Gaussian.
     """
-    means, log_g = common
+    means, log_g, scales = common
     f = x.shape[1]
     if gates == 1:
-        return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g
+        return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g, scales
     given = means.any()
     ridge = np.full(f, TOGETHER) if given else _ridge(f)
     if given:
-        r = _parts(x, z, means, log_g)
+        r = _parts(x, z, means, log_g, scales)
     else:
         r = np.stack([np.abs(z) < BEYOND, z >= BEYOND, z <= -BEYOND], axis=1).astype(float)
     for _ in range(ROUNDS):
         gap = z[:, None] - x @ common[0]
         means = common[0] + _lines(x, gap, w[:, None] * r, ridge)
         log_g = common[1] + _logits(x, r, x @ common[1], w, ridge, log_g - common[1])
-        r = _parts(x, z, means, log_g)
-    return means, log_g
+        square = (w[:, None] * r * (z[:, None] - x @ means) ** 2).sum(axis=0)
+        variance = (square + ridge[-1] * np.exp(2 * common[2])) / (w @ r + ridge[-1])
+        scales = np.log(np.clip(np.sqrt(variance), *DEVIATIONS))
+        scales[0] = 0.0
+        r = _parts(x, z, means, log_g, scales)
+    return means, log_g, scales
 
 
-def _parts(x, z, means, log_g):
-    """Which part [N, G] of each number is of which Gaussian."""
+def _joint(x, z, means, log_g, scales):
     m = x @ means
-    joint = x @ log_g + m * (z[:, None] - m / 2)
+    gap = (z[:, None] - m) / np.exp(scales)
+    return x @ log_g - scales + (z[:, None] ** 2 - gap**2) / 2
+
+
+def _parts(x, z, means, log_g, scales):
+    """Which part [N, G] of each number is of which Gaussian."""
+    joint = _joint(x, z, means, log_g, scales)
     r = np.exp(joint - joint.max(axis=1, keepdims=True))
     return r / r.sum(axis=1, keepdims=True)
 
@@ -285,10 +296,9 @@ def _ratio(block, rows, floor):
     for a in range(rows.normals.shape[1]):
         for c in range(block.means.shape[1]):
             mine = rows.own[:, a] == c
-            x, z = rows.x[mine], rows.normals[mine, a, None]
-            m, log_g = x @ block.means[:, c, a], x @ block.gates[:, c, a]
-            joint = log_g + m * (z - m / 2)
-            out[mine] += _log_sum(joint) - _log_sum(log_g)
+            x, z, gates = rows.x[mine], rows.normals[mine, a], block.gates[:, c, a]
+            of = block.means[:, c, a], gates, block.scales[c, a]
+            out[mine] += _log_sum(_joint(x, z, *of)) - _log_sum(x @ gates)
     for j in range(rows.choices.shape[1]):
         log_p = rows.log_p[:, j]
         log_q = np.where(log_p > -np.inf, np.maximum(log_p, floor), -np.inf)
@@ -309,7 +319,7 @@ def nothing(about: Shape, count: int, gates: int) -> Tilt:
     def block(f, normals, choices, categories, owners):
         owned = categories if any(o >= 0 for o in owners) else 1
         numbers = np.zeros((f, owned, normals, gates))
-        return Block(numbers, numbers, np.zeros((f + 3, choices, categories)))
+        return Block(numbers, numbers, np.zeros((f + 3, choices, categories)), numbers[0])
 
     return Tilt(
         block(1, about.normals0, about.choices0, about.categories0, about.owners0),
@@ -319,7 +329,7 @@ def nothing(about: Shape, count: int, gates: int) -> Tilt:
 
 def scaled(tilt: Tilt, by: float) -> Tilt:
     """A tilt that moves ``by`` of the way."""
-    some = lambda b: Block(by * b.means, b.gates, by * b.shifts)
+    some = lambda b: Block(by * b.means, b.gates, by * b.shifts, 0 * b.scales)
     return Tilt(some(tilt.first), some(tilt.steps))
 
 
