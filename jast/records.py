@@ -27,6 +27,7 @@ RECORDS = {
     "Mode": "jast.search.failure_modes:Mode",
     "Modes": "jast.search.failure_modes:Modes",
     "Roots": "jast.search.tree.prune:Roots",
+    "Branches": "jast.search.tree.edges:Branches",
     "Lesson": "jast.heads.training:Lesson",
     "Estimate": "jast.estimate.estimate:Estimate",
     "Draws": "jast.estimate.draws:Draws",

@@ -3,16 +3,13 @@ copied from a page replays. In a browser, where one is installed.
 """
 
 import json
-import re
-import shutil
-import subprocess
-from html.parser import HTMLParser
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browser import Page, browsed
 
 import jast
 from jast.crude import Nominal
@@ -56,32 +53,6 @@ def made(**changes):
     settings = dict(method="stress", seed=[0, 1], note=EVIL)
     given = (nominal, found, modes, None, np.nan, np.nan, tried, 14, 0, settings, SIM)
     return Report(*given)._replace(**changes)
-
-
-class Page(HTMLParser):
-    """What a browser would see: tags, their attributes, and the texts of scripts."""
-
-    def __init__(self, words):
-        super().__init__()
-        self.tags, self.scripts, self.inside = [], [], False
-        self.feed(words)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        self.inside = tag == "script"
-        if self.inside:
-            self.scripts.append("")
-
-    def handle_endtag(self, tag):
-        self.inside = False
-
-    def handle_data(self, words):
-        if self.inside:
-            self.scripts[-1] += words
-
-    @property
-    def data(self):
-        return json.loads(self.scripts[0])
 
 
 @pytest.fixture(scope="module")
@@ -202,38 +173,6 @@ def test_the_verdict_says_whether_to_believe_it(tmp_path):
     for words, case in cases.items():
         case.html(tmp_path / "r.html")
         assert words in (tmp_path / "r.html").read_text(), words
-
-
-PROBE = """
-<script>
-window.onerror = (message) => { document.title = "error: " + message; };
-setTimeout(() => {
-  const found = {};
-  try { CHECK } catch (error) { found.error = String(error); }
-  document.body.replaceChildren(document.createElement("pre"));
-  document.querySelector("pre").id = "found";
-  document.querySelector("pre").textContent = JSON.stringify(found);
-}, 50);
-</script></body>"""
-
-
-def browsed(page, check, tmp_path):
-    """What the JavaScript ``check`` puts into ``found`` in a headless browser, and its console."""
-    browser = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if browser is None:
-        pytest.skip("no browser: chromium or google-chrome is not installed")
-    path = tmp_path / "probe.html"
-    path.write_text(page.replace("</body>", PROBE.replace("CHECK", check)), encoding="utf-8")
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
-    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000"]
-    done = subprocess.run(
-        [*command, "--dump-dom", path.as_uri()], capture_output=True, text=True, timeout=60
-    )
-    assert "CONSOLE" not in done.stderr and "<title>error" not in done.stdout, done.stderr
-    seen = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
-    return json.loads(Page(f"<script>{seen[1]}</script>").scripts[0])
 
 
 def test_the_slider_moves_in_a_browser(page, tmp_path):

@@ -5,11 +5,12 @@ Every function draws into the ``ax`` (or ``axes``) it is given, or into a new fi
 the axes. What is drawn comes first, then its simulator where a picture needs it. The colours are
 Okabe and Ito's, told apart by colour-blind readers; what matters is told by shape or words as well.
 
-Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`. Of one
-simulator: `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods:
-`convergence`, `proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`,
-`exceedance`, `failure_fan`, `weights`, `levels`. Of failure policies: `training`. Of weakness
-recognition: `failures_found`, `roc`, `failure_grid`, `influence`.
+Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`; of a search tree
+`tree`, and `tree_page`, an HTML file. Of one simulator: `ferry`; `fms`; `colav`, `colav_story`,
+`colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`,
+`surrogate_samples`. Of failure probabilities: `probability`, `exceedance`, `failure_fan`,
+`weights`, `levels`. Of failure policies: `training`. Of weakness recognition: `failures_found`,
+`roc`, `failure_grid`, `influence`.
 """
 
 from jast._doors import listed
@@ -23,6 +24,7 @@ from jast.plot.general import distances, disturbances, history
 from jast.plot.learning import levels, training
 from jast.plot.probability import failure_fan, probability, weights
 from jast.plot.style import COLOURS, STYLE
+from jast.plot.tree import tree, tree_page
 from jast.plot.trials import trial_distances, trials
 from jast.plot.weakness import failures_found, roc
 
@@ -49,6 +51,8 @@ __all__ = [
     "roc",
     "surrogate_samples",
     "training",
+    "tree",
+    "tree_page",
     "trial_distances",
     "trials",
     "weights",

@@ -40,6 +40,7 @@ def forest(
     refine=None,
     top=64,
     record=False,
+    keep_trees=False,
     threads=None,
     lanes=None,
     available=None,
@@ -74,7 +75,8 @@ def forest(
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none":
     the same trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``:
     failures kept in the archive; ``record=True`` keeps the numbers of every episode as well
-    (``result.trials``).
+    (``result.trials``), ``keep_trees=True`` the trees themselves (``result.trees``), which
+    `jast.plot.tree` shows; states are kept at every node then.
 
     ``refine``: evaluations of `jast.search.refine` at the end, on top of the trees, as a share of
     their episodes. It pulls the archived failures to where they are likeliest; ``result.refined``
@@ -130,6 +132,7 @@ def forest(
         refine=refine,
         top=top,
         record=record,
+        keep_trees=keep_trees,
         threads=threads,
         lanes=lanes,
         available=available,

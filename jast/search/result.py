@@ -104,6 +104,10 @@ class SearchResult(NamedTuple):
     mode; they are among ``failures`` too, as those of tree -2, and ``best`` may be one. All other
     fields are of the search itself. None where nothing was refined.
     """
+    trees: Any = None
+    """The trees themselves (`jast.search.tree.edges.Branches`), where the search was asked to
+    ``keep_trees``: for `jast.plot.tree`.
+    """
 
     simulator_steps = results.alias("steps")
 

@@ -75,6 +75,7 @@ def grow_trees(
     refine: float | None,
     top: int,
     record: bool,
+    keep_trees: bool,
     threads: int | None,
     lanes: int | None,
     available: int | None,
@@ -100,7 +101,11 @@ def grow_trees(
     if job.settings is None:
         found = traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
         return joined(sim, job.problem.reward, job.pilot, found, top)
-    wanted = job.plan._replace(record=bool(record))
+    if keep_trees and memoize in ("root", "none"):
+        raise ValueError(
+            f"{method}: keep_trees needs states at every node, received memoize={memoize!r}"
+        )
+    wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
     fitted, threads, lanes = fit(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
     )

@@ -9,6 +9,7 @@ import numpy as np
 from jast.episode import Episode, replay
 from jast.failures import collect, identity
 from jast.search.result import History, SearchResult, Trials
+from jast.search.tree.edges import Branches
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN
 from jast.search.tree.run import Harvest, Traced
 
@@ -64,6 +65,7 @@ def result(
         history=_history(value, fresh_failure, failed),
         invalid=int(has(INVALID).sum()),
         trials=_trials(harvests, value, failed, has(FRESH)),
+        trees=_branches(harvests),
         settings=settings,
         roots=roots,
         heads=None if school is None else school.heads,
@@ -82,6 +84,13 @@ def _trials(harvests: list[Harvest], value, failed, fresh) -> Trials | None:
         failed & fresh,
         fresh,
     )
+
+
+def _branches(harvests: list[Harvest]) -> Branches | None:
+    if not isinstance(harvests[0].branches, Branches):
+        return None
+    beside = lambda *parts: np.concatenate(parts, axis=1)
+    return jax.tree.map(beside, *(h.branches for h in harvests))
 
 
 def _distinct(found: Episode, tree, simulation, top: int) -> np.ndarray:

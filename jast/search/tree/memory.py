@@ -83,7 +83,9 @@ def fit(
         lanes = -(-trees // (threads * rounds)) if host else trees
     lanes = min(lanes, trees, most_lanes(pages_of(problem, plan.prunes * plan.simulations)))
     threads = min(threads, -(-trees // lanes))
-    for memoize in ["node", "root"] if auto and not plan.edges else [plan.memoize]:
+    for memoize in (
+        ["node", "root"] if auto and not (plan.edges or plan.branches) else [plan.memoize]
+    ):
         plan = plan._replace(memoize=memoize)
         one = bytes_per_tree(problem, plan)
         within = lanes if free is None else int(0.8 * free // (one * threads))

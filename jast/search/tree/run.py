@@ -18,7 +18,7 @@ from jast._threads import handed_on
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
 from jast.search.tree import simulate
-from jast.search.tree.edges import edges_of
+from jast.search.tree.edges import branches_of, edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
 from jast.search.tree.prune import prune
 from jast.search.tree.rebuild import rebuild
@@ -41,6 +41,8 @@ class Plan(NamedTuple):
     """Whether all edges are kept for training."""
     record: bool = False
     """Whether the numbers of all episodes are kept."""
+    branches: bool = False
+    """Whether the trees are kept."""
 
 
 class Harvest(NamedTuple):
@@ -65,6 +67,8 @@ class Harvest(NamedTuple):
     """`Edges`, where the plan asks for them."""
     trials: Any = ()
     """[S, 2, B] distance and log p of each simulation's episode, where the plan asks for them."""
+    branches: Any = ()
+    """`Branches`, where the plan asks for them."""
 
 
 @functools.partial(jax.jit, static_argnames=("simulations", "memoize", "pages", "record"))
@@ -85,6 +89,11 @@ def _prune(problem, tree, children, memoize):
 @functools.partial(jax.jit, static_argnames=("children",))
 def _edges(problem, tree, children):
     return edges_of(problem, _shared(problem), tree, children)
+
+
+@functools.partial(jax.jit, static_argnames=("children",))
+def _branches(problem, tree, children):
+    return branches_of(problem, _shared(problem), tree, children)
 
 
 @functools.partial(jax.jit, static_argnames=("memoize",))
@@ -200,13 +209,11 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
         lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]),
         *turns,
     )
-    edges = (
-        jax.device_get(
-            jax.tree.map(lambda a: a[:, : len(group)], _edges(problem, tree, plan.children))
-        )
-        if plan.edges
-        else ()
+    kept = lambda of: jax.device_get(
+        jax.tree.map(lambda a: a[:, : len(group)], of(problem, tree, plan.children))
     )
+    edges = kept(_edges) if plan.edges else ()
+    branches = kept(_branches) if plan.branches else ()
     trials = np.asarray(tree.trials)[..., : len(group)] if plan.record else ()
     return Harvest(
         log,
@@ -218,6 +225,7 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
         i.astype(np.int32),
         edges,
         trials,
+        branches,
     )
 
 

@@ -1,0 +1,83 @@
+"""A search tree: what the search knew along the path to its best episode, as a picture and as a
+page whose nodes open.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from jast.page.nodes import nodes_of
+from jast.plot import style
+
+__all__ = ["tree", "tree_page"]
+
+
+def tree(result: Any, axes: Any = None, *, tree: int | None = None, levels: int = 40) -> list:
+    """Q and visits of the nodes on the path to a tree's best episode, a panel each, and of the
+    other children of each node on it: the tree, opened along that path. A dot is a child.
+
+    Args:
+        result: of `jast.search.mcts` or `jast.search.forest` with ``keep_trees=True``.
+        axes: two, or None for a new figure.
+        tree: which of its trees; default: that of the best episode.
+        levels: how far down the picture goes.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for a result that holds no trees, and a number that it does not have.
+    """
+    nodes = nodes_of("plot.tree", result, tree)
+    path = nodes.path[: levels + 1]
+    with style.axes(axes, (7.2, 5.6), 2) as axes:
+        axes = style.panels("tree", axes, 2, "number of a node")[:2]
+        for ax, values, label in zip(
+            axes, (nodes.q, nodes.visits), ("Q(s, a)", "visits N(s, a)"), strict=True
+        ):
+            for level, node in enumerate(path):
+                below = nodes.children(node)
+                if level == levels or not len(below):
+                    continue
+                ends = np.stack([np.full(len(below), values[node]), values[below]])
+                ax.plot([level, level + 1], ends, color=style.GREY, linewidth=0.5, alpha=0.5)
+                size = 4 + 60 * nodes.visits[below] / nodes.visits[below].max()
+                at = np.full(len(below), level + 1)
+                ax.scatter(at, values[below], s=size, color=style.BLUE, alpha=0.6, linewidth=0)
+            ax.plot(
+                np.arange(len(path)),
+                values[path],
+                color=style.VERMILION,
+                marker="o",
+                markersize=4,
+                label="path to the best episode",
+                zorder=4,
+            )
+            ax.set_ylabel(label)
+            ax.set_xlim(-0.5, len(path) + 0.5)
+        axes[1].set(yscale="log", xlabel="level of the tree")
+        axes[1].xaxis.get_major_locator().set_params(integer=True)
+        axes[0].legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0))
+        title = f"tree {nodes.tree}: {len(nodes.visits):,} nodes, best {nodes.best[0]:.4g}"
+        axes[0].set_title(title, loc="right")
+    return axes
+
+
+def tree_page(result: Any, path: str | os.PathLike, *, tree: int | None = None) -> None:
+    """Write a tree as one HTML file that needs no network and no Python: nodes that open, with
+    visits, Q, the best reward below and the action; the most visited child first; opened along the
+    path to the best episode. Of a large tree the most visited nodes, so that the file stays below
+    3 MB.
+
+    Args:
+        result: of `jast.search.mcts` or `jast.search.forest` with ``keep_trees=True``.
+        path: of the file.
+        tree: which of its trees; default: that of the best episode.
+
+    Raises:
+        ValueError: for a result that holds no trees, and a number that it does not have.
+    """
+    from jast.page.tree import write_tree
+
+    write_tree("plot.tree_page", path, result, tree)
