@@ -22,6 +22,7 @@ __all__ = [
     "cross_entropy",
     "distributions",
     "estimate",
+    "explain",
     "failures",
     "heads",
     "incidents",

@@ -18,7 +18,7 @@ from jast.limit_state import outcome, policy_of
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = ["Descents", "descents", "EPISODES"]
+__all__ = ["Descents", "EPISODES", "descents", "differentiable"]
 
 STEPS, HALVINGS = 12, 5
 EPISODES = STEPS * (HALVINGS + 1)
@@ -56,7 +56,7 @@ def descents(sim: Simulator, starts: jax.Array) -> Descents:
     return jax.vmap(partial(_one, sim))(starts)
 
 
-def _differentiable(sim, z):
+def differentiable(sim, z):
     """The `Episode` of ``z`` [D]: of constant length, so that it can be differentiated backwards,
     and without a random number.
     """
@@ -70,7 +70,7 @@ def _one(sim, start):
         z, best, found, nearest, least, counts = carry
 
         def distance(z):
-            e = _differentiable(sim, z)
+            e = differentiable(sim, z)
             return e.distance, e
 
         (g, e), slope = jax.value_and_grad(distance, has_aux=True)(z)

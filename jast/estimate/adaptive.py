@@ -12,7 +12,7 @@ from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.contract import contract
 from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
-from jast.estimate.batches import balanced, drawn, judged, of_chunk, plain_chunk
+from jast.estimate.batches import balanced, drawn, of_chunk, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
@@ -22,6 +22,7 @@ from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import Seeker, seek
 from jast.estimate.subset import by_levels
 from jast.intervals import checked_level
+from jast.judge import judged
 from jast.policy import nominal_policy
 from jast.results import asked
 from jast.rounding import rounded

@@ -14,8 +14,9 @@ import numpy as np
 
 from jast.counter import generator
 from jast.estimate import markov_tilts
-from jast.estimate.batches import judged, log_ratio
+from jast.estimate.batches import log_ratio
 from jast.estimate.markov_tilts import Tilts, of_the_model, shape
+from jast.judge import judged
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import WIDTHS, proposed
 

@@ -10,20 +10,19 @@ import numpy as np
 from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
-from jast.incidents import hosted
-from jast.limit_state import normal_numbers, normal_of, outcomes, unit
-from jast.pytrees import in_parts
+from jast.judge import Judge
+from jast.limit_state import normal_of, unit
 from jast.search.centred import centred
 from jast.search.moves import moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
 
-PLACES, LANES = 7, (32, 256)
+PLACES = 7
 LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
-"""Points of a path between two failures, episodes simulated at once, and how much farther out than
-the line between the two a path may run: "by much" is a tenth of the way from the origin. The least
-cosine between the two; the least of those that are alike.
+"""Points of a path between two failures, and how much farther out than the line between the two a
+path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
+least of those that are alike.
 """
 
 
@@ -155,7 +154,11 @@ class Paths:
     """
 
     def __init__(self, sim: Simulator, budget: int):
-        self.sim, self.budget, self.spent = sim, budget, 0
+        self.sim, self.budget, self.judge = sim, budget, Judge(sim)
+
+    @property
+    def spent(self) -> int:
+        return self.judge.spent
 
     def between(self, first, second):
         """Whether there is a path between each of the failures ``first`` and that of ``second``
@@ -187,16 +190,6 @@ class Paths:
         size = (1 - t) * norm(v) + t * norm(w)
         arc = np.where(norm(line) > 1e-3, unit(line) * size, 0)
         points = arc[None] * np.array(LIFTS)[:, None, None, None]
-        fails = self.fail(points.reshape(-1, d)).reshape(len(LIFTS), len(t), n)
+        fails = self.judge(points.reshape(-1, d)).failure.reshape(len(LIFTS), len(t), n)
         # no arc is meant between opposite points
         return fails.any(axis=0).all(axis=0) & (cosine > OPPOSITE)
-
-    def fail(self, points):
-        """Whether the episode of each of ``points`` [m, D] fails: [m]."""
-        m, d = points.shape
-        # chunks of two sizes are two programs; a system on the host has none
-        size = m if hosted(self.sim) else LANES[m > LANES[0]]
-        rows = -(-m // size) * size
-        self.spent += rows
-        padded = np.resize(points, (rows, d)).astype(normal_numbers(self.sim))
-        return in_parts(size, partial(outcomes, self.sim), padded).failure[:m]

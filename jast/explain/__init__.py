@@ -1,0 +1,22 @@
+"""Why did it fail? Pure calls of a simulator and an episode, for black boxes, too."""
+
+from jast._doors import listed
+from jast.explain.attribution import Attribution, attribution
+from jast.explain.criticality import Criticality, criticality
+from jast.explain.differential import differential, regression
+from jast.explain.minimal import Minimal, minimal
+from jast.explain.sensitivity import Sensitivity, sensitivity
+
+__all__ = [
+    "Attribution",
+    "Criticality",
+    "Minimal",
+    "Sensitivity",
+    "attribution",
+    "criticality",
+    "differential",
+    "minimal",
+    "regression",
+    "sensitivity",
+]
+__dir__ = listed(__all__)

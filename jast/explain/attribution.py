@@ -1,0 +1,177 @@
+"""attribution: the share of each disturbance in how near the system came to failing."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import _checks, results
+from jast.boundary import differentiable
+from jast.counter import generator
+from jast.episode import Episode
+from jast.explain.point import Given, given, like_disturbances, names, steps_of
+from jast.simulator import Simulator
+
+__all__ = ["Attribution", "attribution"]
+
+POINTS, LINES = 128, 10
+
+
+@results.shown()
+class Attribution(NamedTuple):
+    """By how much each disturbance has lowered the miss distance."""
+
+    values: Any
+    """Like the disturbances [horizon, ...]: above 0 what led towards the failure. In units of the
+    distance; of the gradient, of the distance for each unit that the normal number goes on."""
+    start: Any
+    """The same of x0."""
+    error: Any
+    """Standard errors of ``values``; 0 where nothing is drawn at random."""
+    total: float
+    """Miss distance of the undisturbed system less that of the episode."""
+    method: str
+    parts: tuple
+    """(step, name, value, error), the greatest first; step 0 is x0."""
+    residual: float
+    """``total`` less the sum of all values: what a sum of differences has left out. NaN of the
+    gradient, which need not sum to anything."""
+    evaluations: int
+    """Episodes simulated; one with its gradient counts as 4."""
+
+    def __str__(self):
+        lines = [f"{self.method}: the disturbances lowered the miss distance by {self.total:.4g}"]
+        for step, name, value, error in self.parts[:LINES]:
+            line = f"  step {step:4d}  {name:<12} {value:+10.4g}"
+            line += f" +- {error:.2g}" if error > 0 else ""
+            sums = self.total and not np.isnan(self.residual)
+            lines.append(line + (f"  {value / self.total:6.1%}" if sums else ""))
+        if len(self.parts) > LINES:
+            rest = sum(value for _, _, value, _ in self.parts[LINES:])
+            lines.append(f"  the other {len(self.parts) - LINES:3d} {'':<12} {rest:+10.4g}")
+        return "\n".join(lines)
+
+
+def attribution(
+    sim: Simulator,
+    episode: Episode,
+    method: str = "shapley",
+    *,
+    key: jax.Array | None = None,
+    permutations: int = 200,
+) -> Attribution:
+    """Which disturbances brought the failure about, and by how much?
+
+    The miss distance of the episode is compared with that of the undisturbed system, in which every
+    disturbance is at its mode. ``"shapley"`` (Shapley 1953): the mean of what each number changes
+    when the disturbances are put in, one after the other, in random orders; by simulation alone, so
+    for black boxes, too; the values sum to the whole. ``"integrated"`` (integrated gradients,
+    Sundararajan, Taly and Yan 2017): the gradient along the way from the mode to the episode; they
+    sum to the whole up to ``residual``. ``"gradient"``: the slope at the episode, just outside of
+    the failures, on the way from the mode.
+
+    Args:
+        sim: the simulator; its disturbances have quantile functions.
+        episode: one failure.
+        method: "shapley", "integrated" or "gradient".
+        key: of the orders; `jax.random.key(0)` by default.
+        permutations: orders, at least 2; each costs as many episodes as there are numbers. Every
+            other order is the one before it reversed (antithetic).
+
+    Returns:
+        `Attribution`.
+
+    Raises:
+        ValueError: for another method, where the distance has no finite gradient, and where
+            ``episode`` is not one failure of this simulator.
+    """
+    name = "attribution"
+    if method not in METHODS:
+        raise ValueError(f"{name}: method must be one of {sorted(METHODS)}, received {method!r}")
+    permutations = _checks.whole(name, "permutations", permutations, 2)
+    key = jax.random.key(0) if key is None else key
+    _checks.random_key(name, key)
+    g = given(name, sim, episode)
+    quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
+    if not np.isfinite(quiet):
+        raise ValueError(f"{name}: the undisturbed system has no finite miss distance ({quiet})")
+    total = float(quiet - g.outcome.distance[0])
+    values, error, cost = METHODS[method](g, float(quiet), key, permutations)
+    x0, shaped = like_disturbances(g.sim, values)
+    steps, called = steps_of(g.sim), names(g.sim)
+    live = np.flatnonzero(g.v)
+    parts = [(int(steps[i]), called[i], float(values[i]), float(error[i])) for i in live]
+    parts.sort(key=lambda part: -abs(part[2]))
+    residual = np.nan if method == "gradient" else total - float(values.sum())
+    errors = like_disturbances(g.sim, error)[1]
+    return Attribution(
+        shaped, x0, errors, total, method, tuple(parts), residual, g.judge.spent + cost
+    )
+
+
+def _shapley(g: Given, quiet: float, key: jax.Array, permutations: int):
+    """Means and standard errors [D], by pairs of orders."""
+    live, rng = np.flatnonzero(g.v), generator(key)
+    d, pairs = len(live), -(-permutations // 2)
+    seen = np.zeros((pairs, len(g.v)))
+    if not d:
+        return seen[0], seen[0], 0
+    for i in range(pairs):
+        order = rng.permutation(live)
+        for one in (order, order[::-1]):
+            # row k has the first k + 1 disturbances of the order
+            points = np.zeros((d, len(g.v)))
+            points[:, one] = np.tril(np.ones((d, d))) * g.v[one]
+            along = np.concatenate([[quiet], _finite(g.judge(points).distance)])
+            seen[i, one] -= np.diff(along) / 2
+    error = seen.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(len(g.v), np.nan)
+    return seen.mean(axis=0), error, 0
+
+
+def _integrated(g: Given, quiet: float, key: jax.Array, permutations: int):
+    """By the midpoint rule on the way from 0 to the episode."""
+    shares = (np.arange(POINTS) + 0.5) / POINTS
+    slopes = _gradients(g, shares[:, None] * g.v)
+    return -slopes.mean(axis=0) * g.v, np.zeros(len(g.v)), 4 * POINTS
+
+
+def _gradient(g: Given, quiet: float, key: jax.Array, permutations: int):
+    """Just outside of the failures, where the distance is not yet flat."""
+    shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
+    outside = shares[~g.judge(shares[:, None] * g.v).failure]
+    if not len(outside):
+        raise ValueError("attribution: the system fails all the way from the mode to the episode")
+    slopes = _gradients(g, outside.max() * g.v[None])[0]
+    return -slopes * np.sign(g.v), np.zeros(len(g.v)), 4
+
+
+METHODS: dict[str, Callable] = {
+    "shapley": _shapley,
+    "integrated": _integrated,
+    "gradient": _gradient,
+}
+
+
+def _gradients(g: Given, points: np.ndarray) -> np.ndarray:
+    slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.judge.dtype)), np.float64)
+    if not np.isfinite(slopes).all() or not slopes.any():
+        raise ValueError(
+            "attribution: the miss distance has no finite gradient that leads anywhere; expected"
+            ' method="shapley", which needs none'
+        )
+    return slopes
+
+
+@jax.jit
+def _slopes(sim: Simulator, points: jax.Array) -> jax.Array:
+    return jax.vmap(jax.grad(lambda z: differentiable(sim, z).distance))(points)
+
+
+def _finite(distance: np.ndarray) -> np.ndarray:
+    if not np.isfinite(distance).all():
+        raise ValueError(
+            "attribution: an episode with some of the disturbances has no finite miss distance"
+        )
+    return distance.astype(np.float64)

@@ -1,0 +1,163 @@
+"""differential: where one version of a system fails and another does not."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast.outline import outline
+from jast.pytrees import select, strong
+from jast.simulator import Simulator
+from jast.stress_testing.report import Report
+
+__all__ = ["differential", "regression"]
+
+
+class Both(NamedTuple):
+    """The state of two systems under the same disturbances."""
+
+    a: Any
+    b: Any
+    failed_a: Any
+    failed_b: Any
+    over_a: Any
+    over_b: Any
+    nearest: Any
+    """Miss distance of b so far"""
+    t: Any
+    """int32: steps"""
+
+
+def differential(
+    key: jax.Array, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
+) -> Report:
+    """Which disturbances make version b fail, and not version a; and how probable is that?
+
+    `jast.stress` on `regression` ``(sim_a, sim_b)``. ``report.failures`` are likeliest first; their
+    disturbances replay in both simulators (`jast.replay`). ``report.probability`` is that of a
+    regression.
+
+    Args:
+        key: consumed.
+        sim_a: the former version.
+        sim_b: the new one, of disturbances with the same shapes.
+        budget: evaluations, each of both systems.
+        **settings: as of `jast.stress`.
+
+    Returns:
+        `Report`.
+
+    Raises:
+        ValueError: as `regression` and `jast.stress`.
+    """
+    from jast.stress_testing import stress
+
+    return stress(key, regression(sim_a, sim_b), budget, **settings)
+
+
+def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
+    """Both systems under the same disturbances, as one simulator that fails where ``sim_b`` fails
+    and ``sim_a`` comes to its end without a failure.
+
+    The disturbances are those of b's model for as long as b runs, and then of a's. An episode ends
+    when b has come to its end without a failure, or a has failed, or both are over. The miss
+    distance is that of b; where both fail it is that of an undisturbed b, as no number tells how
+    far a is from not failing.
+
+    Args:
+        sim_a: the former version.
+        sim_b: the new one.
+
+    Returns:
+        An episodic `jast.Simulator`.
+
+    Raises:
+        ValueError: where the disturbances of the two, or of their starts, differ in shape.
+    """
+    a, b = outline(sim_a), outline(sim_b)
+    for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):
+        if _shapes(one) != _shapes(other):
+            raise ValueError(
+                f"regression: {part} of sim_a and sim_b must have the same shapes, received"
+                f" {_shapes(one)} and {_shapes(other)}"
+            )
+    horizon = max(sim_a.horizon, sim_b.horizon)
+    return Simulator(
+        Partial(_init, sim_a, sim_b),
+        Partial(_step, sim_a, sim_b),
+        Partial(_disturbance, sim_a, sim_b),
+        Partial(_evaluate, sim_b),
+        horizon,
+        start=sim_b.start,
+        is_terminal=_is_terminal,
+        observe=Partial(_observe, sim_a, sim_b),
+        episodic=True,
+    )
+
+
+def _shapes(like):
+    return jax.tree.map(lambda s: (s.shape, str(s.dtype)), like)
+
+
+def _arrived(sim, state, t):
+    """(failed, over, miss distance) of one system at ``state`` after ``t`` steps."""
+    event, distance = sim.evaluate(state)
+    over = sim.is_terminal(state) | (t >= sim.horizon)
+    if sim.episodic:
+        event, distance = event & over, jnp.where(over, distance, jnp.inf)
+    return event, event | over, distance
+
+
+def _init(sim_a, sim_b, x0):
+    t = jnp.zeros((), jnp.int32)
+    a, b = strong(sim_a.init(x0)), strong(sim_b.init(x0))
+    failed_a, over_a, _ = _arrived(sim_a, a, t)
+    failed_b, over_b, distance = _arrived(sim_b, b, t)
+    return Both(a, b, failed_a, failed_b, over_a, over_b, strong(distance), t)
+
+
+def _step(sim_a, sim_b, s, x):
+    t = s.t + 1
+    # one that is over stays where it is
+    a = select(s.over_a, s.a, strong(sim_a.step(s.a, x)))
+    b = select(s.over_b, s.b, strong(sim_b.step(s.b, x)))
+    failed_a, over_a, _ = _arrived(sim_a, a, t)
+    failed_b, over_b, distance = _arrived(sim_b, b, t)
+    nearest = jnp.where(s.over_b, s.nearest, jnp.minimum(s.nearest, distance))
+    kept = lambda over, old, new: jnp.where(over, old, new)
+    return Both(
+        a,
+        b,
+        kept(s.over_a, s.failed_a, failed_a),
+        kept(s.over_b, s.failed_b, failed_b),
+        s.over_a | over_a,
+        s.over_b | over_b,
+        nearest,
+        t,
+    )
+
+
+def _disturbance(sim_a, sim_b, s):
+    return D.where(s.over_b, sim_a.disturbance(s.a), sim_b.disturbance(s.b))
+
+
+def _is_terminal(s):
+    return s.failed_a | (s.over_b & ~s.failed_b) | (s.over_a & s.over_b)
+
+
+def _evaluate(sim_b, s):
+    event = s.failed_b & s.over_a & ~s.failed_a
+    both = s.failed_b & ~event
+    quiet = jnp.maximum(_quiet(sim_b).astype(s.nearest.dtype), 1e-3)
+    return event, jnp.where(both, quiet, s.nearest)
+
+
+def _quiet(sim):
+    """The miss distance of the start at its mode."""
+    return jnp.abs(sim.evaluate(strong(sim.init(D.mode(sim.start()))))[1])
+
+
+def _observe(sim_a, sim_b, s):
+    return jnp.concatenate([sim_a.observe(s.a), sim_b.observe(s.b)])

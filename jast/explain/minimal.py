@@ -1,0 +1,204 @@
+"""minimal: the fewest and smallest disturbances of a failure that still make it fail."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast import limit_state as latent
+from jast import results
+from jast.episode import Episode, replay
+from jast.explain.point import Given, given, like_disturbances, names, steps_of
+from jast.simulator import Simulator
+
+__all__ = ["Minimal", "minimal"]
+
+SECTIONS = 31
+"""Places between two ends that are looked at together."""
+SWEEPS, LINES = 3, 12
+"""Rounds of shrinking one number after the other; needed disturbances that are printed."""
+
+
+@results.shown()
+class Minimal(NamedTuple):
+    """What a failure needs."""
+
+    needed: Any
+    """bool, like the disturbances [horizon, ...]: those that are not at their mode."""
+    needed_start: Any
+    """bool, like x0."""
+    episode: Episode
+    """Fails with these alone, and with its states; the others are at the mode."""
+    parts: tuple
+    """(step, name, value, normal number) of each that is needed, by step; step 0 is x0. The normal
+    number tells how unlikely a value is: 0 at the mode, about 1 a standard deviation from there.
+    """
+    numbers: int
+    """How many numbers the disturbances of the given episode have."""
+    evaluations: int
+
+    def __str__(self):
+        steps = sorted({step for step, *_ in self.parts})
+        what = "disturbance is" if len(self.parts) == 1 else "disturbances are"
+        lines = [f"{len(self.parts)} of {self.numbers} {what} needed: {_in_words(steps)}"]
+        lines += [
+            f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} from the mode"
+            for step, name, value, z in self.parts[:LINES]
+        ]
+        if len(self.parts) > LINES:
+            lines.append(f"  ... {len(self.parts) - LINES} more")
+        return "\n".join(lines)
+
+
+def minimal(sim: Simulator, episode: Episode, *, orders: int = 8, budget: int = 5000) -> Minimal:
+    """Which disturbances of a failure are needed, and how large must they be?
+
+    Disturbances are put back to the mode of their distribution for as long as the system still
+    fails, the small ones first, in several orders; of what is left the fewest are kept, none of
+    which can be spared. These are then shrunk towards the mode, together and one by one. Everything
+    is verified by simulation, so this holds for systems without gradients and for black boxes. (A
+    greedy search, as in delta debugging, Zeller and Hildebrandt 2002: there may be a smaller set
+    that no order leads to.)
+
+    Args:
+        sim: the simulator; its disturbances have quantile functions.
+        episode: one failure, an `jast.Episode`.
+        orders: in how many orders disturbances are tried, at least 1; the first is by size, the
+            others are shuffled.
+        budget: evaluations, at which the work ends with what it has by then. About 70 for each
+            needed disturbance and order.
+
+    Returns:
+        `Minimal`.
+
+    Raises:
+        ValueError: where ``episode`` is not one failure of this simulator.
+    """
+    g = given("minimal", sim, episode)
+    kept = _needed(g, max(1, orders), budget)
+    v = _shrunk(g, np.where(kept, g.v, 0.0), budget)
+    e = jax.device_get(latent.episodes(g.sim, np.asarray(v, g.judge.dtype)[None]))
+    e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
+    kept &= np.arange(len(v)) < _used(sim, e)
+    x0, needed = like_disturbances(sim, kept)
+    return Minimal(needed, x0, e, _parts(sim, e, v, kept), int(g.outcome.used[0]), g.judge.spent)
+
+
+def _needed(g: Given, orders: int, budget: int) -> np.ndarray:
+    """[D] bool: the fewest numbers that are not 0 at the end of any order."""
+    rng = np.random.default_rng(0)
+    size = np.abs(g.v)
+    live = np.flatnonzero(size)
+    with np.errstate(divide="ignore"):
+        noise = np.concatenate([np.zeros((1, len(live))), rng.gumbel(size=(orders - 1, len(live)))])
+        order = live[np.argsort(np.log(size[live]) + noise, axis=1)]
+    points = np.tile(g.v, (orders, 1))
+    # of each order what lies before ``at`` is decided
+    at = np.zeros(orders, int)
+    while (at < len(live)).any() and g.judge.spent < budget:
+        points, at = _advanced(g, points, order, at)
+    counts = (points != 0).sum(axis=1)
+    best = points[np.lexsort(((points**2).sum(axis=1), counts))[0]]
+    return _spared(g, best, budget) != 0
+
+
+def _advanced(g: Given, points: np.ndarray, order: np.ndarray, at: np.ndarray):
+    """Put back as much of what comes next in each order as can be in one piece; the number behind
+    the piece stays.
+    """
+    n = order.shape[1]
+    low, high = at.copy(), np.full(len(at), n)  # all before low can be spared, not all before high
+    rows = np.flatnonzero(at < n)
+    ends = lambda i: np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round().astype(int))
+    first = True
+    while len(rows):
+        tried = [ends(i)[1:] if first else ends(i)[1:-1] for i in rows]
+        batch = [_back(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
+        fails = iter(g.judge(np.stack(batch)).failure)
+        for i, t in zip(rows, tried):
+            good = [e for e in t if next(fails)]
+            low[i] = max(good, default=low[i])
+            high[i] = min((e for e in t if e > low[i]), default=high[i] if low[i] < high[i] else n)
+        rows, first = rows[high[rows] - low[rows] > 1], False
+    for i in np.flatnonzero(at < n):
+        points[i] = _back(points[i], order[i, at[i] : low[i]])
+    return points, np.where(at < n, np.minimum(low + 1, n), at)
+
+
+def _back(point: np.ndarray, which: np.ndarray) -> np.ndarray:
+    out = point.copy()
+    out[which] = 0.0
+    return out
+
+
+def _spared(g: Given, point: np.ndarray, budget: int) -> np.ndarray:
+    """``point`` without what can be spared one by one."""
+    while g.judge.spent < budget and (left := np.flatnonzero(point)).size:
+        each = np.tile(point, (len(left), 1))
+        each[np.arange(len(left)), left] = 0.0
+        fails = g.judge(each).failure
+        if not fails.any():
+            break
+        point = each[fails][np.argmax(np.abs(point[left[fails]]))]
+    return point
+
+
+def _shrunk(g: Given, point: np.ndarray, budget: int) -> np.ndarray:
+    """``point`` nearer to the mode, all numbers at first and then each alone."""
+    left = np.flatnonzero(point)
+    point = _scaled(g, point, left)
+    for _ in range(SWEEPS):
+        before = point
+        for i in left:
+            if g.judge.spent >= budget:
+                return point
+            point = _scaled(g, point, np.array([i]))
+        if np.allclose(before, point, rtol=1e-3, atol=0):
+            break
+    return point
+
+
+def _scaled(g: Given, point: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """``point`` with the numbers ``which`` shrunk by the least factor, to 1 / 1024, that leads over
+    failures alone.
+    """
+    low, high = 0.0, 1.0
+    for _ in range(2):
+        factors = np.linspace(high, low, SECTIONS + 2)[1:-1]
+        each = np.tile(point, (len(factors), 1))
+        each[:, which] *= factors[:, None]
+        fails = g.judge(each).failure
+        reached = len(fails) if fails.all() else int(np.argmin(fails))
+        low = factors[reached] if reached < len(fails) else low
+        high = factors[reached - 1] if reached else high
+    out = point.copy()
+    out[which] *= high
+    return out
+
+
+def _used(sim: Simulator, e: Episode) -> int:
+    return int((steps_of(sim) <= int(e.length)).sum())
+
+
+def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple:
+    rows = zip(jax.tree.leaves(e.disturbances), strict=True)
+    each = [np.asarray(a).reshape(len(a), -1) for (a,) in rows]
+    first = [np.asarray(a).reshape(-1) for a in jax.tree.leaves(e.x0)]
+    values = np.concatenate([*first, np.concatenate(each, axis=1).reshape(-1)])
+    steps, called = steps_of(sim), names(sim)
+    return tuple(
+        (int(steps[i]), called[i], float(values[i]), float(v[i])) for i in np.flatnonzero(kept)
+    )
+
+
+def _in_words(steps: list) -> str:
+    """ "steps 4 to 6, 9" """
+    runs: list[list[int]] = []
+    for step in steps:
+        if runs and step == runs[-1][1] + 1:
+            runs[-1][1] = step
+        else:
+            runs.append([step, step])
+    text = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs[:LINES])
+    more = ", ..." if len(runs) > LINES else ""
+    return f"step{'s' if len(steps) != 1 else ''} {text}{more}" if steps else "none"

@@ -1,0 +1,91 @@
+"""An episode as a point of normal numbers that are 0 at the mode, and back."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast import limit_state as latent
+from jast.distributions.numbers import unflat
+from jast.episode import Episode
+from jast.judge import Judge
+from jast.outline import outline
+from jast.pytrees import count
+from jast.search.centred import centred
+from jast.simulator import Simulator
+
+__all__ = ["Given", "given", "like_disturbances", "names", "steps_of"]
+
+
+class Given(NamedTuple):
+    """An episode that is to be explained."""
+
+    sim: Simulator
+    """Centred: 0 is the mode of every disturbance"""
+    judge: Judge
+    v: np.ndarray
+    """[D] float64; 0 where a number decided nothing"""
+    outcome: Any
+    """`Outcomes` of the point, one row"""
+
+
+def given(name: str, sim: Simulator, episode: Episode) -> Given:
+    """The `Given` of an ``episode`` that must fail where it is replayed."""
+    if not isinstance(episode, Episode):
+        raise ValueError(
+            f"{name}: episode must be a jast.Episode (as of result.failures or jast.replay),"
+            f" received {type(episode).__name__}"
+        )
+    if np.ndim(episode.failure):
+        raise ValueError(
+            f"{name}: episode must be one episode, received a batch of shape"
+            f" {np.shape(episode.failure)}: choose one of them"
+        )
+    latent.check(name, sim)
+    of_modes = centred(sim)
+    one = jax.tree.map(lambda a: np.asarray(a)[None], episode._replace(states=None))
+    v = latent.normal_of(of_modes, one)[0].astype(np.float64)
+    judge = Judge(of_modes)
+    outcome = judge(v[None])
+    if not outcome.failure[0]:
+        raise ValueError(
+            f"{name}: episode must fail when it is replayed, received one that ends after"
+            f" {int(outcome.length[0])} steps without a failure"
+        )
+    return Given(of_modes, judge, np.where(np.arange(len(v)) < outcome.used[0], v, 0.0), outcome)
+
+
+def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
+    """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
+    about = outline(sim)
+    start = count(about.x0)
+    shaped = lambda part, like: jax.tree.map(
+        np.asarray, jax.tree.map(lambda a, s: _like(a, s, row.dtype), unflat(part, like), like)
+    )
+    rows = [shaped(part, about.x) for part in row[start:].reshape(sim.horizon, -1)]
+    return shaped(row[:start], about.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
+
+
+def _like(a, s, dtype):
+    return np.asarray(a).astype(dtype).reshape(s.shape)
+
+
+def steps_of(sim: Simulator) -> np.ndarray:
+    """[D]: the step that each number belongs to, from 1; 0 for those of the start."""
+    about = outline(sim)
+    start, each = count(about.x0), count(about.x)
+    return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
+
+
+def names(sim: Simulator) -> list[str]:
+    """[D]: what each number is called: "x" or its field, with its place in an array."""
+    about = outline(sim)
+    return [*_named(about.x0, "x0"), *_named(about.x, "x") * sim.horizon]
+
+
+def _named(like, root):
+    out = []
+    for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or root
+        out += [name + (str(list(at)) if s.shape else "") for at in np.ndindex(s.shape)]
+    return out

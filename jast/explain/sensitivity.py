@@ -1,0 +1,182 @@
+"""sensitivity: how the probability of failure moves with the parameters of the disturbances."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+from jast import _checks, results
+from jast import limit_state as latent
+from jast.episode import replay
+from jast.estimate.batches import drawn, numbers
+from jast.estimate.estimate import Estimate
+from jast.estimate.gaussians import effective
+from jast.intervals import checked_level
+from jast.simulator import Simulator
+
+__all__ = ["Sensitivity", "sensitivity"]
+
+LANES = 1024
+FEW = 100
+"""Effective failures below which nothing is told."""
+
+
+@results.shown()
+class Sensitivity(NamedTuple):
+    """Derivatives of the log probability of failure."""
+
+    rows: tuple
+    """(name, value, derivative of log P, standard error, (low, high)) of each parameter. Times the
+    value it is the elasticity: per cent of P for one per cent of the parameter."""
+    level: float
+    ess: float
+    """Effective number of failures behind them."""
+    reliable: bool
+    """The estimate is, and there are 100 effective failures or more."""
+    evaluations: int
+
+    def __str__(self):
+        lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
+        lines.append(
+            f"{'parameter':<28} {'value':>10} {'d log P':>11} {'elasticity':>11}"
+            f"   {self.level:.0%} interval of d log P"
+        )
+        for name, value, slope, _, (low, high) in self.rows:
+            lines.append(
+                f"{name:<28} {value:10.4g} {slope:11.4g} {slope * value:11.4g}"
+                f"   [{low:.4g}, {high:.4g}]"
+            )
+        return "\n".join(lines)
+
+
+def sensitivity(
+    sim: Simulator,
+    estimate: Estimate,
+    *,
+    key: jax.Array | None = None,
+    samples: int = 16_384,
+    level: float = 0.95,
+) -> Sensitivity:
+    """Which parameter of the disturbances does the probability of failure depend on most?
+
+    The derivative of log P to a parameter of p(x | s) or p(x0) is the mean of the derivative of
+    log p over the failures (the score function or likelihood ratio method; Rubinstein and Shapiro
+    1993). The failures are drawn from the estimate's proposal and weighted. What a disturbance does
+    once it is drawn is held, so this tells nothing of parameters of ``step`` or ``evaluate``: for
+    those compare two estimates.
+
+    Args:
+        sim: the simulator. Its parameters are the floating-point numbers that are bound in
+            ``disturbance`` and ``start`` by a `jax.tree_util.Partial`.
+        estimate: of `jast.estimate.failure_probability`, of this simulator.
+        key: of the draws; `jax.random.key(0)` by default.
+        samples: episodes drawn from its proposal, at least 1024.
+        level: of the intervals (of the delta method).
+
+    Returns:
+        `Sensitivity`.
+
+    Raises:
+        ValueError: where no parameter is bound, the estimate has no proposal for this simulator, or
+            none of the draws fails.
+    """
+    name = "sensitivity"
+    key = jax.random.key(0) if key is None else key
+    _checks.random_key(name, key)
+    samples, level = _checks.whole(name, "samples", samples, LANES), checked_level(name, level)
+    latent.check(name, sim)
+    q = getattr(estimate, "proposal", None)
+    if not isinstance(q, latent.Latent) or q.means.shape[1] != latent.dimension(sim):
+        raise ValueError(
+            f"{name}: estimate must be one of failure_probability with a proposal for this"
+            f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
+        )
+    called, values = _parameters(sim)
+    if not called:
+        raise ValueError(
+            f"{name}: no parameter is bound in the disturbance or the start; expected a"
+            " jax.tree_util.Partial(disturbance, parameter), received functions without any"
+        )
+    logs, scores = [], []
+    for i in range(-(-samples // LANES)):
+        own = jax.random.fold_in(key, i)
+        z, o, log_w, *_ = drawn(sim, q, *numbers(own, LANES, q.means.shape[1], q.means.dtype))
+        rows = np.flatnonzero(np.asarray(o.failure) & np.isfinite(log_w))
+        if len(rows):
+            # all lanes, so that there is one program
+            each = np.asarray(_scores(sim, np.resize(np.asarray(z)[rows], np.shape(z))), np.float64)
+            logs.append(np.asarray(log_w, np.float64)[rows])
+            scores.append(each[: len(rows)])
+    if not logs:
+        raise ValueError(f"{name}: none of {samples} draws of the estimate's proposal fails")
+    log_w, s = np.concatenate(logs), np.concatenate(scores)
+    w = np.exp(log_w - log_w.max())
+    w /= w.sum()
+    slope = w @ s
+    error = np.sqrt((w**2) @ (s - slope) ** 2)
+    half = norm.isf((1 - level) / 2) * error
+    ess = float(effective(log_w))
+    rows = zip(called, values, slope, error, slope - half, slope + half, strict=True)
+    return Sensitivity(
+        tuple((n, float(v), float(d), float(e), (float(a), float(b))) for n, v, d, e, a, b in rows),
+        level,
+        ess,
+        bool(estimate.reliable and ess >= FEW),
+        -(-samples // LANES) * LANES + len(s),
+    )
+
+
+def _split(sim: Simulator) -> tuple[list, list, Any]:
+    """Paths and leaves of what is bound in the disturbance and the start, and the structure."""
+    bound = dict(disturbance=sim.disturbance, start=sim.start)
+    pairs, treedef = jax.tree_util.tree_flatten_with_path(bound)
+    return [path for path, _ in pairs], [jnp.asarray(leaf) for _, leaf in pairs], treedef
+
+
+def _parameters(sim: Simulator) -> tuple[list, np.ndarray]:
+    """Names and values [k] of the floating-point numbers among them."""
+    paths, leaves, _ = _split(sim)
+    called, values = [], []
+    for path, leaf in zip(paths, leaves, strict=True):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            root = str(getattr(path[0], "key", path[0]))
+            # a Partial holds its arguments, then those by name
+            rest = jax.tree_util.keystr(path[2:]) or jax.tree_util.keystr(path[1:])
+            for at in np.ndindex(leaf.shape):
+                called.append(f"{root}{rest}{list(at) if leaf.shape else ''}")
+                values.append(float(leaf[at]))
+    return called, np.asarray(values)
+
+
+@jax.jit
+def _scores(sim: Simulator, z: jax.Array) -> jax.Array:
+    """[n, k]: derivatives of log p of the episodes of ``z`` [n, D], their disturbances held."""
+    _, leaves, treedef = _split(sim)
+    moving = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+
+    def log_p(parameters, e):
+        given = iter(parameters)
+        own = [next(given) if m else leaf for m, leaf in zip(moving, leaves, strict=True)]
+        bound = treedef.unflatten(own)
+        changed = Simulator(
+            sim.init,
+            sim.step,
+            bound["disturbance"],
+            sim.evaluate,
+            sim.horizon,
+            start=bound["start"],
+            is_terminal=sim.is_terminal,
+            observe=sim.observe,
+            episodic=sim.episodic,
+        )
+        return replay(changed, e).log_prob
+
+    def one(z):
+        e = jax.lax.stop_gradient(latent.episodes(sim, z[None]))
+        e = jax.tree.map(lambda a: a[0], e._replace(states=None))
+        slopes = jax.grad(log_p)([a for a, m in zip(leaves, moving, strict=True) if m], e)
+        return jnp.concatenate([a.reshape(-1) for a in slopes])
+
+    return jax.vmap(one)(z)

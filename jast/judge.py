@@ -1,0 +1,64 @@
+"""Points of normal numbers judged by simulation, from the host, in one program whatever their
+number.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast import limit_state as latent
+from jast.incidents import hosted
+from jast.simulator import Simulator
+
+__all__ = ["Judge", "judged"]
+
+LANES, BLOCK, HELD = 4096, 128, 2**20
+"""Points of a call at most, those that run side by side, and numbers that a call may take."""
+
+
+class Judge:
+    """Judges points of ``sim`` and counts the episodes, ``spent``."""
+
+    def __init__(self, sim: Simulator):
+        self.sim, self.dtype, self.spent = sim, latent.normal_numbers(sim), 0
+
+    def __call__(self, points: np.ndarray) -> latent.Outcomes:
+        """`Outcomes` [m] of ``points`` [m, D]."""
+        self.spent += len(points)
+        return judged(self.sim, np.asarray(points, self.dtype))
+
+
+def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
+    """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
+    box runs once a point, in batches of ``n``.
+    """
+    if hosted(sim):
+        return jax.device_get(latent.outcomes(sim, jnp.asarray(z)))
+    n, d = z.shape
+    lanes = max(min(LANES, HELD // d // BLOCK * BLOCK), BLOCK)
+    out = []
+    for i in range(0, n, lanes):
+        part = z[i : i + lanes]
+        padded = np.zeros((lanes, d), z.dtype)
+        padded[: len(part)] = part
+        o = jax.device_get(_in_blocks(sim, padded, np.int32(len(part))))
+        out.append(latent.Outcomes(*(a[: len(part)] for a in o)))
+    return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+
+
+@jax.jit
+def _in_blocks(sim, z, n):
+    """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
+    run = jax.vmap(partial(latent.outcome, sim))
+    like = jax.eval_shape(run, z)
+
+    def block(i, out):
+        new = run(lax.dynamic_slice_in_dim(z, i * BLOCK, BLOCK))
+        place = partial(lax.dynamic_update_slice_in_dim, start_index=i * BLOCK, axis=0)
+        return jax.tree.map(place, out, new)
+
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)
