@@ -1,11 +1,11 @@
 """sensitivity: how the probability of failure moves with the parameters of the disturbances."""
 
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
 
 from jast import _checks, results
 from jast import limit_state as latent
@@ -116,7 +116,7 @@ def sensitivity(
     w /= w.sum()
     slope = w @ s
     error = np.sqrt((w**2) @ (s - slope) ** 2)
-    half = norm.isf((1 - level) / 2) * error
+    half = NormalDist().inv_cdf(0.5 + level / 2) * error
     ess = float(effective(log_w))
     rows = zip(called, values, slope, error, slope - half, slope + half, strict=True)
     return Sensitivity(
