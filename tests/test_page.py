@@ -119,6 +119,24 @@ def test_long_and_wide_episodes_are_thinned(steps, width):
         assert v == pytest.approx(x[t - 1, 0], rel=1e-5)
 
 
+def test_keys_are_no_numbers_and_x0_is_shown():
+    """A state may hold random keys; what chose the start stands there, too."""
+    sim = jast.Simulator(
+        init=lambda x0: {"key": jax.random.key(0), "at": x0},
+        step=lambda s, x: s | {"at": s["at"] + x},
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s["at"] > 2, jnp.maximum(2 - s["at"], 0)),
+        start=lambda: Normal(0.0, 1.0),
+        horizon=2,
+    )
+    e = jast.replay(sim, jnp.ones(2), jnp.asarray(0.25))
+    found = traces.trace(sim, e, None, 1000)
+    assert [group["name"] for group in found["states"]] == ["at"]
+    assert found["states"][0]["columns"] == [[0.25, 1.25, 2.25]]
+    assert found["x0"][0]["name"] == "x0" and found["x0"][0]["columns"] == [[0.25]]
+    assert found["distance"] == [1.75, 0.75, 0.0]
+
+
 def test_pictures_keep_to_their_room():
     states, steps = np.arange(40), list(range(0, 40, 2))
     found = traces.pictures("html", lambda s: "x" * int(s), states, steps, 200)

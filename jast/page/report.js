@@ -64,18 +64,19 @@ function table(mode, i) {
   const line = (name, value, undisturbed) => body.append(make("tr", {}, make("td", {}, name),
     make("td", { class: "number" }, words(value)),
     make("td", { class: "number" }, words(undisturbed))));
-  const part = (title, groups, quiet) => {
+  const part = (title, groups, quiet, at = i) => {
     if (!groups || !groups.length) return;
     body.append(make("tr", {}, make("th", { colspan: 3 }, title)));
     groups.forEach((group, g) => {
       group.columns.forEach((column, j) =>
-        line(group.name + group.entries[j], column[i], quiet ? quiet[g][j][i] : null));
+        line(group.name + group.entries[j], column[at], quiet ? quiet[g][j][i] : null));
       if (group.more) line(`${group.name}: ${group.more} more numbers`, null, null);
     });
   };
   part("state", mode.states, mode.quiet);
   if (mode.distance) line("miss distance", mode.distance[i], null);
-  part(mode.steps[i] ? "disturbance of this step" : "disturbance: the start has none", mode.x, null);
+  if (mode.steps[i]) part("disturbance of this step", mode.x, null);
+  else part("disturbance of the start", mode.x0, null, 0);
   return make("table", {}, make("thead", {}, make("tr", {}, make("th", {}, "name"),
     make("th", {}, "value"), make("th", {}, mode.quiet ? "undisturbed" : ""))), body);
 }

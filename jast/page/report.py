@@ -118,8 +118,9 @@ def _head(report: Any, verdict: Sequence[tuple[str, str]], advice: str) -> str:
         words, mood = "The system fails without any disturbance.", "bad"
     elif len(report.failures):
         e, ways = report.failures.best, f"{n} way{'s' * (n != 1)} to fail" if n else "A failure"
+        steps = int(e.length)
         words = (
-            f"{ways} found. The likeliest takes {int(e.length)} steps and has log p"
+            f"{ways} found. The likeliest takes {steps} step{'s' * (steps != 1)} and has log p"
             f" {float(e.reward):.2f} relative to the mode of the disturbances."
         )
         mood = "bad"

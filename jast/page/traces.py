@@ -31,19 +31,22 @@ def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: 
 
     Returns:
         ``steps`` (shown, 0 is the start), ``length``, ``x`` (groups of columns over the steps; that
-        of step t led to state t), and where there is a simulator ``states``, ``quiet`` (the same of
-        the undisturbed episode, None behind its end) and ``distance``.
+        of step t led to state t), ``x0`` (the same at the start), and where there is a simulator
+        ``states``, ``quiet`` (the same of the undisturbed episode, None behind its end) and
+        ``distance``.
     """
-    whole = None if sim is None else states_of(sim, episode)
+    played = None if sim is None else _played(sim, episode)
+    whole = jax.tree.map(_numbers, played)
     n = int(episode.length)
     width = sum(min(ENTRIES, _size(a)) for a in jax.tree.leaves((whole, episode.disturbances)))
     stride = max(1, -(-(n + 1) * 2 * max(width, 1) // most))
     steps = sorted({*range(0, n + 1, stride), n})
     found = {"steps": steps, "length": n, "x": groups(episode.disturbances, steps, "x", late=1)}
+    found["x0"] = groups(jax.tree.map(lambda a: np.asarray(a)[None], episode.x0), [0], "x0")
     if sim is None:
         return found
     found["states"] = groups(whole, steps, "state")
-    found["distance"] = distances(sim, whole, steps)
+    found["distance"] = distances(sim, played, steps)
     if quiet is not None:
         there = [t for t in steps if t <= int(quiet.length)]
         calm = groups(states_of(sim, quiet), there, "state")
@@ -52,10 +55,17 @@ def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: 
 
 
 def states_of(sim: Simulator, episode: Episode) -> Any:
-    """[horizon + 1, ...] NumPy arrays."""
-    if episode.states is None:
-        episode = replay(sim, episode)
-    return jax.tree.map(np.asarray, jax.device_get(episode.states))
+    """[horizon + 1, ...] NumPy arrays; of a random key, which is no number, an empty one."""
+    return jax.tree.map(_numbers, _played(sim, episode))
+
+
+def _played(sim: Simulator, episode: Episode) -> Any:
+    return (replay(sim, episode) if episode.states is None else episode).states
+
+
+def _numbers(a: Any) -> np.ndarray:
+    key = jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key)
+    return np.zeros((len(a), 0)) if key else np.asarray(a)
 
 
 def distances(sim: Simulator, states: Any, steps: list[int]) -> list[float] | None:
@@ -78,6 +88,8 @@ def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
     for path, a in jax.tree_util.tree_leaves_with_path(tree):
         a = np.asarray(a)
         if a.dtype.kind not in "fiub" and not np.can_cast(a.dtype, float, "same_kind"):
+            continue
+        if not a.size:
             continue
         flat = a.reshape(len(a), -1)
         names = [str(list(index)) if index else "" for index in np.ndindex(a.shape[1:])]
