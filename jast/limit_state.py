@@ -24,6 +24,7 @@ from jast.distributions.numbers import unflat
 from jast.episode import Episode, replay, rollout
 from jast.outline import outline
 from jast.policy import Policy
+from jast.products import product, rows_of
 from jast.progress import Progress, advance, begin, conclude
 from jast.pytrees import count
 from jast.rewards import log_likelihood
@@ -150,7 +151,7 @@ def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
     z = np.empty_like(e)
     for i in np.unique(k):
         rows = k == i
-        z[rows] = np.asarray(q.means[i]) + e[rows] @ np.asarray(q.factors[i]).T
+        z[rows] = np.asarray(q.means[i]) + product(e[rows], np.asarray(q.factors[i]).T)
     return z
 
 
@@ -160,20 +161,21 @@ def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
     live, (n, d) = _live(q), z.shape
     means, inverses = (np.asarray(a)[:live].astype(z.dtype) for a in (q.means, q.inverses))
-    shift = np.einsum("kij,kj->ki", inverses, means).reshape(-1)
+    shift = np.einsum("kij,kj->ki", inverses, means)[:, None]
     diagonals = np.log(np.diagonal(inverses, axis1=1, axis2=2).astype(np.float64))
     volumes = np.concatenate([np.zeros((live, 1)), np.cumsum(diagonals, axis=1)], axis=1)
     out = np.zeros((n, len(q.log_weights)))
-    flat = inverses.reshape(-1, d).T
-    rows = max(ROWS // (live * d), 1)
+    turned = inverses.transpose(0, 2, 1)
+    rows = max(min(ROWS // (live * d), rows_of(n, d * d)), 1)
     for i in range(0, n, rows):
-        part, m = z[i : i + rows, None], used[i : i + rows]
-        e = (part[:, 0] @ flat - shift).reshape(-1, live, d)
+        part, m = z[i : i + rows], used[i : i + rows]
+        e = np.matmul(part, turned) - shift
         # the squares differ by (z - e)(z + e): no cancellation of two large sums
         gap = part - e
         if (m < d).any():
-            gap *= (np.arange(d) < m[:, None])[:, None]
-        out[i : i + rows, :live] = 0.5 * np.einsum("nkd,nkd->nk", gap, part + e) + volumes[:, m].T
+            gap *= np.arange(d) < m[:, None]
+        ratio = 0.5 * np.einsum("knd,knd->kn", gap, part + e) + volumes[:, m]
+        out[i : i + rows, :live] = ratio.T
     return out
 
 

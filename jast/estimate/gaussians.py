@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jast.limit_state import Latent
+from jast.products import gram, product
 
 __all__ = ["Gaussians", "as_latent", "fit", "log_density", "log_sum", "shrunk", "together", "unit"]
 
@@ -247,7 +248,7 @@ def _maximise(z, r, count, anchors):
         kept = total == total.max()
     parts = []
     for i in np.flatnonzero(kept):
-        mean = r[:, i] @ z / total[i]
+        mean = np.einsum("n,nd->d", r[:, i], z) / total[i]
         if anchors is not None and len(anchors):
             # what a mean differs from its design point may be noise alone (James and Stein 1961)
             gaps = mean - anchors
@@ -258,7 +259,7 @@ def _maximise(z, r, count, anchors):
                 else mean
             )
         e = z - mean
-        values, vectors = np.linalg.eigh((e.T * r[:, i]) @ e / total[i])
+        values, vectors = np.linalg.eigh(gram(e, r[:, i]) / total[i])
         parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))
     weights, means, values, vectors = (np.stack(a) for a in zip(*parts, strict=True))
     return Gaussians(weights / weights.sum(), means, values, vectors)
@@ -267,8 +268,8 @@ def _maximise(z, r, count, anchors):
 def _log_joint(g, z):
     out = np.empty((len(g.weights), len(z)))
     for row, weight, mean, values, vectors in zip(out, *g, strict=True):
-        e = z @ vectors - mean @ vectors
-        np.matmul(np.square(e, out=e), -0.5 / values, out=row)
+        e = product(z, vectors) - mean @ vectors
+        np.einsum("nd,d->n", np.square(e, out=e), -0.5 / values, out=row)
         row += np.log(weight) - 0.5 * np.log(2 * np.pi * values).sum()
     # sums over components run along columns
     return out.T

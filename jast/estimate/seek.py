@@ -19,6 +19,7 @@ from jast.estimate.gaussians import Gaussians, as_latent, effective, fit, togeth
 from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore
 from jast.incidents import hosted
+from jast.products import product
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
@@ -274,7 +275,7 @@ def _nearest(points, centres):
     """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n,
     D].
     """
-    return np.argmax(points @ centres.T - 0.5 * (centres**2).sum(axis=1), axis=1)
+    return np.argmax(product(points, centres.T) - 0.5 * (centres**2).sum(axis=1), axis=1)
 
 
 def _defended(g, low, rare):
