@@ -36,8 +36,10 @@ SEEN, LOST = 100, 2.0
 of what was found, from which the proposal is given up.
 """
 ASTRAY = "no proposal was found that draws failures by their weights"
-TILTS = 0.2
-"""Of the budget, what must be left for tilts to be tried after Gaussians."""
+TILTS, POOR = 0.2, 0.05
+"""Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
+below which they are.
+"""
 EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
@@ -66,7 +68,7 @@ def failure_probability(
     lost failure modes, which are taken in, or else the estimate is UNRELIABLE. Systems of 30 steps
     or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with tilts
     of each step's own disturbance by the state and the time, fitted by cross-entropy, of choices
-    by their odds; others where the Gaussians promise a standard error above 1 %. What is left of
+    by their odds; others where the Gaussians promise few effective draws. What is left of
     the budget, about half, is drawn from the proposal as it then stands: the estimate and its
     interval are of these episodes alone. A tenth of them or more, up to two fifths where the
     standard error stays below 1 %, are the model's own draws, which meet what no explorer was led
@@ -136,15 +138,14 @@ def _beside_gaussians(s, t, gradients):
     tried = [t]
 
     def instead(s):
-        astray = _promised(s, 1) < tilt_estimate.SERVES or s.asked > LOST
-        if tried[0] is not None or not astray or _plain_is_better(s):
+        if tried[0] is not None or _promised(s, 1) > tilt_estimate.SERVES or _plain_is_better(s):
             return False
         tried[0] = tilt_estimate.after(s)
         return tried[0].serves(tilt_estimate.SERVES)
 
     seek(s, gradients, instead)
     n, [t], known = s.budget - s.spent, tried, s.log_mean is not None
-    poor = _astray(s, n) or 1 / math.sqrt(_promised(s, n)) > EXACT
+    poor = _astray(s, n) or _promised(s, 1) < POOR
     if t is None and poor and n > TILTS * s.budget and not (known and _plain_is_better(s)):
         t = tilt_estimate.after(s)
     gaussian = 0.0 if not known or max(s.lost, s.asked) > LOST else _promised(s, 1)

@@ -90,10 +90,10 @@ def _lost(s, t, takes):
         s.reasons.append("the budget did not last to look for lost failure modes")
     if thin > THIN:
         s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
-    if share <= 2 * (thin + LOST) + LOST:
+    if share <= 3 * (thin + LOST):
         return False
-    most = int(0.15 * s.budget)
-    if not takes or s.budget - s.spent < 2 * most:
+    most = int(min(GUARD * s.budget, REST * (s.budget - s.spent)))
+    if not takes or most < t.batch:
         s.reasons.append(
             f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
         )
