@@ -5,7 +5,7 @@ benchmarks.probability [--json] [--quick | --smoke] [--only PART ...]``.
 published Algorithm 2, traces a second; ``range``: log P to 1e-100 in float32; ``policy``: failure
 policies by both learners at equal steps of the simulator; ``default``: `failure_probability` over
 seeds, with and without gradients, beside OpenTURNS on the same limit states and evaluations;
-``cases``: the fixed cases;
+``cases``: the fixed cases, of benchmarks.limit_states and benchmarks.markov_systems;
 ``coverage``: problems drawn by seed (benchmarks.limit_states), how often the 95 % interval covers,
 how often an estimate is flagged, and how often an interval misses without a flag. Float32
 throughout.
@@ -25,6 +25,7 @@ from scipy import stats
 import jast
 from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
+from benchmarks.markov_systems import markov_cases
 from benchmarks.sizes import options, size
 from jast.distributions import Normal
 from jast.distributions.mixtures import blend
@@ -214,6 +215,14 @@ def line(name, r):
     return text + (f"  CPU {r['cpu_s']:.1f} s" if isinstance(r.get("cpu_s"), float) else "")
 
 
+def _chosen(args):
+    """The fixed cases that are asked for."""
+    if args.smoke:
+        return cases(["four-branch"])
+    every = [*cases(), *markov_cases()]
+    return [c for c in every if args.cases is None or c.name in args.cases]
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.probability", description=__doc__.splitlines()[0]
@@ -232,6 +241,9 @@ def main(argv=None):
         help=", ".join(FAMILIES),
     )
     parser.add_argument("--budget", type=int, help="default 100,000")
+    parser.add_argument(
+        "--cases", nargs="+", metavar="CASE", help="names of fixed cases; default: all"
+    )
     args = parser.parse_args(argv)
     parts = args.only or [
         part for part in PARTS if not (args.quick and part in ("policy", "cases"))
@@ -288,7 +300,7 @@ def main(argv=None):
                 )
     if "cases" in parts:
         report["cases"] = {}
-        for c in cases(["four-branch"] if args.smoke else None):
+        for c in _chosen(args):
             report["cases"][c.name] = r = ours([c[1:]] * seeds(10, 10, 1), budget)
             say(line(c.name, r))
     if "coverage" in parts:
