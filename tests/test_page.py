@@ -15,6 +15,7 @@ import jast
 from jast.crude import Nominal
 from jast.distributions import Joint, Normal
 from jast.estimate.estimate import Estimate
+from jast.explain import Criticality, Minimal
 from jast.page import document, report, traces
 from jast.search.failure_modes import Mode, Modes
 from jast.stress_testing.report import Report, Tried
@@ -58,7 +59,11 @@ def made(**changes):
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "report.html"
-    made().html(path, draw=lambda s: f"<svg>{float(s.speed)}|{EVIL}", explanations=[EVIL])
+    p = np.array([0.1, 0.2, 0.4, 1.0])
+    risk = Criticality(p, np.stack([p / 2, np.ones(4)], 1), 0.95, 2, 3, 3, 9, 0, 36)
+    least = Minimal(None, None, made().failures[0], ((3, EVIL, 2.5, 5.0),), 3, 70)
+    told = [[EVIL, risk, None, least]]
+    made().html(path, draw=lambda s: f"<svg>{float(s.speed)}|{EVIL}", explanations=told)
     return path.read_text(encoding="utf-8")
 
 
@@ -72,6 +77,13 @@ def test_a_page_stands_alone_and_lets_nothing_out(page):
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "")  # the name of a language
     assert page.count("&lt;script&gt;fail()&lt;/script&gt;") >= 3  # explanation, tried, settings
     assert EVIL in seen.data["modes"][0]["pictures"]["fragments"][0]
+
+
+def test_explanations_are_told_drawn_and_marked(page):
+    first, second = Page(page).data["modes"]
+    assert first["risk"] == [0.1, 0.2, 0.4, 1.0] and first["interval"][1] == [1.0] * 4
+    assert first["needed"] == [3] and "risk" not in second and "needed" not in second
+    assert "1 of 3 disturbance is needed" in page and "it stays at 0.95 or more from step 3" in page
 
 
 def test_traces_have_the_fields_and_numbers_of_the_system(page):
@@ -207,6 +219,7 @@ def test_the_slider_moves_in_a_browser(page, tmp_path):
       slider.value = 1;
       slider.dispatchEvent(new Event("input"));
       found.first = look();
+      found.needed = card.querySelectorAll(".needed").length;
       found.panels = card.querySelectorAll(".traces svg").length;
       found.json = JSON.parse(card.querySelector(".json").textContent).length;
       card.querySelector(".play").click();
@@ -218,4 +231,9 @@ def test_the_slider_moves_in_a_browser(page, tmp_path):
     assert float(found["first"]["speed"]) == pytest.approx(2.1, rel=1e-5)
     assert float(found["first"]["picture"].split("|")[0]) == pytest.approx(2.1, rel=1e-5)
     assert found["first"]["cursor"] != found["last"]["cursor"]
-    assert found["panels"] == 4 and found["json"] == 3 and found["play"] == "Stop"
+    assert (
+        found["panels"] == 5
+        and found["needed"] == 1
+        and found["json"] == 3
+        and found["play"] == "Stop"
+    )

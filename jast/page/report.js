@@ -23,7 +23,7 @@ function lines(svg, xs, ys, x, y, attributes) {
 }
 
 // a figure of columns over the steps; returns it and a function that moves its cursor
-function panel(name, entries, columns, quiet, steps) {
+function panel(name, entries, columns, quiet, steps, marked = []) {
   const all = [...columns, ...quiet].flat().filter((v) => v !== null).map(Number)
     .filter(Number.isFinite);
   let low = all.reduce((a, b) => Math.min(a, b), Infinity);
@@ -47,6 +47,8 @@ function panel(name, entries, columns, quiet, steps) {
     { stroke: "#999", "stroke-width": 1.2, "stroke-dasharray": "4 3" }));
   columns.forEach((column, i) => lines(svg, steps, column, x, y,
     { stroke: COLOURS[i % COLOURS.length], "stroke-width": 1.8 }));
+  marked.forEach((t) => svg.append(make("circle",
+    { cx: x(t), cy: HEIGHT - BOTTOM, r: 3, fill: "#b84a00", class: "needed" })));
   const cursor = make("line", { y1: TOP, y2: HEIGHT - BOTTOM, stroke: "#222", class: "cursor" });
   svg.append(cursor);
   const caption = make("figcaption", {}, name);
@@ -75,8 +77,10 @@ function table(mode, i) {
   };
   part("state", mode.states, mode.quiet);
   if (mode.distance) line("miss distance", mode.distance[i], null);
-  if (mode.steps[i]) part("disturbance of this step", mode.x, null);
-  else part("disturbance of the start", mode.x0, null, 0);
+  if (mode.risk) line("probability of failing from here", mode.risk[i], null);
+  const needed = (mode.needed || []).includes(mode.steps[i]) ? ", which is needed" : "";
+  if (mode.steps[i]) part(`disturbance of this step${needed}`, mode.x, null);
+  else part(`disturbance of the start${needed}`, mode.x0, null, 0);
   return make("table", {}, make("thead", {}, make("tr", {}, make("th", {}, "name"),
     make("th", {}, "value"), make("th", {}, mode.quiet ? "undisturbed" : ""))), body);
 }
@@ -85,8 +89,8 @@ function card(article) {
   const mode = data.modes[Number(article.dataset.mode)];
   const find = (name) => article.querySelector(`.${name}`);
   const moves = [], traces = find("traces");
-  const add = (name, entries, columns, quiet) => {
-    const [figure, move] = panel(name, entries, columns, quiet, mode.steps);
+  const add = (name, entries, columns, quiet, marked) => {
+    const [figure, move] = panel(name, entries, columns, quiet, mode.steps, marked);
     traces.append(figure);
     moves.push(move);
   };
@@ -95,7 +99,11 @@ function card(article) {
     group.columns.slice(0, few), mode.quiet ? mode.quiet[g].slice(0, few) : []));
   if (mode.distance) add("miss distance", [""], [mode.distance], []);
   mode.x.forEach((group) => add(`disturbance ${group.name}`, group.entries.slice(0, few),
-    group.columns.slice(0, few), []));
+    group.columns.slice(0, few), [], mode.needed));
+  if (mode.risk) {
+    add("probability of failing from here (dashed: its interval)", [""], [mode.risk], mode.interval);
+  }
+  if (mode.needed) traces.append(make("p", { class: "legend" }, "dots: disturbances that are needed"));
   if (mode.quiet) traces.append(make("p", { class: "legend" }, "dashed: the undisturbed system"));
 
   const slider = find("slider"), picture = find("picture");

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast.episode import Episode
 from jast.page.document import document, figure, plain, rows, table, text, write
-from jast.page.traces import exact, pictures, states_of, trace
+from jast.page.traces import exact, pictures, short, states_of, trace
 from jast.simulator import Simulator
 
 __all__ = ["write_report"]
@@ -73,10 +73,12 @@ def write_report(
             f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
             f" received {len(explanations)}"
         )
-    data = {"modes": _data(report, failures, sim, draw)}
+    told = [_several(one) for one in explanations]
+    told += [[]] * (len(failures) - len(told))
+    data = {"modes": _data(report, failures, told, sim, draw)}
     body = [
         _head(report, verdict, advice),
-        _modes(report, failures, data["modes"], list(explanations), sim),
+        _modes(report, failures, data["modes"], told, sim),
         _work(report),
         _settings(report),
     ]
@@ -88,11 +90,36 @@ def _shown(report: Any) -> list[Episode]:
     return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
-def _data(report: Any, failures: list[Episode], sim: Any, draw: Any) -> list[dict]:
+def _several(explanation: Any) -> list:
+    """One or many; a result of `jast.explain` is a tuple of its own kind, and one."""
+    several = explanation if type(explanation) in (list, tuple) else [explanation]
+    return [one for one in several if one is not None]
+
+
+def _explained(explanations: list, steps: list[int]) -> dict:
+    """What the traces show of explanations: the probability of failing from each step (`risk`), and
+    the steps whose disturbances are needed.
+    """
+    from jast.explain import Criticality, Minimal
+
+    found = {}
+    for one in explanations:
+        if isinstance(one, Criticality) and len(one.probability) == steps[-1] + 1:
+            found["risk"] = short(one.probability[steps])
+            found["interval"] = [short(end) for end in one.interval[steps].T]
+        if isinstance(one, Minimal):
+            found["needed"] = sorted({int(step) for step, *_ in one.parts})
+    return found
+
+
+def _data(
+    report: Any, failures: list[Episode], explanations: list[list], sim: Any, draw: Any
+) -> list[dict]:
     quiet, n, left, found = report.nominal.undisturbed, max(len(failures), 1), EXACT, []
     for number, episode in enumerate(failures, 1):
         card = trace(sim, episode, quiet, NUMBERS // n)
         card["name"] = f"failure-{number}"
+        card |= _explained(explanations[number - 1], card["steps"])
         values = json.dumps(plain(exact(episode)))
         size = len(values) + values.count('"')
         card["exact"] = values if size <= left else None
@@ -157,6 +184,7 @@ def _probability(p: Any) -> str:
             )
         )
     reasons = "".join(f"<li>{text(words)}</li>" for words in p.warnings)
+    mood = "value" if p.reliable or np.isnan(p.log_mean) else "value doubt"
     if p.reliable:
         badge = "<p class='badge good'>reliable: no known reason against it</p>"
         facts += [("remark", words) for words in p.warnings]
@@ -165,13 +193,13 @@ def _probability(p: Any) -> str:
     else:
         badge = f"<div class='badge bad'>UNRELIABLE: do not believe it<ul>{reasons}</ul></div>"
     return (
-        f"<div id=probability><h2>Probability of failure</h2><p class=value>{text(value)}</p>"
+        f"<div id=probability><h2>Probability of failure</h2><p class='{mood}'>{text(value)}</p>"
         f"<p>{text(more)}</p>{badge}{rows(facts)}</div>"
     )
 
 
 def _modes(
-    report: Any, failures: list[Episode], data: list[dict], explanations: list, sim: Any
+    report: Any, failures: list[Episode], data: list[dict], explanations: list[list], sim: Any
 ) -> str:
     if not failures:
         return "<section id=modes><h2>Failure modes</h2><p>none</p></section>"
@@ -187,8 +215,7 @@ def _modes(
             mode = report.modes[i]
             share = "not known" if np.isnan(mode.share) else f"{100 * mode.share:.1f} %"
             facts += [("members", mode.members), ("share", share)]
-        given = explanations[i] if i < len(explanations) else None
-        cards.append(_card(i + 1, facts, data[i], given))
+        cards.append(_card(i + 1, facts, data[i], explanations[i]))
     more = len(report.modes) - len(failures)
     notes = [f"{more} more modes are not shown."] * (more > 0)
     if sim is None:
@@ -197,10 +224,9 @@ def _modes(
     return f"<section id=modes><h2>Failure modes</h2>{words}{''.join(cards)}</section>"
 
 
-def _card(number: int, facts: list, data: dict, explanation: Any) -> str:
+def _card(number: int, facts: list, data: dict, explanations: list) -> str:
     """One mode; the script fills the elements that have a class and no words."""
-    several = explanation if type(explanation) in (list, tuple) else [explanation]
-    words = "".join(f"<pre>{text(one)}</pre>" for one in several if one is not None)
+    words = "".join(f"<pre>{text(one)}</pre>" for one in explanations)
     held = (
         "<p><button class=copy>Copy JSON</button> <button class=download>Download"
         f" failure-{number}.json</button></p><pre class=json></pre>"

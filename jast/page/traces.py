@@ -13,7 +13,7 @@ from jast.episode import Episode, replay
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
-__all__ = ["exact", "pictures", "trace"]
+__all__ = ["exact", "groups", "pictures", "short", "states_of", "trace"]
 
 ENTRIES = 24
 """Numbers of one array that a page shows; the others are counted."""

@@ -90,8 +90,10 @@ class Report(NamedTuple):
                 one (a report from `jast.load`) the page shows disturbances alone.
             draw: one state -> an SVG or HTML fragment, which the page shows as it is, at the step
                 of the slider. Its state is a pytree of NumPy arrays.
-            explanations: for the card of each mode, in their order: anything whose ``str`` says
-                something of it, a list of such things, or None.
+            explanations: for the card of each mode, in their order: a result of `jast.explain`,
+                anything else whose ``str`` says something of it, a list of such things, or None.
+                `jast.explain.criticality` is drawn, too, and what `jast.explain.minimal` needs is
+                marked.
 
         Raises:
             ValueError: for ``draw`` without a simulator, a ``draw`` that returns no text or too
