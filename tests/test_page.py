@@ -61,7 +61,9 @@ def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "report.html"
     p = np.array([0.1, 0.2, 0.4, 1.0])
     risk = Criticality(p, np.stack([p / 2, np.ones(4)], 1), 0.95, 2, 3, 3, 9, 0, 36)
-    least = Minimal(None, None, made().failures[0], ((3, EVIL, 2.5, 5.0),), 3, 70)
+    least = Minimal(
+        {EVIL: np.arange(8) == 2}, (), made().failures[0], ((3, EVIL, 2.5, 5.0),), 3, 70
+    )
     told = [[EVIL, risk, None, least]]
     made().html(path, draw=lambda s: f"<svg>{float(s.speed)}|{EVIL}", explanations=told)
     return path.read_text(encoding="utf-8")
@@ -82,7 +84,7 @@ def test_a_page_stands_alone_and_lets_nothing_out(page):
 def test_explanations_are_told_drawn_and_marked(page):
     first, second = Page(page).data["modes"]
     assert first["risk"] == [0.1, 0.2, 0.4, 1.0] and first["interval"][1] == [1.0] * 4
-    assert first["needed"] == [3] and "risk" not in second and "needed" not in second
+    assert first["needed"] == {EVIL: [3]} and "risk" not in second and "needed" not in second
     assert "1 of 3 disturbance is needed" in page and "it stays at 0.95 or more from step 3" in page
 
 

@@ -78,9 +78,8 @@ function table(mode, i) {
   part("state", mode.states, mode.quiet);
   if (mode.distance) line("miss distance", mode.distance[i], null);
   if (mode.risk) line("probability of failing from here", mode.risk[i], null);
-  const needed = (mode.needed || []).includes(mode.steps[i]) ? ", which is needed" : "";
-  if (mode.steps[i]) part(`disturbance of this step${needed}`, mode.x, null);
-  else part(`disturbance of the start${needed}`, mode.x0, null, 0);
+  if (mode.steps[i]) part("disturbance of this step", mode.x, null);
+  else part("disturbance of the start", mode.x0, null, 0);
   return make("table", {}, make("thead", {}, make("tr", {}, make("th", {}, "name"),
     make("th", {}, "value"), make("th", {}, mode.quiet ? "undisturbed" : ""))), body);
 }
@@ -99,7 +98,7 @@ function card(article) {
     group.columns.slice(0, few), mode.quiet ? mode.quiet[g].slice(0, few) : []));
   if (mode.distance) add("miss distance", [""], [mode.distance], []);
   mode.x.forEach((group) => add(`disturbance ${group.name}`, group.entries.slice(0, few),
-    group.columns.slice(0, few), [], mode.needed));
+    group.columns.slice(0, few), [], mode.needed && mode.needed[group.name]));
   if (mode.risk) {
     add("probability of failing from here (dashed: its interval)", [""], [mode.risk], mode.interval);
   }

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast.episode import Episode
 from jast.page.document import document, figure, plain, rows, table, text, write
-from jast.page.traces import exact, pictures, short, states_of, trace
+from jast.page.traces import exact, groups, pictures, short, states_of, trace
 from jast.simulator import Simulator
 
 __all__ = ["write_report"]
@@ -98,7 +98,7 @@ def _several(explanation: Any) -> list:
 
 def _explained(explanations: list, steps: list[int]) -> dict:
     """What the traces show of explanations: the probability of failing from each step (`risk`), and
-    the steps whose disturbances are needed.
+    the steps at which each disturbance is needed.
     """
     from jast.explain import Criticality, Minimal
 
@@ -108,7 +108,11 @@ def _explained(explanations: list, steps: list[int]) -> dict:
             found["risk"] = short(one.probability[steps])
             found["interval"] = [short(end) for end in one.interval[steps].T]
         if isinstance(one, Minimal):
-            found["needed"] = sorted({int(step) for step, *_ in one.parts})
+            every = list(range(1, steps[-1] + 1))
+            found["needed"] = {
+                group["name"]: [t for t in every if any(c[t - 1] == 1 for c in group["columns"])]
+                for group in groups(one.needed, every, "x", late=1)
+            }
     return found
 
 
@@ -236,12 +240,12 @@ def _card(number: int, facts: list, data: dict, explanations: list) -> str:
     return (
         f'<article class=card id="mode-{number}" data-mode="{number - 1}">'
         f"<h3>Mode {number}</h3>{rows(facts, 'facts wide')}"
-        f'<div class="explanation"{"" if words else " hidden"}><h4>Explanation</h4>{words}</div>'
         f"<div class=player><label>step <output class=step></output> <input type=range min=0"
         f' max="{len(data["steps"]) - 1}" value="{len(data["steps"]) - 1}" class=slider'
         f' aria-label="step of mode {number}"></label> <button class=play>Play</button></div>'
         "<div class=stage><div class=picture hidden></div><div class=numbers></div></div>"
         "<div class=traces></div>"
+        f'<div class="explanation"{"" if words else " hidden"}><h4>Explanation</h4>{words}</div>'
         f"<details><summary>Exact disturbances</summary>{held}</details></article>"
     )
 
