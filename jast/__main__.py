@@ -14,7 +14,9 @@ import numpy as np
 from jast import actions, failures, nominal, plot, replay, rewards, save, simulators
 from jast.actions import UniformBox
 from jast.contract import check
+from jast.explain import cards
 from jast.intervals import clopper_pearson
+from jast.outline import outline
 from jast.rewards import likelihood
 from jast.search.cem import cem
 from jast.search.forest import forest
@@ -194,11 +196,21 @@ def _stress(options, own):
     archive = options.output / "failures.npz"
     failures.save(archive, report.failures, report.settings | dict(simulator=name))
     page = options.output / "report.html"
-    report.html(page)
+    report.html(page, explanations=_explained(options, sim, report))
     print(f"saved {path}\nsaved {archive}\nsaved {page}")
     if best is not None:
         _pictures(options, {"episode": lambda: _drawn(options, own, best, sim)})
     return 130 if "interrupted" in report.settings else 0
+
+
+def _explained(options, sim, report):
+    """What the page says of the modes: a tenth of the budget on top."""
+    about = outline(sim)
+    if not (report.modes and about.disturbance.quantile and about.start.quantile):
+        return ()
+    found = cards(jax.random.key(options.seed), sim, report.modes, options.budget // 10)
+    print(f"{found[0][0]}\n")
+    return found
 
 
 def _run(options):

@@ -12,6 +12,7 @@ import jast
 from benchmarks.stress_systems import slips
 from jast import explain
 from jast.distributions import Joint, Normal, Uniform
+from jast.search.failure_modes import Mode
 
 
 def sums(weights, limit, **changes):
@@ -245,3 +246,15 @@ def test_a_random_start_is_told_apart(key):
     m = explain.minimal(sim, e)
     assert [(step, name) for step, name, *_ in m.parts] == [(0, "x0")]
     assert bool(m.needed_start) and not m.needed.any()
+
+
+def test_cards_of_modes(key):
+    """A small budget leaves criticality out."""
+    sim = planted([2, 4], 8)
+    x = jnp.zeros(8).at[jnp.array([2, 4])].set(3.5)
+    one = Mode(jast.replay(sim, x), 1, 1.0)
+    ((m, c),) = explain.cards(key, sim, [one], 4000)
+    assert m.needed.sum() == 2 and c.draws == 2000 // 9
+    ((alone,),) = explain.cards(key, sim, [one], 200)
+    assert alone.needed.sum() == 2
+    assert explain.cards(key, sim, []) == []

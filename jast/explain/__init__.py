@@ -2,6 +2,7 @@
 
 from jast._doors import listed
 from jast.explain.attribution import Attribution, attribution
+from jast.explain.cards import cards
 from jast.explain.criticality import Criticality, criticality
 from jast.explain.differential import differential, regression
 from jast.explain.minimal import Minimal, minimal
@@ -13,6 +14,7 @@ __all__ = [
     "Minimal",
     "Sensitivity",
     "attribution",
+    "cards",
     "criticality",
     "differential",
     "minimal",

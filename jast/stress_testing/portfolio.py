@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -30,12 +31,8 @@ LEAST, ESTIMABLE, SMALL = 300, 5000, 20
 """Evaluations of a call, and of an estimate that finds its own proposal; numbers of an episode up
 to which a surrogate does with fewer.
 """
-NOMINAL, SEARCH, REFINE, PATHS = 0.05, 0.2, 0.15, 0.05
-"""Shares of the budget; the last is the most that a look at the modes may cost. What is left is for
-the probability. Without an estimate of its own all is divided between the first three.
-"""
-SEARCH_OF_FEW, FIRST_EXPLORER = 0.3, 100
-"""Of a small budget the share that the search may have until it has so many evaluations."""
+PATHS = 0.05
+"""Share of the budget that a look at the modes may cost at most."""
 FIRST, CALLS, FADING, FEW = 0.5, 6, 0.1, 2000
 """Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
 of its last gain is expected of one that gained nothing since; evaluations below which each explorer
@@ -97,6 +94,21 @@ def stress(
     return work.report(settings)
 
 
+class Shares(NamedTuple):
+    """Of the budget; what is left is for the probability."""
+
+    nominal: float
+    search: float
+    refine: float
+
+
+LARGE, BY_SURROGATE, NO_ESTIMATE = (
+    Shares(0.05, 0.2, 0.15),
+    Shares(0.05, 0.3, 0.35),
+    Shares(0.125, 0.5, 0.375),
+)
+
+
 class _Work:
     """What is known so far, and what it cost."""
 
@@ -109,9 +121,10 @@ class _Work:
         self.pool = self.failures = self.known = empty(sim)
         self.modes, self.tried, self.spent, self.invalid = Modes(), [], 0, 0
         self.residual = self.late = np.nan
-        self.estimable = self.latent and (
-            latent.dimension(sim) <= SMALL or (1 - NOMINAL - SEARCH - REFINE) * budget >= ESTIMABLE
-        )
+        large = (1 - sum(LARGE)) * budget >= ESTIMABLE
+        self.estimable = self.latent and (large or latent.dimension(sim) <= SMALL)
+        shares = (LARGE if large else BY_SURROGATE) if self.estimable else NO_ESTIMATE
+        self.parts = Shares(*(int(share * budget) for share in shares))
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
@@ -124,15 +137,11 @@ class _Work:
         self.watch.reach(min(self.spent, self.budget))
         self.watch.tell()
 
-    def share(self, part):
-        """Evaluations of a part of the search, of which there is more without an estimate."""
-        return int(self.budget * part / (1 if self.estimable else NOMINAL + SEARCH + REFINE))
-
     def look(self):
         """The system as it is."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
-            self.nominal = nominal(self.next_key(), self.sim, self.share(NOMINAL))
+            self.nominal = nominal(self.next_key(), self.sim, self.parts.nominal)
         quiet, n = self.nominal.undisturbed, self.nominal
         self.note("nominal", n.episodes, n.failing, invalid=n.invalid)
         if quiet is not None and bool(quiet.failure):
@@ -141,7 +150,7 @@ class _Work:
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
-        total = max(self.share(SEARCH), min(int(SEARCH_OF_FEW * self.budget), FIRST_EXPLORER))
+        total = self.parts.search
         end, few = self.spent + total, total < FEW
         first = explorers_of(self.sim, total if few else int(FIRST * total))
         gains = {name: self.explore(name, each) for name, each in first.items()}
@@ -178,7 +187,7 @@ class _Work:
             best = self.pool[0]
             self.modes = Modes([Mode(best, int(self.pool.counts.sum()), 1.0)])
             return
-        budget = self.share(REFINE)
+        budget = self.parts.refine
         chosen = self.pool
         for part in (1.0,) if budget < FEW else (0.6, 0.4):
             result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
@@ -216,7 +225,7 @@ class _Work:
             return
         known = self.known if len(self.known) else None
         if not len(self.pool):  # the estimate may find what the search did not
-            rest -= self.share(REFINE)
+            rest -= self.parts.refine
         rest = max(rest - self.counted(), few_calls.LEAST)
         p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
         self.probability = p
