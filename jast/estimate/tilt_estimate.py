@@ -27,9 +27,10 @@ GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
-COVERED, GUARD, THIN = 50.0, 0.15, 0.06
-"""As in `jast.estimate.seek`; what the search for lost failures may cost, of the budget; a part of
-the probability that may lie, by all batches, where the proposal does not cover it.
+COVERED, MET, GUARD, THIN = 50.0, 20, 0.15, 0.06
+"""As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
+what the search for lost failures may cost, of the budget; a part of the probability that may lie,
+by all batches, where the proposal does not cover it.
 """
 
 
@@ -78,10 +79,11 @@ def _lost(s, t, takes):
     if not size:
         s.reasons.append("the budget did not last to look for lost failure modes")
         return False
-    q, threshold = t.tilts(t.q), -t.log_mean - math.log(COVERED)
+    covered = math.log(max(COVERED, THIN * (s.budget - s.spent) / MET))
+    q, threshold = t.tilts(t.q), -t.log_mean - covered
     p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=room)
     share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
-    thin = t.thin(math.log(COVERED))
+    thin = t.thin(covered)
     s.note(
         f"guard (tilts): {share:.2%} of the probability is not covered, {thin:.2%} by its batches",
         p.evaluations,

@@ -7,6 +7,7 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast import results
+from jast._checks import number, whole
 from jast.episode import Episode, replay
 from jast.explain.point import Given, given, like_disturbances, names, steps_of
 from jast.simulator import Simulator
@@ -50,7 +51,14 @@ class Minimal(NamedTuple):
         return "\n".join(lines)
 
 
-def minimal(sim: Simulator, episode: Episode, *, orders: int = 8, budget: int = 5000) -> Minimal:
+def minimal(
+    sim: Simulator,
+    episode: Episode,
+    *,
+    orders: int = 8,
+    slack: float = 0.1,
+    budget: int = 5000,
+) -> Minimal:
     """Which disturbances of a failure are needed, and how large must they be?
 
     Disturbances are put back to the mode of their distribution for as long as the system still
@@ -65,6 +73,8 @@ def minimal(sim: Simulator, episode: Episode, *, orders: int = 8, budget: int = 
         episode: one failure, an `jast.Episode`.
         orders: in how many orders disturbances are tried, at least 1; the first is by size, the
             others are shuffled.
+        slack: the share by which disturbances may grow in place of those that are put back, 0 or
+            more: of a failure that was pulled to where it is likeliest none could be spared.
         budget: evaluations, at which the work ends with what it has by then. About 70 for each
             needed disturbance and order.
 
@@ -72,10 +82,15 @@ def minimal(sim: Simulator, episode: Episode, *, orders: int = 8, budget: int = 
         `Minimal`.
 
     Raises:
-        ValueError: where ``episode`` is not one failure of this simulator.
+        ValueError: for bad arguments, and where ``episode`` is not one failure of this simulator.
     """
-    g = given("minimal", sim, episode)
-    kept = _needed(g, max(1, orders), budget)
+    name = "minimal"
+    orders, budget = whole(name, "orders", orders, 1), whole(name, "budget", budget, 1)
+    slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
+    g = given(name, sim, episode)
+    if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:
+        g = farther
+    kept = _needed(g, orders, budget)
     v = _shrunk(g, np.where(kept, g.v, 0.0), budget)
     e = jax.device_get(latent.episodes(g.sim, np.asarray(v, g.judge.dtype)[None]))
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
