@@ -45,6 +45,7 @@ def test_names_in_the_tables_exist():
             "jast.actions",
             "jast.cross_entropy",
             "jast.estimate",
+            "jast.explain",
             "jast.rewards",
             "jast.plot",
         ), name

@@ -27,10 +27,10 @@ GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
-COVERED, MET, GUARD, THIN = 50.0, 20, 0.15, 0.06
+COVERED, MET, GUARD, THIN, WRONG = 50.0, 20, 0.15, 0.06, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
 what the search for lost failures may cost, of the budget; a part of the probability that may lie,
-by all batches, where the proposal does not cover it.
+by all batches, where the proposal does not cover it; standard errors that may be lost.
 """
 
 
@@ -96,6 +96,9 @@ def _lost(s, t, takes):
         return False
     most = int(min(GUARD * s.budget, REST * (s.budget - s.spent)))
     if not takes or most < t.batch:
+        # what is below the standard error of the last draws does not make their interval wrong
+        if share < WRONG / math.sqrt(t.promised * (s.budget - s.spent)):
+            return False
         s.reasons.append(
             f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
         )
