@@ -210,6 +210,25 @@ def test_sensitivity_of_the_landing(key):
     assert "elasticity" in str(found)
 
 
+def test_sensitivity_of_a_long_system(key):
+    """Thirty steps are drawn by tilts: of a sum of normals P = Phi(-limit / (s sqrt(30))), so that
+    d log P / d s is hazard * beta / s. Within 4 standard errors.
+    """
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=Partial(lambda spread, s: Normal(jnp.zeros_like(s), spread), jnp.asarray(1.0)),
+        evaluate=lambda s: (s >= 20.0, jnp.maximum(20.0 - s, 0.0)),
+        horizon=30,
+        episodic=True,
+    )
+    found = explain.sensitivity(sim, jast.estimate.failure_probability(key, sim, 20_000))
+    beta = 20 / math.sqrt(30)
+    hazard = math.exp(-(beta**2) / 2) / math.sqrt(2 * math.pi) / (math.erfc(beta / 2**0.5) / 2)
+    ((_, _, slope, error, _),) = found.rows
+    assert abs(slope - hazard * beta) < 4 * error and error < 0.05 * slope
+
+
 def test_bad_input(key):
     sim = sums(np.ones(3), 4.0)
     failing = jast.replay(sim, jnp.full(3, 2.0))

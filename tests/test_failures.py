@@ -2,6 +2,7 @@
 exactly what was saved, or says why not.
 """
 
+import csv
 import json
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from systems import PUBLISHED
 import jast
 from jast import failures as F
 from jast import files
-from jast.distributions import Independent, Joint, Normal
+from jast.distributions import Independent, Joint, MultivariateNormalDiag, Normal
 
 FERRY = jast.simulators.ferry()
 REWARD = jast.rewards.standard(event_bonus=30.0, density="mode")
@@ -418,3 +419,36 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, archive, seed):
         path.write_bytes(whole[:length])
         with pytest.raises(ValueError, match="damaged|not a jast archive"):
             F.load(path)
+
+
+def test_failures_as_plain_numbers(tmp_path):
+    """A stranger's program gets the same failure from the table: ten lines of plain Python."""
+    sim = jast.Simulator(
+        init=lambda x0: x0,
+        step=lambda s, x: s + x["gust"].sum() - x["pull"],
+        disturbance=lambda s: Joint(
+            dict(
+                gust=MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)),
+                pull=Normal(jnp.asarray(0.0), 1.0),
+            )
+        ),
+        evaluate=lambda s: (s >= 4, jnp.maximum(4 - s, 0.0)),
+        horizon=6,
+        start=lambda: Normal(jnp.asarray(0.0), 1.0),
+    )
+    found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+    arrays = jast.failures.to_numpy(found)
+    n = len(found)
+    assert arrays["x.gust"].shape == (n, 6, 2) and arrays["x0"].shape == (n,)
+    np.testing.assert_array_equal(arrays["length"], found.episodes.length)
+
+    path = tmp_path / "failures.csv"
+    jast.failures.to_csv(path, found)
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["failure"] == "3"]
+    state = float(rows[0]["x0"])
+    for row in rows[1:]:
+        state += float(row["x.gust[0]"]) + float(row["x.gust[1]"]) - float(row["x.pull"])
+    assert len(rows) == 1 + int(found[2].length) and state == pytest.approx(4, abs=4)
+    assert state >= 4 - 1e-5
+    assert float(rows[1]["x.pull"]) == float(found[2].disturbances["pull"][0])

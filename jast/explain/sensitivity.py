@@ -10,9 +10,10 @@ import numpy as np
 from jast import _checks, results
 from jast import limit_state as latent
 from jast.episode import replay
-from jast.estimate.batches import drawn, numbers
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
+from jast.estimate.markov_tilts import Tilts, shape
+from jast.estimate.redrawn import redrawn
 from jast.intervals import checked_level
 from jast.simulator import Simulator
 
@@ -88,7 +89,7 @@ def sensitivity(
     samples, level = _checks.whole(name, "samples", samples, LANES), checked_level(name, level)
     latent.check(name, sim)
     q = getattr(estimate, "proposal", None)
-    if not isinstance(q, latent.Latent) or q.means.shape[1] != latent.dimension(sim):
+    if not _fits(sim, q):
         raise ValueError(
             f"{name}: estimate must be one of failure_probability with a proposal for this"
             f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
@@ -102,7 +103,7 @@ def sensitivity(
     logs, scores = [], []
     for i in range(-(-samples // LANES)):
         own = jax.random.fold_in(key, i)
-        z, o, log_w, *_ = drawn(sim, q, *numbers(own, LANES, q.means.shape[1], q.means.dtype))
+        z, o, log_w = redrawn(own, sim, q, LANES)
         rows = np.flatnonzero(np.asarray(o.failure) & np.isfinite(log_w))
         if len(rows):
             # all lanes, so that there is one program
@@ -126,6 +127,13 @@ def sensitivity(
         bool(estimate.reliable and ess >= FEW),
         -(-samples // LANES) * LANES + len(s),
     )
+
+
+def _fits(sim: Simulator, q: Any) -> bool:
+    """Whether ``q`` is a proposal for this simulator."""
+    if isinstance(q, latent.Latent):
+        return q.means.shape[1] == latent.dimension(sim)
+    return isinstance(q, Tilts) and q.frame.centre.shape[0] == shape(sim).seen
 
 
 def _split(sim: Simulator) -> tuple[list, list, Any]:
