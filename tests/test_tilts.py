@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from scipy.stats import norm
 
 import jast
 from benchmarks.limit_states import autoregression_probability, ruin_probability
 from benchmarks.markov_systems import CASES
+from benchmarks.stress_systems import latch
 from jast import distributions as D
 from jast.distributions.parts import parts
 from jast.estimate import failure_probability, failure_samples
@@ -214,3 +216,24 @@ def test_long_first_passage(horizon):
     sim = autoregression(horizon=horizon)
     found = failure_probability(jax.random.key(0), sim, 30_000)
     assert good(found, autoregression_probability(0.1, 5.0, horizon)), str(found)
+
+
+@pytest.mark.parametrize("choice", [False, True])
+def test_what_is_decided_at_the_start(key, choice):
+    """Forty steps that change nothing: P = Phi(-3.5) of the start, within 4 standard errors."""
+    coin = D.Bernoulli(probs=jnp.asarray(0.1), dtype=jnp.int32)
+    sim = jast.Simulator(
+        init=lambda x0: x0,
+        step=lambda s, x: s + 0 * x.astype(s.dtype),
+        disturbance=lambda s: coin if choice else D.Normal(jnp.zeros(()), 1.0),
+        evaluate=lambda s: (s >= 3.5, jnp.maximum(3.5 - s, 0.0)),
+        horizon=40,
+        start=lambda: D.Normal(jnp.zeros(()), 1.0),
+    )
+    r = jast.estimate.failure_probability(key, sim, 20_000)
+    assert r.reliable and abs(r.mean / norm.sf(3.5) - 1) < 4 * r.relative_error
+
+
+def test_a_distance_that_tells_nothing_ends_flagged(key):
+    """Every state is as near as the start: nothing leads a tilt anywhere."""
+    assert not jast.estimate.failure_probability(key, latch(), 5000).reliable

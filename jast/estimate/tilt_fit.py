@@ -79,6 +79,8 @@ def frame_of(about: Shape, trace: Trace, length: np.ndarray, w: np.ndarray) -> F
     """The `Frame` of weighted traces: the miss distance, then the principal parts of what is left
     of the others, each of unit variance where it varies at all.
     """
+    if not length.any():  # all were over at their start
+        return unseen(about, len(trace.seen))
     live = np.arange(len(trace.seen))[:, None] < length[None]
     seen = trace.seen[live].astype(np.float64)
     each = np.broadcast_to(w[None], live.shape)[live]

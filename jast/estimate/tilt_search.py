@@ -264,6 +264,9 @@ def seek_tilts(s: TiltSeeker, most: int) -> None:
             s.take(b)
             break
         used = s.until(rows_of(b, level), level)
+        if not used.length.any():
+            s.history.append(f"tilts: every start is as near as {level:.3g}")
+            continue
         s.note(b, f"level {level:.4g}", used.log_weight)
         s.mixture = mixture_of(s, used, used.log_weight)
     s.refit(most, REFITS)
