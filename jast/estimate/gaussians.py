@@ -73,8 +73,7 @@ def _subspace(points, weights, count, anchors):
     inside = _like_noise(values, count)
     own = vectors[:, ~inside].T
     if anchors is not None and len(anchors):
-        nearest = np.argmax(points @ anchors.T - 0.5 * (anchors**2).sum(axis=1), axis=1)
-        share = np.bincount(nearest, weights, len(anchors))
+        share = np.bincount(nearest(points, anchors), weights, len(anchors))
         own = np.concatenate([anchors[share > 0.01], own])
     spanning = np.concatenate([mean[None], own])
     basis, size, _ = np.linalg.svd(spanning.T)
@@ -166,6 +165,26 @@ def effective(log_weights):
     """(sum w)^2 / sum w^2."""
     w = np.exp(log_weights - log_weights.max())
     return w.sum() ** 2 / (w**2).sum()
+
+
+def tempered(log_w, least):
+    """The greatest power, at most 1, of the weights that leaves an effective number of
+    ``least``.
+    """
+    if effective(log_w) >= least:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if effective(middle * log_w) >= least else (low, middle)
+    return low
+
+
+def nearest(points, centres):
+    """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n,
+    D].
+    """
+    return np.argmax(product(points, centres.T) - 0.5 * (centres**2).sum(axis=1), axis=1)
 
 
 def log_density(g, z):

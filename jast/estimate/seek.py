@@ -15,11 +15,19 @@ from jast import limit_state as latent
 from jast.counter import generator
 from jast.estimate.batches import Batch, balanced, drawn, numbers, over_batches
 from jast.estimate.design_points import design_points, distinct
-from jast.estimate.gaussians import Gaussians, as_latent, effective, fit, together, unit
+from jast.estimate.gaussians import (
+    Gaussians,
+    as_latent,
+    effective,
+    fit,
+    nearest,
+    tempered,
+    together,
+    unit,
+)
 from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore
 from jast.incidents import hosted
-from jast.products import product
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
@@ -211,9 +219,9 @@ def _fit(s):
     s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
     s.rare = s.log_mean < RARE
     points, centres = s.filled(*_failing(s.batches)), s.centres()
-    owner = _nearest(points, centres)
+    owner = nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW
-    owner = _nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
+    owner = nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
     # the second moment of the weights under another proposal, by the points at hand: sum of w p / q
     variance = lambda q: np.logaddexp.reduce(log_w - over_batches(q, s.batches))
     choices = {"as it was": s.q, "modes": _by_owner(s, points, log_w, owner)}
@@ -252,7 +260,7 @@ def _by_owner(s, points, log_w, owner):
             continue
         # few great weights would make a mixture fit their own noise: a power below 1 of them leads
         # the same way, in more batches
-        power = _power(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
+        power = tempered(log_w[rows], min(max(200, 5 * s.dimension), 0.5 * len(rows)))
         v = np.exp(power * (log_w[rows] - log_w[rows].max()))
         g = fit(
             s.rng,
@@ -271,13 +279,6 @@ def _by_owner(s, points, log_w, owner):
     )
 
 
-def _nearest(points, centres):
-    """Which of ``centres`` [m, D] as a unit Gaussian has most likely made each of ``points`` [n,
-    D].
-    """
-    return np.argmax(product(points, centres.T) - 0.5 * (centres**2).sum(axis=1), axis=1)
-
-
 def _defended(g, low, rare):
     """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the
     model.
@@ -290,16 +291,3 @@ def _defended(g, low, rare):
         else [(1 - model, g)]
     )
     return [*parts, (model, unit(np.zeros((1, d))))] if model else parts
-
-
-def _power(log_w, least):
-    """The greatest power, at most 1, of the weights that leaves an effective number of
-    ``least``.
-    """
-    if effective(log_w) >= least:
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(30):
-        middle = (low + high) / 2
-        low, high = (middle, high) if effective(middle * log_w) >= least else (low, middle)
-    return low

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast.counter import generator
-from jast.estimate.gaussians import effective
+from jast.estimate.gaussians import effective, tempered
 from jast.estimate.markov_tilts import Tilts, Trace, features, played, shape
 from jast.estimate.tilt_fit import (
     as_tilts,
@@ -285,19 +285,9 @@ def mixture_of(s: TiltSeeker, used: Drawn, log_w: np.ndarray, of: Any = None) ->
     for part, mass in zip(of.T, masses / masses.sum(), strict=True):
         with np.errstate(divide="ignore"):
             own = np.maximum(log_w + np.log(part), log_w.max() - 500)
-        power = _power(own, min(200, 0.3 * part.sum()))
+        power = tempered(own, min(200, 0.3 * part.sum()))
         v = np.exp(power * (own - own.max()))
         one = fit(rows, v, effective(power * own), s.model)
         tilts += [one, scaled(one, HALF)]
         weights += [mass * (1 - MODEL - WIDE), mass * WIDE]
     return tilts, weights, frame
-
-
-def _power(log_w, least):
-    if effective(log_w) >= least:
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(30):
-        middle = (low + high) / 2
-        low, high = (middle, high) if effective(middle * log_w) >= least else (low, middle)
-    return low
