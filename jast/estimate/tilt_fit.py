@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jast.estimate.gaussians import log_sum
 from jast.estimate.markov_tilts import (
     Block,
     Frame,
@@ -258,7 +259,7 @@ def _logits(x, target, log_p, w, ridge, start=None):
 
     def value(out):
         log_q = log_p + x @ out
-        log_q = log_q - _log_sum(log_q)[:, None]
+        log_q = log_q - log_sum(log_q)[:, None]
         with np.errstate(invalid="ignore"):
             each = np.where(target > 0, target * log_q, 0).sum(axis=1)
         return w @ each - 0.5 * ridge @ (out**2).sum(axis=1), np.exp(log_q)
@@ -300,19 +301,14 @@ def _ratio(block, rows, floor):
             mine = rows.own[:, a] == c
             x, z, gates = rows.x[mine], rows.normals[mine, a], block.gates[:, c, a]
             of = block.means[:, c, a], gates, block.scales[c, a]
-            out[mine] += _log_sum(_joint(x, z, *of)) - _log_sum(x @ gates)
+            out[mine] += log_sum(_joint(x, z, *of)) - log_sum(x @ gates)
     for j in range(rows.choices.shape[1]):
         log_p = rows.log_p[:, j]
         log_q = np.where(log_p > -np.inf, np.maximum(log_p, floor), -np.inf)
         log_q = log_q + _with_surprise(rows, j) @ block.shifts[:, j]
         at = lambda a: np.take_along_axis(a, rows.choices[:, j, None], axis=1)[:, 0]  # noqa: B023
-        out += at(log_q) - _log_sum(log_q) - at(log_p)
+        out += at(log_q) - log_sum(log_q) - at(log_p)
     return out
-
-
-def _log_sum(a):
-    top = a.max(axis=1)
-    return top + np.log(np.exp(a - top[:, None]).sum(axis=1))
 
 
 def nothing(about: Shape, count: int, gates: int) -> Tilt:
