@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pictures import drawn, matplotlib, plt
+from systems import dice, ring
 
 import jast
 from jast import plot
@@ -90,10 +91,31 @@ def test_disturbances_of_any_structure():
     axes = plot.disturbances(jast.rollout(jax.random.key(0), sim))
     assert [len(drawn(ax).lines) for ax in axes] == [1, 3, 9] and [
         ax.get_ylabel() for ax in axes
-    ] == ["x['a']", "x['b']", "x['c']"]
+    ] == ["a", "b", "c"]
     with pytest.raises(ValueError, match="plot.disturbances: axes must be at least 3"):
         plot.disturbances(jast.rollout(jax.random.key(0), sim), plt.figure().subplots())
     drawn(plot.disturbances(jast.replay(FERRY, jnp.zeros((0,))))[0])
+
+
+def test_disturbances_by_how_far_out_they_are():
+    """A normal number by its standard deviations from its mode, a choice by its rarity."""
+    sim = ring()
+    x = {
+        "gust": jnp.array([[0.5, -1.0], [0.0, 0.25]]),
+        "hit": jnp.array([1, 0]),
+    }
+    e = jast.replay(sim, x, {"gust": jnp.asarray(-2.0), "hit": jnp.asarray(1)})
+    axes = plot.disturbances(e, sim=sim)
+    assert [drawn(ax).get_ylabel() for ax in axes] == ["x0 gust", "x0 hit", "gust", "hit"]
+    lines = [[line.get_ydata() for line in ax.lines] for ax in axes]
+    np.testing.assert_allclose(lines[0], [[-2.0]], atol=1e-5)
+    np.testing.assert_allclose(lines[1], [[0.0]], atol=1e-5)
+    np.testing.assert_allclose(lines[2], [[1.0, 0.0], [-2.0, 0.5]], atol=1e-5)
+    rare = np.sqrt(2 * np.log(0.6 / 0.4))
+    np.testing.assert_allclose(lines[3], [[rare, 0.0]], atol=1e-5)
+    assert "standard deviations" in axes[0].get_title(loc="left")
+    with pytest.raises(ValueError, match="plot.disturbances: disturbance.*no quantile function"):
+        plot.disturbances(jast.rollout(jax.random.key(0), dice()), sim=dice())
 
 
 def test_distances():

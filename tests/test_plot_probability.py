@@ -15,6 +15,7 @@ from jast import plot
 from jast.estimate import Exceedance, FailureSamples, Traces, pareto_k
 from jast.estimate.estimate import Estimate
 from jast.plot.style import BLUE, VERMILION
+from jast.search.failure_modes import Mode, Modes
 
 WALK = jast.simulators.walk1d()
 FEW = jax.device_get(
@@ -162,20 +163,39 @@ def test_a_fan_of_miss_distances():
     assert plot.failure_fan(FAILED, WALK, ax=given) is given
 
 
+def test_a_fan_by_mode_and_of_a_field():
+    """A colour and a mark for each mode; a field by its name; one episode is a fan of one."""
+    few = jax.tree.map(lambda a: a[:4], FAILED)
+    ax = drawn(
+        plot.failure_fan(few, WALK, "state", modes=np.array([0, 2, 0, 7]), units=dict(state="m"))
+    )
+    assert legend(ax) == ["mode 1: 2 failures", "mode 3: 1 failure", "mode 8: 1 failure"]
+    assert ax.get_ylabel() == "state (m)"
+    marks = [line for line in ax.lines if line.get_linestyle() == "None"]
+    assert [line.get_marker() for line in marks] == ["o", "^", "x"]
+    assert len({line.get_color() for line in marks}) == 3
+    only = jax.tree.map(lambda a: a[0], FAILED)
+    assert len(plot.failure_fan(only, WALK).lines) == 3
+    heads = Modes([Mode(jax.tree.map(lambda a, i=i: a[i], FAILED), 1, 0.5) for i in (0, 1)])
+    ax = plot.failure_fan(jax.tree.map(lambda a: a[:2], FAILED), WALK, modes=heads)
+    assert legend(ax) == ["mode 1: 1 failure", "mode 2: 1 failure"]
+    assert legend(plot.failure_fan(heads, WALK)) == legend(ax)
+
+
 def test_a_fan_refuses():
     for other in (
-        jax.tree.map(lambda a: a[0], FEW),
         jax.tree.map(lambda a: a[:0], FEW),
         FEW.length,
         SimpleNamespace(),
     ):
-        with pytest.raises(
-            ValueError,
-            match=(
-                "plot.failure_fan: samples must be FailureSamples or Episodes with one leading axis"
-            ),
-        ):
+        with pytest.raises(ValueError, match="plot.failure_fan: samples must be failures"):
             plot.failure_fan(other, WALK)
+    with pytest.raises(ValueError, match="plot.failure_fan: sim must be the jast.Simulator"):
+        plot.failure_fan(FAILED)
+    with pytest.raises(ValueError, match="plot.failure_fan: fields must be among .*'speed'"):
+        plot.failure_fan(FAILED, WALK, "speed")
+    with pytest.raises(ValueError, match="plot.failure_fan: modes must be"):
+        plot.failure_fan(FAILED, WALK, modes=[0])
     with pytest.raises(ValueError, match="plot.failure_fan: most must be"):
         plot.failure_fan(FAILED, WALK, most=0)
     with pytest.raises(

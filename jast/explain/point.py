@@ -8,6 +8,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast.distributions.numbers import unflat
 from jast.episode import Episode
+from jast.fields import called, entries
 from jast.judge import Judge
 from jast.outline import outline
 from jast.pytrees import count
@@ -86,6 +87,5 @@ def names(sim: Simulator) -> list[str]:
 def _named(like, root):
     out = []
     for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
-        name = jax.tree_util.keystr(path, simple=True, separator=".") or root
-        out += [name + (str(list(at)) if s.shape else "") for at in np.ndindex(s.shape)]
+        out += [called(path, root) + entry for entry in entries(s.shape)]
     return out

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jast.episode import Episode, replay
+from jast.fields import fields
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
@@ -85,21 +86,14 @@ def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
     ``late``: row 0 is of step 1, and step 0 has none.
     """
     found = []
-    for path, a in jax.tree_util.tree_leaves_with_path(tree):
-        a = np.asarray(a)
-        if a.dtype.kind not in "fiub" and not np.can_cast(a.dtype, float, "same_kind"):
-            continue
-        if not a.size:
-            continue
-        flat = a.reshape(len(a), -1)
-        names = [str(list(index)) if index else "" for index in np.ndindex(a.shape[1:])]
+    for called, places, flat in fields(tree, name):
         column = lambda j, flat=flat: short(
             [np.nan if t < late else float(flat[t - late, j]) for t in steps]
         )
         found.append(
             {
-                "name": jax.tree_util.keystr(path, simple=True, separator=".") or name,
-                "entries": names[:ENTRIES],
+                "name": called,
+                "entries": places[:ENTRIES],
                 "more": max(0, flat.shape[1] - ENTRIES),
                 "columns": [column(j) for j in range(min(flat.shape[1], ENTRIES))],
             }

@@ -5,10 +5,10 @@ Every function draws into the ``ax`` (or ``axes``) it is given, or into a new fi
 the axes. What is drawn comes first, then its simulator where a picture needs it. The colours are
 Okabe and Ito's, told apart by colour-blind readers; what matters is told by shape or words as well.
 
-Of any system: `history`, `trials`, `trial_distances`, `disturbances`, `distances`; of a search tree
-`tree`, and `tree_page`, an HTML file. Of one simulator: `ferry`; `fms`; `colav`, `colav_story`,
-`colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`,
-`surrogate_samples`. Of failure probabilities: `probability`, `exceedance`, `failure_fan`,
+Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
+`trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
+`ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
+`proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `exceedance`,
 `weights`, `levels`. Of failure policies: `training`. Of weakness recognition: `failures_found`,
 `roc`, `failure_grid`, `influence`.
 """
@@ -18,11 +18,13 @@ from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.exceedance import exceedance
 from jast.plot.failing_inputs import failure_grid, influence
+from jast.plot.fan import failure_fan
 from jast.plot.ferry import ferry
 from jast.plot.fms import fms
 from jast.plot.general import distances, disturbances, history
 from jast.plot.learning import levels, training
-from jast.plot.probability import failure_fan, probability, weights
+from jast.plot.probability import probability, weights
+from jast.plot.states import phase, traces
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.tree import tree, tree_page
 from jast.plot.trials import trial_distances, trials
@@ -46,10 +48,12 @@ __all__ = [
     "history",
     "influence",
     "levels",
+    "phase",
     "probability",
     "proposal_contours",
     "roc",
     "surrogate_samples",
+    "traces",
     "training",
     "tree",
     "tree_page",

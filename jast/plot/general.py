@@ -2,11 +2,17 @@
 came.
 """
 
+from typing import Any
+
 import jax
 import numpy as np
 
-from jast.episode import Episode
+from jast import limit_state as latent
+from jast.distributions.spread import spread
+from jast.episode import Episode, replay
+from jast.fields import fields
 from jast.plot import style
+from jast.simulator import Simulator
 
 __all__ = ["disturbances", "distances", "history"]
 
@@ -73,39 +79,86 @@ def history(results, ax=None, total=False):
     return ax
 
 
-def disturbances(episode, axes=None):
+def disturbances(
+    episode: Episode,
+    axes: Any = None,
+    *,
+    sim: Simulator | None = None,
+    units: dict | None = None,
+) -> list:
     """The disturbances of one `Episode` over its steps, a panel for each array of x, a line for
-    each of its numbers. Returns the list of Axes.
+    each of its numbers.
+
+    Args:
+        episode: one.
+        axes: one for each array, or None for a new figure.
+        sim: its simulator: then each number is drawn by how far out it is, so that numbers of
+            all kinds compare. 0 is the mode; 1 is as far as one standard deviation of a normal
+            number. Numbers go by the quantile map of their distribution. A choice has no order: it
+            stands at sqrt(2 (log p of the likeliest - log p)), which for a normal number is the
+            same distance. Panels of x0, at step 0, come first. Grey: up to 1 and up to 2.
+        units: name -> unit, for the labels; not where ``sim`` is given.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for no or many episodes, too few axes, and a simulator with a distribution that
+            has no quantile function.
     """
     style.one("disturbances", episode)
     n = int(episode.length)
+    if sim is None:
+        first, steps = (), episode.disturbances
+    else:
+        latent.check("plot.disturbances", sim)
+        first, steps = jax.device_get(_spreads(sim, episode._replace(states=None)))
     panels = [
-        (jax.tree_util.keystr(path) or "x", np.asarray(a))
-        for path, a in jax.tree_util.tree_leaves_with_path(episode.disturbances)
+        (f._replace(name=f.name if f.name.startswith("x0") else f"x0 {f.name}"), 0)
+        for f in fields(first, "x0", lead=0)
     ]
-    with style.axes(axes, (6.8, 1.4 + 2.0 * max(len(panels), 1)), max(len(panels), 1)) as axes:
+    panels += [(f, 1) for f in fields(steps, "x")]
+    count = max(len(panels), 1)
+    with style.axes(axes, (6.8, 1.4 + 2.0 * count), count) as axes:
         axes = style.panels("disturbances", axes, len(panels), "array of x")
-        for ax, (name, a) in zip(axes, panels, strict=False):
-            rows = a[:n].reshape(n, -1) if n else np.zeros((0, int(np.prod(a.shape[1:]))))
+        for ax, ((name, places, values), begin) in zip(axes, panels, strict=False):
+            rows = values[:n] if begin else values[None]
             few = rows.shape[1] <= len(style.COLOURS)
+            if sim is not None:
+                for reach, alpha in ((2, 0.1), (1, 0.12)):
+                    ax.axhspan(-reach, reach, color=style.GREY, alpha=alpha, linewidth=0, zorder=0)
             for i, row in enumerate(rows.T):
                 colour = style.COLOURS[i] if few else style.shade(i / (rows.shape[1] - 1))
                 ax.plot(
-                    np.arange(1, n + 1),
+                    np.arange(begin, begin + len(row)),
                     row,
                     color=colour,
-                    marker="o",
-                    markersize=3.5 if few else 0,
-                    label=f"{i}",
+                    marker=style.MARKERS[i] if few else "o",
+                    markersize=3.5 if few or not begin else 0,
+                    label=places[i],
                     linewidth=1.6 if few else 0.9,
                 )
-            if few and 1 < rows.shape[1] and n:
+            if few and 1 < rows.shape[1] and rows.size:
                 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="entry")
-            ax.set(ylabel=f"x{name}" if name != "x" else "x", xlim=(0.5, max(n, 1) + 0.5))
+            ax.set(
+                ylabel=style.labelled(name, units if sim is None else None),
+                xlim=(-0.5 if panels and not panels[0][1] else 0.5, max(n, 1) + 0.5),
+            )
             ax.xaxis.get_major_locator().set_params(integer=True)
         axes[len(panels) - 1].set_xlabel("step")
-        axes[0].set_title(style.headline("Disturbances", episode))
+        what = "Disturbances" if sim is None else "Disturbances in standard deviations"
+        axes[0].set_title(style.headline(what, episode))
     return axes
+
+
+@jax.jit
+def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
+    """How far out x0 and each disturbance [T, ...] of an episode are."""
+    states = jax.tree.map(lambda a: a[:-1], replay(sim, episode).states)
+    rows = jax.tree.leaves(episode.disturbances)[0].shape[0]
+    states = jax.tree.map(lambda a: a[:rows], states)
+    steps = jax.vmap(lambda s, x: spread(sim.disturbance(s), x))(states, episode.disturbances)
+    return spread(sim.start(), episode.x0) if jax.tree.leaves(episode.x0) else (), steps
 
 
 def distances(*episodes, labels=None, bins=40, ax=None):

@@ -1,22 +1,13 @@
-"""Pictures of `jast.estimate`: probabilities and their intervals, what failures look like, and
-whether the weights can be trusted.
+"""Pictures of `jast.estimate`: probabilities and their intervals, and whether the weights can be
+trusted.
 """
 
-from collections.abc import Callable
-from typing import Any
-
-import jax
 import numpy as np
 
-from jast._checks import whole
-from jast.episode import Episode, replay
-from jast.estimate import Estimate, FailureSamples, Traces, pareto_k
-from jast.failures import Failures
+from jast.estimate import Estimate, Traces, pareto_k
 from jast.plot import style
-from jast.search.result import SearchResult
-from jast.simulator import Simulator
 
-__all__ = ["failure_fan", "probability", "weights"]
+__all__ = ["probability", "weights"]
 
 
 def probability(estimates, truth=None, ax=None):
@@ -88,85 +79,6 @@ def probability(estimates, truth=None, ax=None):
                 ncols=3,
                 fontsize=9,
             )
-    return ax
-
-
-@style.result_first
-def failure_fan(
-    samples: SearchResult | Failures | FailureSamples | Episode,
-    sim: Simulator,
-    value: Callable[[Any], Any] | None = None,
-    nominal: Episode | None = None,
-    ax: Any = None,
-    most: int = 200,
-    label: str | None = None,
-) -> Any:
-    """How a number of the state runs to failure, a line an episode with a mark where it fails, in
-    two colours where some end above 0 and others below.
-
-    Args:
-        samples: a result of a search, its archive, `jast.estimate.FailureSamples`, or a batch of
-            `Episode` with one leading axis; each is replayed.
-        sim: their simulator.
-        value: state -> number (default: the miss distance).
-        nominal: a batch of other episodes, grey and behind.
-        most: of a batch are drawn, evenly taken.
-        label: of the axis (default: the name of ``value``).
-
-    Returns:
-        The Axes.
-
-    Raises:
-        ValueError: for samples of another kind, a value that is not one number, and ``most`` below
-            1.
-    """
-    caller = "failure_fan"
-    samples = samples.failures if isinstance(samples, SearchResult | FailureSamples) else samples
-    samples = samples.episodes if isinstance(samples, Failures) else samples
-    lines = _lines(caller, "samples", sim, samples, value, most)
-    behind = [] if nominal is None else _lines(caller, "nominal", sim, nominal, value, most)
-    with style.axes(ax, (6.8, 3.8)) as ax:
-        for i, line in enumerate(behind):
-            ax.plot(
-                line,
-                color=style.GREY,
-                linewidth=0.6,
-                alpha=0.5,
-                zorder=2,
-                label="_" if i else f"{len(behind)} nominal episodes",
-            )
-        up = np.array([line[-1] > 0 for line in lines], bool)
-        both = up.any() and (~up & (np.array([line[-1] for line in lines]) < 0)).any()
-        for side, colour, marker in (
-            ((True, style.BLUE, "^"), (False, style.VERMILION, "v"))
-            if both
-            else ((None, style.BLUE, "o"),)
-        ):
-            own = [
-                line for line, above in zip(lines, up, strict=True) if side is None or above == side
-            ]
-            name = (
-                f"{len(own)} failures"
-                if side is None
-                else f"{len(own)} of {len(lines)} failures {'above' if side else 'below'} 0"
-            )
-            alpha = float(np.clip(12 / len(own), 0.12, 0.8))
-            for line in own:
-                ax.plot(line, color=colour, linewidth=0.8, alpha=alpha, zorder=3)
-            ends = [len(line) - 1 for line in own], [line[-1] for line in own]
-            ax.plot(
-                *ends,
-                linestyle="",
-                marker=marker,
-                markersize=3.5,
-                color=colour,
-                alpha=min(2 * alpha, 1),
-                zorder=4,
-            )
-            ax.plot([], [], color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
-        ax.set(xlabel="step", ylabel=label or _name(value), xlim=(0, None))
-        ax.xaxis.get_major_locator().set_params(integer=True)
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
     return ax
 
 
@@ -242,14 +154,6 @@ def weights(traces, ax=None):
     return ax
 
 
-def _name(value):
-    """What a picture calls a number of the state."""
-    if value is None:
-        return "miss distance"
-    name = getattr(value, "__name__", "<lambda>")
-    return "number of the state" if name == "<lambda>" else name.replace("_", " ")
-
-
 def _row(ax, e, y, interval):
     """One estimate at the height ``y``."""
     low, high = e.interval
@@ -297,34 +201,3 @@ def _words(row):
     if np.isnan(e.mean):
         return f"below {e.interval[1]:.3g}" if e.interval[1] < 1 else "no failure seen"
     return f"{e.mean:.3g}  " + ("UNRELIABLE" if bad else f"SE {100 * e.relative_error:.2g} %")
-
-
-def _lines(caller, name, sim, episodes, value, most):
-    """[steps + 1] of the value for each episode."""
-    if (
-        not isinstance(episodes, Episode)
-        or np.ndim(episodes.length) != 1
-        or not len(episodes.length)
-    ):
-        received = (
-            f"leading axes {np.shape(episodes.length)}"
-            if isinstance(episodes, Episode)
-            else type(episodes).__name__
-        )
-        raise ValueError(
-            f"plot.{caller}: {name} must be FailureSamples or Episodes with one leading axis,"
-            f" received {received}"
-        )
-    rows = np.unique(
-        np.linspace(0, len(episodes.length) - 1, whole(f"plot.{caller}", "most", most)).astype(int)
-    )
-    few = jax.tree.map(lambda a: np.asarray(a)[rows], episodes._replace(states=None))
-    number = value if value is not None else lambda s: sim.evaluate(s)[1]
-    out = np.asarray(
-        jax.jit(jax.vmap(lambda e: jax.vmap(number)(replay(sim, e).states)))(few), float
-    )
-    if out.ndim != 2:
-        raise ValueError(
-            f"plot.{caller}: value must return one number, received shape {out.shape[2:]}"
-        )
-    return [row[: int(n) + 1] for row, n in zip(out, few.length, strict=True)]

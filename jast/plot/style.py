@@ -142,6 +142,18 @@ def result_first(picture: Callable[..., Any]) -> Callable[..., Any]:
     return either
 
 
+def labelled(name, units):
+    """A label: the name of a number, or of the array that it is of, with its unit where given."""
+    array = name.partition("[")[0]
+    unit = (units or {}).get(name, (units or {}).get(array))
+    return f"{name} ({unit})" if unit else name
+
+
+def look(i):
+    """The colour and the marker of the kind number ``i``; grey from the seventh on."""
+    return (COLOURS[i], MARKERS[i]) if i < len(COLOURS) else (GREY, "x")
+
+
 def panels(caller, axes, least, each):
     """The axes as a flat list, or a ValueError where they are fewer than ``least``, one for
     ``each``.

@@ -148,6 +148,18 @@ def nearest(w, v):
     return np.argmax(unit(w) @ unit(v).T, axis=1)
 
 
+def owners(sim: Simulator, episodes: Episode, modes: Modes) -> np.ndarray:
+    """Of each of the failures ``episodes`` [n] the number of the mode, from 0, whose likeliest
+    failure it points most nearly to: [n]. Paths are not looked for, so nothing is evaluated; of
+    the mode's own failure it is that mode.
+    """
+    sim = centred(sim)
+    each = [m.failure._replace(states=None) for m in modes]
+    heads = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+    v, w = (np.asarray(normal_of(sim, e), np.float64) for e in (heads, episodes))
+    return nearest(w, v)
+
+
 class Paths:
     """Looks for paths of failures between points of ``sim``, `jast.search.centred`, for at most
     ``budget`` evaluations.

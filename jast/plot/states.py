@@ -1,0 +1,204 @@
+"""Episodes of any system: how its numbers went, against what they do by chance, and one number over
+another.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from jast.plot import style
+from jast.plot.played import (
+    DISTANCE,
+    Given,
+    Lines,
+    chosen,
+    given,
+    kind_words,
+    kinds,
+    lines,
+    nominal_lines,
+    quiet_line,
+)
+
+__all__ = ["draw_traces", "phase", "traces"]
+
+PANELS = 8
+BANDS = ((0.05, 0.95, 0.15), (0.25, 0.75, 0.35))
+"""Quantiles and opacity."""
+DASHED = (0, (4, 2))
+
+
+@style.result_first
+def traces(
+    samples: Any,
+    sim: Any = None,
+    fields: Any = None,
+    *,
+    modes: Any = None,
+    nominal: Any = None,
+    units: dict | None = None,
+    most: int = 60,
+    axes: Any = None,
+) -> list:
+    """How the numbers of the state went in failures, a panel each, against the ordinary: grey bands
+    from the 5 to the 95 % and from the 25 to the 75 % quantile of nominal episodes (of those that
+    still run), dashed the undisturbed system. A mark ends each failure; its colour is its mode.
+
+    Args:
+        samples: a report of `jast.stress`, its modes, a result of a search, its archive,
+            `jast.estimate.FailureSamples`, an `Episode` or a batch of them. Each is replayed.
+        sim: their simulator; not needed with a report that holds it.
+        fields: names to draw: "speed", "position[0]", or "position" for all its numbers; "miss
+            distance"; "disturbance gust". Default: the first seven numbers that move, and the
+            miss distance; of a black box that is judged at its end, its disturbances.
+        modes: `jast.search.Modes`, by which failures are told apart (by direction), or the number
+            of the mode of each, from 0. Default: those of a report.
+        nominal: an `Episode` batch, or how many to draw with key 0. Default: 200; of a black box
+            none.
+        units: name -> unit, for the labels.
+        most: failures drawn, evenly taken.
+        axes: one for each field, or None for a new figure.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for samples of another kind, and a field that there is not.
+    """
+    caller = "traces"
+    g = given(caller, samples, sim, modes, most)
+    own = lines(g.sim, g.episodes)
+    names = chosen(caller, fields, own, PANELS)
+    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
+    columns = 1 if len(names) < 4 else 2
+    rows = -(-len(names) // columns)
+    size = (6.8, 1.1 + 1.9 * rows) if columns == 1 else (9.6, 1.0 + 1.75 * rows)
+    new = axes is None
+    with style.axes(axes, size, rows, columns) as axes:
+        axes = style.panels(caller, axes, len(names), "field")
+        for ax in axes[len(names) :]:
+            ax.remove()
+        axes = axes[: len(names)]
+        draw_traces(axes, names, g, own, behind, quiet, units)
+        for ax in axes[-columns:]:
+            ax.set_xlabel("step")
+            ax.tick_params(labelbottom=True)
+        handles, words = axes[0].get_legend_handles_labels()
+        if new:
+            axes[0].figure.legend(handles, words, loc="outside upper left", ncols=3, fontsize=9)
+        else:
+            axes[0].legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
+    return axes
+
+
+def draw_traces(
+    axes: list,
+    names: list[str],
+    g: Given,
+    own: Lines,
+    behind: Lines | None,
+    quiet: Lines | None,
+    units: dict | None = None,
+) -> None:
+    """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend."""
+    last = int(own.length.max())
+    for ax, name in zip(axes, names, strict=True):
+        if behind is not None and name in behind.columns:
+            _bands(ax, behind.columns[name][:, : last + 1], len(behind.length))
+        if quiet is not None and name in quiet.columns:
+            row = quiet.columns[name][0, : last + 1]
+            ax.plot(row, color=style.INK, linewidth=1.3, linestyle=DASHED, label="undisturbed")
+        for kind, rows in kinds(g):
+            colour, marker = style.look(kind)
+            alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
+            label = kind_words(g, kind, len(rows))
+            for i in rows:
+                line, n = own.columns[name][i], own.length[i]
+                ax.plot(line, color=colour, linewidth=1.4, alpha=alpha, zorder=3)
+                ax.plot(
+                    n, line[n], color=colour, marker=marker, markersize=4.5, alpha=alpha, zorder=4
+                )
+            look = dict(color=colour, marker=marker, markersize=4.5, linewidth=1.4)
+            ax.plot([], [], label=label, **look)
+        if name == DISTANCE:
+            ax.axhline(0, color=style.GREY, linewidth=0.8, zorder=1)
+        ax.set(ylabel=style.labelled(name, units), xlim=(0, max(last, 1)))
+        ax.margins(x=0.02)
+        ax.xaxis.get_major_locator().set_params(integer=True)
+
+
+def _bands(ax: Any, rows: np.ndarray, n: int) -> None:
+    at = np.flatnonzero(np.isfinite(rows).any(axis=0))
+    if not len(at):
+        return
+    for low, high, alpha in BANDS:
+        edges = np.nanquantile(rows[:, at], (low, high), axis=0)
+        label = f"{high - low:.0%} of {n} nominal episodes"
+        ax.fill_between(at, *edges, color=style.GREY, alpha=alpha, linewidth=0, label=label)
+
+
+@style.result_first
+def phase(
+    samples: Any,
+    sim: Any = None,
+    fields: tuple[str, str] | None = None,
+    *,
+    modes: Any = None,
+    nominal: Any = None,
+    units: dict | None = None,
+    most: int = 60,
+    ax: Any = None,
+) -> Any:
+    """Phase portrait: one number of the state over another. Failures in the colours of their modes,
+    a square where each starts and a mark where it ends; grey nominal episodes, dashed the
+    undisturbed one.
+
+    Args:
+        samples, sim, modes, nominal, units, most: as of `traces`.
+        fields: two names, across and up. Default: the first two numbers that move.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: as `traces`, and where there are not two fields.
+    """
+    caller = "phase"
+    g = given(caller, samples, sim, modes, most)
+    own = lines(g.sim, g.episodes)
+    names = chosen(caller, fields, own, PANELS)
+    if fields is None:
+        names = [k for k in names if k != DISTANCE] + [DISTANCE] * (DISTANCE in names)
+        names = names[:2]
+    if len(names) != 2:
+        raise ValueError(f"plot.{caller}: fields must be two names, received {names}")
+    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
+    with style.axes(ax, (6.2, 5.2)) as ax:
+        if behind is not None:
+            across, up = (behind.columns[k] for k in names)
+            alpha = float(np.clip(15 / len(across), 0.05, 0.6))
+            for i in range(len(across)):
+                ax.plot(across[i], up[i], color=style.GREY, linewidth=0.8, alpha=alpha, zorder=1)
+            label = f"{len(across)} nominal episodes"
+            ax.plot([], [], color=style.GREY, linewidth=1.2, label=label)
+        if quiet is not None:
+            row = [quiet.columns[k][0] for k in names]
+            look = dict(color=style.INK, linewidth=1.3, linestyle=DASHED)
+            ax.plot(*row, **look, label="undisturbed", zorder=3)
+        for kind, rows in kinds(g):
+            colour, marker = style.look(kind)
+            alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
+            for i in rows:
+                across, up = (own.columns[k][i] for k in names)
+                n = own.length[i]
+                first = int(np.argmax(np.isfinite(across) & np.isfinite(up)))
+                ax.plot(across, up, color=colour, linewidth=1.4, alpha=alpha, zorder=4)
+                start = dict(color=style.INK, marker="s", markersize=4, zorder=5)
+                ax.plot(across[first], up[first], **start)
+                end = dict(color=colour, marker=marker, markersize=6, alpha=alpha, zorder=6)
+                ax.plot(across[n], up[n], **end)
+            look = dict(color=colour, marker=marker, markersize=6, linewidth=1.4)
+            ax.plot([], [], label=kind_words(g, kind, len(rows)), **look)
+        ax.set(xlabel=style.labelled(names[0], units), ylabel=style.labelled(names[1], units))
+        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+    return ax
