@@ -13,7 +13,7 @@ from jast.estimate import markov_tilts as tilts
 from jast.estimate.batches import drawn, numbers
 from jast.policy import Policy
 
-__all__ = ["redrawn"]
+__all__ = ["fits", "redrawn"]
 
 
 def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.ndarray]:
@@ -29,6 +29,13 @@ def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.nda
     o, ratio, trace = tilts.played(sim, q, *chance)
     z = latent.normal_of(sim, _episodes(sim, trace))
     return z, o, tilts.log_weight(q, ratio)[0]
+
+
+def fits(sim: Any, q: Any) -> bool:
+    """Whether ``q`` is a proposal of `jast.estimate.failure_probability` for this simulator."""
+    if isinstance(q, latent.Latent):
+        return q.means.shape[1] == latent.dimension(sim)
+    return isinstance(q, tilts.Tilts) and q.frame.centre.shape[0] == tilts.shape(sim).seen
 
 
 @jax.jit

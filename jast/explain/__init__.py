@@ -6,19 +6,26 @@ from jast.explain.cards import cards
 from jast.explain.criticality import Criticality, criticality
 from jast.explain.differential import differential, regression
 from jast.explain.minimal import Minimal, minimal
+from jast.explain.monitor import Monitor, monitor
+from jast.explain.rules import Rule, Rules, rules
 from jast.explain.sensitivity import Sensitivity, sensitivity
 
 __all__ = [
     "Attribution",
     "Criticality",
     "Minimal",
+    "Monitor",
+    "Rule",
+    "Rules",
     "Sensitivity",
     "attribution",
     "cards",
     "criticality",
     "differential",
     "minimal",
+    "monitor",
     "regression",
+    "rules",
     "sensitivity",
 ]
 __dir__ = listed(__all__)

@@ -10,7 +10,7 @@ from jast import _checks, results
 from jast import distributions as D
 from jast.episode import Episode, played, replay
 from jast.intervals import checked_level, clopper_pearson
-from jast.pytrees import select
+from jast.pytrees import in_lanes, select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
@@ -88,16 +88,16 @@ def criticality(
     draws, level = _checks.whole(name, "draws", draws, 1), checked_level(name, level)
     episode = replay(sim, episode)
     steps = int(episode.length)
-    rows = np.repeat(np.arange(steps + 1), draws)
-    failing, invalid = np.zeros(steps + 1, int), 0
+    rows = np.repeat(np.arange(steps + 1, dtype=np.int32), draws)
     given = jax.tree.map(jnp.asarray, (episode.x0, episode.disturbances))
-    for i in range(0, len(rows), LANES):
-        part = rows[i : i + LANES]
-        kept = jnp.asarray(np.resize(part, LANES), jnp.int32)
-        keys = jax.random.split(jax.random.fold_in(key, i), LANES)
-        ended, wrong = jax.device_get(_continued(keys, sim, *given, kept))
-        np.add.at(failing, part, ended[: len(part)])
-        invalid += int(wrong[: len(part)].sum())
+
+    def lanes(at, kept):
+        keys = jax.random.split(jax.random.fold_in(key, at[0]), LANES)
+        return _continued(keys, sim, *given, kept)
+
+    at = np.arange(len(rows), dtype=np.int32)
+    ended, wrong = in_lanes(LANES, lanes, at, rows)
+    failing, invalid = np.bincount(rows[ended], minlength=steps + 1), int(wrong.sum())
     p = failing / draws
     interval = np.stack([clopper_pearson(int(k), draws, level) for k in failing])
     below, sure = np.flatnonzero(p < 0.5), np.flatnonzero(p < CERTAIN)

@@ -94,7 +94,7 @@ def minimal(
     v = _shrunk(g, np.where(kept, g.v, 0.0), budget)
     e = jax.device_get(latent.episodes(g.sim, np.asarray(v, g.judge.dtype)[None]))
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
-    kept &= np.arange(len(v)) < _used(sim, e)
+    kept &= steps_of(sim) <= int(e.length)
     x0, needed = like_disturbances(sim, kept)
     return Minimal(needed, x0, e, _parts(sim, e, v, kept), int(g.outcome.used[0]), g.judge.spent)
 
@@ -189,10 +189,6 @@ def _scaled(g: Given, point: np.ndarray, which: np.ndarray) -> np.ndarray:
     out = point.copy()
     out[which] *= high
     return out
-
-
-def _used(sim: Simulator, e: Episode) -> int:
-    return int((steps_of(sim) <= int(e.length)).sum())
 
 
 def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple:

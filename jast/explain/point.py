@@ -15,7 +15,7 @@ from jast.pytrees import count
 from jast.search.centred import centred
 from jast.simulator import Simulator
 
-__all__ = ["Given", "given", "like_disturbances", "names", "steps_of"]
+__all__ = ["Given", "called", "given", "like_disturbances", "names", "steps_of"]
 
 
 class Given(NamedTuple):
@@ -81,10 +81,13 @@ def steps_of(sim: Simulator) -> np.ndarray:
 def names(sim: Simulator) -> list[str]:
     """[D]: what each number is called: "x" or its field, with its place in an array."""
     about = outline(sim)
-    return [*_named(about.x0, "x0"), *_named(about.x, "x") * sim.horizon]
+    return [*called(about.x0, "x0"), *called(about.x, "x") * sim.horizon]
 
 
-def _named(like, root):
+def called(like: Any, root: str) -> list[str]:
+    """What each number of ``like``, arrays or their shapes, is called: its field with its place in
+    an array, or ``root``.
+    """
     out = []
     for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
         out += [called(path, root) + entry for entry in entries(s.shape)]

@@ -12,8 +12,7 @@ from jast import limit_state as latent
 from jast.episode import replay
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.redrawn import redrawn
+from jast.estimate.redrawn import fits, redrawn
 from jast.intervals import checked_level
 from jast.simulator import Simulator
 
@@ -89,7 +88,7 @@ def sensitivity(
     samples, level = _checks.whole(name, "samples", samples, LANES), checked_level(name, level)
     latent.check(name, sim)
     q = getattr(estimate, "proposal", None)
-    if not _fits(sim, q):
+    if not fits(sim, q):
         raise ValueError(
             f"{name}: estimate must be one of failure_probability with a proposal for this"
             f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
@@ -127,13 +126,6 @@ def sensitivity(
         bool(estimate.reliable and ess >= FEW),
         -(-samples // LANES) * LANES + len(s),
     )
-
-
-def _fits(sim: Simulator, q: Any) -> bool:
-    """Whether ``q`` is a proposal for this simulator."""
-    if isinstance(q, latent.Latent):
-        return q.means.shape[1] == latent.dimension(sim)
-    return isinstance(q, Tilts) and q.frame.centre.shape[0] == shape(sim).seen
 
 
 def _split(sim: Simulator) -> tuple[list, list, Any]:

@@ -1,0 +1,135 @@
+"""Episodes in whatever form a user has them, as one batch; and what their ends left undrawn."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import distributions as D
+from jast import rewards
+from jast.episode import Episode, play_back
+from jast.failures import Failures, identity
+from jast.incidents import hosted
+from jast.outline import outline
+from jast.pytrees import in_lanes
+from jast.search.failure_modes import Mode
+from jast.simulator import Simulator
+
+__all__ = ["Whole", "distinct", "gathered", "whole"]
+
+LANES = 256
+
+
+class Whole(NamedTuple):
+    """Episodes [n] whose disturbances go on to the horizon, on the host."""
+
+    x0: Any
+    disturbances: Any
+    """[n, horizon, ...]: behind the end of an episode what the model would have drawn on."""
+    length: np.ndarray
+    states: Any
+    """[n, horizon + 1, ...]; random keys are left out."""
+    evaluations: int
+
+
+def gathered(function: str, argument: str, sim: Simulator, given: Any) -> Episode:
+    """One batch [n], on the host and without states, of a `jast.Episode` (one or a batch), a
+    `jast.failures.Failures`, anything that has these as ``failures``, or a sequence of episodes or
+    of modes.
+
+    Raises:
+        ValueError: which names the ``argument``, for anything else and for episodes that are not of
+            ``sim``.
+    """
+    e = given
+    if not isinstance(e, Episode | Failures) and isinstance(
+        getattr(e, "failures", None), Failures | Episode
+    ):
+        e = e.failures
+    if isinstance(e, Failures):
+        e = e.episodes
+    elif isinstance(e, list | tuple) and not isinstance(e, Episode):
+        each = [part.failure if isinstance(part, Mode) else part for part in e]
+        if not all(isinstance(part, Episode) and np.ndim(part.length) == 0 for part in each):
+            raise ValueError(_refusal(function, argument, given))
+        if not each:
+            raise ValueError(f"{function}: {argument} must hold episodes, received none")
+        bare = [jax.device_get(part._replace(states=None)) for part in each]
+        e = jax.tree.map(lambda *a: np.stack([np.asarray(one) for one in a]), *bare)
+    if not isinstance(e, Episode):
+        raise ValueError(_refusal(function, argument, given))
+    e = jax.tree.map(np.asarray, jax.device_get(e._replace(states=None)))
+    if e.length.ndim == 0:
+        e = jax.tree.map(lambda a: a[None], e)
+    if e.length.ndim != 1:
+        raise ValueError(
+            f"{function}: {argument} must have one leading axis, received the shape"
+            f" {e.length.shape}"
+        )
+    about, n = outline(sim), len(e.length)
+    for part, like, rows in ((e.x0, about.x0, ()), (e.disturbances, about.x, (sim.horizon,))):
+        wanted = jax.tree.map(lambda s, rows=rows: (n, *rows, *s.shape), like)
+        if jax.tree.map(np.shape, part) != wanted:
+            raise ValueError(
+                f"{function}: {argument} must be episodes of sim, with disturbances of the shapes"
+                f" {wanted}, received {jax.tree.map(np.shape, part)}"
+            )
+    return e
+
+
+def distinct(e: Episode) -> np.ndarray:
+    """Rows of the first of each of the equal episodes [n]."""
+    seen: dict[bytes, int] = {}
+    for i in range(len(e.length)):
+        seen.setdefault(identity(jax.tree.map(lambda a, i=i: a[i], e)), i)
+    return np.fromiter(seen.values(), int, len(seen))
+
+
+def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Whole:
+    """The episodes [n] of `gathered`, whose disturbances go on.
+
+    A failing episode is over sooner than others; what would have come is drawn from the model at
+    its last state. So no number tells that an episode was over.
+
+    Args:
+        states: whether states are asked for. Without them episodes that all last to the horizon are
+            not played again.
+    """
+    n = len(e.length)
+    if not states and (e.length == sim.horizon).all():
+        return Whole(e.x0, e.disturbances, e.length, None, 0)
+    x, s = in_lanes(
+        n if hosted(sim) else LANES,
+        lambda *a: _played_on(sim, key, *a),
+        *(np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length),
+    )
+    return Whole(e.x0, x, e.length, s, n)
+
+
+@jax.jit
+def _played_on(sim: Simulator, key: Any, at: Any, x0: Any, x: Any, length: Any) -> Any:
+    def one(at, x0, x, length):
+        e = play_back(sim, rewards.STANDARD, x0, x, length)
+        last = sim.disturbance(jax.tree.map(lambda a: a[length], e.states))
+        keys = jax.random.split(jax.random.fold_in(key, at), sim.horizon)
+        more = jax.vmap(lambda k: D.sample(last, k))(keys)
+        live = jnp.arange(sim.horizon, dtype=jnp.int32) < length
+        merged = jax.tree.map(
+            lambda a, b: jnp.where(live.reshape(-1, *(1,) * (a.ndim - 1)), a, b), x, more
+        )
+        return merged, jax.tree.map(_plain, e.states)
+
+    return jax.vmap(one)(at, x0, x, length)
+
+
+def _plain(a: jax.Array) -> jax.Array:
+    key = jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key)
+    return jnp.zeros((len(a), 0)) if key else a
+
+
+def _refusal(function, argument, given):
+    return (
+        f"{function}: {argument} must be episodes (a jast.Episode with a leading axis, a list of"
+        f" them, result.failures, a report), received {type(given).__name__}"
+    )

@@ -1,0 +1,338 @@
+"""monitor: while the system runs, will it fail within the next steps?"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast import _checks, results, rewards
+from jast.counter import generator
+from jast.episode import Episode, play_back, rollout
+from jast.explain.gathered import distinct, gathered
+from jast.explain.learning import DISTINCT, learner, parted
+from jast.explain.variants import seeds, variants
+from jast.incidents import hosted
+from jast.intervals import clopper_pearson
+from jast.pytrees import in_lanes
+from jast.simulator import Simulator
+from jast.weakness.measures import Roc, roc
+
+__all__ = ["Monitor", "monitor"]
+
+HELD_OUT, ASIDE, DRAWS, LANES = 0.3, 0.3, 4, 256
+"""The share of the episodes that is held out; of the rest, that which sets the threshold; draws of
+a proposal for each episode wanted; episodes that are played at a time."""
+ROWS, BINS, REPEATS = 200_000, 256, 400
+"""Observations to learn from, the most; of the bootstrap: different scores, and samples."""
+
+
+@results.result("evaluations")
+class Monitor(NamedTuple):
+    """A classifier of observations, and how it does on episodes that it has not seen."""
+
+    model: Any
+    """The scikit-learn classifier."""
+    within: int
+    """Steps that it looks ahead."""
+    threshold: float
+    """It warns where `probability` is above this."""
+    false_alarms: tuple
+    """(share, (low, high)): of the held-out others, those with a warning at any step. Near misses
+    are not among them."""
+    warned: tuple
+    """(share, (low, high)): of the held-out failures, those with a warning before the failure."""
+    ahead: tuple
+    """Steps from the first warning to the failure: the least of 90 %, the median, and the least of
+    10 %, of those with a warning; NaN where there is none."""
+    auc: float
+    """Area under the ROC curve: the chance that of two held-out moments, one within reach of a
+    failure and one not, the first has the higher probability."""
+    auc_interval: tuple
+    roc: Roc
+    held_out: tuple
+    """(failures, near misses, others): episodes."""
+    level: float
+    maxima: np.ndarray
+    """The greatest probability of each of the others that set the threshold, sorted."""
+    evaluations: int
+    settings: dict
+
+    def __str__(self):
+        n, near, calm = self.held_out
+        (rate, (a, b)), (hit, (c, d)) = self.false_alarms, self.warned
+        low, high = self.auc_interval
+        few, median, many = self.ahead
+        return "\n".join(
+            [
+                f"fails within {self.within} steps? on {n} failures, {near} near misses and {calm}"
+                " others held out:",
+                f"  area under the ROC curve {self.auc:.4f} [{low:.4f}, {high:.4f}]",
+                f"  warns above {self.threshold:.3g}: in {hit:.1%} [{c:.1%}, {d:.1%}] of the"
+                " failures before they fail,",
+                f"    {median:g} steps ahead (median; 90 % at least {few:g}, 10 % at least"
+                f" {many:g}),",
+                f"    and in {rate:.1%} [{a:.1%}, {b:.1%}] of the others",
+            ]
+        )
+
+    def probability(self, observation: Any) -> Any:
+        """Of failing within the next steps: a float for one observation [d], [n] for many [n, d].
+
+        That is among episodes like those learned from, of which a third or half fail. In operation
+        failures are rarer, so this is a score to compare with ``threshold``, not how probable a
+        failure is.
+        """
+        x = np.asarray(observation, float)
+        d = self.model.n_features_in_
+        if x.ndim not in (1, 2) or x.shape[-1] != d:
+            raise ValueError(
+                f"probability: observation must be [{d}] or [n, {d}], received {list(x.shape)}"
+            )
+        p = self.model.predict_proba(np.atleast_2d(x))[:, 1]
+        return float(p[0]) if x.ndim == 1 else p
+
+    def warns(self, observation: Any) -> Any:
+        """Whether `probability` is above the threshold: bool, or [n] bool."""
+        return self.probability(observation) > self.threshold
+
+    def threshold_for(self, false_alarms: float) -> float:
+        """Above which at most this share of the others that set thresholds would ever warn."""
+        _checks.number(
+            "threshold_for", "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1"
+        )
+        return _threshold(self.maxima, false_alarms)
+
+
+def monitor(
+    sim: Simulator,
+    failures: Any,
+    others: Any = None,
+    *,
+    within: int = 5,
+    observe: Callable[[Any], Any] | None = None,
+    model: str = "boosted",
+    false_alarms: float = 0.01,
+    key: jax.Array | None = None,
+    episodes: int = 1000,
+    level: float = 0.95,
+) -> Monitor:
+    """A runtime monitor: will the system fail within the next ``within`` steps?
+
+    A classifier of scikit-learn learns it from what is observed at each step of failing and other
+    episodes. ``monitor(...).probability(observation)`` is then its answer, which needs neither the
+    simulator nor JAX. 30 % of the episodes are held out, and tell how good it is.
+
+    Without ``others`` the episodes are simulated: failures and near misses as in
+    `jast.explain.rules`, and as many ordinary episodes, drawn from the model. The threshold is such
+    that ``false_alarms`` of ordinary episodes, of some that are set aside for this, would ever
+    warn.
+
+    Args:
+        sim: the simulator.
+        failures: as of `jast.explain.rules`.
+        others: ordinary episodes, that do not fail; by default they are drawn.
+        within: steps, at least 1.
+        observe: state -> vector of numbers, what the monitor gets to see; by default
+            ``sim.observe``.
+        model: "boosted", a hundred small boosted trees (Friedman 2001), or "logistic", the
+            regression on standardised numbers.
+        false_alarms: the share of ordinary episodes, from 0 to 1, that may warn.
+        key: of the draws and of what is held out; `jax.random.key(0)` by default.
+        episodes: without ``others``: failures, near misses and ordinary episodes, so many of each
+            at most; at least 40.
+        level: of the intervals: exact ones of shares, and of the area that of the bootstrap over
+            episodes (Efron 1979).
+
+    Returns:
+        `Monitor`.
+
+    Raises:
+        ValueError: for bad arguments, episodes that are not what they should be, and too few.
+        ImportError: without scikit-learn.
+    """
+    name = "monitor"
+    learner(name, "ensemble")
+    key = jax.random.key(0) if key is None else key
+    _checks.random_key(name, key)
+    within = _checks.whole(name, "within", within, 1)
+    episodes = _checks.whole(name, "episodes", episodes, 40)
+    share = lambda v: 0 <= v <= 1
+    rate = _checks.number(name, "false_alarms", false_alarms, share, "from 0 to 1")
+    level = _checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+    if model not in MODELS:
+        raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
+    first, second = jax.random.split(key)
+    e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes)
+    seen = _observed(name, sim, sim.observe if observe is None else observe, e)
+    rng = generator(second)
+    out = parted(rng, owner, group, HELD_OUT)
+    aside = np.zeros(len(out), bool)
+    calm = np.flatnonzero(~out & (owner == ORDINARY))
+    aside[rng.permutation(calm)[: max(int(ASIDE * len(calm)), 1)]] = True
+    live = np.arange(seen.shape[1]) < e.length[:, None]
+    soon = live & (owner == FAILING)[:, None]
+    soon &= e.length[:, None] - np.arange(seen.shape[1]) <= within
+    learned = np.argwhere(live & ~(out | aside)[:, None])
+    if len(learned) > ROWS:
+        learned = learned[rng.choice(len(learned), ROWS, replace=False)]
+    i, t = learned.T
+    if soon[i, t].all() or not soon[i, t].any():
+        raise ValueError(
+            f"{name}: within must leave moments that are not followed by a failure, and some that"
+            f" are; received {within} where failures have {e.length[owner == FAILING].mean():.3g}"
+            " steps"
+        )
+    fitted = MODELS[model](name).fit(seen[i, t], soon[i, t])
+    score = np.full(live.shape, -np.inf)
+    score[live] = fitted.predict_proba(seen[live])[:, 1]
+    maxima = np.sort(score[aside].max(axis=1))
+    threshold = _threshold(maxima, rate)
+    alarm = score > threshold
+    failing, ordinary = out & (owner == FAILING), out & (owner == ORDINARY)
+    hit, wrong = alarm[failing].any(axis=1), alarm[ordinary].any(axis=1)
+    steps = (e.length[failing] - np.argmax(alarm[failing], axis=1))[hit]
+    ahead = np.quantile(steps, (0.1, 0.5, 0.9), method="lower") if len(steps) else [np.nan] * 3
+    counted = lambda a: (float(a.mean()), clopper_pearson(int(a.sum()), len(a), level))
+    rows = live & out[:, None]
+    return Monitor(
+        fitted,
+        within,
+        threshold,
+        counted(wrong),
+        counted(hit),
+        tuple(map(float, ahead)),
+        *_areas(rng, score, soon, rows, group, level),
+        roc(score[rows], soon[rows]),
+        tuple(int(np.sum(out & (owner == k))) for k in (FAILING, NEAR, ORDINARY)),
+        level,
+        maxima,
+        spent + len(e.length),
+        results.asked(
+            name, key, within=within, model=model, false_alarms=rate, episodes=episodes, level=level
+        ),
+    )
+
+
+FAILING, NEAR, ORDINARY = 1, 2, 0
+
+
+def _boosted(name: str) -> Any:
+    return learner(name, "ensemble").HistGradientBoostingClassifier(
+        max_leaf_nodes=8, early_stopping=False, random_state=0
+    )
+
+
+def _logistic(name: str) -> Any:
+    pipeline, scaler = learner(name, "pipeline"), learner(name, "preprocessing").StandardScaler()
+    return pipeline.make_pipeline(
+        scaler, learner(name, "linear_model").LogisticRegression(max_iter=1000)
+    )
+
+
+MODELS: dict[str, Callable] = {"boosted": _boosted, "logistic": _logistic}
+
+
+def _episodes(name, key, sim, failures, others, episodes):
+    """The episodes [n], what they are [n], their group [n], evaluations."""
+    k, more, calm = jax.random.split(key, 3)
+    if others is None:
+        s = seeds(name, k, sim, failures, None, DRAWS * episodes)
+        v = variants(more, sim, s, episodes)
+        plain = _ordinary(calm, sim, episodes)
+        parts, spent = (v.failures, v.near, plain), s.evaluations + v.evaluations + episodes
+        owner = (FAILING, NEAR, ORDINARY)
+        groups = [v.seed, v.near_seed]
+        if len(np.unique(s.z, axis=0)) < DISTINCT:
+            # too few failures to hold some out: then their variants are
+            groups = [np.arange(len(v.seed)), len(v.seed) + np.arange(len(v.near_seed))]
+    else:
+        a = gathered(name, "failures", sim, failures)
+        b = gathered(name, "others", sim, others)
+        parts, spent, groups, owner = (a, b), 0, [], (FAILING, ORDINARY)
+        for argument, part, wanted in (("failures", a, True), ("others", b, False)):
+            if wrong := int((part.failure != wanted).sum()):
+                raise ValueError(
+                    f"{name}: {argument} must {'all' if wanted else 'not'} fail, received"
+                    f" {len(part.length)} episodes, of which {wrong} do{' not' if wanted else ''}"
+                )
+        rows = [distinct(part) for part in parts]
+        parts = tuple(jax.tree.map(lambda v, r=r: v[r], p) for p, r in zip(parts, rows))
+        groups = [np.arange(len(parts[0].length))]
+    many = [len(part.length) for part in parts]
+    for argument, n in (("failures", many[0]), ("others", many[-1])):
+        if n < 3 * DISTINCT:
+            raise ValueError(
+                f"{name}: {argument} must be {3 * DISTINCT} distinct episodes or more, received {n}"
+            )
+    top = max(int(g.max(initial=-1)) for g in groups) + 1
+    groups.append(top + np.arange(many[-1]))
+    e = jax.tree.map(lambda *a: np.concatenate(a), *parts)
+    return e, np.repeat(owner, many), np.concatenate(groups), spent
+
+
+def _ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
+    """At most ``n`` episodes of the model that do not fail."""
+    size = n if hosted(sim) else LANES
+    at = np.arange(n, dtype=np.int32)
+    e = in_lanes(size, lambda at: _drawn(key, sim, at), at)
+    return jax.tree.map(lambda a: a[~e.failure], e)
+
+
+@jax.jit
+def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
+    one = lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None)
+    return jax.vmap(one)(at)
+
+
+def _observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
+    """[n, horizon + 1, d] of the states."""
+    watch = observe if isinstance(observe, Partial) else Partial(observe)
+    size = len(e.length) if hosted(sim) else LANES
+    seen = in_lanes(size, partial(_watched, sim, watch), e.x0, e.disturbances, e.length)
+    if not isinstance(seen, np.ndarray) or seen.ndim != 3:
+        shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
+        raise ValueError(
+            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
+        )
+    return seen.astype(float)
+
+
+@jax.jit
+def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
+    def one(x0, x, length):
+        states = play_back(sim, rewards.STANDARD, x0, x, length).states
+        return jax.tree.map(jnp.asarray, jax.vmap(observe)(states))
+
+    return jax.vmap(one)(x0, x, length)
+
+
+def _threshold(maxima: np.ndarray, rate: float) -> float:
+    """The least above which a share of at most ``rate`` of ``maxima`` is."""
+    n = len(maxima)
+    return float(maxima[n - 1 - min(int(rate * n), n - 1)])
+
+
+def _areas(rng, score, soon, rows, group, level) -> tuple:
+    """(area under the ROC curve, its interval by the bootstrap over groups of episodes)."""
+    values = np.sort(score[rows])
+    edges = np.unique(values[np.linspace(0, len(values) - 1, BINS).astype(int)])
+    bins = np.searchsorted(edges, score[rows])
+    each = np.broadcast_to(group[:, None], score.shape)[rows]
+    names, at = np.unique(each, return_inverse=True)
+    counts = np.zeros((2, len(names), len(edges) + 1))
+    np.add.at(counts, (soon[rows].astype(int), at, bins), 1)
+    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), REPEATS)
+    no, yes = times @ counts[0], times @ counts[1]
+
+    def area(no, yes):
+        below = np.cumsum(no, axis=-1) - no / 2
+        total = no.sum(axis=-1) * yes.sum(axis=-1)
+        return np.sum(yes * below, axis=-1) / np.where(total > 0, total, np.nan)
+
+    tail = (1 - level) / 2
+    low, high = np.nanquantile(area(no, yes), (tail, 1 - tail))
+    return roc(score[rows], soon[rows]).area, (float(low), float(high))

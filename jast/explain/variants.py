@@ -1,0 +1,202 @@
+"""Failures as the model has them, and near misses: variants of failures that are known."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast import limit_state as latent
+from jast.counter import generator
+from jast.episode import Episode
+from jast.estimate.batches import resampled
+from jast.estimate.redrawn import fits, redrawn
+from jast.explain.gathered import distinct, gathered
+from jast.incidents import hosted
+from jast.judge import Judge
+from jast.markov import proposed
+from jast.pytrees import in_lanes
+from jast.search.centred import centred
+from jast.search.failure_modes import Mode, Modes, nearest
+from jast.simulator import Simulator
+
+__all__ = ["Seeds", "Variants", "seeds", "variants"]
+
+SCALES = (1.0, 0.3, 1.0, 0.7, 1.0, 0.15, 1.0, 0.5)
+"""How far the disturbances of a move go: 1 is a new draw."""
+DRAWS, LANES, MOST = 1024, 256, 6
+"""Of a proposal at a time; episodes that are played at a time; modes that are told apart."""
+
+
+class Seeds(NamedTuple):
+    """Failures that are known, as points of normal numbers."""
+
+    z: np.ndarray
+    """[m, D]"""
+    used: np.ndarray
+    """[m] how many of the numbers decided something."""
+    log_weight: np.ndarray
+    """[m] by how much each stands for the model; all 0 where that is not known."""
+    label: np.ndarray
+    """[m] index into"""
+    names: tuple
+    evaluations: int
+
+
+class Variants(NamedTuple):
+    """Episodes that fail, and near misses: [n] each."""
+
+    failures: Episode
+    label: np.ndarray
+    """[n] of the failures: index into the names of the seeds."""
+    seed: np.ndarray
+    """[n] of the failures: which of the seeds they come from."""
+    near: Episode
+    near_seed: np.ndarray
+    evaluations: int
+
+
+def seeds(
+    function: str, key: jax.Array, sim: Simulator, given: Any, labels: Any, draws: int
+) -> Seeds:
+    """The `Seeds` in ``given``: of an estimate, or the estimate of a report, failures of its
+    proposal with their weights, ``draws`` of it; else the episodes themselves.
+
+    Args:
+        labels: names of the kinds of the episodes, one each; None: of a report or of
+            `jast.search.Modes` the number of the mode, else all are of one kind.
+    """
+    latent.check(function, sim)
+    estimate = getattr(given, "probability", None) or given
+    q = getattr(estimate, "proposal", None)
+    modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
+    if labels is None and q is not None and fits(sim, q):
+        found = _of_proposal(key, sim, q, draws)
+        if len(found.z):
+            return _of_modes(sim, found, modes)
+    e = gathered(function, "failures", sim, given)
+    of_mode = isinstance(given, list | tuple) and any(isinstance(part, Mode) for part in given)
+    if labels is not None:
+        names, label = np.unique(np.asarray(labels).astype(str), return_inverse=True)
+        if label.shape != e.length.shape:
+            raise ValueError(
+                f"{function}: labels must be one for each of the {len(e.length)} failures, received"
+                f" the shape {np.shape(labels)}"
+            )
+    elif of_mode and len(e.length) > 1:
+        label = np.minimum(np.arange(len(e.length)), MOST)
+        names = _numbered(min(len(e.length), MOST))
+        e = jax.tree.map(lambda a: a[:MOST], e)
+        label = label[:MOST]
+    else:
+        names, label = ("fails",), np.zeros(len(e.length), int)
+    rows = distinct(e)
+    e, label = jax.tree.map(lambda a: a[rows], e), label[rows]
+    if not len(e.length):
+        raise ValueError(f"{function}: failures must hold at least one failure, received none")
+    z = latent.normal_of(sim, e)
+    o = Judge(sim)(z)
+    if not e.failure.all() or not o.failure.any():
+        raise ValueError(
+            f"{function}: failures must all fail, received"
+            f" {int((~(e.failure & o.failure)).sum())} of {len(z)} that do not"
+        )
+    z, label, used = z[o.failure], label[o.failure], o.used[o.failure]
+    found = Seeds(z, used, np.zeros(len(z)), label, tuple(names), len(rows))
+    return found if labels is not None or of_mode else _of_modes(sim, found, modes)
+
+
+def _of_proposal(key: jax.Array, sim: Simulator, q: Any, draws: int) -> Seeds:
+    parts = []
+    for i in range(-(-draws // DRAWS)):
+        z, o, log_w = redrawn(jax.random.fold_in(key, i), sim, q, DRAWS)
+        rows = np.asarray(o.failure) & np.isfinite(log_w)
+        parts.append((np.asarray(z)[rows], np.asarray(o.used)[rows], np.asarray(log_w)[rows]))
+    z, used, log_w = map(np.concatenate, zip(*parts, strict=True))
+    spent = -(-draws // DRAWS) * DRAWS
+    return Seeds(z, used, log_w.astype(float), np.zeros(len(z), int), ("fails",), spent)
+
+
+def _of_modes(sim: Simulator, s: Seeds, modes: Any) -> Seeds:
+    """``s`` with the mode in whose direction each lies, where there are several; each mode has its
+    likeliest failure as a seed, too.
+    """
+    if modes is None or len(modes) < 2:
+        return s
+    best = gathered("rules", "modes", sim, list(modes)[:MOST])
+    of_modes = centred(sim)
+    heads = latent.normal_of(sim, best)
+    judge = Judge(sim)
+    o = judge(heads)
+    z = np.concatenate([s.z, heads[o.failure]]).astype(heads.dtype)
+    used = np.concatenate([s.used, o.used[o.failure]])
+    there = _moved(sim, of_modes, z)
+    label = nearest(there, latent.normal_of(of_modes, best).astype(float))
+    label[len(s.z) :] = np.flatnonzero(o.failure)
+    # a mode's likeliest failure counts only where nothing else is known of the mode
+    log_w = np.concatenate([s.log_weight, np.full(int(o.failure.sum()), -700.0)])
+    k = len(best.length)
+    return Seeds(z, used, log_w, label, _numbered(k), s.evaluations + judge.spent)
+
+
+def _numbered(k: int) -> tuple:
+    return tuple(f"mode {i + 1}" for i in range(k))
+
+
+def _moved(sim: Simulator, of_modes: Simulator, z: np.ndarray) -> np.ndarray:
+    return latent.normal_of(of_modes, _played(sim, z)[0]).astype(float)
+
+
+def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
+    """``n`` failures and at most as many near misses, from Markov chains that begin at ``s``.
+
+    In each move of a chain some of the disturbances are drawn anew, or moved a little, so that the
+    model stays as it is (`jast.markov.proposed`): where the system still fails the chain goes
+    there, and where it does not that is a near miss, of which each chain keeps one at random. So
+    disturbances that matter not are as in any other episode, in failures and near misses alike.
+    All kinds of failures get the same number of chains.
+    """
+    rng, judge = generator(key), Judge(sim)
+    kinds = np.unique(s.label)
+    each = [_chosen(rng, s, k, -(-n // len(kinds))) for k in kinds]
+    seed = np.concatenate(each)
+    z = s.z[seed].astype(np.float64)
+    behind = np.arange(z.shape[1]) >= s.used[seed][:, None]
+    z = np.where(behind, rng.standard_normal(z.shape), z)
+    near, misses = np.zeros_like(z), np.zeros(len(z), int)
+    for scale in SCALES:
+        meant = rng.random(z.shape) < rng.random((len(z), 1))
+        to = np.where(meant, proposed(z, rng.standard_normal(z.shape), scale, 1.0), z)
+        o = judge(to)
+        rejected = ~o.failure & ~o.invalid
+        misses += rejected
+        kept = rejected & (rng.random(len(z)) * misses < 1)
+        near[kept] = to[kept]
+        z = np.where(o.failure[:, None], to, z)
+    missed = np.flatnonzero(misses)
+    failing, played = _played(sim, z)
+    calm, more = _played(sim, near[missed]) if len(missed) else (failing, 0)
+    fails = np.flatnonzero(failing.failure)
+    calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
+    take = lambda e, rows: jax.tree.map(lambda a: a[rows], e)
+    return Variants(
+        take(failing, fails),
+        s.label[seed[fails]],
+        seed[fails],
+        take(calm, calm_rows),
+        seed[missed[calm_rows]] if len(missed) else np.zeros(0, int),
+        judge.spent + played + more,
+    )
+
+
+def _chosen(rng: np.random.Generator, s: Seeds, kind: int, n: int) -> np.ndarray:
+    """Rows [n] of the seeds of one kind, by weight; all alike, so many times each."""
+    rows = np.flatnonzero(s.label == kind)
+    return rows[resampled(s.log_weight[rows], n, rng.random())]
+
+
+def _played(sim: Simulator, z: np.ndarray) -> tuple[Episode, int]:
+    """The episodes [n] of the points ``z`` [n, D], and how many were simulated."""
+    points = jnp.asarray(z, latent.normal_numbers(sim))
+    size = len(z) if hosted(sim) else LANES  # a black box plays none twice
+    return in_lanes(size, lambda part: latent.episodes(sim, part), points), len(z)
