@@ -7,7 +7,8 @@ import jax
 import numpy as np
 
 from jast.explain.gathered import Whole
-from jast.explain.point import called
+from jast.explain.point import numbers_of
+from jast.fields import fields
 from jast.outline import outline
 from jast.simulator import Simulator
 
@@ -62,8 +63,8 @@ def table(
     """
     found: list[tuple[Feature, np.ndarray]] = []
     if d.of != "states":
-        for path, v in zip(called(outline(sim).x0, "x0"), _flat(episodes.x0, 1), strict=True):
-            found.append((Feature(f"{path} at the start", "number"), v))
+        for name, v in _columns(episodes.x0, "x0", 1):
+            found.append((Feature(f"{name} at the start", "number"), v))
         parts = list(_components(sim, episodes))
         for name, v in parts:
             if name in d.kinds:
@@ -80,7 +81,15 @@ def table(
 
 def _components(sim: Simulator, episodes: Whole) -> Iterator[tuple[str, np.ndarray]]:
     """(name, values [n, horizon]) of each number of a disturbance."""
-    yield from zip(called(outline(sim).x, "x"), _flat(episodes.disturbances, 2), strict=True)
+    named = numbers_of(outline(sim).x, "x")
+    yield from zip(named, _flat(episodes.disturbances, 2), strict=True)
+
+
+def _columns(tree: Any, root: str, lead: int) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, values) of each number of ``tree``, whose first ``lead`` axes stay."""
+    for part in fields(tree, root, lead):
+        for i, entry in enumerate(part.entries):
+            yield part.name + entry, part.values[..., i]
 
 
 def _flat(tree: Any, lead: int) -> list[np.ndarray]:
@@ -180,13 +189,10 @@ def _of_states(
     sim: Simulator, states: Any, at: np.ndarray, lead: int
 ) -> Iterator[tuple[Feature, np.ndarray]]:
     """Of the states that are seen until step ``at`` [n]."""
-    like = outline(sim).state
-    names = called(jax.tree.map(_shown, like), "state")
     rows, when = np.arange(len(at)), f"{lead} step{'s' * (lead != 1)} before the end"
     seen = np.arange(sim.horizon + 1) <= at[:, None]
     far: Callable = lambda v, value: np.where(seen, v, value)
-    for name, v in zip(names, _flat(states, 2), strict=True):
-        v = v.astype(float)
+    for name, v in _columns(states, "state", 2):
         yield Feature(f"{name} {when}", "number"), v[rows, at]
         yield Feature(f"greatest {name} until {when}", "number"), far(v, -np.inf).max(axis=1)
         yield Feature(f"least {name} until {when}", "number"), far(v, np.inf).min(axis=1)
@@ -196,9 +202,3 @@ def _of_states(
             Feature(f"rise of {name} in the 4 steps until {when}", "number"),
             (v[rows, at] - v[rows, np.maximum(at - 4, 0)]),
         )
-
-
-def _shown(s: Any) -> Any:
-    """A random key is no number."""
-    key = jax.dtypes.issubdtype(s.dtype, jax.dtypes.prng_key)
-    return jax.ShapeDtypeStruct((0,), bool) if key else s

@@ -15,7 +15,7 @@ from jast.pytrees import count
 from jast.search.centred import centred
 from jast.simulator import Simulator
 
-__all__ = ["Given", "called", "given", "like_disturbances", "names", "steps_of"]
+__all__ = ["Given", "given", "like_disturbances", "names", "numbers_of", "steps_of"]
 
 
 class Given(NamedTuple):
@@ -81,10 +81,10 @@ def steps_of(sim: Simulator) -> np.ndarray:
 def names(sim: Simulator) -> list[str]:
     """[D]: what each number is called: "x" or its field, with its place in an array."""
     about = outline(sim)
-    return [*called(about.x0, "x0"), *called(about.x, "x") * sim.horizon]
+    return [*numbers_of(about.x0, "x0"), *numbers_of(about.x, "x") * sim.horizon]
 
 
-def called(like: Any, root: str) -> list[str]:
+def numbers_of(like: Any, root: str) -> list[str]:
     """What each number of ``like``, arrays or their shapes, is called: its field with its place in
     an array, or ``root``.
     """
