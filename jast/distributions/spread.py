@@ -1,5 +1,6 @@
-"""How far out a value is, in standard deviations of a normal number."""
+"""How far out a value is, in standard deviations of a normal number; how probable a choice is."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jast.distributions.base import is_distribution
 from jast.distributions.verbs import has_mode, mode, to_normal
 
-__all__ = ["spread"]
+__all__ = ["chances", "spread"]
 
 
 def spread(d: Any, x: Any) -> Any:
@@ -16,13 +17,39 @@ def spread(d: Any, x: Any) -> Any:
     where there is none); of a choice, which has no order, sqrt(2 (log p of the likeliest - log p)),
     the distance at which a normal number is as much less likely than its mode.
     """
-    if hasattr(d, "distributions"):
-        each, treedef = jax.tree.flatten(d.distributions, is_leaf=is_distribution)
-        values = treedef.flatten_up_to(x)
-        return treedef.unflatten([spread(a, b) for a, b in zip(each, values, strict=True)])
-    inner = d
-    while hasattr(inner, "reinterpreted_batch_ndims"):
-        inner = inner.distribution
+    return _parted(_spread, d, x)
+
+
+def chances(d: Any, x: Any) -> Any:
+    """Like ``x``, floats: the probability of each number that is whole, 0 of the others."""
+    return _parted(_chance, d, x)
+
+
+def _parted(of: Callable, d: Any, x: Any) -> Any:
+    """``of`` each independent part of ``d`` and its value."""
+    if not hasattr(d, "distributions"):
+        return of(d, x)
+    each, treedef = jax.tree.flatten(d.distributions, is_leaf=is_distribution)
+    values = treedef.flatten_up_to(x)
+    return treedef.unflatten([_parted(of, a, b) for a, b in zip(each, values, strict=True)])
+
+
+def _inner(d: Any) -> Any:
+    while hasattr(d, "reinterpreted_batch_ndims"):
+        d = d.distribution
+    return d
+
+
+def _chance(d: Any, x: Any) -> Any:
+    none = jax.tree.map(lambda a: jnp.zeros(jnp.shape(a)), x)
+    if jax.tree.structure(x) != jax.tree.structure(0) or not jnp.issubdtype(x.dtype, jnp.integer):
+        return none
+    log_p = _inner(d).log_prob(x)
+    return jnp.exp(log_p) if log_p.shape == x.shape else none
+
+
+def _spread(d: Any, x: Any) -> Any:
+    inner = _inner(d)
     if type(inner).__name__ in ("Bernoulli", "Categorical"):
         gap = inner.log_prob(inner.mode()) - inner.log_prob(x)
         return jnp.sqrt(2 * jnp.maximum(gap, 0))

@@ -16,18 +16,15 @@ from jax import lax
 from jast import distributions as D
 from jast import results, rewards
 from jast._checks import random_key, whole
-from jast.counter import generator
 from jast.episode import play_back
 from jast.estimate import diagnostics
 from jast.estimate.answers import asked
-from jast.estimate.batches import of_chunk, plain_chunk
 from jast.estimate.draws import interval, key_of, of_weights, share, shares
 from jast.estimate.importance_sampling import component
-from jast.estimate.markov_tilts import Tilts
 from jast.estimate.proposals import as_proposal
-from jast.estimate.redrawn import redrawn
+from jast.estimate.redrawn import points
 from jast.intervals import clopper_pearson, log_normal
-from jast.limit_state import Latent, dimension, place, policy_of
+from jast.limit_state import Latent, dimension, policy_of
 from jast.policy import nominal_policy
 from jast.pytrees import clear, select, strong
 
@@ -212,7 +209,7 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
         if draws.source == "policy":
             made = jax.random.split(jax.random.fold_in(key, i), draws.lanes)
         else:
-            made = _points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
+            made = points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
         for a in range(0, len(lanes), BLOCK):
             part = np.arange(a, a + BLOCK).clip(max=len(lanes) - 1)
             seen = _judged(
@@ -226,15 +223,6 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
                     )
                 out[k].append(np.asarray(v)[: len(lanes) - a])
     return {k: np.concatenate(v) for k, v in out.items()}
-
-
-def _points(key, i, sim, q, n, lanes):
-    """The first ``n`` points, or more, of the ``lanes`` of a chunk."""
-    if isinstance(q, str):
-        return plain_chunk(key, i, n, sim)
-    if isinstance(q, Tilts):
-        return redrawn(generator(key, 2, i), sim, q, lanes)[0]
-    return place(q, *of_chunk(key, i, n, q))
 
 
 @partial(jax.jit, static_argnums=5)

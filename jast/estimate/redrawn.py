@@ -1,4 +1,4 @@
-"""More episodes of the proposal that an estimate was made with."""
+"""The draws of an estimate, and more of its proposal."""
 
 from typing import Any
 
@@ -7,13 +7,15 @@ import numpy as np
 
 from jast import distributions as D
 from jast import limit_state as latent
+from jast.counter import generator
 from jast.distributions.parts import parts
 from jast.episode import rollout
 from jast.estimate import markov_tilts as tilts
-from jast.estimate.batches import drawn, numbers
+from jast.estimate.batches import drawn, numbers, of_chunk, plain_chunk
+from jast.estimate.draws import Draws, key_of
 from jast.policy import Policy
 
-__all__ = ["fits", "redrawn"]
+__all__ = ["failing", "fits", "points", "redrawn"]
 
 
 def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.ndarray]:
@@ -36,6 +38,35 @@ def fits(sim: Any, q: Any) -> bool:
     if isinstance(q, latent.Latent):
         return q.means.shape[1] == latent.dimension(sim)
     return isinstance(q, tilts.Tilts) and q.frame.centre.shape[0] == tilts.shape(sim).seen
+
+
+def points(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.ndarray:
+    """The first ``n`` points, or more, of the ``lanes`` of chunk ``i`` of an estimate with the
+    draws of ``q``. On the host.
+    """
+    if isinstance(q, str):
+        return plain_chunk(key, i, n, sim)
+    if isinstance(q, tilts.Tilts):
+        return redrawn(generator(key, 2, i), sim, q, lanes)[0]
+    return latent.place(q, *of_chunk(key, i, n, q))
+
+
+def failing(sim: Any, draws: Draws, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """The failing draws that an estimate kept, at most ``most``, evenly taken: (points z [m, D],
+    log p - log q [m], steps [m], evaluations). Only tilts, which look at states, evaluate, and
+    nothing is judged again. On the host.
+    """
+    kept = np.flatnonzero(draws.failure)
+    kept = kept[np.unique(np.linspace(0, len(kept) - 1, min(most, len(kept))).astype(int))]
+    rows, key, out = draws.row[kept], key_of(draws), []
+    chunks = np.unique(rows // draws.lanes)
+    for i in chunks:
+        lanes = rows[rows // draws.lanes == i] % draws.lanes
+        made = points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
+        out.append(made[lanes])
+    spent = len(chunks) * draws.lanes * isinstance(draws.source, tilts.Tilts)
+    log_w, length = draws.log_weight[kept].astype(np.float64), draws.length[kept]
+    return np.concatenate(out), log_w, length, spent
 
 
 @jax.jit

@@ -5,6 +5,7 @@ from jast.explain.attribution import Attribution, attribution
 from jast.explain.cards import cards
 from jast.explain.criticality import Criticality, criticality
 from jast.explain.differential import differential, regression
+from jast.explain.indices import Index, Indices, indices
 from jast.explain.minimal import Minimal, minimal
 from jast.explain.monitor import Monitor, monitor
 from jast.explain.rules import Rule, Rules, rules
@@ -13,6 +14,8 @@ from jast.explain.sensitivity import Sensitivity, sensitivity
 __all__ = [
     "Attribution",
     "Criticality",
+    "Index",
+    "Indices",
     "Minimal",
     "Monitor",
     "Rule",
@@ -22,6 +25,7 @@ __all__ = [
     "cards",
     "criticality",
     "differential",
+    "indices",
     "minimal",
     "monitor",
     "regression",

@@ -1,0 +1,236 @@
+"""indices: how much each disturbance decides whether the system fails."""
+
+import math
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr, ndtri
+
+from jast import _checks, results
+from jast import limit_state as latent
+from jast.counter import generator
+from jast.distributions.spread import chances
+from jast.episode import replay
+from jast.estimate.answers import asked
+from jast.estimate.batches import resampled
+from jast.estimate.estimate import Estimate
+from jast.estimate.gaussians import effective
+from jast.estimate.redrawn import failing
+from jast.explain.point import names, steps_of
+from jast.intervals import clopper_pearson
+from jast.judge import Judge
+from jast.outline import outline
+from jast.pytrees import count
+from jast.simulator import Simulator
+
+__all__ = ["Index", "Indices", "indices"]
+
+KEPT, LANES = 16_384, 1024
+"""Failing draws that are looked at, at most, and those whose choices are looked up at a time."""
+FEW = 100
+"""Effective failures below which nothing is told."""
+WIDTH = 0.02
+"""Of the cells in which failures are counted, in standard deviations."""
+SHOWN = 20
+
+
+class Index(NamedTuple):
+    """One number of the disturbances."""
+
+    name: str
+    """Its field, with its place in an array"""
+    step: int
+    """From 1; 0 is the start"""
+    mean: float
+    """Its normal number, on average over the failures: 0 where a failure does not move it"""
+    first: float
+    """First-order index: the share of the variance of failing that this number decides alone"""
+    first_interval: tuple
+    """(low, high) at ``level``, of the delta method"""
+    total: float
+    """Total index: the share that it decides alone or together with others; NaN where not asked"""
+    total_interval: tuple
+    """(low, high) at ``level``, of counts"""
+
+
+@results.shown()
+class Indices(NamedTuple):
+    """Sensitivity of a failure to each number of the disturbances."""
+
+    rows: tuple
+    """An `Index` for each number, x0 first, then step by step"""
+    probability: float
+    """Of failure: what a first-order index is about where a number decides nothing alone is a small
+    multiple of it"""
+    level: float
+    ess: float
+    """Effective number of failures behind the means and the first-order indices"""
+    reliable: bool
+    """The estimate is, and there are 100 effective failures or more"""
+    evaluations: int
+
+    def __str__(self):
+        lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
+        lines.append(
+            f"{'number':<20} {'step':>4} {'mean':>7} {'first order':>12} {'total':>7}"
+            f"   {self.level:.0%} intervals"
+        )
+        key = lambda r: (-r.total if r.total == r.total else 0.0, -r.first)
+        for r in sorted(self.rows, key=key)[:SHOWN]:
+            (a, b), (c, d) = r.first_interval, r.total_interval
+            ends = f"[{a:.3g}, {b:.3g}]" + (f"  [{c:.3f}, {d:.3f}]" if d == d else "")
+            total = f"{r.total:7.3f}" if r.total == r.total else "      -"
+            lines.append(f"{r.name:<20} {r.step:4d} {r.mean:7.3f} {r.first:12.4g} {total}   {ends}")
+        if len(self.rows) > SHOWN:
+            lines.append(f"{len(self.rows) - SHOWN} more numbers")
+        return "\n".join(lines)
+
+
+def indices(
+    key: jax.Array,
+    sim: Simulator,
+    estimate: Estimate,
+    *,
+    draws: int = 400,
+    level: float | None = None,
+) -> Indices:
+    """Which disturbance decides whether the system fails, alone and together with others?
+
+    The variance-based (Sobol) indices of the indicator of failure 1_F over the independent normal
+    numbers z behind the disturbances (Papaioannou and Straub, 2021; Li, Lu, Feng and Wang, 2012).
+    First order: S_i = Var(E[1_F | z_i]) / Var(1_F). By Bayes' rule E[1_F | z_i] is P f(z_i | F) /
+    phi(z_i), so S_i comes from the failures that the estimate has drawn already (Perrin and Defaux,
+    2019), here without a bias of their number: a sum over pairs of failures in cells of 0.02
+    standard deviations. Total: T_i = E[Var(1_F | all others)] / Var(1_F), which is
+    (1 - Q_i) / (1 - P), Q_i the probability that a failure stays one when z_i alone is drawn anew.
+    Q_i is counted on new episodes.
+
+    Of rare failures that take several disturbances together first-order indices are tiny and total
+    ones near 1; they still rank the disturbances.
+
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        estimate: of this simulator, by `jast.estimate.failure_probability` from 5000 episodes on.
+        draws: episodes for the total index of each number; 0: none, and no total indices.
+        level: of the intervals; default: that of the estimate.
+
+    Returns:
+        `Indices`. Its ``evaluations`` are ``draws`` for each number, and, where the estimate was
+        made by tilts, those of the chunks that are drawn again.
+
+    Raises:
+        ValueError: for an estimate without draws or without a failure, one by a policy, or of
+            another simulator.
+    """
+    name = "indices"
+    _checks.random_key(name, key)
+    kept, level = asked(name, estimate, level)
+    draws = _checks.whole(name, "draws", draws, 0)
+    latent.check(name, sim)
+    if isinstance(kept.source, str) and kept.source != "model":
+        raise ValueError(
+            f"{name}: estimate must have drawn normal numbers, received one of {estimate.method} by"
+            f" a {kept.source}"
+        )
+    if not kept.failure.any():
+        raise ValueError(f"{name}: estimate must hold a failure, received one without")
+    if isinstance(kept.source, latent.Latent):
+        of, d = kept.source.means.shape[1], latent.dimension(sim)
+        if of != d:
+            raise ValueError(
+                f"{name}: sim must be the simulator of the estimate, of {of} numbers, received one"
+                f" of {d}"
+            )
+    rng = generator(key)
+    z, log_w, length, spent = failing(sim, kept, KEPT)
+    z = _placed(sim, z, length, rng)
+    w = np.exp(log_w - log_w.max())
+    w /= w.sum()
+    p, n_eff = float(estimate.mean), float(effective(log_w))
+    normal = NormalDist().inv_cdf(0.5 + level / 2)
+    judge, picks = Judge(sim), resampled(log_w, draws, rng.random()) if draws else None
+    rows = []
+    for i, (called, step) in enumerate(zip(names(sim), steps_of(sim), strict=True)):
+        gain, error = _gain(z[:, i], w)
+        first = p * (gain - 1) / (1 - p)
+        half = normal * math.hypot(p * error, first * float(estimate.relative_error)) / (1 - p)
+        total, ends = math.nan, (math.nan, math.nan)
+        if picks is not None:
+            fails = int(_redrawn(judge, z[picks], i, rng))
+            # as many independent failures as both samples are worth
+            n = max(int(1 / (1 / draws + 1 / n_eff)), 1)
+            q = fails / draws
+            low = clopper_pearson(math.floor(q * n), n, level)[0]
+            high = clopper_pearson(math.ceil(q * n), n, level)[1]
+            total, ends = (1 - q) / (1 - p), ((1 - high) / (1 - p), min((1 - low) / (1 - p), 1.0))
+        mean = float(w @ z[:, i])
+        rows.append(
+            Index(called, int(step), mean, first, (first - half, first + half), total, ends)
+        )
+    good = bool(estimate.reliable and n_eff >= FEW)
+    return Indices(tuple(rows), p, level, n_eff, good, spent + judge.spent)
+
+
+def _redrawn(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> int:
+    """How many of the failures ``z`` still fail with number ``i`` drawn anew."""
+    moved = z.copy()
+    moved[:, i] = rng.standard_normal(len(z))
+    return np.count_nonzero(judge(moved).failure)
+
+
+def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, float]:
+    """E[f(z | F) / phi(z) | F] of one number, from failures ``z`` [m] with weights ``w`` of sum 1,
+    and its standard error. No failure is compared with itself.
+    """
+    cells, at = np.unique(np.floor(z.astype(np.float64) / WIDTH), return_inverse=True)
+    # as a tail's own number: no difference of numbers near 1
+    tail = lambda v: 0.5 * math.erfc(v / math.sqrt(2))
+    near = np.minimum(np.abs(cells), np.abs(cells + 1)) * WIDTH
+    phi = np.array([tail(a) - tail(a + WIDTH) for a in near])
+    others = (np.bincount(at, w, len(cells))[at] - w) / np.maximum(phi, 1e-300)[at]
+    pairs = 1 - w @ w
+    gain = float(w @ others / pairs) if pairs > 0 else math.nan
+    each = others / np.maximum(1 - w, 1e-12) - gain
+    return gain, 2 * float(np.sqrt((w * w) @ each**2))
+
+
+def _placed(
+    sim: Simulator, z: np.ndarray, length: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """The points ``z`` [m, D] as drawn from p(z | failure): a whole number anywhere in the normal
+    numbers that give it, and numbers behind the end of an episode, which decided nothing, as the
+    model has them.
+    """
+    about = outline(sim)
+    whole = [np.issubdtype(leaf.dtype, np.integer) for leaf in jax.tree.leaves((about.x0, about.x))]
+    if any(whole):
+        chance = np.concatenate(
+            [
+                np.asarray(_chances(sim, np.resize(z[i : i + LANES], (LANES, z.shape[1]))))
+                for i in range(0, len(z), LANES)
+            ]
+        )[: len(z)]
+        u = np.asarray(ndtr(-np.abs(z)))
+        u = u + chance * (rng.random(z.shape) - 0.5)
+        moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)
+        z = np.where(chance > 0, moved, z)
+    used = count(about.x0) + length * count(about.x)
+    blank = np.arange(z.shape[1]) >= used[:, None]
+    return np.where(blank, rng.standard_normal(z.shape), z).astype(z.dtype)
+
+
+@jax.jit
+def _chances(sim: Simulator, z: jax.Array) -> jax.Array:
+    """[n, D]: the probability of each whole number of the episodes of ``z``, 0 of the others."""
+
+    def one(e: Any) -> tuple[Any, Any]:
+        states = jax.tree.map(lambda a: a[:-1], replay(sim, e).states)
+        steps = jax.vmap(lambda s, x: chances(sim.disturbance(s), x))(states, e.disturbances)
+        return chances(sim.start(), e.x0) if outline(sim).random_start else (), steps
+
+    first, steps = jax.vmap(one)(latent.episodes(sim, z))
+    return latent.flat(sim, first, steps)
