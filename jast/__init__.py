@@ -36,6 +36,7 @@ __all__ = [
     "save",
     "search",
     "simulators",
+    "specs",
     "stress",
     "weakness",
 ]

@@ -23,6 +23,7 @@ WALLS = [
     ("jast.search", ("jast.estimate", "jast.policies", "jast.weakness")),
     ("jast.cross_entropy", ("jast.search", "jast.estimate", "jast.policies")),
     ("jast.distributions", ("jast.episode", "jast.search", "jast.estimate", "jast.heads")),
+    ("jast.specs", ("jast.search", "jast.estimate", "jast.explain", "jast.simulators")),
     ("jast.episode", ("jast.search", "jast.estimate", "jast.heads", "jast.simulators")),
 ]
 

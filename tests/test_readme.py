@@ -13,25 +13,40 @@ import jast
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text()
 SYSTEMS = (ROOT / "docs/systems.md").read_text()
+SPECIFICATIONS = (ROOT / "docs/specifications.md").read_text()
 
 
-@pytest.mark.long
-def test_the_example_runs_and_finds_a_failure(tmp_path):
-    [code] = re.findall(r"```python\n(.*?)```", TEXT, re.S)
-    (tmp_path / "example.py").write_text(code)
+def run(text, folder):
+    """What the one Python example of ``text`` prints."""
+    [code] = re.findall(r"```python\n(.*?)```", text, re.S)
+    (folder / "example.py").write_text(code)
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [sys.executable, "example.py"],
-        cwd=tmp_path,
+        cwd=folder,
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
         timeout=600,
     )
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.long
+def test_the_example_runs_and_finds_a_failure(tmp_path):
+    printed = run(TEXT, tmp_path)
     shown = TEXT.split("This prints")[1]
     for words in ("undisturbed  no failure", "locally likeliest", "likeliest    log p -10.79"):
-        assert words in done.stdout and words in shown
+        assert words in printed and words in shown
+
+
+@pytest.mark.long
+def test_the_example_of_specifications_prints_what_it_says(tmp_path):
+    printed = run(SPECIFICATIONS, tmp_path)
+    shown = SPECIFICATIONS.split("```")[3]
+    words = lambda text: re.findall(r"[a-z]{4,}", text)
+    assert words(printed) == words(shown)
 
 
 def test_names_in_the_tables_exist():

@@ -1,0 +1,26 @@
+"""Specifications: requirements as signal temporal logic, their robustness on a trace, which part
+broke and when, and simulators whose failure is the violation.
+"""
+
+from jast._doors import listed
+from jast.specs.formulas import Formula, always, eventually, implies, predicate, until
+from jast.specs.parts import Part, Parts, parts
+from jast.specs.robustness import robustness
+from jast.specs.simulator import Monitored, trace_of, under
+
+__all__ = [
+    "Formula",
+    "Monitored",
+    "Part",
+    "Parts",
+    "always",
+    "eventually",
+    "implies",
+    "parts",
+    "predicate",
+    "robustness",
+    "trace_of",
+    "under",
+    "until",
+]
+__dir__ = listed(__all__)

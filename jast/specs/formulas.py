@@ -1,0 +1,272 @@
+"""Formulas of signal temporal logic: small pytrees, built with Python, that print as they read.
+
+``predicate(lambda s: s.gap - 7.5, "gap > 7.5")`` is a formula; ``always``, ``eventually``,
+``until``, ``implies`` and the operators ``&``, ``|``, ``~`` make larger ones. The syntax is that of
+Maler and Nickovic (2004), Monitoring temporal properties of continuous signals; a window [a, b] is
+in seconds from the moment at which the formula is asked, and both ends belong to it.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+from jax.tree_util import Partial
+
+__all__ = [
+    "Formula",
+    "Implies",
+    "Junction",
+    "Not",
+    "Predicate",
+    "Temporal",
+    "Until",
+    "always",
+    "children",
+    "eventually",
+    "implies",
+    "predicate",
+    "predicates",
+    "until",
+]
+
+_static = dict(metadata=dict(static=True))
+
+
+class Formula:
+    """What all formulas have in common."""
+
+    def __and__(self, other: "Formula") -> "Formula":
+        return _joined("&", self, other)
+
+    def __or__(self, other: "Formula") -> "Formula":
+        return _joined("|", self, other)
+
+    def __invert__(self) -> "Formula":
+        return Not(self)
+
+    def __bool__(self) -> bool:
+        raise ValueError(
+            f"specs: {self} is a formula: combine formulas by &, | and ~, not by words"
+        )
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Predicate(Formula):
+    """See `predicate`."""
+
+    margin: Callable[[Any], Any]
+    name: str = field(**_static)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Not(Formula):
+    """``~of``."""
+
+    of: Formula
+
+    def __str__(self) -> str:
+        return f"~{_inner(self.of)}"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Junction(Formula):
+    """All of ``parts`` ("&"), or any of them ("|")."""
+
+    parts: tuple[Formula, ...]
+    kind: str = field(**_static)
+
+    def __str__(self) -> str:
+        return f" {self.kind} ".join(map(_inner, self.parts))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Implies(Formula):
+    """See `implies`."""
+
+    left: Formula
+    right: Formula
+
+    def __str__(self) -> str:
+        return f"{_inner(self.left)} implies {_inner(self.right)}"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Temporal(Formula):
+    """See `always` and `eventually`, which ``kind`` names."""
+
+    of: Formula
+    kind: str = field(**_static)
+    a: float = field(**_static)
+    b: float | None = field(**_static)
+
+    def __str__(self) -> str:
+        return f"{self.kind}{window(self)} {_inner(self.of)}"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Until(Formula):
+    """See `until`."""
+
+    left: Formula
+    right: Formula
+    a: float = field(**_static)
+    b: float | None = field(**_static)
+
+    def __str__(self) -> str:
+        return f"{_inner(self.left)} until{window(self)} {_inner(self.right)}"
+
+
+def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
+    """A formula about one moment.
+
+    Args:
+        fn: state -> margin, a float scalar: above 0 where it holds, and the farther from 0 the
+            clearer. In JAX. What a `jax.tree_util.Partial` binds is traced.
+        name: how it prints and is named in errors, as "gap > 7.5"; by default the function's name.
+
+    Returns:
+        `Formula`.
+
+    Raises:
+        ValueError: where ``fn`` is no function or ``name`` no text. What ``fn`` returns is looked
+            at where the formula is used.
+    """
+    if not callable(fn):
+        raise ValueError(f"predicate: fn must be a function of the state, received {fn!r}")
+    if name is None:
+        own = getattr(getattr(fn, "func", fn), "__name__", "")
+        name = own if own.isidentifier() else "predicate"
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"predicate: name must be a text, received {name!r}")
+    return Predicate(fn if isinstance(fn, Partial) else Partial(fn), name)
+
+
+def always(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
+    """``f`` holds at every moment of the window.
+
+    Args:
+        f: `Formula`.
+        a, b: the window in seconds, 0 <= a <= b; without ``b`` it goes on to the trace's end.
+
+    Returns:
+        `Formula`. Its robustness is the least of ``f`` in the window.
+
+    Raises:
+        ValueError: for what is no formula, and for a window that is negative or reversed.
+    """
+    return Temporal(_formula("always", "f", f), "always", *_window("always", f, a, b))
+
+
+def eventually(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
+    """``f`` holds at some moment of the window.
+
+    Args:
+        f: `Formula`.
+        a, b: the window in seconds, 0 <= a <= b; without ``b`` it goes on to the trace's end.
+
+    Returns:
+        `Formula`. Its robustness is the greatest of ``f`` in the window.
+
+    Raises:
+        ValueError: for what is no formula, and for a window that is negative or reversed.
+    """
+    return Temporal(_formula("eventually", "f", f), "eventually", *_window("eventually", f, a, b))
+
+
+def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> Formula:
+    """``g`` holds at some moment of the window, and ``f`` at every moment from now up to then, that
+    one included.
+
+    Args:
+        f, g: `Formula`.
+        a, b: the window in seconds, 0 <= a <= b; without ``b`` it goes on to the trace's end.
+
+    Returns:
+        `Formula`. Its robustness at t is the greatest over t' in [t + a, t + b] of the least of
+        g(t') and of f over [t, t'] (Donze and Maler 2010, Robust satisfaction of temporal logic
+        over real-valued signals).
+
+    Raises:
+        ValueError: for what is no formula, and for a window that is negative or reversed.
+    """
+    f, g = _formula("until", "f", f), _formula("until", "g", g)
+    return Until(f, g, *_window("until", g, a, b))
+
+
+def implies(f: Formula, g: Formula) -> Formula:
+    """Where ``f`` holds, ``g`` does: the same as ``~f | g``.
+
+    Raises:
+        ValueError: for what is no formula.
+    """
+    return Implies(_formula("implies", "f", f), _formula("implies", "g", g))
+
+
+def children(f: Formula) -> tuple[Formula, ...]:
+    """The formulas that ``f`` is made of."""
+    if isinstance(f, Predicate):
+        return ()
+    if isinstance(f, Junction):
+        return f.parts
+    return (f.of,) if isinstance(f, Not | Temporal) else (f.left, f.right)
+
+
+def predicates(f: Formula) -> Iterator[Predicate]:
+    """The predicates of ``f`` as they read, from left to right."""
+    if isinstance(f, Predicate):
+        yield f
+    for child in children(f):
+        yield from predicates(child)
+
+
+def window(f: Temporal | Until) -> str:
+    """The window of ``f`` as it prints: "[0, 30]"; "" for the whole trace."""
+    if f.b is None:
+        return f"[{f.a:g}, end]" if f.a else ""
+    return f"[{f.a:g}, {f.b:g}]"
+
+
+def _joined(kind: str, *parts: Formula) -> Formula:
+    for part in parts:
+        _formula(kind, "each side", part)
+    flat = lambda p: p.parts if isinstance(p, Junction) and p.kind == kind else (p,)
+    return Junction(sum(map(flat, parts), ()), kind)
+
+
+def _inner(f: Formula) -> str:
+    text = str(f)
+    alone = isinstance(f, Not) or (isinstance(f, Predicate) and text.isidentifier())
+    return text if alone else f"({text})"
+
+
+def _formula(function: str, name: str, f: Any) -> Formula:
+    if not isinstance(f, Formula):
+        raise ValueError(
+            f"{function}: {name} must be a formula, as jast.specs.predicate(function) makes it,"
+            f" received {f!r}"
+        )
+    return f
+
+
+def _window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, float | None]:
+    number = lambda v: isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
+    if not (number(a) and (b is None or number(b)) and 0 <= a and (b is None or a <= b)):
+        raise ValueError(
+            f"{function} {_inner(f)}: the window must be two numbers of seconds, 0 <= a <= b (b may"
+            f" be left out: to the trace's end), received a={a!r}, b={b!r}"
+        )
+    return float(a), None if b is None else float(b)

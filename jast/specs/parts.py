@@ -1,0 +1,107 @@
+"""Which part of a formula broke, and when: every sub-formula asked at the moment that decides."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast import results
+from jast.specs import robustness as R
+from jast.specs.formulas import Formula, Implies, Not, Predicate, Until, children
+
+__all__ = ["Part", "Parts", "parts"]
+
+
+class Part(NamedTuple):
+    """A sub-formula, at the moment at which the whole formula's robustness depends on it."""
+
+    formula: Formula
+    depth: int
+    """How many formulas it is inside of."""
+    time: float
+    """Seconds; NaN where nothing was decided within the trace."""
+    value: float
+    """Its robustness then."""
+    held: bool
+    """It is above 0."""
+    decides: bool
+    """Its robustness is the whole formula's, or less it (below ``~``, left of ``implies``)."""
+    values: np.ndarray
+    """[T] its robustness at each moment, windows clipped at the trace's end."""
+
+
+@results.shown()
+class Parts(NamedTuple):
+    """What `parts` found: prints as a table."""
+
+    rows: tuple[Part, ...]
+    """The formula itself first, each formula before its parts."""
+    dt: float
+
+    def __str__(self) -> str:
+        width = max(2 * p.depth + len(str(p.formula)) for p in self.rows)
+        width = max(min(width, 70), 10)
+        lines = [f"{'':<{width}}  {'at s':>8}  {'robustness':>11}"]
+        for p in self.rows:
+            text = "  " * p.depth + str(p.formula)
+            text = text if len(text) <= width else text[: width - 3] + "..."
+            when = "-" if np.isnan(p.time) else f"{p.time:g}"
+            said = ("holds" if p.held else "does not") + (", decides" if p.decides else "")
+            lines.append(f"{text:<{width}}  {when:>8}  {p.value:11.5g}  {said}")
+        return "\n".join(lines)
+
+
+def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> Parts:
+    """Which part of a formula broke, and when; or, where it holds, what came nearest.
+
+    The formula is asked at 0 s. What is inside of a window is asked at the moment of it that
+    decides: the worst for ``always``, the best for ``eventually`` and ``until``.
+
+    Args:
+        formula: `Formula`.
+        trace: a pytree of arrays [T, ...], as for `robustness`.
+        dt: seconds between samples.
+        goes_on: as for `robustness`: for the trace of an episode that ended where the violation
+            was certain.
+
+    Returns:
+        `Parts`: a row for each sub-formula, with its trace of robustness. On the host.
+
+    Raises:
+        ValueError: as `robustness`.
+    """
+    dt = R.spacing("parts", dt)
+    R.robustness(formula, trace, dt, goes_on=goes_on)  # its checks
+    given = R.margins("parts", formula, trace)
+    found = jax.device_get(R.values(formula, given, dt, goes_on))
+    total, rows = found.own[0], []
+
+    def look(f: Formula, v: R.Values, at: int | None, depth: int) -> None:
+        value = float(v.own[at]) if at is not None else float("nan")
+        time = float("nan") if at is None else at * dt
+        decides = abs(value) == abs(float(total)) and np.isfinite(value)
+        rows.append(Part(f, depth, time, value, value > 0, decides, v.own))
+        moments = _moments(f, v, at, dt)
+        for child, part, when in zip(children(f), v.parts, moments, strict=True):
+            look(child, part, when, depth + 1)
+
+    look(formula, found, 0, 0)
+    return Parts(tuple(rows), dt)
+
+
+def _moments(f: Formula, v: R.Values, at: int | None, dt: float) -> list[int | None]:
+    """When the parts of ``f`` are asked, which is itself asked ``at``."""
+    if at is None or isinstance(f, Predicate | Not | Implies) or not hasattr(f, "b"):
+        return [at] * len(v.parts)
+    if not np.isfinite(v.own[at]):  # open yet
+        return [None] * len(v.parts)
+    first, last = R.samples_in("parts", f, dt)
+    end = None if last is None else at + last + 1
+    inside = slice(at + first, end)
+    if isinstance(f, Until):
+        left, right = v.parts
+        sofar = np.minimum.accumulate(left.own[at:])[first : None if last is None else last + 1]
+        then = at + first + int(np.argmax(np.minimum(right.own[inside], sofar)))
+        return [at + int(np.argmin(left.own[at : then + 1])), then]
+    pick = np.argmin if f.kind == "always" else np.argmax
+    return [at + first + int(pick(v.parts[0].own[inside]))]

@@ -1,0 +1,218 @@
+"""under: a simulator whose failure is the violation of a formula."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast.contract import contract
+from jast.episode import Episode
+from jast.outline import outline
+from jast.simulator import Simulator
+from jast.specs import monitor
+from jast.specs.formulas import Formula, predicates
+from jast.specs.robustness import fits, margins, spacing
+
+__all__ = ["Monitored", "trace_of", "under"]
+
+
+class Monitored(NamedTuple):
+    """State of a system under a formula."""
+
+    state: Any
+    """The system's own."""
+    samples: Any
+    """int32: samples of the trace so far."""
+    memory: Any
+    """`jast.specs.monitor.Memory` of each window."""
+    robustness: Any
+    """The greatest that the trace's robustness can still come to; at the trace's end, the
+    robustness. Infinite where all is open yet.
+    """
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Watch:
+    """What the functions of the simulator share."""
+
+    sim: Simulator
+    formula: Formula
+    samples: Any
+    dt: float = field(metadata=dict(static=True))
+    total: int = field(metadata=dict(static=True))
+
+
+def under(
+    sim: Simulator,
+    formula: Formula,
+    dt: float = 1.0,
+    *,
+    samples: Callable[[Any], Any] | None = None,
+) -> Simulator:
+    """``sim`` under a specification: a failure is an episode whose trace violates ``formula``, and
+    the miss distance is the robustness.
+
+    The trace is the states s_0, s_1, .., dt seconds apart. A monitor in the state (`Monitored`)
+    knows the greatest robustness that the trace can still come to. An episode ends, failing, at the
+    first moment at which that is below 0: no continuation satisfies the formula, if its predicates
+    may come to anything. Else it goes on to the system's own end, where the trace ends and windows
+    are clipped (`jast.specs.robustness`; where ``is_terminal`` ends it before a window began,
+    ``always`` holds there and ``eventually`` does not). The miss distance is the robustness of the
+    whole trace, 0 for a failure.
+
+    Where the bound is finite from the first state on, as for ``always`` of a predicate, it is the
+    miss distance of each state: it never rises, so its least over the states is the last. Otherwise
+    (``eventually``, for one) the simulator is ``episodic``: judged at its end, which still is the
+    first moment of certainty. Either way a state tells all that matters, so trees may keep and
+    return to it. A step costs O(r log r) for a formula whose outermost windows contain what looks r
+    samples ahead, and 1 where that is a predicate.
+
+    Args:
+        sim: `jast.Simulator`. Its own failure event and miss distance play no part.
+        formula: `Formula` of ``sim``'s states (or of what ``samples`` makes of one).
+        dt: seconds of a step; with ``samples``, seconds between samples. Static.
+        samples: state -> pytree of arrays [k, ...]: the k samples of the step that led to this
+            state, in order, the last of them at the state; for a step that holds more than one. At
+            the start its last row counts. None: the state itself.
+
+    Returns:
+        `jast.Simulator`, with the horizon, start, disturbances and ``observe`` of ``sim``.
+
+    Raises:
+        ValueError: naming the sub-formula, for a window beyond the horizon or that holds no sample,
+            and for a predicate that raises, as over a field that the state lacks, or that returns
+            no float scalar. A NaN from a predicate makes an episode invalid, as any other NaN.
+    """
+    if not isinstance(formula, Formula):
+        raise ValueError(f"under: formula must be a jast.specs formula, received {formula!r}")
+    if samples is not None and not callable(samples):
+        raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
+    contract(sim, observed=False)
+    samples = samples if samples is None or isinstance(samples, Partial) else Partial(samples)
+    about, dt = outline(sim), spacing("under", dt)
+    watch = _Watch(sim, formula, samples, dt, 0)
+    rows = jax.eval_shape(lambda: _rows(watch, _zeros(about.state)))
+    sizes = {a.shape[0] if a.ndim else 0 for a in jax.tree.leaves(rows)}
+    if len(sizes) != 1 or 0 in sizes:
+        raise ValueError(
+            "under: samples must return arrays [k, ...] with one k of at least 1, received"
+            f" {jax.tree.map(lambda a: a.shape, rows)}"
+        )
+    total = sim.horizon * sizes.pop() + 1
+    fits("under", formula, total, dt)
+    watch = _Watch(sim, formula, samples, dt, total)
+    shapes = jax.eval_shape(lambda: margins("under", formula, _rows(watch, _zeros(about.state))))
+    watched = dict(
+        init=Partial(_init, watch),
+        step=Partial(_step, watch),
+        disturbance=Partial(_disturbance, watch),
+        horizon=sim.horizon,
+        start=sim.start,
+        observe=Partial(_observe, watch),
+    )
+    if _open_at_first(watch, shapes[0].dtype):
+        end = Partial(_over, watch)
+        return Simulator(evaluate=_evaluate, is_terminal=end, episodic=True, **watched)
+    return Simulator(evaluate=_evaluate, is_terminal=Partial(_ended, watch), **watched)
+
+
+def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> Any:
+    """The trace of an episode of a system `under` a formula, for `jast.specs.parts`.
+
+    Args:
+        episode: one `jast.Episode` with its states, as `jast.replay` returns it.
+        samples: as for `under`.
+
+    Returns:
+        The system's states, a pytree of arrays [n, ...] up to the episode's end: with
+        ``goes_on=True`` where that came before the horizon.
+
+    Raises:
+        ValueError: for an episode without states, or of another system.
+    """
+    if not isinstance(getattr(episode, "states", None), Monitored):
+        raise ValueError(
+            "trace_of: episode must be a jast.replay of a simulator of jast.specs.under, received"
+            f" {type(episode).__name__} with states {type(getattr(episode, 'states', None))}"
+        )
+    n = int(episode.length) + 1
+    states = jax.tree.map(lambda a: np.asarray(a)[:n], episode.states.state)
+    if samples is None:
+        return states
+    rows = jax.vmap(samples)(states)
+    flat = lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])])
+    return jax.tree.map(lambda a: flat(np.asarray(a)), rows)
+
+
+def _init(watch: _Watch, x0: Any) -> Monitored:
+    state = watch.sim.init(x0)
+    rows = jax.tree.map(lambda a: a[-1:], _rows(watch, state))
+    given = margins("under", watch.formula, rows)
+    memory = monitor.begin(watch.formula, watch.dt, watch.total, given[0].dtype)
+    return _pushed(watch, state, jnp.zeros((), jnp.int32), memory, given)
+
+
+def _step(watch: _Watch, s: Monitored, x: Any) -> Monitored:
+    state = watch.sim.step(s.state, x)
+    given = margins("under", watch.formula, _rows(watch, state))
+    return _pushed(watch, state, s.samples, s.memory, given)
+
+
+def _pushed(watch: _Watch, state: Any, samples: Any, memory: Any, given: Any) -> Monitored:
+    after = samples + len(given[0])
+    unknown = (after < watch.total) & ~jnp.asarray(watch.sim.is_terminal(state))
+    memory, bound = monitor.push(
+        watch.formula, memory, given, samples, unknown, watch.dt, watch.total
+    )
+    return Monitored(state, after, memory, bound)
+
+
+def _rows(watch: _Watch, state: Any) -> Any:
+    if watch.samples is None:
+        return jax.tree.map(lambda a: jnp.asarray(a)[None], state)
+    return watch.samples(state)
+
+
+def _disturbance(watch: _Watch, s: Monitored) -> Any:
+    return watch.sim.disturbance(s.state)
+
+
+def _observe(watch: _Watch, s: Monitored) -> Any:
+    return watch.sim.observe(s.state)
+
+
+def _evaluate(s: Monitored) -> tuple[jax.Array, jax.Array]:
+    # infinite only where all is open yet, or was at an early end: finite, and sums of it are, too
+    most = float(jnp.finfo(s.robustness.dtype).max) ** 0.5
+    return s.robustness < 0, jnp.clip(s.robustness, 0, most)
+
+
+def _ended(watch: _Watch, s: Monitored) -> Any:
+    return watch.sim.is_terminal(s.state)
+
+
+def _over(watch: _Watch, s: Monitored) -> Any:
+    return (s.robustness < 0) | watch.sim.is_terminal(s.state)
+
+
+def _open_at_first(watch: _Watch, dtype: Any) -> bool:
+    """Whether the bound may be infinite after the first sample."""
+    given = tuple(jnp.zeros(1, dtype) for _ in predicates(watch.formula))
+    memory = monitor.begin(watch.formula, watch.dt, watch.total, dtype)
+
+    def bound() -> jax.Array:
+        unknown = jnp.ones((), bool)
+        start = jnp.zeros((), jnp.int32)
+        return monitor.push(watch.formula, memory, given, start, unknown, watch.dt, watch.total)[1]
+
+    with jax.ensure_compile_time_eval():
+        return bool(jnp.isinf(bound()))
+
+
+def _zeros(like: Any) -> Any:
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
