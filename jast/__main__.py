@@ -24,6 +24,7 @@ from jast.search.mcts import mcts
 from jast.search.monte_carlo import monte_carlo
 from jast.search.result import table
 from jast.simulator import Simulator
+from jast.simulators.drawings import DRAWN
 from jast.stress_testing import stress
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
@@ -196,7 +197,8 @@ def _stress(options, own):
     archive = options.output / "failures.npz"
     failures.save(archive, report.failures, report.settings | dict(simulator=name))
     page = options.output / "report.html"
-    report.html(page, explanations=_explained(options, sim, report))
+    draw = simulators.draw if isinstance(outline(sim).state, tuple(DRAWN)) else None
+    report.html(page, draw=draw, explanations=_explained(options, sim, report))
     print(f"saved {path}\nsaved {archive}\nsaved {page}")
     if best is not None:
         _pictures(options, {"episode": lambda: _drawn(options, own, best, sim)})

@@ -1,8 +1,10 @@
-"""Simulated systems with a source and a known truth, one file (or folder) each."""
+"""Simulated systems with a source and a known truth, one file (or folder) each; `draw` is
+a picture of a state of some of them."""
 
 from jast.simulators.autoregression import autoregression
 from jast.simulators.bluesky import bluesky, bluesky_flight
 from jast.simulators.colav import colav
+from jast.simulators.drawings import draw
 from jast.simulators.ferry import ferry
 from jast.simulators.fms import fms, fms_misses, fms_path
 from jast.simulators.landing import landing, landing_probability
@@ -16,6 +18,7 @@ __all__ = [
     "bluesky",
     "bluesky_flight",
     "colav",
+    "draw",
     "ferry",
     "fms",
     "fms_misses",

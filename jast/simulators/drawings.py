@@ -1,0 +1,108 @@
+"""Pictures of one state of the simulators that move in a plane, as SVG: what the page of a report
+shows beside its slider (``report.html(path, draw=jast.simulators.draw)``).
+"""
+
+import math
+from typing import Any
+
+from jast.simulators import svg
+from jast.simulators.colav.planner import SPEEDS
+from jast.simulators.colav.system import COLLISION as TOUCH
+from jast.simulators.colav.system import ColavState
+from jast.simulators.ferry import COLLISION, FerryState
+from jast.simulators.pendulum import PendulumState
+from jast.simulators.svg import BLUE, GREEN, GREY, INK, VERMILION
+
+__all__ = ["DRAWN", "draw"]
+
+HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
+"""Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
+
+
+def draw(state: Any) -> str:
+    """One state of `ferry`, `colav` or `pendulum` as an SVG picture.
+
+    Args:
+        state: a `FerryState`, `ColavState` or `PendulumState` of scalars.
+
+    Returns:
+        The SVG element, as text.
+
+    Raises:
+        ValueError: for a state of another system.
+    """
+    for kind, picture in DRAWN.items():
+        if isinstance(state, kind):
+            return picture(state)
+    raise ValueError(
+        f"draw: state must be one of {[kind.__name__ for kind in DRAWN]}, received a"
+        f" {type(state).__name__}"
+    )
+
+
+def _ferry(s: FerryState) -> str:
+    plane = svg.Plane((-22.0, -8.0), (114.0, 112.0), 360)
+    ferry, other = (float(s.ferry_x), float(s.ferry_y)), (float(s.x), float(s.y))
+    gap = math.dist(ferry, other)
+    return plane.picture(
+        plane.line([(0.0, 50.0), (105.0, 50.0)], GREY, dash="4 4"),
+        plane.circle(ferry, COLLISION, BLUE, 0.2),
+        plane.line([ferry, other], INK if gap < 4 * COLLISION else "#ccc", width=1),
+        plane.shape(_placed(ferry, math.pi / 2), BLUE),
+        plane.shape(_placed(other, float(s.heading)), VERMILION),
+        plane.words((-19.0, 105.0), "ferry", BLUE),
+        plane.words((2.0, 105.0), "adversary", VERMILION),
+        plane.words((112.0, 105.0), f"distance {gap:.2f}", INK, "end"),
+        plane.words((112.0, -4.0), f"collision: within {COLLISION:g}", GREY, "end"),
+    )
+
+
+def _colav(s: ColavState) -> str:
+    plane = svg.Plane((-38.0, -6.0), (58.0, 112.0), 330)
+    own, other, seen = s.pose, s.adversary.pose, s.track
+    places = [(float(p.e), float(p.n)) for p in (own, other, seen)]
+    course = math.atan2(float(seen.v_e), float(seen.v_n))
+    near = math.dist(*places[:2])
+    return plane.picture(
+        plane.line([(0.0, 0.0), (0.0, 100.0)], GREY, dash="4 4"),
+        plane.line(places[1:], INK, width=1),
+        plane.circle(places[0], TOUCH, BLUE, 0.4),
+        plane.shape(_placed(places[0], float(own.psi)), BLUE),
+        plane.shape(_placed(places[1], float(other.psi)), VERMILION),
+        plane.shape(_placed(places[2], course), "none", GREEN),
+        plane.words((-36.0, 107.0), "ferry", BLUE),
+        plane.words((-22.0, 107.0), "adversary", VERMILION),
+        plane.words((3.0, 107.0), "as believed", GREEN),
+        plane.words((56.0, 107.0), f"{near:.1f} m apart", INK, "end"),
+        plane.words((56.0, -3.0), f"ordered {SPEEDS[int(s.choice)]:.2f} m/s", INK, "end"),
+    )
+
+
+def _pendulum(s: PendulumState) -> str:
+    plane = svg.Plane((-1.3, -0.35), (1.3, 1.35), 330)
+    theta, omega = float(s.theta), float(s.omega)
+    at = lambda angle, r: (r * math.sin(angle), r * math.cos(angle))
+    # where it will be in a tenth of a second at this speed
+    ahead = [at(theta + 0.1 * omega * i / 10, 1.12) for i in range(11)]
+    return plane.picture(
+        plane.line([(-1.2, 0.0), (1.2, 0.0)], GREY),
+        plane.line([(0.0, 0.0), (0.0, 1.15)], GREY, dash="4 4"),
+        plane.line([(0.0, 0.0), at(theta, 1.0)], INK, width=3),
+        plane.circle(at(theta, 1.0), 0.07, BLUE),
+        plane.line(ahead, VERMILION, width=2),
+        plane.words((-1.25, -0.25), f"{math.degrees(theta):.1f} degrees", BLUE),
+        plane.words((1.25, -0.25), f"{omega:.2f} rad/s", VERMILION, "end"),
+    )
+
+
+def _placed(place: tuple[float, float], heading: float) -> list[tuple[float, float]]:
+    """The hull at ``place``, its bow to ``heading`` (radians from up to the right)."""
+    sin, cos = math.sin(heading), math.cos(heading)
+    return [
+        (place[0] + ahead * sin + right * cos, place[1] + ahead * cos - right * sin)
+        for ahead, right in HULL
+    ]
+
+
+DRAWN = {FerryState: _ferry, ColavState: _colav, PendulumState: _pendulum}
+"""Kind of state -> its picture."""
