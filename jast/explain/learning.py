@@ -28,14 +28,18 @@ def learner(function: str, module: str) -> Any:
 def parted(
     rng: np.random.Generator, owner: np.ndarray, group: np.ndarray, share: float
 ) -> np.ndarray:
-    """Which episodes [n] are held out: a ``share`` of the groups of each class ``owner`` [n], so
-    that all episodes of a ``group`` [n] are on one side.
-
-    Of each class at least one group is held out, and one is not.
+    """Which episodes [n] are held out: of each class ``owner`` [n] at most a ``share``, by groups
+    drawn at random, so that all episodes of a ``group`` [n] are on one side; one group at least.
     """
     out = np.zeros(len(owner), bool)
     for k in np.unique(owner):
-        groups = rng.permutation(np.unique(group[owner == k]))
-        many = min(max(int(round(share * len(groups))), 1), len(groups) - 1)
-        out |= (owner == k) & np.isin(group, groups[:many])
+        groups, sizes = np.unique(group[owner == k], return_counts=True)
+        most, taken = share * sizes.sum(), 0
+        chosen = []
+        for i in rng.permutation(len(groups)):
+            if taken + sizes[i] <= most:
+                chosen.append(groups[i])
+                taken += sizes[i]
+        chosen = chosen or [groups[np.argmin(sizes)]]
+        out |= (owner == k) & np.isin(group, chosen)
     return out

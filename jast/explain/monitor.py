@@ -245,10 +245,7 @@ def _episodes(name, key, sim, failures, others, episodes):
         plain = _ordinary(calm, sim, episodes)
         parts, spent = (v.failures, v.near, plain), s.evaluations + v.evaluations + episodes
         owner = (FAILING, NEAR, ORDINARY)
-        groups = [v.seed, v.near_seed]
-        if len(np.unique(s.z, axis=0)) < DISTINCT:
-            # too few failures to hold some out: then their variants are
-            groups = [np.arange(len(v.seed)), len(v.seed) + np.arange(len(v.near_seed))]
+        groups = [v.group, v.near_group]
     else:
         a = gathered(name, "failures", sim, failures)
         b = gathered(name, "others", sim, others)

@@ -126,13 +126,14 @@ def rules(
     often the rules are right.
 
     Without ``others`` the episodes are simulated: Markov chains start from the failures given, and
-    draw some of the disturbances anew or move them a little, as the model has it. What still fails
-    is a failure, what no longer does is a near miss. So what has no part in the failures is the
-    same in both. Of a report of `jast.stress`, or an estimate of
+    draw some of the disturbances anew, move them a little, or let all come some steps later, as the
+    model has it. What still fails is a failure, what no longer does is a near miss. So what has no
+    part in the failures is the same in both. Of a report of `jast.stress`, or an estimate of
     `jast.estimate.failure_probability`, the chains start from weighted draws of its proposal: then
     the failures are as probable as in the model. All that precision and recall tell is about
     episodes like these, as many failures as near misses: among ordinary episodes, of which few
-    fail, a rule is less precise.
+    fail, a rule is less precise. Variants of one failure are held out together, unless more than a
+    quarter of the chains starts from it.
 
     Args:
         sim: the simulator. Without ``others`` its disturbances have quantile functions.
@@ -143,7 +144,7 @@ def rules(
         labels: names of the kinds of the failures, one for each; there are rules for each kind. By
             default those of a report or of modes are told apart by their mode, the first six.
         key: of the draws and of what is held out; `jax.random.key(0)` by default.
-        episodes: failures to be simulated without ``others``, at least 20. About 10 evaluations
+        episodes: failures to be simulated without ``others``, at least 20. About 13 evaluations
             for each of them, and of an estimate 4 more.
         of: "disturbances", "states" or "both". States are those seen until ``lead`` steps before
             the end of the episode; others end when a failure drawn at random did.
@@ -209,7 +210,7 @@ def _episodes(name, key, sim, failures, others, labels, episodes):
     if others is None or many:
         s = seeds(name, k, sim, failures, labels, DRAWS * episodes)
         v = variants(more, sim, s, episodes)
-        near = len(v.near_seed)
+        near = len(v.near_group)
         if many:
             near = min(near, _checks.whole(name, "others", others, 1))
         if near < 2 * DISTINCT:
@@ -220,10 +221,7 @@ def _episodes(name, key, sim, failures, others, labels, episodes):
         cut = jax.tree.map(lambda a: a[:near], v.near)
         e = jax.tree.map(lambda a, b: np.concatenate([a, b]), v.failures, cut)
         owner = np.concatenate([1 + v.label, np.zeros(near, int)])
-        few = min(len(np.unique(s.z[s.label == i], axis=0)) for i in np.unique(v.label)) < DISTINCT
-        group = np.concatenate([v.seed, v.near_seed[:near]])
-        # too few failures to hold some out: then their variants are
-        group = np.arange(len(owner)) if few else group
+        group = np.concatenate([v.group, v.near_group[:near]])
         return e, owner, group, (OTHERS, *s.names), s.evaluations + v.evaluations
     a, b = gathered(name, "failures", sim, failures), gathered(name, "others", sim, others)
     for argument, part, wanted in (("failures", a, True), ("others", b, False)):

@@ -15,17 +15,22 @@ from jast.explain.gathered import distinct, gathered
 from jast.incidents import hosted
 from jast.judge import Judge
 from jast.markov import proposed
-from jast.pytrees import in_lanes
+from jast.outline import outline
+from jast.pytrees import count, in_lanes
 from jast.search.centred import centred
 from jast.search.failure_modes import Mode, Modes, nearest
 from jast.simulator import Simulator
 
 __all__ = ["Seeds", "Variants", "seeds", "variants"]
 
-SCALES = (1.0, 0.3, 1.0, 0.7, 1.0, 0.15, 1.0, 0.5)
-"""How far the disturbances of a move go: 1 is a new draw."""
-DRAWS, LANES, MOST = 1024, 256, 6
-"""Of a proposal at a time; episodes that are played at a time; modes that are told apart."""
+SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
+"""How far the disturbances of a move go: 1 is a new draw. None: they all come some steps later,
+those at the end first.
+"""
+DRAWS, LANES, MOST, MANY = 1024, 256, 6, 0.25
+"""Of a proposal at a time; episodes that are played at a time; modes that are told apart; the share
+of the chains that may start from one seed for seeds to be held out as a whole.
+"""
 
 
 class Seeds(NamedTuple):
@@ -49,10 +54,10 @@ class Variants(NamedTuple):
     failures: Episode
     label: np.ndarray
     """[n] of the failures: index into the names of the seeds."""
-    seed: np.ndarray
-    """[n] of the failures: which of the seeds they come from."""
+    group: np.ndarray
+    """[n] of the failures: those of one group come from the same seed, unless one seed has many."""
     near: Episode
-    near_seed: np.ndarray
+    near_group: np.ndarray
     evaluations: int
 
 
@@ -70,6 +75,7 @@ def seeds(
     estimate = getattr(given, "probability", None) or given
     q = getattr(estimate, "proposal", None)
     modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
+    modes = modes if isinstance(modes, Modes) else None
     if labels is None and q is not None and fits(sim, q):
         found = _of_proposal(key, sim, q, draws)
         if len(found.z):
@@ -150,11 +156,12 @@ def _moved(sim: Simulator, of_modes: Simulator, z: np.ndarray) -> np.ndarray:
 def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     """``n`` failures and at most as many near misses, from Markov chains that begin at ``s``.
 
-    In each move of a chain some of the disturbances are drawn anew, or moved a little, so that the
-    model stays as it is (`jast.markov.proposed`): where the system still fails the chain goes
-    there, and where it does not that is a near miss, of which each chain keeps one at random. So
-    disturbances that matter not are as in any other episode, in failures and near misses alike.
-    All kinds of failures get the same number of chains.
+    In each move of a chain some of the disturbances are drawn anew, or moved a little
+    (`jast.markov.proposed`), or all come some steps later, so that the model stays as it is: where
+    the system still fails the chain goes there, and where it does not that is a near miss, of which
+    each chain keeps one at random. So disturbances that matter not are as in any other episode, in
+    failures and near misses alike, and so is the time where it does not matter. All kinds of
+    failures get the same number of chains.
     """
     rng, judge = generator(key), Judge(sim)
     kinds = np.unique(s.label)
@@ -165,8 +172,7 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     z = np.where(behind, rng.standard_normal(z.shape), z)
     near, misses = np.zeros_like(z), np.zeros(len(z), int)
     for scale in SCALES:
-        meant = rng.random(z.shape) < rng.random((len(z), 1))
-        to = np.where(meant, proposed(z, rng.standard_normal(z.shape), scale, 1.0), z)
+        to = _later(rng, sim, z) if scale is None else _redrawn(rng, z, scale)
         o = judge(to)
         rejected = ~o.failure & ~o.invalid
         misses += rejected
@@ -179,14 +185,40 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     fails = np.flatnonzero(failing.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
     take = lambda e, rows: jax.tree.map(lambda a: a[rows], e)
+    label, group = s.label[seed[fails]], seed[fails]
+    near_group = seed[missed[calm_rows]]
+    crowded = any(
+        np.unique(group[label == k], return_counts=True)[1].max() > MANY * np.sum(label == k)
+        for k in np.unique(label)
+    )
+    if crowded:
+        # no seed can be held out: its variants are
+        group = np.arange(len(fails))
+        near_group = len(fails) + np.arange(len(calm_rows))
     return Variants(
         take(failing, fails),
-        s.label[seed[fails]],
-        seed[fails],
+        label,
+        group,
         take(calm, calm_rows),
-        seed[missed[calm_rows]] if len(missed) else np.zeros(0, int),
+        near_group,
         judge.spent + played + more,
     )
+
+
+def _redrawn(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray:
+    """``z`` [n, D] of which some numbers moved, of each row another share."""
+    meant = rng.random(z.shape) < rng.random((len(z), 1))
+    return np.where(meant, proposed(z, rng.standard_normal(z.shape), scale, 1.0), z)
+
+
+def _later(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
+    """``z`` [n, D] with the disturbances some steps later, in a ring."""
+    n, steps = len(z), sim.horizon
+    start = count(outline(sim).x0)
+    at = (np.arange(steps) - rng.integers(0, steps, (n, 1))) % steps
+    rows = z[:, start:].reshape(n, steps, -1)
+    moved = np.take_along_axis(rows, at[:, :, None], axis=1)
+    return np.concatenate([z[:, :start], moved.reshape(n, -1)], axis=1)
 
 
 def _chosen(rng: np.random.Generator, s: Seeds, kind: int, n: int) -> np.ndarray:

@@ -1,0 +1,223 @@
+"""Systems whose failures have causes that were planted, for `benchmarks.explain`.
+
+The settings of `jast.explain.rules` and `monitor` were chosen on the systems of
+`benchmarks.stress_systems`, not on these.
+"""
+
+import math
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+import jast
+from jast.distributions import Exponential, Joint, Normal
+
+__all__ = ["PLANTED", "Planted", "lane", "planted", "version", "walk"]
+
+STEPS, DELAY, FIELDS = 50, 0.2, ("delay", "gust")
+"""Steps of an episode, mean delay (s), and what a disturbance has."""
+PLANTED = (
+    "one step of 50",
+    "two causes, 1 to 20",
+    "delay with a gust",
+    "delay with a gust, any step",
+)
+NEVER = -100.0
+"""A limit that every disturbance is above."""
+
+
+class Planted(NamedTuple):
+    """A system, and what leads to its failures."""
+
+    sim: jast.Simulator
+    causes: list
+    """For each cause the limits of (step, field), of which all must be passed; a cause that may
+    come at any step has the step None."""
+
+    def named(self, cause: int) -> set:
+        """What a rule for the cause speaks of."""
+        if any(step is None for step, _ in self.causes[cause]):
+            return {"greatest gust", "delay while gust is greatest"}
+        return {f"{field} at step {step}" for step, field in self.causes[cause]}
+
+    def failing(self, rng: np.random.Generator, cause: int, n: int) -> Any:
+        """Disturbances [n, steps] of failures by one cause, as probable as in the model."""
+        x, at = _model(rng, n), rng.integers(0, STEPS, n)
+        for (step, field), limit in self.causes[cause].items():
+            u, rows = 1 - rng.random(n), np.arange(n)
+            tail = np.array([NormalDist().inv_cdf(v) for v in u * NormalDist().cdf(-limit)])
+            beyond = limit - DELAY * np.log(u) if field == "delay" else -tail
+            # just above, whatever a float32 makes of it
+            x[field][rows, at if step is None else step - 1] = beyond * (1 + 1e-6)
+        return x
+
+    def near(self, rng: np.random.Generator, cause: int, n: int) -> Any:
+        """Disturbances [n, steps] of which those that matter are anywhere up to a quarter beyond
+        their limits; some fail.
+        """
+        x, at = _model(rng, n), rng.integers(0, STEPS, n)
+        for (step, field), limit in self.causes[cause].items():
+            x[field][np.arange(n), at if step is None else step - 1] = 1.25 * limit * rng.random(n)
+        return x
+
+    def episodes(self, x: Any) -> jast.Episode:
+        """These disturbances, played."""
+        each = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), x)
+        return _replayed(self.sim, each)
+
+
+@jax.jit
+def _replayed(sim, x):
+    return jax.vmap(lambda one: jast.replay(sim, one)._replace(states=None))(x)
+
+
+def _model(rng, n):
+    gust, delay = rng.standard_normal((n, STEPS)), rng.exponential(DELAY, (n, STEPS))
+    return dict(delay=delay, gust=gust)
+
+
+def planted(name: str, seed: int) -> Planted:
+    """One of `PLANTED`, with steps drawn by ``seed``."""
+    rng = np.random.default_rng([seed, PLANTED.index(name)])
+    first, second = (int(t) for t in 1 + rng.choice(STEPS, 2, replace=False))
+    rare = lambda p: -NormalDist().inv_cdf(p)
+    late = lambda p: -DELAY * math.log(p)
+    if name == "one step of 50":
+        causes = [{(first, "gust"): rare(3e-6)}]
+    elif name == "two causes, 1 to 20":
+        causes = [{(first, "gust"): rare(4e-5)}, {(second, "gust"): rare(2e-6)}]
+    elif name == "delay with a gust":
+        causes = [{(first, "delay"): late(2e-3), (first, "gust"): rare(2e-3)}]
+    else:
+        causes = [{(None, "delay"): late(1e-2), (None, "gust"): rare(2e-4)}]
+        limits = jnp.array([causes[0][None, field] for field in FIELDS])
+        return Planted(_any_step(limits), causes)
+    limits = np.full((2, STEPS, len(FIELDS)), NEVER)
+    if len(causes) == 1:
+        limits[1] = -NEVER
+    for k, cause in enumerate(causes):
+        for (step, field), limit in cause.items():
+            limits[k, step - 1, FIELDS.index(field)] = limit
+    return Planted(_planted(jnp.asarray(limits)), causes)
+
+
+class Short(NamedTuple):
+    t: jax.Array
+    short: jax.Array
+    """By how much each cause has been missed, at most."""
+
+
+def _weather(s):
+    return Joint(dict(delay=Exponential(1 / DELAY), gust=Normal(0.0, 1.0)))
+
+
+def _row(x):
+    return jnp.stack([x[field] for field in FIELDS])
+
+
+def _watch(limits, s, x):
+    return Short(s.t + 1, jnp.maximum(s.short, jnp.max(limits[:, s.t] - _row(x), axis=1)))
+
+
+def _missed(s):
+    near = jnp.maximum(jnp.min(s.short), 0.0)
+    return near <= 0, near
+
+
+def _planted(limits):
+    """Fails where at the end all limits of a cause [k, steps, fields] were passed."""
+    return jast.Simulator(
+        init=_unseen,
+        step=Partial(_watch, limits),
+        disturbance=_weather,
+        evaluate=_missed,
+        horizon=STEPS,
+        episodic=True,
+    )
+
+
+def _unseen(x0):
+    return Short(jnp.zeros((), jnp.int32), jnp.full(2, NEVER))
+
+
+def _any_step(limits):
+    """Fails at the first step at which all limits [fields] are passed."""
+    return jast.Simulator(
+        init=lambda x0: Short(jnp.zeros((), jnp.int32), jnp.full(2, 3.0)),
+        step=Partial(_at_once, limits),
+        disturbance=_weather,
+        evaluate=_missed,
+        horizon=STEPS,
+    )
+
+
+def _at_once(limits, s, x):
+    return Short(s.t + 1, jnp.full(2, jnp.max(limits - _row(x))))
+
+
+def walk(limit, steps=20):
+    """A random walk that fails above ``limit`` at its end: from s after t steps with the
+    probability Phi((s - limit) / sqrt(steps - t)).
+    """
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
+        horizon=steps,
+        episodic=True,
+    )
+
+
+class Car(NamedTuple):
+    offset: jax.Array
+    drift: jax.Array
+
+
+def lane(gust, camera):
+    """A car keeps its lane in gusts, by a camera with errors: no closed form is known."""
+    return jast.Simulator(
+        init=lambda x0: Car(jnp.array(0.0), jnp.array(0.0)),
+        step=_steered,
+        disturbance=Partial(_lane_weather, jnp.asarray(gust), jnp.asarray(camera)),
+        evaluate=lambda c: (jnp.abs(c.offset) >= 1.2, jnp.maximum(1.2 - jnp.abs(c.offset), 0.0)),
+        horizon=8,
+    )
+
+
+def _steered(car, x):
+    drift = 0.8 * car.drift - 0.3 * (car.offset + x["camera"]) + x["gust"]
+    return Car(car.offset + drift, drift)
+
+
+def _lane_weather(gust, camera, car):
+    zero = jnp.zeros_like(gust)
+    return Joint(dict(camera=Normal(zero, camera), gust=Normal(zero, gust)))
+
+
+SIDE = 4.753424
+"""Phi(-SIDE) = 1e-6."""
+
+
+def version(new: bool):
+    """A controller that holds a load against gusts on either side: both versions let go above 3.6
+    standard deviations of the sum of two; the new one, by a wrong branch, below -`SIDE`, too.
+    """
+
+    def evaluate(s):
+        above, below = 3.6 - s, s + SIDE
+        near = jnp.where(s > 0, above, jnp.maximum(below, 0.0) if new else 10.0)
+        return near <= 0, jnp.maximum(near, 0.0)
+
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x / math.sqrt(2),
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=evaluate,
+        horizon=2,
+        episodic=True,
+    )
