@@ -328,7 +328,7 @@ def main(argv=None):
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="default: all")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
-    parts = args.parts or size(args, list(PARTS), list(PARTS), ["minimal", "criticality"])
+    parts = args.parts or size(args, list(PARTS), list(PARTS), ["criticality"])
     seeds = args.seeds or size(args, 20, 2, 1)
     budget = size(args, 20_000, 10_000, 2000)
     report = run(parts, seeds, budget)

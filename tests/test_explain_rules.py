@@ -85,19 +85,19 @@ def test_rules_tell_kinds_of_failures_apart():
             s[0] + 1,
             jnp.where(
                 s[0] == 4,
-                jnp.maximum(jnp.minimum(2.0 - x["gust"], 1.5 - x["delay"]), 0.0),
+                jnp.maximum(jnp.minimum(3.2 - x["gust"], 3.0 - x["delay"]), 0.0),
                 3.0,
             ),
         )
     )
-    a, b = drawn(0, 8, sim, gust=2.0), drawn(1, 8, sim, delay=1.5)
+    a, b = drawn(0, 8, sim, gust=3.2), drawn(1, 8, sim, delay=3.0)
     both = jax.tree.map(lambda u, v: jnp.concatenate([u, v]), a, b)
     labels = ["wind"] * 8 + ["lag"] * 8
     r = explain.rules(sim, both, labels=labels, episodes=400)
     assert r.classes == ("does not fail", "lag", "wind")
     names = {rule.label: {what for what, *_ in rule.conditions} for rule in r.rules}
     assert "gust at step 5" in names["wind"] and "delay at step 5" in names["lag"]
-    assert min(r.recall.values()) > 0.85 and min(r.precision.values()) > 0.85
+    assert min(r.recall.values()) > 0.9 and min(r.precision.values()) > 0.9
 
 
 def test_what_is_held_out_was_not_learned_from():

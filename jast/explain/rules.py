@@ -222,7 +222,7 @@ def _episodes(name, key, sim, failures, others, labels, episodes):
         e = jax.tree.map(lambda a, b: np.concatenate([a, b]), v.failures, cut)
         owner = np.concatenate([1 + v.label, np.zeros(near, int)])
         group = np.concatenate([v.group, v.near_group[:near]])
-        return e, owner, group, (OTHERS, *s.names), s.evaluations + v.evaluations
+        return e, owner, group, (OTHERS, *map(str, s.names)), s.evaluations + v.evaluations
     a, b = gathered(name, "failures", sim, failures), gathered(name, "others", sim, others)
     for argument, part, wanted in (("failures", a, True), ("others", b, False)):
         if (wrong := int((part.failure != wanted).sum())) or not len(part.length):
