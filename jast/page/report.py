@@ -9,9 +9,10 @@ import jax
 import numpy as np
 
 from jast.episode import Episode
-from jast.page.document import document, figure, plain, rows, table, text, write
+from jast.page.document import document, plain, rows, table, text, write
 from jast.page.traces import exact, groups, pictures, short, states_of, trace
 from jast.simulator import Simulator
+from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict, work
 
 __all__ = ["write_report"]
 
@@ -45,8 +46,6 @@ print(episode.failure, episode.length, episode.distance)
 def write_report(
     path: Any,
     report: Any,
-    verdict: Sequence[tuple[str, str]],
-    advice: str,
     sim: Simulator | None,
     draw: Callable[[Any], str] | None,
     explanations: Sequence[Any],
@@ -56,8 +55,6 @@ def write_report(
     Args:
         path: of the file.
         report: a `jast.stress_testing.Report`.
-        verdict: its rows in words.
-        advice: what to do next, in words.
         sim: plays the failures again, for their states; without one there are none.
         draw: one state -> an SVG or HTML fragment.
         explanations: of the modes, in their order.
@@ -77,7 +74,7 @@ def write_report(
     told += [[]] * (len(failures) - len(told))
     data = {"modes": _data(report, failures, told, sim, draw)}
     body = [
-        _head(report, verdict, advice),
+        _head(report),
         _modes(report, failures, data["modes"], told, sim),
         _work(report),
         _settings(report),
@@ -142,63 +139,33 @@ def _title(report: Any) -> str:
     return f"jast: {words}"
 
 
-def _head(report: Any, verdict: Sequence[tuple[str, str]], advice: str) -> str:
+def _head(report: Any) -> str:
     """The verdict on one screen."""
-    quiet, n = report.nominal.undisturbed, len(report.modes)
-    if quiet is not None and bool(quiet.failure):
-        words, mood = "The system fails without any disturbance.", "bad"
-    elif len(report.failures):
-        e, ways = report.failures.best, f"{n} way{'s' * (n != 1)} to fail" if n else "A failure"
-        steps = int(e.length)
-        words = (
-            f"{ways} found. The likeliest takes {steps} step{'s' * (steps != 1)} and has log p"
-            f" {float(e.reward):.2f} relative to the mode of the disturbances."
-        )
-        mood = "bad"
-    else:
-        words, mood = f"No failure was found in {report.episodes:,} evaluations.", "good"
-    known = [(name or "", value) for name, value in verdict if name and name != "probability"]
+    words, mood = headline(report)
+    known = [(name, value) for name, value in verdict(report) if name and name != "probability"]
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
         f"</h1></header>\n<main>\n<section id=verdict>{_probability(report.probability)}"
         f"{rows([*known, ('evaluations', f'{report.episodes:,}')])}"
-        f"<p class=advice>{text(advice)}</p></section>"
+        f"<p class=advice>{text(advice(report))}</p></section>"
     )
 
 
 def _probability(p: Any) -> str:
     """The probability, its interval, and whether to believe it."""
+    b = belief(p)
     if p is None:
-        return "<div id=probability><h2>Probability of failure</h2><p>not estimated</p></div>"
-    low, high = p.interval
-    if np.isnan(p.log_mean):
-        value = f"below {figure(high, 3)}"
-        more = f"no failure in {p.samples:,} draws of the model; at {p.level:.0%}"
+        return f"<div id=probability><h2>Probability of failure</h2><p>{b.value}</p></div>"
+    reasons = "".join(f"<li>{text(words)}</li>" for words in b.reasons)
+    if b.mood == "good":
+        badge = f"<p class='badge good'>{b.badge}</p>"
     else:
-        value = figure(p.mean, 4) if p.mean > 1e-300 else f"10^{p.log10_mean:.2f}"
-        more = f"{p.level:.0%} interval {figure(low, 4)} to {figure(high, 4)}"
-    facts = [("method", p.method), ("evaluations", f"{p.episodes:,}")]
-    if not np.isnan(p.relative_error):
-        facts.append(("relative standard error", f"{100 * p.relative_error:.3g} %"))
-    if p.unseen is not None:
-        facts.append(
-            (
-                "unseen",
-                f"failures that nothing led to: below {figure(p.unseen, 3)} at {p.level:.0%}",
-            )
-        )
-    reasons = "".join(f"<li>{text(words)}</li>" for words in p.warnings)
-    mood = "value" if p.reliable or np.isnan(p.log_mean) else "value doubt"
-    if p.reliable:
-        badge = "<p class='badge good'>reliable: no known reason against it</p>"
-        facts += [("remark", words) for words in p.warnings]
-    elif np.isnan(p.log_mean):
-        badge = f"<div class=badge>an upper bound is all that is known<ul>{reasons}</ul></div>"
-    else:
-        badge = f"<div class='badge bad'>UNRELIABLE: do not believe it<ul>{reasons}</ul></div>"
+        look = "'badge bad'" if b.mood == "bad" else "badge"
+        badge = f"<div class={look}>{b.badge}<ul>{reasons}</ul></div>"
     return (
-        f"<div id=probability><h2>Probability of failure</h2><p class='{mood}'>{text(value)}</p>"
-        f"<p>{text(more)}</p>{badge}{rows(facts)}</div>"
+        "<div id=probability><h2>Probability of failure</h2>"
+        f"<p class='value{' doubt' * (b.mood == 'bad')}'>{text(b.value)}</p>"
+        f"<p>{text(b.more)}</p>{badge}{rows(b.facts)}</div>"
     )
 
 
@@ -209,17 +176,7 @@ def _modes(
         return "<section id=modes><h2>Failure modes</h2><p>none</p></section>"
     cards = []
     for i, episode in enumerate(failures):
-        facts = [
-            ("log p relative to the mode", f"{float(episode.reward):.4f}"),
-            ("log p", f"{float(episode.log_prob):.4f}"),
-            ("miss distance", figure(episode.distance)),
-            ("steps", int(episode.length)),
-        ]
-        if i < len(report.modes):
-            mode = report.modes[i]
-            share = "not known" if np.isnan(mode.share) else f"{100 * mode.share:.1f} %"
-            facts += [("members", mode.members), ("share", share)]
-        cards.append(_card(i + 1, facts, data[i], explanations[i]))
+        cards.append(_card(i + 1, mode_facts(report, i, episode), data[i], explanations[i]))
     more = len(report.modes) - len(failures)
     notes = [f"{more} more modes are not shown."] * (more > 0)
     if sim is None:
@@ -251,12 +208,7 @@ def _card(number: int, facts: list, data: dict, explanations: list) -> str:
 
 
 def _work(report: Any) -> str:
-    lines = []
-    for name, evaluations in report.spent.items():
-        parts = [part for part in report.tried if part.name == name]
-        best = max(part.best for part in parts)
-        failing = sum(part.failing for part in parts)
-        lines.append((name, len(parts), evaluations, failing, "" if best == -np.inf else best))
+    lines = [(*row, "" if best == -np.inf else best) for *row, best in work(report)]
     head = ("tried", "calls", "evaluations", "failing", "best log p relative to the mode")
     return f"<section id=tried><h2>What was tried</h2>{table(head, lines)}</section>"
 

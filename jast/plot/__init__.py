@@ -1,9 +1,10 @@
 """Pictures of episodes and searches, with matplotlib (the extra ``jast[plot]``), which is imported
 only when something is drawn.
 
-Every function draws into the ``ax`` (or ``axes``) it is given, or into a new figure, and returns
-the axes. What is drawn comes first, then its simulator where a picture needs it. The colours are
-Okabe and Ito's, told apart by colour-blind readers; what matters is told by shape or words as well.
+`report` makes one page of a report of `jast.stress`. Every other function draws into the ``ax`` (or
+``axes``) it is given, or into a new figure, and returns the axes. What is drawn comes first, then
+its simulator where a picture needs it. The colours are Okabe and Ito's, told apart by colour-blind
+readers; what matters is told by shape or words as well.
 
 Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
 `trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
@@ -24,6 +25,7 @@ from jast.plot.fms import fms
 from jast.plot.general import distances, disturbances, history
 from jast.plot.learning import levels, training
 from jast.plot.probability import probability, weights
+from jast.plot.report import report
 from jast.plot.states import phase, traces
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.tree import tree, tree_page
@@ -50,6 +52,7 @@ __all__ = [
     "levels",
     "phase",
     "probability",
+    "report",
     "proposal_contours",
     "roc",
     "surrogate_samples",

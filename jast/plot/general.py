@@ -14,7 +14,7 @@ from jast.fields import fields
 from jast.plot import style
 from jast.simulator import Simulator
 
-__all__ = ["disturbances", "distances", "history"]
+__all__ = ["disturbances", "distances", "history", "spreads"]
 
 
 def history(results, ax=None, total=False):
@@ -112,7 +112,7 @@ def disturbances(
         first, steps = (), episode.disturbances
     else:
         latent.check("plot.disturbances", sim)
-        first, steps = jax.device_get(_spreads(sim, episode._replace(states=None)))
+        first, steps = spreads(sim, episode)
     panels = [
         (f._replace(name=f.name if f.name.startswith("x0") else f"x0 {f.name}"), 0)
         for f in fields(first, "x0", lead=0)
@@ -151,9 +151,15 @@ def disturbances(
     return axes
 
 
+def spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
+    """How far out x0 (``()`` where the start is fixed) and each disturbance [T, ...] of an episode
+    are, in standard deviations. On the host.
+    """
+    return jax.device_get(_spreads(sim, episode._replace(states=None)))
+
+
 @jax.jit
 def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
-    """How far out x0 and each disturbance [T, ...] of an episode are."""
     states = jax.tree.map(lambda a: a[:-1], replay(sim, episode).states)
     rows = jax.tree.leaves(episode.disturbances)[0].shape[0]
     states = jax.tree.map(lambda a: a[:rows], states)

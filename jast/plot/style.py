@@ -142,11 +142,16 @@ def result_first(picture: Callable[..., Any]) -> Callable[..., Any]:
     return either
 
 
+def plain(text):
+    """A user's words, in which no "$" begins a formula."""
+    return str(text).replace("$", r"\$")
+
+
 def labelled(name, units):
-    """A label: the name of a number, or of the array that it is of, with its unit where given."""
+    """A label: the name of a number with its unit, that of its array where it has none."""
     array = name.partition("[")[0]
     unit = (units or {}).get(name, (units or {}).get(array))
-    return f"{name} ({unit})" if unit else name
+    return plain(f"{name} ({unit})" if unit else name)
 
 
 def look(i):

@@ -153,6 +153,8 @@ def owners(sim: Simulator, episodes: Episode, modes: Modes) -> np.ndarray:
     failure it points most nearly to: [n]. Paths are not looked for, so nothing is evaluated; of
     the mode's own failure it is that mode.
     """
+    if len(modes) == 1:
+        return np.zeros(len(episodes.length), int)
     sim = centred(sim)
     each = [m.failure._replace(states=None) for m in modes]
     heads = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)

@@ -12,6 +12,7 @@ from jast.estimate.estimate import Estimate
 from jast.failures import Failures
 from jast.search.failure_modes import Modes
 from jast.simulator import Simulator
+from jast.stress_testing.words import advice, verdict, work
 
 __all__ = ["Report", "Tried"]
 
@@ -64,10 +65,10 @@ class Report(NamedTuple):
         return spent
 
     def __str__(self):
-        lines = [*(f"{name:<13}{text}" for name, text in _verdict(self)), ""]
+        lines = [*(f"{name:<13}{text}" for name, text in verdict(self)), ""]
         if self.modes:
             lines += [str(self.modes), ""]
-        lines += [*_work(self), "", *_next(self)]
+        lines += [*_work(self), "", advice(self)]
         return "\n".join(lines)
 
     def html(
@@ -102,46 +103,7 @@ class Report(NamedTuple):
         from jast.page.report import write_report
 
         sim = self.sim if sim is None else sim
-        write_report(path, self, _verdict(self), "\n".join(_next(self)), sim, draw, explanations)
-
-
-def _verdict(r):
-    """Rows of a name and a text; a row without a name goes on with the one before."""
-    quiet = r.nominal.undisturbed
-    if quiet is None:
-        alone = "not defined: a disturbance has neither a mode nor a median"
-    else:
-        outcome = "FAILS" if bool(quiet.failure) else "no failure"
-        alone = f"{outcome}, distance {float(quiet.distance):.4g}, {int(quiet.length)} steps"
-    rows = [("undisturbed", alone)]
-    rows.append(("plain draws", f"{r.nominal.failing} of {r.nominal.episodes} fail"))
-    p = r.probability
-    if p is None:
-        rows.append(("probability", "not estimated"))
-    elif np.isnan(p.log_mean):
-        bound = f"below {p.interval[1]:.3g} at {p.level:.0%}"
-        rows.append(("probability", f"no failure in {p.samples} draws of the model: {bound}"))
-    elif not p.reliable:
-        rows.append(("probability", f"UNRELIABLE: {p.warnings[0]}"))
-        rows.append(("", f"{p.mean:.4g}, which must not be believed"))
-    else:
-        low, high = p.interval
-        rows.append(("probability", f"{p.mean:.4g}   {p.level:.0%} [{low:.4g}, {high:.4g}]"))
-    if len(r.failures):
-        e = r.failures.best
-        text = f"log p {float(e.reward):.4f} relative to the mode, {int(e.length)} steps"
-        if np.isfinite(r.residual) and r.residual < 0.05:
-            text += f"; locally likeliest, residual {r.residual:.1e}"
-        elif np.isfinite(r.late):
-            text += f"; its refinement last gained {r.late:.1e}"
-        rows.append(("likeliest", text))
-    else:
-        rows.append(("likeliest", "no failure was found"))
-    if r.invalid:
-        rows.append(("invalid", f"{r.invalid} episodes gave numbers that are not finite"))
-    if "interrupted" in r.settings:
-        rows.append(("interrupted", r.settings["interrupted"]))
-    return rows
+        write_report(path, self, sim, draw, explanations)
 
 
 def _work(r):
@@ -149,23 +111,8 @@ def _work(r):
     lines = [
         f"{'tried':<22} {'calls':>5} {'evaluations':>12} {'failing':>9} {'best log p rel.':>16}"
     ]
-    for name, evaluations in r.spent.items():
-        parts = [part for part in r.tried if part.name == name]
-        best = max(part.best for part in parts)
+    for name, calls, evaluations, failing, best in work(r):
         text = "-" if best == -np.inf else f"{best:.4f}"
-        failing = sum(part.failing for part in parts)
-        lines.append(f"{name:<22} {len(parts):5d} {evaluations:12d} {failing:9d} {text:>16}")
+        lines.append(f"{name:<22} {calls:5d} {evaluations:12d} {failing:9d} {text:>16}")
     lines.append(f"{'in all':<28} {r.episodes:12d}")
     return lines
-
-
-def _next(r):
-    """What a user would do next."""
-    if r.nominal.undisturbed is not None and bool(r.nominal.undisturbed.failure):
-        return ["next: mend the system, which fails without any disturbance"]
-    if not len(r.failures):
-        return ["next: a larger budget; a miss distance that falls on the way to a failure"]
-    words = ["next: jast.replay(sim, report.failures[0]) for its states"]
-    if r.probability is not None and not r.probability.reliable:
-        words.append("a larger budget, or jast.estimate.subset_simulation, for the probability")
-    return ["; ".join(words)]

@@ -1,0 +1,297 @@
+"""A report of `jast.stress` as a picture: one page to print or to attach."""
+
+import textwrap
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast.fields import fields
+from jast.outline import outline
+from jast.plot import style
+from jast.plot.general import spreads
+from jast.plot.played import (
+    DISTANCE,
+    Given,
+    Lines,
+    chosen,
+    given,
+    lines,
+    nominal_lines,
+    quiet_line,
+)
+from jast.plot.states import draw_traces
+from jast.simulator import Simulator
+from jast.stress_testing import Report
+from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict, work
+
+__all__ = ["report"]
+
+WIDTH, MARGIN = 8.27, 0.55
+"""Inches: as wide as A4."""
+LINE, MODE, PANEL = 0.185, 1.62, 1.02
+"""Inches: of a line of words, of a failure mode, and of its panels."""
+MODES, EACH = 4, 12
+"""Modes that are drawn, and failures of each."""
+MOODS = {"good": style.GREEN, "bad": style.VERMILION, "unknown": style.GREY}
+
+
+def report(
+    report: Report,
+    sim: Simulator | None = None,
+    *,
+    nominal: Any = None,
+    units: dict | None = None,
+) -> Any:
+    """A report on one page: what was found, the probability and whether to believe it, the first
+    four modes, what was tried. ``figure.savefig("report.pdf")`` makes a file of it.
+
+    Of each mode there are two numbers of the state, those that leave their nominal bands the most
+    (as `traces` draws them), and the disturbances of its likeliest failure in standard deviations
+    (as `disturbances` draws them).
+
+    Args:
+        report: of `jast.stress`.
+        sim: plays the failures again; default: the report's own. Without one (a report from
+            `jast.load`) there are no traces, and disturbances are as they are.
+        nominal: as of `traces`.
+        units: name -> unit, for the labels.
+
+    Returns:
+        The matplotlib Figure, as wide as A4.
+
+    Raises:
+        ValueError: for anything but a report.
+    """
+    import matplotlib.pyplot as plt
+
+    if not isinstance(report, Report):
+        raise ValueError(
+            f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
+        )
+    sim = report.sim if sim is None else sim
+    shown = [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
+    told = belief(report.probability)
+    left = _left(told)
+    known = [(name, words) for name, words in verdict(report) if name not in ("", "probability")]
+    right = _wrapped([*known, ("evaluations", f"{report.episodes:,}")], 43)
+    title = textwrap.wrap(headline(report)[0], 72)
+    tried = work(report)
+    top = 0.35 + 0.27 * len(title) + 0.15
+    facts = max(0.7 + LINE * len(left), LINE * len(right)) + 0.25
+    table = LINE * (len(tried) + 2) + 0.3
+    modes = 0.45 + MODE * len(shown) if shown else 0.0
+    height = MARGIN + top + facts + modes + table + 2 * LINE + MARGIN
+    with style.styled():
+        figure = plt.figure(figsize=(WIDTH, height))
+        page = _Page(figure, height)
+        _title(page, title, headline(report)[1])
+        page.y = MARGIN + top
+        _belief(page, told, left)
+        _rows(page, right, MARGIN + 3.75, 1.0)
+        page.y = MARGIN + top + facts
+        if shown:
+            _modes(page, report, sim, shown, nominal, units)
+        page.y = MARGIN + top + facts + modes
+        _tried(page, report, tried)
+        page.y += 0.1
+        for line in textwrap.wrap(advice(report), 100):
+            page.words(MARGIN, line, color=style.GREY, fontsize=8.5)
+            page.y += LINE
+    return figure
+
+
+class _Page:
+    """A figure that is filled from the top, in inches."""
+
+    def __init__(self, figure: Any, height: float):
+        self.figure, self.height, self.y = figure, height, MARGIN
+
+    def words(self, x: float, text: str, down: float = 0.0, **look: Any) -> None:
+        """``text`` with its upper edge at ``y`` + ``down``."""
+        place = x / WIDTH, 1 - (self.y + down) / self.height
+        self.figure.text(*place, style.plain(text), va="top", **look)
+
+    def axes(self, x: float, width: float, height: float, down: float = 0.0) -> Any:
+        below = 1 - (self.y + down + height) / self.height
+        return self.figure.add_axes((x / WIDTH, below, width / WIDTH, height / self.height))
+
+
+def _title(page: _Page, title: list[str], mood: str) -> None:
+    page.words(MARGIN, "jast: adaptive stress test", color=style.GREY, fontsize=9)
+    for i, line in enumerate(title):
+        page.words(MARGIN, line, 0.22 + 0.27 * i, color=MOODS[mood], fontsize=13.5, weight="bold")
+
+
+def _left(told: Any) -> list[tuple[str, str]]:
+    rows = [("", told.more)] if told.more else []
+    rows += [("!", told.badge)] if told.badge else []
+    return _wrapped([*rows, *((">", reason) for reason in told.reasons), *told.facts], 44)
+
+
+def _wrapped(rows: list, width: int) -> list[tuple[str, str]]:
+    """Rows of a name and a line; what goes on has no name."""
+    out = []
+    for name, words in rows:
+        room = width + 14 if name in ("", "!", ">") else width - max(0, len(name) - 12)
+        first, *rest = textwrap.wrap(str(words), room) or [""]
+        out += [(name, first), *((">" if name == ">" else None, line) for line in rest)]
+    return out
+
+
+def _belief(page: _Page, told: Any, rows: list) -> None:
+    page.words(MARGIN, "Probability of failure", weight="bold", fontsize=10.5)
+    doubt = told.mood == "bad"
+    look = dict(color=style.GREY, fontsize=13) if doubt else dict(fontsize=19, weight="bold")
+    page.words(MARGIN, told.value, 0.23, **look)
+    for i, (name, words) in enumerate(rows):
+        down = 0.66 + LINE * i
+        if name == "!":
+            page.words(MARGIN, words, down, fontsize=9, weight="bold", color=MOODS[told.mood])
+        elif name in ("", ">"):
+            page.words(MARGIN + 0.1 * (name == ">"), words, down, fontsize=8.5)
+        else:
+            page.words(MARGIN, name or "", down, fontsize=8.5, color=style.GREY)
+            page.words(MARGIN + 1.5, words, down, fontsize=8.5)
+
+
+def _rows(page: _Page, rows: list, x: float, indent: float) -> None:
+    for i, (name, words) in enumerate(rows):
+        page.words(x, name or "", LINE * i, fontsize=8.5, color=style.GREY)
+        page.words(x + indent, words, LINE * i, fontsize=8.5)
+
+
+def _modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units: Any) -> None:
+    more = len(report.modes) - len(shown)
+    words = f"Failure modes{f' ({len(shown)} of {len(report.modes)})' if more > 0 else ''}"
+    page.words(MARGIN, words, weight="bold", fontsize=10.5)
+    page.y += 0.45
+    owned = None
+    if sim is not None:
+        g = _failures(report, sim, shown)
+        own, behind = lines(sim, g.episodes), nominal_lines("report", sim, nominal)
+        owned = g, own, behind, quiet_line(sim)
+    for k, failure in enumerate(shown):
+        facts = "   ".join(f"{name} {value}" for name, value in mode_facts(report, k, failure))
+        colour, marker = style.look(k)
+        page.words(MARGIN, f"Mode {k + 1}", -0.12, weight="bold", fontsize=9, color=colour)
+        page.words(MARGIN + 0.65, facts, -0.12, fontsize=8.5)
+        wide = 1.88 if owned else 5.0
+        if owned:
+            _traces(page, *owned, k, units, legend=k == 0)
+        x = MARGIN + 0.45 + (5.1 if owned else 0.0)
+        _pushes(page.axes(x, wide, PANEL, 0.2), sim, failure)
+        page.y += MODE
+
+
+def _failures(report: Any, sim: Any, shown: list) -> Given:
+    """The likeliest failure of each mode ``shown``, then all that the report has."""
+    each = [e._replace(states=None) for e in (*shown, *report.failures[:64])]
+    mode = np.arange(len(shown))
+    if report.modes:
+        others = given("report", report.failures, sim, report.modes, 64).mode
+    else:
+        others = np.zeros(len(each) - len(shown), int)
+    episodes = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+    return Given(episodes, sim, np.concatenate([mode, others]), len(shown))
+
+
+def _traces(
+    page: _Page,
+    g: Given,
+    own: Lines,
+    behind: Lines | None,
+    quiet: Lines | None,
+    k: int,
+    units: Any,
+    legend: bool,
+) -> None:
+    """Two panels of mode ``k``."""
+    rows = np.flatnonzero(g.mode == k)[: EACH + 1]
+    episodes = jax.tree.map(lambda a: a[rows], g.episodes)
+    few = Given(episodes, g.sim, np.full(len(rows), k), k + 1)
+    part = Lines({n: a[rows] for n, a in own.columns.items()}, own.length[rows], own.state)
+    names = _telling(part, behind)
+    axes = [page.axes(MARGIN + 0.45 + 2.55 * i, 1.88, PANEL, 0.2) for i in range(len(names))]
+    draw_traces(axes, names, few, part, behind, quiet, units)
+    for ax in axes:
+        _small(ax, "step")
+    if legend:
+        look = dict(fontsize=7, ncols=4, loc="lower right", handlelength=1.6, columnspacing=1.2)
+        handles, words = axes[0].get_legend_handles_labels()
+        keep = [i for i, word in enumerate(words) if not word.startswith("mode")]
+        at = ((WIDTH - MARGIN + 0.1) / WIDTH, 1 - (page.y - 0.2) / page.height)
+        page.figure.legend(
+            [handles[i] for i in keep], [words[i] for i in keep], bbox_to_anchor=at, **look
+        )
+
+
+def _telling(own: Lines, behind: Lines | None) -> list[str]:
+    """Two numbers, those of the first failure that leave the nominal bands the most."""
+    names = chosen("report", None, own, 1000)
+    far = {}
+    for name in names:
+        values = own.columns[name][0]
+        usual = values[None] if behind is None else behind.columns[name]
+        there = np.isfinite(values) & np.isfinite(usual).any(axis=0)
+        low, middle, high = np.nanquantile(usual[:, there], (0.05, 0.5, 0.95), axis=0)
+        spread = max(float((high - low).max()), 1e-9 * float(np.abs(values[there]).max()), 1e-300)
+        far[name] = float(np.abs(values[there] - middle).max()) / spread
+    best = sorted((n for n in names if n != DISTANCE), key=lambda n: -far[n])[:2]
+    best += [DISTANCE] * (len(best) < 2)
+    return [n for n in names if n in best]
+
+
+def _pushes(ax: Any, sim: Any, failure: Any) -> None:
+    """The disturbances of a failure over its steps."""
+    n = int(failure.length)
+    about = None if sim is None else outline(sim)
+    normal = about is not None and about.disturbance.quantile and about.start.quantile
+    first, steps = spreads(sim, failure) if normal else ((), failure.disturbances)
+    found = [(f, 0, f.values[None]) for f in fields(first, "x0", lead=0)]
+    found += [(f, 1, f.values[:n]) for f in fields(steps, "x")]
+    named = [
+        (f.name + place, at, v[:, i]) for f, at, v in found for i, place in enumerate(f.entries)
+    ]
+    named = [
+        (f"x0 {name}" if not at and "x0" not in name else name, at, v) for name, at, v in named
+    ]
+    if normal:
+        ax.axhspan(-2, 2, color=style.GREY, alpha=0.1, linewidth=0, zorder=0)
+        ax.axhspan(-1, 1, color=style.GREY, alpha=0.12, linewidth=0, zorder=0)
+    few = len(named) <= len(style.COLOURS)
+    for i, (name, at, values) in enumerate(named):
+        colour, marker = style.look(i) if few else (style.shade(i / (len(named) - 1)), "o")
+        size = 2.5 if few or not at else 0
+        look = dict(color=colour, marker=marker, markersize=size, linewidth=1.2 if few else 0.8)
+        ax.plot(np.arange(at, at + len(values)), values, label=style.plain(name), **look)
+    if few and len(named) > 1:
+        ax.legend(fontsize=6.5, loc="best", handlelength=1.2, borderpad=0.1, labelspacing=0.2)
+    ax.set_ylabel("disturbance" + " (sd)" * bool(normal))
+    _small(ax, "step")
+
+
+def _small(ax: Any, label: str) -> None:
+    ax.set_xlabel(label, fontsize=8, labelpad=1)
+    ax.yaxis.label.set_size(8)
+    ax.yaxis.labelpad = 2
+    ax.tick_params(labelsize=7, pad=1, length=0)
+    ax.xaxis.get_major_locator().set_params(integer=True, nbins=5)
+    ax.yaxis.get_major_locator().set_params(nbins=5)
+
+
+def _tried(page: _Page, report: Any, rows: list) -> None:
+    page.words(MARGIN, "What was tried", weight="bold", fontsize=10.5)
+    page.y += 0.27
+    head = ("", "calls", "evaluations", "failing", "best log p relative to the mode")
+    ends = (MARGIN, MARGIN + 2.4, MARGIN + 3.5, MARGIN + 4.4, WIDTH - MARGIN)
+    body = [
+        (n, f"{c}", f"{e:,}", f"{f:,}", "-" if b == -np.inf else f"{b:.4f}")
+        for n, c, e, f, b in rows
+    ]
+    body.append(("in all", "", f"{report.episodes:,}", "", ""))
+    for i, row in enumerate([head, *body]):
+        for j, (x, words) in enumerate(zip(ends, row, strict=True)):
+            look = dict(color=style.GREY) if i == 0 else {}
+            page.words(x, words, fontsize=8.5, ha="right" if j else "left", **look)
+        page.y += LINE
