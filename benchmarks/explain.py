@@ -31,8 +31,8 @@ from jast.distributions import Normal
 
 __all__ = ["PARTS", "run"]
 
-FRESH = 1000
-"""Fresh failures of each cause, and fresh others."""
+GIVEN, FRESH = 400, 1000
+"""Failures that rules are told; fresh failures of each cause, and fresh others."""
 
 
 def minimal(seeds, budget):
@@ -64,30 +64,40 @@ ANY = {(None, "gust"), (None, "delay")}
 
 def rules(seeds, budget):
     """Precision and recall of the rules for each planted cause, on fresh episodes."""
+    return _ruled(seeds, lambda p, seed: p.episodes(p.sample(np.random.default_rng(seed), GIVEN)))
+
+
+def rules_of_estimates(seeds, budget):
+    """The same where the failures are those of an estimate, whose proposal may lack a cause."""
+    estimate = jast.estimate.failure_probability
+    return _ruled(seeds, lambda p, seed: estimate(jax.random.key(seed), p.sim, budget))
+
+
+def _ruled(seeds, given):
     out = {}
     for name in PLANTED:
         rows = {}
         for seed in range(seeds):
             p, key = planted(name, seed), jax.random.key(seed)
-            estimate = jast.estimate.failure_probability(key, p.sim, budget)
+            failures = given(p, seed)
             begin = time.process_time()
-            found = explain.rules(p.sim, estimate, key=key)
+            found = explain.rules(p.sim, failures, key=key)
             cost = time.process_time() - begin
             for cause in range(len(p.causes)):
                 row = dict(zip(("precision", "recall", "named"), _fresh(found, p, cause, seed)))
                 row |= dict(cpu_seconds=cost, rules=len(found.rules))
                 rows.setdefault(cause, []).append(row)
         for cause, each in rows.items():
-            label = name if len(rows) == 1 else f"{name}: {'the rarer' * cause or 'the other'}"
+            label = name if len(rows) == 1 else f"{name}: {'the rarer' if cause else 'the other'}"
             column = lambda k, each=each: [float(row[k]) for row in each]
             out[label] = dict(
+                both_95=sum(r["precision"] >= 0.95 and r["recall"] >= 0.95 for r in each),
+                named=int(sum(column("named"))),
+                seeds=seeds,
                 precision=float(np.median(column("precision"))),
                 worst_precision=min(column("precision")),
                 recall=float(np.median(column("recall"))),
                 worst_recall=min(column("recall")),
-                named=int(sum(column("named"))),
-                both_95=sum(r["precision"] >= 0.95 and r["recall"] >= 0.95 for r in each),
-                seeds=seeds,
                 rules=float(np.mean(column("rules"))),
                 cpu_seconds=float(np.median(column("cpu_seconds"))),
             )
@@ -299,7 +309,17 @@ def ferry(seeds, budget):
 
 
 PARTS = {
-    f.__name__: f for f in (minimal, rules, criticality, sensitivity, differential, monitor, ferry)
+    f.__name__: f
+    for f in (
+        minimal,
+        rules,
+        rules_of_estimates,
+        criticality,
+        sensitivity,
+        differential,
+        monitor,
+        ferry,
+    )
 }
 
 

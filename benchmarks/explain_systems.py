@@ -55,6 +55,13 @@ class Planted(NamedTuple):
             x[field][rows, at if step is None else step - 1] = beyond * (1 + 1e-6)
         return x
 
+    def sample(self, rng: np.random.Generator, n: int) -> Any:
+        """Disturbances [n, steps] of failures, by all causes as often as in the model."""
+        rarer = int((rng.random(n) < 1 / 21).sum()) if len(self.causes) == 2 else 0
+        parts = [self.failing(rng, 0, n - rarer)]
+        parts += [self.failing(rng, 1, rarer)] if rarer else []
+        return {field: np.concatenate([x[field] for x in parts]) for field in FIELDS}
+
     def near(self, rng: np.random.Generator, cause: int, n: int) -> Any:
         """Disturbances [n, steps] of which those that matter are anywhere up to a quarter beyond
         their limits; some fail.
