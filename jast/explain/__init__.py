@@ -8,8 +8,9 @@ from jast.explain.differential import differential, regression
 from jast.explain.indices import Index, Indices, indices
 from jast.explain.minimal import Minimal, minimal
 from jast.explain.monitor import Monitor, monitor
-from jast.explain.rules import Rule, Rules, rules
+from jast.explain.rules import Rules, rules
 from jast.explain.sensitivity import Sensitivity, sensitivity
+from jast.explain.trees import Rule
 
 __all__ = [
     "Attribution",

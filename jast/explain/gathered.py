@@ -16,7 +16,7 @@ from jast.pytrees import in_lanes
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
-__all__ = ["Whole", "distinct", "gathered", "whole"]
+__all__ = ["Whole", "distinct", "gathered", "kinds_of", "whole"]
 
 LANES = 256
 
@@ -84,6 +84,17 @@ def distinct(e: Episode) -> np.ndarray:
     for i in range(len(e.length)):
         seen.setdefault(identity(jax.tree.map(lambda a, i=i: a[i], e)), i)
     return np.fromiter(seen.values(), int, len(seen))
+
+
+def kinds_of(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np.ndarray]:
+    """The different names in ``labels``, and the number of that of each of ``n`` failures."""
+    names, at = np.unique(np.asarray(labels).astype(str), return_inverse=True)
+    if at.shape != (n,):
+        raise ValueError(
+            f"{function}: labels must be one for each of the {n} failures, received the shape"
+            f" {np.shape(labels)}"
+        )
+    return tuple(names.tolist()), at
 
 
 def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Whole:

@@ -1,31 +1,25 @@
 """monitor: while the system runs, will it fail within the next steps?"""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
-from jast import _checks, results, rewards
+from jast import _checks, results
 from jast.counter import generator
-from jast.episode import Episode, play_back, rollout
-from jast.explain.gathered import distinct, gathered
-from jast.explain.learning import DISTINCT, learner, parted
-from jast.explain.variants import seeds, variants
-from jast.incidents import hosted
+from jast.explain.cases import simulated, told
+from jast.explain.learning import learner, parted
+from jast.explain.observed import observed, ordinary
 from jast.intervals import clopper_pearson
-from jast.pytrees import in_lanes
 from jast.simulator import Simulator
 from jast.weakness.measures import Roc, roc
 
 __all__ = ["Monitor", "monitor"]
 
-HELD_OUT, ASIDE, DRAWS, LANES = 0.3, 0.3, 4, 256
-"""The share of the episodes that is held out; of the rest, that which sets the threshold; draws of
-a proposal for each episode wanted; episodes that are played at a time."""
+HELD_OUT, ASIDE, LEAST = 0.3, 0.3, 12
+"""The share of the episodes that is held out; of the rest, that which sets the threshold; failures,
+and others, the least."""
 ROWS, BINS, REPEATS = 200_000, 256, 400
 """Observations to learn from, the most; of the bootstrap: different scores, and samples."""
 
@@ -167,7 +161,7 @@ def monitor(
         raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
     first, second = jax.random.split(key)
     e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes)
-    seen = _observed(name, sim, sim.observe if observe is None else observe, e)
+    seen = observed(name, sim, sim.observe if observe is None else observe, e)
     rng = generator(second)
     out = parted(rng, owner, group, HELD_OUT)
     aside = np.zeros(len(out), bool)
@@ -238,73 +232,22 @@ MODELS: dict[str, Callable] = {"boosted": _boosted, "logistic": _logistic}
 
 def _episodes(name, key, sim, failures, others, episodes):
     """The episodes [n], what they are [n], their group [n], evaluations."""
-    k, more, calm = jax.random.split(key, 3)
-    if others is None:
-        s = seeds(name, k, sim, failures, None, DRAWS * episodes)
-        v = variants(more, sim, s, episodes)
-        plain = _ordinary(calm, sim, episodes)
-        parts, spent = (v.failures, v.near, plain), s.evaluations + v.evaluations + episodes
-        owner = (FAILING, NEAR, ORDINARY)
-        groups = [v.group, v.near_group]
-    else:
-        a = gathered(name, "failures", sim, failures)
-        b = gathered(name, "others", sim, others)
-        parts, spent, groups, owner = (a, b), 0, [], (FAILING, ORDINARY)
-        for argument, part, wanted in (("failures", a, True), ("others", b, False)):
-            if wrong := int((part.failure != wanted).sum()):
-                raise ValueError(
-                    f"{name}: {argument} must {'all' if wanted else 'not'} fail, received"
-                    f" {len(part.length)} episodes, of which {wrong} do{' not' if wanted else ''}"
-                )
-        rows = [distinct(part) for part in parts]
-        parts = tuple(jax.tree.map(lambda v, r=r: v[r], p) for p, r in zip(parts, rows))
-        groups = [np.arange(len(parts[0].length))]
-    many = [len(part.length) for part in parts]
-    for argument, n in (("failures", many[0]), ("others", many[-1])):
-        if n < 3 * DISTINCT:
-            raise ValueError(
-                f"{name}: {argument} must be {3 * DISTINCT} distinct episodes or more, received {n}"
-            )
-    top = max(int(g.max(initial=-1)) for g in groups) + 1
-    groups.append(top + np.arange(many[-1]))
-    e = jax.tree.map(lambda *a: np.concatenate(a), *parts)
-    return e, np.repeat(owner, many), np.concatenate(groups), spent
-
-
-def _ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
-    """At most ``n`` episodes of the model that do not fail."""
-    size = n if hosted(sim) else LANES
-    at = np.arange(n, dtype=np.int32)
-    e = in_lanes(size, lambda at: _drawn(key, sim, at), at)
-    return jax.tree.map(lambda a: a[~e.failure], e)
-
-
-@jax.jit
-def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
-    one = lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None)
-    return jax.vmap(one)(at)
-
-
-def _observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
-    """[n, horizon + 1, d] of the states."""
-    watch = observe if isinstance(observe, Partial) else Partial(observe)
-    size = len(e.length) if hosted(sim) else LANES
-    seen = in_lanes(size, partial(_watched, sim, watch), e.x0, e.disturbances, e.length)
-    if not isinstance(seen, np.ndarray) or seen.ndim != 3:
-        shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
+    if others is not None:
+        cases = told(name, sim, failures, others, None, LEAST)
+        return cases.episodes, cases.kind, cases.group, 0
+    *keys, calm = jax.random.split(key, 3)
+    cases = simulated(name, tuple(keys), sim, failures, None, episodes)
+    plain = ordinary(calm, sim, episodes)
+    n = len(plain.length)
+    if n < LEAST:
         raise ValueError(
-            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
+            f"{name}: others: {n} of {episodes} ordinary episodes do not fail, expected {LEAST} or"
+            " more"
         )
-    return seen.astype(float)
-
-
-@jax.jit
-def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
-    def one(x0, x, length):
-        states = play_back(sim, rewards.STANDARD, x0, x, length).states
-        return jax.tree.map(jnp.asarray, jax.vmap(observe)(states))
-
-    return jax.vmap(one)(x0, x, length)
+    e = jax.tree.map(lambda a, b: np.concatenate([a, b]), cases.episodes, plain)
+    kind = np.concatenate([np.where(cases.kind > 0, FAILING, NEAR), np.full(n, ORDINARY)])
+    group = np.concatenate([cases.group, cases.group.max() + 1 + np.arange(n)])
+    return e, kind, group, cases.evaluations + episodes
 
 
 def _threshold(maxima: np.ndarray, rate: float) -> float:

@@ -9,38 +9,18 @@ import numpy as np
 from jast import _checks, results
 from jast.counter import generator
 from jast.episode import Episode
+from jast.explain.cases import simulated, told
 from jast.explain.features import Describer, describer, table
-from jast.explain.gathered import distinct, gathered, whole
+from jast.explain.gathered import gathered, whole
 from jast.explain.learning import DISTINCT, learner, parted
-from jast.explain.variants import seeds, variants
-from jast.intervals import clopper_pearson
+from jast.explain.trees import grown, read
 from jast.simulator import Simulator
 
-__all__ = ["Rule", "Rules", "rules"]
+__all__ = ["Rules", "rules"]
 
-OTHERS, HELD_OUT, FOLDS, DRAWS = "does not fail", 0.3, 3, 4
-"""What the others are called; the share of the episodes that is held out; parts of the rest by
-which the size of the tree is chosen; draws of a proposal for each episode wanted."""
+HELD_OUT = 0.3
+"""The share of the episodes that is held out."""
 OF = "disturbances", "states", "both"
-
-
-class Rule(NamedTuple):
-    """One way through the tree."""
-
-    label: str
-    """What it says of an episode: "fails", or the kind of failure."""
-    conditions: tuple
-    """(what, kind, low, high) of each: ``low < what <= high``. What holds or not is 1 or 0."""
-    precision: float
-    """Of the held-out episodes that it fits, the share that is of this label."""
-    precision_interval: tuple
-    recall: float
-    """Of the held-out episodes of this label, the share that it fits."""
-    recall_interval: tuple
-
-    def __str__(self):
-        text = " and ".join(map(_condition, self.conditions)) or "always"
-        return f"{text} -> {self.label}"
 
 
 @results.result("evaluations")
@@ -170,7 +150,14 @@ def rules(
     if of not in OF:
         raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
     first, second, third = jax.random.split(key, 3)
-    e, owner, group, names, spent = _episodes(name, first, sim, failures, others, labels, episodes)
+    number = isinstance(others, int | np.integer) and not isinstance(others, bool)
+    if others is None or number:
+        many = _checks.whole(name, "others", others, 1) if number else None
+        keys = tuple(jax.random.split(first))
+        cases = simulated(name, keys, sim, failures, labels, episodes, many)
+    else:
+        cases = told(name, sim, failures, others, labels, DISTINCT)
+    e, owner, group, names, spent = cases
     seen = whole(sim, e, second, of != "disturbances")
     rng = generator(third)
     ends = e.length[owner > 0]
@@ -181,13 +168,13 @@ def rules(
             f"{name}: disturbances and states must be finite, received some that are not"
         )
     out = parted(rng, owner, group, HELD_OUT)
-    tree = _grown(trees, rng, x[~out], owner[~out], group[~out], most)
+    tree = grown(trees, rng, x[~out], owner[~out], group[~out], most)
     said, leaf = tree.predict(x[out]), tree.apply(x[out])
     truth = owner[out]
     ratio = lambda part, all_: float(part / all_) if all_ else float("nan")
     right = [int(np.sum((said == k) & (truth == k))) for k in range(len(names))]
     return Rules(
-        _rules(tree, features, names, leaf, truth, level),
+        read(tree, features, names, leaf, truth, level),
         names,
         {n: ratio(right[k], np.sum(said == k)) for k, n in enumerate(names)},
         {n: ratio(right[k], np.sum(truth == k)) for k, n in enumerate(names)},
@@ -203,139 +190,6 @@ def rules(
     )
 
 
-def _episodes(name, key, sim, failures, others, labels, episodes):
-    """The episodes [n], their class [n] (0: others), their group [n], the classes, evaluations."""
-    k, more = jax.random.split(key)
-    many = isinstance(others, int | np.integer) and not isinstance(others, bool)
-    if others is None or many:
-        s = seeds(name, k, sim, failures, labels, DRAWS * episodes)
-        v = variants(more, sim, s, episodes)
-        near = len(v.near_group)
-        if many:
-            near = min(near, _checks.whole(name, "others", others, 1))
-        if near < 2 * DISTINCT:
-            raise ValueError(
-                f"{name}: others: {near} of the variants of the failures do not fail, expected"
-                f" {2 * DISTINCT} or more: nearly everything fails"
-            )
-        cut = jax.tree.map(lambda a: a[:near], v.near)
-        e = jax.tree.map(lambda a, b: np.concatenate([a, b]), v.failures, cut)
-        owner = np.concatenate([1 + v.label, np.zeros(near, int)])
-        group = np.concatenate([v.group, v.near_group[:near]])
-        return e, owner, group, (OTHERS, *map(str, s.names)), s.evaluations + v.evaluations
-    a, b = gathered(name, "failures", sim, failures), gathered(name, "others", sim, others)
-    for argument, part, wanted in (("failures", a, True), ("others", b, False)):
-        if (wrong := int((part.failure != wanted).sum())) or not len(part.length):
-            raise ValueError(
-                f"{name}: {argument} must {'all fail' if wanted else 'not fail'}, received"
-                f" {len(part.length)} episodes, of which {wrong} do{'' if not wanted else ' not'}"
-            )
-    kinds, label = ("fails",), np.zeros(len(a.length), int)
-    if labels is not None:
-        kinds, label = np.unique(np.asarray(labels).astype(str), return_inverse=True)
-        if label.shape != a.length.shape:
-            raise ValueError(
-                f"{name}: labels must be one for each of the {len(a.length)} failures, received"
-                f" the shape {np.shape(labels)}"
-            )
-    rows, calm = distinct(a), distinct(b)
-    a, b = (jax.tree.map(lambda v, r=r: v[r], part) for part, r in ((a, rows), (b, calm)))
-    owner = np.concatenate([1 + label[rows], np.zeros(len(calm), int)])
-    least = int(np.unique(owner, return_counts=True)[1].min())
-    if least < DISTINCT:
-        raise ValueError(
-            f"{name}: failures and others must be {DISTINCT} distinct episodes or more of each"
-            f" kind, received {least}; without others rules simulates more"
-        )
-    e = jax.tree.map(lambda u, v: np.concatenate([u, v]), a, b)
-    return e, owner, np.arange(len(owner)), (OTHERS, *map(str, kinds)), 0
-
-
 def _ends(rng: np.random.Generator, e: Episode, ends: np.ndarray) -> np.ndarray:
     """[n]: the ends of failures, and of others one drawn from ``ends``, but not behind theirs."""
     return np.where(e.failure, e.length, np.minimum(e.length, rng.choice(ends, len(e.length))))
-
-
-def _grown(trees, rng, x, owner, group, most):
-    """The tree of fewest ways that does as well as the best, up to one standard error (Breiman et
-    al. 1984, section 3.4.3) of its balanced accuracy on the parts left out.
-    """
-    least = max(2, len(owner) // 200)
-    grow = lambda ways, rows: trees.DecisionTreeClassifier(
-        max_leaf_nodes=ways, min_samples_leaf=least, class_weight="balanced", random_state=0
-    ).fit(x[rows], owner[rows])
-    sizes = range(2, most + 1)
-    score = np.zeros((FOLDS, len(sizes)))
-    for i in range(FOLDS):
-        out = parted(rng, owner, group, 1 / FOLDS)
-        for j, ways in enumerate(sizes):
-            said = grow(ways, ~out).predict(x[out])
-            kinds = np.unique(owner[out])
-            score[i, j] = np.mean([np.mean(said[owner[out] == k] == k) for k in kinds])
-    mean = score.mean(axis=0)
-    best = int(np.argmax(mean))
-    tested = len(owner) / FOLDS
-    error = np.sqrt(mean[best] * (1 - mean[best]) / tested)
-    chosen = int(np.flatnonzero(mean >= mean[best] - error)[0])
-    return grow(sizes[chosen], np.ones(len(owner), bool))
-
-
-def _rules(tree, features, names, leaf, truth, level) -> tuple:
-    """`Rule` of each leaf that says of an episode that it fails."""
-    t, found = tree.tree_, []
-
-    def walk(node: int, bounds: dict) -> None:
-        if t.children_left[node] < 0:
-            k = int(tree.classes_[np.argmax(t.value[node][0])])
-            if k:
-                here = leaf == node
-                hits, fits, all_ = (
-                    int(np.sum(here & (truth == k))),
-                    int(here.sum()),
-                    int(np.sum(truth == k)),
-                )
-                conditions = tuple(
-                    (features[i].name, features[i].kind, low, high)
-                    for i, (low, high) in bounds.items()
-                )
-                found.append(
-                    Rule(
-                        names[k], conditions, *_share(hits, fits, level), *_share(hits, all_, level)
-                    )
-                )
-            return
-        i, cut = int(t.feature[node]), float(t.threshold[node])
-        low, high = bounds.get(i, (-np.inf, np.inf))
-        walk(t.children_left[node], bounds | {i: (low, min(high, cut))})
-        walk(t.children_right[node], bounds | {i: (max(low, cut), high)})
-
-    walk(0, {})
-    return tuple(sorted(found, key=lambda r: (names.index(r.label), -r.recall)))
-
-
-def _share(part: int, all_: int, level: float) -> tuple:
-    if not all_:
-        return float("nan"), (0.0, 1.0)
-    return part / all_, clopper_pearson(part, all_, level)
-
-
-def _condition(condition: tuple) -> str:
-    """ "gust at step 12 > 3.1" """
-    what, kind, low, high = condition
-    if kind == "truth":
-        return what if low > -np.inf else f"not {what}"
-    if kind == "count":
-        low, high = np.floor(low) + 1, np.floor(high)
-        if low == high:
-            return f"{what} = {low:.0f}"
-        least, most = (f"{what} >= {low:.0f}", f"{what} <= {high:.0f}")
-        between = f"{low:.0f} <= {what} <= {high:.0f}"
-    else:
-        least, most, between = (
-            f"{what} > {low:.3g}",
-            f"{what} <= {high:.3g}",
-            f"{low:.3g} < {what} <= {high:.3g}",
-        )
-    return (
-        between if np.isfinite(low) and np.isfinite(high) else (least if np.isfinite(low) else most)
-    )

@@ -10,15 +10,16 @@ from jast import limit_state as latent
 from jast.counter import generator
 from jast.episode import Episode
 from jast.estimate.batches import resampled
+from jast.estimate.estimate import Estimate
 from jast.estimate.redrawn import fits, redrawn
-from jast.explain.gathered import distinct, gathered
+from jast.explain.gathered import distinct, gathered, kinds_of
 from jast.incidents import hosted
 from jast.judge import Judge
 from jast.markov import proposed
 from jast.outline import outline
 from jast.pytrees import count, in_lanes
 from jast.search.centred import centred
-from jast.search.failure_modes import Mode, Modes, nearest
+from jast.search.failure_modes import Modes, nearest
 from jast.simulator import Simulator
 
 __all__ = ["Seeds", "Variants", "seeds", "variants"]
@@ -79,23 +80,20 @@ def seeds(
     if labels is None and q is not None and fits(sim, q):
         found = _of_proposal(key, sim, q, draws)
         if len(found.z):
-            return _of_modes(sim, found, modes)
-    e = gathered(function, "failures", sim, given)
-    of_mode = isinstance(given, list | tuple) and any(isinstance(part, Mode) for part in given)
+            return _of_modes(function, sim, found, modes)
+    if isinstance(given, Estimate):
+        raise ValueError(
+            f"{function}: failures must be episodes, or an estimate with a proposal for sim of"
+            f" which some draws fail; received one of {given.method} without"
+        )
+    of_mode = isinstance(given, Modes) and len(given) > 1
+    e = gathered(function, "failures", sim, given[:MOST] if of_mode else given)
+    n = len(e.length)
+    names, label = ("fails",), np.zeros(n, int)
     if labels is not None:
-        names, label = np.unique(np.asarray(labels).astype(str), return_inverse=True)
-        if label.shape != e.length.shape:
-            raise ValueError(
-                f"{function}: labels must be one for each of the {len(e.length)} failures, received"
-                f" the shape {np.shape(labels)}"
-            )
-    elif of_mode and len(e.length) > 1:
-        label = np.minimum(np.arange(len(e.length)), MOST)
-        names = _numbered(min(len(e.length), MOST))
-        e = jax.tree.map(lambda a: a[:MOST], e)
-        label = label[:MOST]
-    else:
-        names, label = ("fails",), np.zeros(len(e.length), int)
+        names, label = kinds_of(function, labels, n)
+    elif of_mode:
+        names, label = _numbered(n), np.arange(n)
     rows = distinct(e)
     e, label = jax.tree.map(lambda a: a[rows], e), label[rows]
     if not len(e.length):
@@ -108,8 +106,8 @@ def seeds(
             f" {int((~(e.failure & o.failure)).sum())} of {len(z)} that do not"
         )
     z, label, used = z[o.failure], label[o.failure], o.used[o.failure]
-    found = Seeds(z, used, np.zeros(len(z)), label, tuple(names), len(rows))
-    return found if labels is not None or of_mode else _of_modes(sim, found, modes)
+    found = Seeds(z, used, np.zeros(len(z)), label, names, len(rows))
+    return found if labels is not None or of_mode else _of_modes(function, sim, found, modes)
 
 
 def _of_proposal(key: jax.Array, sim: Simulator, q: Any, draws: int) -> Seeds:
@@ -123,13 +121,13 @@ def _of_proposal(key: jax.Array, sim: Simulator, q: Any, draws: int) -> Seeds:
     return Seeds(z, used, log_w.astype(float), np.zeros(len(z), int), ("fails",), spent)
 
 
-def _of_modes(sim: Simulator, s: Seeds, modes: Any) -> Seeds:
+def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
     """``s`` with the mode in whose direction each lies, where there are several; each mode has its
     likeliest failure as a seed, too.
     """
     if modes is None or len(modes) < 2:
         return s
-    best = gathered("rules", "modes", sim, list(modes)[:MOST])
+    best = gathered(function, "modes", sim, modes[:MOST])
     of_modes = centred(sim)
     heads = latent.normal_of(sim, best)
     judge = Judge(sim)

@@ -1,0 +1,89 @@
+"""What rules and monitors learn from: episodes of known kinds, given by the user or simulated."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast.episode import Episode
+from jast.explain.gathered import distinct, gathered, kinds_of
+from jast.explain.learning import DISTINCT
+from jast.explain.variants import seeds, variants
+from jast.simulator import Simulator
+
+__all__ = ["OTHERS", "Cases", "simulated", "told"]
+
+OTHERS, DRAWS = "does not fail", 4
+"""What the others are called; draws of a proposal for each episode wanted."""
+
+
+class Cases(NamedTuple):
+    """Episodes [n], failures first."""
+
+    episodes: Episode
+    kind: np.ndarray
+    """[n] int: 0 does not fail, else a kind of failure."""
+    group: np.ndarray
+    """[n] int: what is held out together."""
+    names: tuple
+    """Of the kinds."""
+    evaluations: int
+
+
+def simulated(
+    function: str,
+    keys: tuple,
+    sim: Simulator,
+    failures: Any,
+    labels: Sequence | None,
+    episodes: int,
+    most: int | None = None,
+) -> Cases:
+    """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses.
+
+    Args:
+        keys: of the draws of a proposal, and of the chains.
+    """
+    s = seeds(function, keys[0], sim, failures, labels, DRAWS * episodes)
+    v = variants(keys[1], sim, s, episodes)
+    near = len(v.near_group) if most is None else min(most, len(v.near_group))
+    if near < 2 * DISTINCT:
+        raise ValueError(
+            f"{function}: others: {near} of the variants of the failures do not fail, expected"
+            f" {2 * DISTINCT} or more: nearly everything fails"
+        )
+    e = jax.tree.map(lambda a, b: np.concatenate([a, b[:near]]), v.failures, v.near)
+    kind = np.concatenate([1 + v.label, np.zeros(near, int)])
+    group = np.concatenate([v.group, v.near_group[:near]])
+    return Cases(e, kind, group, (OTHERS, *s.names), s.evaluations + v.evaluations)
+
+
+def told(
+    function: str, sim: Simulator, failures: Any, others: Any, labels: Sequence | None, least: int
+) -> Cases:
+    """The episodes that the user has, each once; ``least`` or more of each kind."""
+    parts, kind, names = [], [], ("fails",)
+    for argument, given, wanted in (("failures", failures, True), ("others", others, False)):
+        e = gathered(function, argument, sim, given)
+        if wrong := int((e.failure != wanted).sum()):
+            raise ValueError(
+                f"{function}: {argument} must {'all' if wanted else 'not'} fail, received"
+                f" {len(e.length)} episodes, of which {wrong} do{' not' if wanted else ''}"
+            )
+        each = np.full(len(e.length), int(wanted))
+        if wanted and labels is not None:
+            names, each = kinds_of(function, labels, len(e.length))
+            each = each + 1
+        rows = distinct(e)
+        parts.append(jax.tree.map(lambda a, rows=rows: a[rows], e))
+        kind.append(each[rows])
+        few = min((int(np.sum(kind[-1] == k)) for k in np.unique(each)), default=0)
+        if few < least:
+            raise ValueError(
+                f"{function}: {argument} must be {least} distinct episodes or more of each kind,"
+                f" received {few}; without others {function} simulates more"
+            )
+    e = jax.tree.map(lambda a, b: np.concatenate([a, b]), *parts)
+    owner = np.concatenate(kind)
+    return Cases(e, owner, np.arange(len(owner)), (OTHERS, *names), 0)

@@ -1,0 +1,57 @@
+"""Ordinary episodes, and what is observed at each step of any."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast import rewards
+from jast.episode import Episode, play_back, rollout
+from jast.incidents import hosted
+from jast.pytrees import in_lanes
+from jast.simulator import Simulator
+
+__all__ = ["observed", "ordinary"]
+
+LANES = 256
+"""Episodes that are played at a time."""
+
+
+def ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
+    """At most ``n`` episodes of the model that do not fail."""
+    size = n if hosted(sim) else LANES
+    at = np.arange(n, dtype=np.int32)
+    e = in_lanes(size, lambda at: _drawn(key, sim, at), at)
+    return jax.tree.map(lambda a: a[~e.failure], e)
+
+
+@jax.jit
+def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
+    one = lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None)
+    return jax.vmap(one)(at)
+
+
+def observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
+    """[n, horizon + 1, d] of the states."""
+    watch = observe if isinstance(observe, Partial) else Partial(observe)
+    size = len(e.length) if hosted(sim) else LANES
+    seen = in_lanes(size, partial(_watched, sim, watch), e.x0, e.disturbances, e.length)
+    if not isinstance(seen, np.ndarray) or seen.ndim != 3:
+        shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
+        raise ValueError(
+            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
+        )
+    return seen.astype(float)
+
+
+@jax.jit
+def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
+    def one(x0, x, length):
+        states = play_back(sim, rewards.STANDARD, x0, x, length).states
+        return jax.tree.map(jnp.asarray, jax.vmap(observe)(states))
+
+    return jax.vmap(one)(x0, x, length)

@@ -1,0 +1,119 @@
+"""Decision trees: how large they grow, and the rules that they hold."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jast import results
+from jast.explain.learning import parted
+from jast.intervals import clopper_pearson
+
+__all__ = ["Rule", "grown", "read"]
+
+FOLDS = 3
+"""Parts of the episodes by which the size of a tree is chosen."""
+
+
+@results.shown()
+class Rule(NamedTuple):
+    """One way through the tree."""
+
+    label: str
+    """What it says of an episode: "fails", or the kind of failure."""
+    conditions: tuple
+    """(what, kind, low, high) of each: ``low < what <= high``. What holds or not is 1 or 0."""
+    precision: float
+    """Of the held-out episodes that it fits, the share that is of this label."""
+    precision_interval: tuple
+    recall: float
+    """Of the held-out episodes of this label, the share that it fits."""
+    recall_interval: tuple
+
+    def __str__(self):
+        text = " and ".join(map(_condition, self.conditions)) or "always"
+        return f"{text} -> {self.label}"
+
+
+def grown(trees, rng, x, owner, group, most):
+    """The tree of fewest ways that does as well as the best, up to one standard error (Breiman et
+    al. 1984, section 3.4.3) of its balanced accuracy on the parts left out.
+    """
+    least = max(2, len(owner) // 200)
+    grow = lambda ways, rows: trees.DecisionTreeClassifier(
+        max_leaf_nodes=ways, min_samples_leaf=least, class_weight="balanced", random_state=0
+    ).fit(x[rows], owner[rows])
+    sizes = range(2, most + 1)
+    score = np.zeros((FOLDS, len(sizes)))
+    for i in range(FOLDS):
+        out = parted(rng, owner, group, 1 / FOLDS)
+        for j, ways in enumerate(sizes):
+            said = grow(ways, ~out).predict(x[out])
+            kinds = np.unique(owner[out])
+            score[i, j] = np.mean([np.mean(said[owner[out] == k] == k) for k in kinds])
+    mean = score.mean(axis=0)
+    best = int(np.argmax(mean))
+    tested = len(owner) / FOLDS
+    error = np.sqrt(mean[best] * (1 - mean[best]) / tested)
+    chosen = int(np.flatnonzero(mean >= mean[best] - error)[0])
+    return grow(sizes[chosen], np.ones(len(owner), bool))
+
+
+def read(tree, features, names, leaf, truth, level) -> tuple:
+    """`Rule` of each leaf that says of an episode that it fails."""
+    t, found = tree.tree_, []
+
+    def walk(node: int, bounds: dict) -> None:
+        if t.children_left[node] < 0:
+            k = int(tree.classes_[np.argmax(t.value[node][0])])
+            if k:
+                here = leaf == node
+                hits, fits, all_ = (
+                    int(np.sum(here & (truth == k))),
+                    int(here.sum()),
+                    int(np.sum(truth == k)),
+                )
+                conditions = tuple(
+                    (features[i].name, features[i].kind, low, high)
+                    for i, (low, high) in bounds.items()
+                )
+                found.append(
+                    Rule(
+                        names[k], conditions, *_share(hits, fits, level), *_share(hits, all_, level)
+                    )
+                )
+            return
+        i, cut = int(t.feature[node]), float(t.threshold[node])
+        low, high = bounds.get(i, (-np.inf, np.inf))
+        walk(t.children_left[node], bounds | {i: (low, min(high, cut))})
+        walk(t.children_right[node], bounds | {i: (max(low, cut), high)})
+
+    walk(0, {})
+    return tuple(sorted(found, key=lambda r: (names.index(r.label), -r.recall)))
+
+
+def _share(part: int, all_: int, level: float) -> tuple:
+    if not all_:
+        return float("nan"), (0.0, 1.0)
+    return part / all_, clopper_pearson(part, all_, level)
+
+
+def _condition(condition: tuple) -> str:
+    """ "gust at step 12 > 3.1" """
+    what, kind, low, high = condition
+    if kind == "truth":
+        return what if low > -np.inf else f"not {what}"
+    if kind == "count":
+        low, high = np.floor(low) + 1, np.floor(high)
+        if low == high:
+            return f"{what} = {low:.0f}"
+        least, most = (f"{what} >= {low:.0f}", f"{what} <= {high:.0f}")
+        between = f"{low:.0f} <= {what} <= {high:.0f}"
+    else:
+        least, most, between = (
+            f"{what} > {low:.3g}",
+            f"{what} <= {high:.3g}",
+            f"{low:.3g} < {what} <= {high:.3g}",
+        )
+    return (
+        between if np.isfinite(low) and np.isfinite(high) else (least if np.isfinite(low) else most)
+    )
