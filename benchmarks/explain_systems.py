@@ -154,12 +154,16 @@ def _unseen(x0):
 def _any_step(limits):
     """Fails at the first step at which all limits [fields] are passed."""
     return jast.Simulator(
-        init=lambda x0: Short(jnp.zeros((), jnp.int32), jnp.full(2, 3.0)),
+        init=_calm,
         step=Partial(_at_once, limits),
         disturbance=_weather,
         evaluate=_missed,
         horizon=STEPS,
     )
+
+
+def _calm(x0):
+    return Short(jnp.zeros((), jnp.int32), jnp.full(2, 3.0))
 
 
 def _at_once(limits, s, x):
