@@ -22,9 +22,9 @@ from jast.archive import arrays_of, check_part, describe, named
 from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.simulator import Simulator
-from jast.tables import to_csv, to_numpy
+from jast.tables import from_json, to_csv, to_numpy
 
-__all__ = ["Failures", "collect", "load", "merge", "save", "to_csv", "to_numpy"]
+__all__ = ["Failures", "collect", "from_json", "load", "merge", "save", "to_csv", "to_numpy"]
 __dir__ = listed(__all__)
 
 SCALARS = ("log_prob", "distance", "failure", "length", "reward")

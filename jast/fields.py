@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax.tree_util import SequenceKey
 
-__all__ = ["Field", "called", "entries", "fields"]
+__all__ = ["Field", "called", "entries", "fields", "place"]
 
 
 class Field(NamedTuple):
@@ -24,9 +24,14 @@ def called(path: tuple, root: str) -> str:
     """The name of the leaf at ``path`` of a pytree that is called ``root``: "car.speed" in named
     tuples and dicts, "x.0" in plain tuples, ``root`` itself where it is the whole.
     """
-    name = jax.tree_util.keystr(path, simple=True, separator=".")
+    name = place(path)
     numbered = bool(path) and isinstance(path[0], SequenceKey)
     return f"{root}.{name}" if numbered else name or root
+
+
+def place(path: tuple) -> str:
+    """``path`` in words: "car.speed", "0"; "" for the whole."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def entries(shape: tuple) -> list[str]:

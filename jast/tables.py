@@ -1,13 +1,22 @@
-"""Failures as plain numbers: for a simulator of the user's own, which may not be in Python."""
+"""Failures as plain numbers: for a simulator of the user's own, which may not be in Python; and
+back from the page of a report.
+"""
 
 import csv
+import json
 import os
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-__all__ = ["to_csv", "to_numpy"]
+from jast.episode import Episode, replay
+from jast.fields import place
+from jast.outline import outline
+from jast.simulator import Simulator
+
+__all__ = ["from_json", "to_csv", "to_numpy"]
 
 OF_EPISODE = ("length", "log_prob", "distance", "reward")
 
@@ -28,7 +37,7 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
     out = {name: getattr(e, name) for name in OF_EPISODE}
     for root, part in (("x0", e.x0), ("x", e.disturbances)):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
-            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            name = place(path)
             out[f"{root}.{name}" if name else root] = leaf
     return out
 
@@ -39,7 +48,17 @@ def to_csv(path: str | os.PathLike, failures: Any) -> None:
     The columns are ``failure`` (from 1, the best first), ``step`` (from 1; 0 is the start) and the
     numbers of the disturbance, named as by `to_numpy`, those of an array with their place, as
     "x[2]". With a random start row 0 has the numbers of x0. All digits are kept: read back as
-    doubles they are the same numbers.
+    doubles they are the same numbers. Failure 3 in a simulator of your own, whose disturbance is
+    ``x``::
+
+        import csv
+
+        with open("failures.csv", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["failure"] == "3"]
+        mine = MySimulator()
+        for row in rows:
+            mine.step(float(row["x"]))
+        print(mine.failed())
 
     Args:
         path: of the file; an older one of that name is replaced.
@@ -62,6 +81,42 @@ def to_csv(path: str | os.PathLike, failures: Any) -> None:
             for t in range(int(arrays["length"][i])):
                 row = [n for v in of_steps.values() for n in _numbers(v[i, t])]
                 table.writerow([i + 1, t + 1, *[""] * len(first), *row])
+
+
+def from_json(path: str | os.PathLike, sim: Simulator) -> Episode:
+    """A failure that the page of a report gave as a file (`jast.stress_testing.Report.html`),
+    played again to the bit.
+
+    Args:
+        path: of the file.
+        sim: the simulator that it is of.
+
+    Returns:
+        The `jast.Episode`, with its states.
+
+    Raises:
+        ValueError: for a file that holds no failure, or one of another simulator.
+    """
+    try:
+        given = json.loads(Path(path).read_text(encoding="utf-8"))
+        parts = [{a["name"]: a for a in given[name]} for name in ("x0", "disturbances")]
+    except (json.JSONDecodeError, KeyError, TypeError) as wrong:
+        raise ValueError(
+            f"from_json: path must be a file from the page of a report, received {str(path)!r},"
+            f" which is none: {wrong!r}"
+        ) from None
+    about, wholes = outline(sim), []
+    for name, like, part in zip(("x0", "x"), (about.x0, about.x), parts, strict=True):
+        pairs, treedef = jax.tree_util.tree_flatten_with_path(like)
+        names = [place(at) for at, _ in pairs]
+        if set(names) != set(part):
+            raise ValueError(
+                f"from_json: sim must be the simulator of the failure, of {name} {sorted(part)},"
+                f" received one of {sorted(names)}"
+            )
+        arrays = (np.array(part[name]["values"], part[name]["dtype"]) for name in names)
+        wholes.append(treedef.unflatten(list(arrays)))
+    return replay(sim, wholes[1], wholes[0])
 
 
 def _names(name: str, shape: tuple) -> list[str]:

@@ -452,3 +452,28 @@ def test_failures_as_plain_numbers(tmp_path):
     assert len(rows) == 1 + int(found[2].length) and state == pytest.approx(4, abs=4)
     assert state >= 4 - 1e-5
     assert float(rows[1]["x.pull"]) == float(found[2].disturbances["pull"][0])
+
+
+def test_the_example_of_a_table_runs(tmp_path, monkeypatch, key, capsys):
+    """What the docstring shows, with a walk of our own."""
+    import textwrap
+
+    sim = jast.simulators.walk1d(threshold=3.0)
+    found = jast.search.monte_carlo(key, sim, episodes=2000, refine=0, top=4).failures
+    monkeypatch.chdir(tmp_path)
+    jast.failures.to_csv("failures.csv", found)
+
+    class MySimulator:
+        at = 0.0
+
+        def step(self, x):
+            self.at += x
+
+        def failed(self):
+            return abs(self.at) >= 3.0 - 1e-5
+
+    words = jast.failures.to_csv.__doc__.split("``x``::")[1].split("Args:")[0]
+    code = textwrap.dedent(words)
+    assert len(code.strip().splitlines()) <= 10
+    exec(code, dict(MySimulator=MySimulator))
+    assert capsys.readouterr().out == "True\n"

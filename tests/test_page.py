@@ -3,6 +3,7 @@ copied from a page replays. In a browser, where one is installed.
 """
 
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +73,22 @@ def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):
     assert episode.failure and int(episode.length) == int(best.length)
     assert np.asarray(episode.disturbances[EVIL]).tobytes() == best.disturbances[EVIL].tobytes()
     assert capsys.readouterr().out.startswith("True")
+    met = []
+    mine = SimpleNamespace(step=lambda **x: met.append(x[EVIL]))
+    exec(report.OWN, {"mine": mine})
+    assert np.stack(met).tobytes() == best.disturbances[EVIL][: int(best.length)].tobytes()
+    assert max(len(code.splitlines()) for code in (report.SNIPPET, report.OWN)) <= 10
+
+
+def test_what_is_no_failure_of_the_system_is_refused(page, tmp_path):
+    path = tmp_path / "failure-1.json"
+    path.write_text(Page(page).data["modes"][0]["exact"])
+    with pytest.raises(ValueError, match="from_json: sim must be the simulator of the failure, of"):
+        jast.failures.from_json(path, jast.simulators.walk1d())
+    for words in ("3", "{}", "no json"):
+        path.write_text(words)
+        with pytest.raises(ValueError, match="from_json: path must be a file from the page"):
+            jast.failures.from_json(path, SIM)
 
 
 def test_numbers_that_json_does_not_have():

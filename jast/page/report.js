@@ -142,6 +142,6 @@ function card(article) {
 }
 
 document.querySelectorAll(".card").forEach(card);
-const code = document.querySelector("#replay");
-code.querySelector(".copy").addEventListener("click", (event) =>
-  copy(code.querySelector("pre").textContent, event.target));
+document.querySelectorAll("#replay .code").forEach((code) =>
+  code.querySelector(".copy").addEventListener("click", (event) =>
+    copy(code.querySelector("pre").textContent, event.target)));

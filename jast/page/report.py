@@ -24,22 +24,22 @@ MODES = 16
 """Cards; further modes are counted."""
 
 SNIPPET = """\
-import json
-from pathlib import Path
-
-import jax
-import numpy as np
-
 import jast
-from jast.outline import outline
 
 # sim = ...  your jast.Simulator
-failure = json.loads(Path("failure-1.json").read_text())  # the button above downloads it
-whole = lambda arrays: [np.array(a["values"], a["dtype"]) for a in arrays]
-x0, x = (jax.tree.structure(part) for part in (outline(sim).x0, outline(sim).x))
-x0, x = x0.unflatten(whole(failure["x0"])), x.unflatten(whole(failure["disturbances"]))
-episode = jast.replay(sim, x, x0)
+episode = jast.failures.from_json("failure-1.json", sim)  # the button above downloads it
 print(episode.failure, episode.length, episode.distance)
+"""
+OWN = """\
+import json
+import numpy as np
+
+with open("failure-1.json") as file:  # the button above downloads it
+    failure = json.load(file)
+x = {a["name"]: np.array(a["values"], a["dtype"]) for a in failure["disturbances"]}
+# mine = ...  your simulator, at its start
+for t in range(failure["length"]):
+    mine.step(**{name or "x": values[t] for name, values in x.items()})
 """
 
 
@@ -213,6 +213,13 @@ def _work(report: Any) -> str:
     return f"<section id=tried><h2>What was tried</h2>{table(head, lines)}</section>"
 
 
+def _code(name: str, words: str) -> str:
+    return (
+        f"<div class=code><p>{text(name)} <button class=copy>Copy</button></p>"
+        f"<pre>{text(words)}</pre></div>"
+    )
+
+
 def _settings(report: Any) -> str:
     from jast import __version__
 
@@ -228,8 +235,8 @@ def _settings(report: Any) -> str:
         for k, v in report.settings.items()
     ]
     return (
-        "<section id=replay><h2>Replay failure 1</h2><p><button class=copy>Copy</button></p>"
-        f"<pre>{text(SNIPPET)}</pre></section>"
+        "<section id=replay><h2>Replay failure 1</h2>"
+        f"{_code('With jast', SNIPPET)}{_code('In a simulator of your own', OWN)}</section>"
         f"<section id=settings><h2>Settings and versions</h2>{rows([*asked, *versions])}"
         f"<details><summary>The report as text</summary><pre>{text(report)}</pre></details>"
         "</section>\n</main>"

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jast.episode import Episode, replay
-from jast.fields import fields
+from jast.fields import fields, place
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
@@ -112,7 +112,7 @@ def exact(episode: Episode) -> dict:
     def arrays(tree: Any) -> list[dict]:
         return [
             {
-                "name": jax.tree_util.keystr(path, simple=True, separator="."),
+                "name": place(path),
                 "dtype": np.asarray(a).dtype.name,
                 "values": np.asarray(a).tolist(),
             }
