@@ -1,6 +1,7 @@
 """Simulated systems with a source and a known truth, one file (or folder) each; `draw` is
 a picture of a state of some of them."""
 
+from jast.simulators import arch
 from jast.simulators.autoregression import autoregression
 from jast.simulators.bluesky import bluesky, bluesky_flight
 from jast.simulators.colav import colav
@@ -14,6 +15,7 @@ from jast.simulators.ruin import ruin, ruin_probability
 from jast.simulators.walk import walk1d
 
 __all__ = [
+    "arch",
     "autoregression",
     "bluesky",
     "bluesky_flight",

@@ -1,0 +1,13 @@
+"""The falsification benchmarks of ARCH-COMP: models under requirements in temporal logic.
+
+Inputs are uniform in their ranges, so that all episodes of a length are equally likely and only
+failing counts; with a density of yours, also how likely a failure is.
+"""
+
+from jast._doors import listed
+from jast.simulators.arch.cars import Cars
+from jast.simulators.arch.models import chasing_cars, simulate
+from jast.simulators.arch.specifications import SPECIFICATIONS
+
+__all__ = ["Cars", "SPECIFICATIONS", "chasing_cars", "simulate"]
+__dir__ = listed(__all__)

@@ -1,0 +1,52 @@
+"""The requirements of the falsification category of ARCH-COMP, as formulas.
+
+CC4's inner window differs between tools: 5 s in FalStar and the report of 2024 ("CC4"), 20 s in
+stgem and FReaK ("CC4-20", which asks for 115 s of 100: windows are clipped at the end). CC3 has the
+inequality of the category's reports.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from jast.specs import Formula, always, eventually, implies, predicate
+
+__all__ = ["SPECIFICATIONS"]
+
+
+def _wider(i: int, metres: float) -> Formula:
+    """Car i + 2 is more than that ahead of car i + 1; i from 0."""
+    return predicate(lambda s: s.gaps[i] - metres, f"y{i + 2} - y{i + 1} >= {metres:g}")
+
+
+def _narrower(i: int, metres: float) -> Formula:
+    return predicate(lambda s: metres - s.gaps[i], f"y{i + 2} - y{i + 1} <= {metres:g}")
+
+
+def _cc4(inner: float) -> Formula:
+    return always(eventually(always(_wider(3, 8.0), 0, inner), 0, 30), 0, 65)
+
+
+def _ccx() -> Formula:
+    apart = [always(predicate(lambda s, i=i: s.gaps[i] - 7.5, f"y{i + 2} - y{i + 1} > 7.5"), 0, 50)
+             for i in range(4)]  # fmt: skip
+    return apart[0] & apart[1] & apart[2] & apart[3]
+
+
+SPECIFICATIONS: Mapping[str, Formula] = MappingProxyType(
+    {
+        "CC1": always(_narrower(3, 40.0), 0, 100),
+        "CC2": always(eventually(_wider(3, 15.0), 0, 30), 0, 70),
+        "CC3": always(
+            always(_narrower(0, 20.0), 0, 20) | eventually(_wider(3, 40.0), 0, 20), 0, 80
+        ),
+        "CC4": _cc4(5.0),
+        "CC4-20": _cc4(20.0),
+        "CC5": always(
+            eventually(implies(always(_wider(0, 9.0), 0, 5), always(_wider(3, 9.0), 5, 20)), 0, 8),
+            0,
+            72,
+        ),
+        "CCx": _ccx(),
+    }
+)
+"""Name -> formula of the trace of its model, at seconds."""
