@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 import jast
+from benchmarks.explain_systems import planted
 from benchmarks.stress_systems import slips
 from jast import explain
 from jast.distributions import Joint, Normal, Uniform
 from jast.explain.learning import parted
+from jast.search import Mode, Modes
 
 pytest.importorskip("sklearn", reason="rules and monitors learn with scikit-learn")
 
@@ -79,25 +81,55 @@ def test_a_rule_is_right_about_fresh_episodes(found):
     assert found.predict(jax.tree.map(lambda a: a[0], bad)).shape == (1,)
 
 
-def test_rules_tell_kinds_of_failures_apart():
-    sim = late_gust(
-        step=lambda s, x: (
-            s[0] + 1,
-            jnp.where(
-                s[0] == 4,
-                jnp.maximum(jnp.minimum(3.2 - x["gust"], 3.0 - x["delay"]), 0.0),
-                3.0,
-            ),
-        )
+TWO = late_gust(
+    step=lambda s, x: (
+        s[0] + 1,
+        jnp.where(
+            s[0] == 4,
+            jnp.maximum(jnp.minimum(3.2 - x["gust"], 3.0 - x["delay"]), 0.0),
+            3.0,
+        ),
     )
-    a, b = drawn(0, 8, sim, gust=3.2), drawn(1, 8, sim, delay=3.0)
+)
+"""Fails at step 5 where the gust is above 3.2, or the delay above 3."""
+
+
+def test_rules_tell_kinds_of_failures_apart():
+    a, b = drawn(0, 8, TWO, gust=3.2), drawn(1, 8, TWO, delay=3.0)
     both = jax.tree.map(lambda u, v: jnp.concatenate([u, v]), a, b)
     labels = ["wind"] * 8 + ["lag"] * 8
-    r = explain.rules(sim, both, labels=labels, episodes=400)
+    r = explain.rules(TWO, both, labels=labels, episodes=400)
     assert r.classes == ("does not fail", "lag", "wind")
     names = {rule.label: {what for what, *_ in rule.conditions} for rule in r.rules}
     assert "gust at step 5" in names["wind"] and "delay at step 5" in names["lag"]
     assert min(r.recall.values()) > 0.9 and min(r.precision.values()) > 0.9
+
+
+def test_rules_of_modes_and_of_an_archive(key):
+    """Each mode has rules of its own; an archive is as good as a batch."""
+    e = [drawn(i, 1, TWO, **{name: 3.2}) for i, name in enumerate(("gust", "delay"))]
+    one = [jax.tree.map(lambda a: a[0], each) for each in e]
+    r = explain.rules(TWO, Modes(Mode(failure, 1, 0.5) for failure in one), episodes=200)
+    assert r.classes == ("does not fail", "mode 1", "mode 2")
+    assert {rule.label for rule in r.rules} == {"mode 1", "mode 2"}
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *e)
+    archive = jast.failures.collect(TWO, jast.rewards.standard(), both)
+    a, b = (explain.rules(TWO, given, episodes=100) for given in (archive, archive.episodes))
+    assert str(a) == str(b)
+
+
+@pytest.mark.long
+def test_rules_and_a_monitor_of_an_estimate(key):
+    """Failures of its proposal, with their weights."""
+    p = planted("one step of 50", 5)
+    estimate = jast.estimate.failure_probability(key, p.sim, 10_000)
+    r = explain.rules(p.sim, estimate, key=key)
+    assert p.named(0) == {what for what, *_ in r.rules[0].conditions}
+    bad = p.episodes(p.failing(np.random.default_rng(0), 0, 500))
+    assert np.mean(r.predict(bad) == "fails") > 0.95
+    sim = jast.simulators.pendulum()
+    m = explain.monitor(sim, jast.estimate.failure_probability(key, sim, 10_000), within=3)
+    assert m.auc > 0.9
 
 
 def test_what_is_held_out_was_not_learned_from():
@@ -210,6 +242,8 @@ def test_bad_rules():
         explain.rules(SIM, bad, labels=["a"])
     with pytest.raises(ValueError, match="distinct episodes or more"):
         explain.rules(SIM, jax.tree.map(lambda a: jnp.stack([a[0]] * 6), bad), calm)
+    with pytest.raises(ValueError, match="an estimate with a proposal .* monte_carlo without"):
+        explain.rules(SIM, jast.estimate.monte_carlo(jax.random.key(0), SIM, 100))
     with pytest.raises(ValueError, match="rules: of must be"):
         explain.rules(SIM, bad, of="everything")
     with pytest.raises(ValueError, match="rules: others: 0 of the variants"):
