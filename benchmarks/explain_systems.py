@@ -127,7 +127,7 @@ def _row(x):
 
 
 def _watch(limits, s, x):
-    return Short(s.t + 1, jnp.maximum(s.short, jnp.max(limits[:, s.t] - _row(x), axis=1)))
+    return Short(s.t + 1, jnp.maximum(s.short, jnp.max(limits[:, s.t] - _row(x)[None], axis=1)))
 
 
 def _missed(s):

@@ -1,5 +1,6 @@
 """Failures as the model has them, and near misses: variants of failures that are known."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,8 @@ from jast.markov import proposed
 from jast.outline import outline
 from jast.pytrees import count, in_lanes
 from jast.search.centred import centred
-from jast.search.failure_modes import Modes, nearest
+from jast.search.failure_modes import Modes
+from jast.search.moves import moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Seeds", "Variants", "seeds", "variants"]
@@ -122,7 +124,7 @@ def _of_proposal(key: jax.Array, sim: Simulator, q: Any, draws: int) -> Seeds:
 
 
 def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
-    """``s`` with the mode in whose direction each lies, where there are several; each mode has its
+    """``s`` with the mode that each is most alike, where there are several; each mode has its
     likeliest failure as a seed, too.
     """
     if modes is None or len(modes) < 2:
@@ -134,8 +136,7 @@ def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
     o = judge(heads)
     z = np.concatenate([s.z, heads[o.failure]]).astype(heads.dtype)
     used = np.concatenate([s.used, o.used[o.failure]])
-    there = _moved(sim, of_modes, z)
-    label = nearest(there, latent.normal_of(of_modes, best).astype(float))
+    label = _nearest(of_modes, _played(sim, z)[0], best)
     label[len(s.z) :] = np.flatnonzero(o.failure)
     # a mode's likeliest failure counts only where nothing else is known of the mode
     log_w = np.concatenate([s.log_weight, np.full(int(o.failure.sum()), -700.0)])
@@ -147,8 +148,17 @@ def _numbered(k: int) -> tuple:
     return tuple(f"mode {i + 1}" for i in range(k))
 
 
-def _moved(sim: Simulator, of_modes: Simulator, z: np.ndarray) -> np.ndarray:
-    return latent.normal_of(of_modes, _played(sim, z)[0]).astype(float)
+def _nearest(of_modes: Simulator, e: Episode, best: Episode) -> np.ndarray:
+    """[n] the one of ``best`` in whose direction each of ``e`` lies, as it is or moved in time so
+    that both end together.
+    """
+    there, heads = (latent.normal_of(of_modes, each) for each in (e, best))
+    move = jax.vmap(partial(moved_in_time, of_modes))
+    cosines = [latent.unit(there) @ latent.unit(heads).T]
+    for head, end in zip(heads, best.length, strict=True):
+        moved = np.asarray(move(there, jnp.asarray(end - e.length, jnp.int32)))
+        cosines.append(latent.unit(moved) @ latent.unit(head))
+    return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)
 
 
 def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
