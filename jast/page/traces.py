@@ -14,7 +14,7 @@ from jast.fields import fields, place
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
-__all__ = ["exact", "groups", "pictures", "short", "states_of", "trace"]
+__all__ = ["exact", "far", "groups", "pictures", "short", "states_of", "trace"]
 
 ENTRIES = 24
 """Numbers of one array that a page shows; the others are counted."""
@@ -75,8 +75,13 @@ def distances(sim: Simulator, states: Any, steps: list[int]) -> list[float] | No
     """
     if sim.episodic or hosted(sim):
         return None
-    found = jax.jit(jax.vmap(lambda sim, s: sim.evaluate(s)[1], in_axes=(None, 0)))(sim, states)
-    return short(np.asarray(found, float)[steps])
+    return short(np.asarray(far(sim, states), float)[steps])
+
+
+@jax.jit
+def far(sim: Simulator, states: Any) -> jax.Array:
+    """Miss distance of each of ``states`` [n, ...]."""
+    return jax.vmap(lambda s: sim.evaluate(s)[1])(states)
 
 
 def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:

@@ -15,6 +15,7 @@ from jast.failures import Failures
 from jast.fields import fields
 from jast.incidents import hosted
 from jast.outline import outline
+from jast.page.traces import far
 from jast.policy import undisturbed
 from jast.search.failure_modes import Mode, Modes, owners
 from jast.search.result import SearchResult
@@ -141,8 +142,7 @@ def lines(sim: Simulator, episodes: Episode) -> Lines:
     """
     states = episodes.states
     if states is None:
-        again = jax.vmap(lambda e: replay(sim, e).states)
-        states = (again if hosted(sim) else jax.jit(again))(episodes)
+        states = (_states if hosted(sim) else _compiled_states)(sim, episodes)
     length = np.asarray(episodes.length)
     there = np.arange(sim.horizon + 1) <= length[:, None]
     box = isinstance(states, Record | Standing)  # a record of the disturbances, then
@@ -151,13 +151,25 @@ def lines(sim: Simulator, episodes: Episode) -> Lines:
     if isinstance(states, Standing):
         columns[DISTANCE] = np.where(there, np.asarray(states.distance, float), np.nan)
     elif not sim.episodic and not box:
-        far = jax.jit(jax.vmap(jax.vmap(lambda s: sim.evaluate(s)[1])))(states)
-        columns[DISTANCE] = np.where(there, np.asarray(far, float), np.nan)
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), states)
+        distance = np.asarray(far(sim, flat), float).reshape(there.shape)
+        columns[DISTANCE] = np.where(there, distance, np.nan)
     own = tuple(columns)
     late = jax.tree.map(lambda a: _late(np.asarray(a, float), sim.horizon), episodes.disturbances)
     for name, values in _columns(late, "disturbance", there).items():
         columns[name if name.startswith("disturbance") else f"disturbance {name}"] = values
     return Lines(columns, length, own or tuple(columns))
+
+
+def _states(sim: Simulator, episodes: Episode) -> Any:
+    return jax.vmap(lambda e: replay(sim, e).states)(episodes)
+
+
+def _drawn(sim: Simulator, keys: jax.Array) -> Episode:
+    return jax.vmap(lambda k: rollout(k, sim))(keys)
+
+
+_compiled_states, _compiled_draws = jax.jit(_states), jax.jit(_drawn)
 
 
 def _columns(tree: Any, root: str, there: np.ndarray) -> dict[str, np.ndarray]:
@@ -196,8 +208,7 @@ def nominal_lines(caller: str, sim: Simulator, nominal: Any) -> Lines | None:
     if not count:
         return None
     keys = jax.random.split(jax.random.key(0), count)
-    drawn = jax.vmap(lambda k: rollout(k, sim))
-    return lines(sim, (drawn if hosted(sim) else jax.jit(drawn))(keys))
+    return lines(sim, (_drawn if hosted(sim) else _compiled_draws)(sim, keys))
 
 
 def quiet_line(sim: Simulator) -> Lines | None:
