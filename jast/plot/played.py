@@ -192,6 +192,12 @@ def _moves(values: np.ndarray) -> bool:
     return bool(len(seen)) and float(np.ptp(seen)) > 0
 
 
+def _departs(values: np.ndarray, usual: np.ndarray) -> bool:
+    gap = np.abs(values - usual)
+    size = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    return bool((gap[np.isfinite(gap)] > 1e-6 * size).any())
+
+
 def nominal_lines(caller: str, sim: Simulator, nominal: Any) -> Lines | None:
     """The `Lines` of nominal episodes: those of an `Episode` batch, or so many drawn with key 0.
 
@@ -222,13 +228,16 @@ def quiet_line(sim: Simulator) -> Lines | None:
     return lines(sim, jax.tree.map(lambda a: a[None], quiet))
 
 
-def chosen(caller: str, names: Any, of: Lines, most: int) -> list[str]:
+def chosen(caller: str, names: Any, of: Lines, most: int, quiet: Lines | None = None) -> list[str]:
     """The names to draw: those asked for, where "car" stands for all numbers of that array; or the
-    first ``most`` of what moves, the miss distance among them.
+    first ``most`` of what moves, and otherwise than in the episode ``quiet``, the miss distance
+    among them.
     """
     if names is None:
         rest = [k for k in of.state if k != DISTANCE]
         rest = [k for k in rest if _moves(of.columns[k])] or rest
+        if quiet is not None:
+            rest = [k for k in rest if _departs(of.columns[k], quiet.columns[k])] or rest
         own = [DISTANCE] * (DISTANCE in of.state)
         return [*rest[: most - len(own)], *own]
     found = []

@@ -49,8 +49,9 @@ def traces(
             `jast.estimate.FailureSamples`, an `Episode` or a batch of them. Each is replayed.
         sim: their simulator; not needed with a report that holds it.
         fields: names to draw: "speed", "position[0]", or "position" for all its numbers; "miss
-            distance"; "disturbance gust". Default: the first seven numbers that move, and the
-            miss distance; of a black box that is judged at its end, its disturbances.
+            distance"; "disturbance gust". Default: the first seven numbers that go otherwise than
+            undisturbed, and the miss distance; of a black box that is judged at its end, its
+            disturbances.
         modes: `jast.search.Modes`, by which failures are told apart (by direction), or the number
             of the mode of each, from 0. Default: those of a report.
         nominal: an `Episode` batch, or how many to draw with key 0. Default: 200; of a black box
@@ -68,8 +69,8 @@ def traces(
     caller = "traces"
     g = given(caller, samples, sim, modes, most)
     own = lines(g.sim, g.episodes)
-    names = chosen(caller, fields, own, PANELS)
     behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
+    names = chosen(caller, fields, own, PANELS, quiet)
     columns = 1 if len(names) < 4 else 2
     rows = -(-len(names) // columns)
     size = (6.8, 1.1 + 1.9 * rows) if columns == 1 else (9.6, 1.0 + 1.75 * rows)
@@ -155,7 +156,8 @@ def phase(
 
     Args:
         samples, sim, modes, nominal, units, most: as of `traces`.
-        fields: two names, across and up. Default: the first two numbers that move.
+        fields: two names, across and up. Default: the first two numbers that go otherwise than
+            undisturbed.
 
     Returns:
         The Axes.
@@ -166,13 +168,13 @@ def phase(
     caller = "phase"
     g = given(caller, samples, sim, modes, most)
     own = lines(g.sim, g.episodes)
-    names = chosen(caller, fields, own, PANELS)
+    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
+    names = chosen(caller, fields, own, PANELS, quiet)
     if fields is None:
         names = [k for k in names if k != DISTANCE] + [DISTANCE] * (DISTANCE in names)
         names = names[:2]
     if len(names) != 2:
         raise ValueError(f"plot.{caller}: fields must be two names, received {names}")
-    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
     with style.axes(ax, (6.2, 5.2)) as ax:
         if behind is not None:
             across, up = (behind.columns[k] for k in names)
