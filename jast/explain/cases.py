@@ -15,7 +15,8 @@ from jast.simulator import Simulator
 __all__ = ["OTHERS", "Cases", "simulated", "told"]
 
 OTHERS, DRAWS = "does not fail", 4
-"""What the others are called; draws of a proposal for each episode wanted."""
+"""What the others are called; draws of an estimate that are looked at for each episode
+wanted."""
 
 
 class Cases(NamedTuple):
@@ -33,20 +34,21 @@ class Cases(NamedTuple):
 
 def simulated(
     function: str,
-    keys: tuple,
+    key: jax.Array,
     sim: Simulator,
     failures: Any,
     labels: Sequence | None,
     episodes: int,
     most: int | None = None,
 ) -> Cases:
-    """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses.
-
-    Args:
-        keys: of the draws of a proposal, and of the chains.
-    """
-    s = seeds(function, keys[0], sim, failures, labels, DRAWS * episodes)
-    v = variants(keys[1], sim, s, episodes)
+    """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses."""
+    s = seeds(function, sim, failures, labels, DRAWS * episodes)
+    v = variants(key, sim, s, episodes)
+    if len(v.label) < 2 * DISTINCT:
+        raise ValueError(
+            f"{function}: failures must fail when they are played again, received those of which"
+            f" {len(v.label)} of {episodes} variants do"
+        )
     near = len(v.near_group) if most is None else min(most, len(v.near_group))
     if near < 2 * DISTINCT:
         raise ValueError(

@@ -235,8 +235,8 @@ def _episodes(name, key, sim, failures, others, episodes):
     if others is not None:
         cases = told(name, sim, failures, others, None, LEAST)
         return cases.episodes, cases.kind, cases.group, 0
-    *keys, calm = jax.random.split(key, 3)
-    cases = simulated(name, tuple(keys), sim, failures, None, episodes)
+    own, calm = jax.random.split(key)
+    cases = simulated(name, own, sim, failures, None, episodes)
     plain = ordinary(calm, sim, episodes)
     n = len(plain.length)
     if n < LEAST:

@@ -109,8 +109,8 @@ def rules(
     draw some of the disturbances anew, move them a little, or let all come some steps later, as the
     model has it. What still fails is a failure, what no longer does is a near miss. So what has no
     part in the failures is the same in both. Of a report of `jast.stress`, or an estimate of
-    `jast.estimate.failure_probability`, the chains start from weighted draws of its proposal: then
-    the failures are as probable as in the model. All that precision and recall tell is about
+    `jast.estimate.failure_probability`, the chains start from its failing draws, by their weights:
+    then the failures are as probable as in the model. All that precision and recall tell is about
     episodes like these, as many failures as near misses: among ordinary episodes, of which few
     fail, a rule is less precise. Variants of one failure are held out together, unless more than a
     quarter of the chains starts from it.
@@ -125,7 +125,7 @@ def rules(
             default those of a report or of modes are told apart by their mode, the first six.
         key: of the draws and of what is held out; `jax.random.key(0)` by default.
         episodes: failures to be simulated without ``others``, at least 20. About 13 evaluations
-            for each of them, and of an estimate 4 more.
+            for each of them.
         of: "disturbances", "states" or "both". States are those seen until ``lead`` steps before
             the end of the episode; others end when a failure drawn at random did.
         lead: steps, 0 or more; at 0 the rules say again what a failure is.
@@ -153,8 +153,7 @@ def rules(
     number = isinstance(others, int | np.integer) and not isinstance(others, bool)
     if others is None or number:
         many = _checks.whole(name, "others", others, 1) if number else None
-        keys = tuple(jax.random.split(first))
-        cases = simulated(name, keys, sim, failures, labels, episodes, many)
+        cases = simulated(name, first, sim, failures, labels, episodes, many)
     else:
         cases = told(name, sim, failures, others, labels, DISTINCT)
     e, owner, group, names, spent = cases

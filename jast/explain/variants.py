@@ -11,8 +11,9 @@ from jast import limit_state as latent
 from jast.counter import generator
 from jast.episode import Episode
 from jast.estimate.batches import resampled
+from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
-from jast.estimate.redrawn import fits, redrawn
+from jast.estimate.redrawn import failing, fits
 from jast.explain.gathered import distinct, gathered, kinds_of
 from jast.incidents import hosted
 from jast.judge import Judge
@@ -30,9 +31,9 @@ SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
 """How far the disturbances of a move go: 1 is a new draw. None: they all come some steps later,
 those at the end first.
 """
-DRAWS, LANES, MOST, MANY = 1024, 256, 6, 0.25
-"""Of a proposal at a time; episodes that are played at a time; modes that are told apart; the share
-of the chains that may start from one seed for seeds to be held out as a whole.
+LANES, MOST, MANY = 256, 6, 0.25
+"""Episodes that are played at a time; modes that are told apart; the share of the chains that may
+start from one seed for seeds to be held out as a whole.
 """
 
 
@@ -64,11 +65,9 @@ class Variants(NamedTuple):
     evaluations: int
 
 
-def seeds(
-    function: str, key: jax.Array, sim: Simulator, given: Any, labels: Any, draws: int
-) -> Seeds:
-    """The `Seeds` in ``given``: of an estimate, or the estimate of a report, failures of its
-    proposal with their weights, ``draws`` of it; else the episodes themselves.
+def seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> Seeds:
+    """The `Seeds` in ``given``: of an estimate, or the estimate of a report, the failing draws that
+    it kept, at most ``most``, with their weights; else the episodes themselves.
 
     Args:
         labels: names of the kinds of the episodes, one each; None: of a report or of
@@ -76,17 +75,19 @@ def seeds(
     """
     latent.check(function, sim)
     estimate = getattr(given, "probability", None) or given
-    q = getattr(estimate, "proposal", None)
+    kept = estimate.draws if isinstance(estimate, Estimate) else None
     modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
     modes = modes if isinstance(modes, Modes) else None
-    if labels is None and q is not None and fits(sim, q):
-        found = _of_proposal(key, sim, q, draws)
-        if len(found.z):
-            return _of_modes(function, sim, found, modes)
+    if labels is None and _serves(sim, kept):
+        z, log_w, length, spent = failing(sim, kept, most)
+        about = outline(sim)
+        used = count(about.x0) + length * count(about.x)
+        s = Seeds(z, used, log_w, np.zeros(len(z), int), ("fails",), spent)
+        return _of_modes(function, sim, s, modes)
     if isinstance(given, Estimate):
         raise ValueError(
-            f"{function}: failures must be episodes, or an estimate with a proposal for sim of"
-            f" which some draws fail; received one of {given.method} without"
+            f"{function}: failures must be episodes, or an estimate for sim that drew normal"
+            f" numbers and met failures; received one of {given.method} that did not"
         )
     of_mode = isinstance(given, Modes) and len(given) > 1
     e = gathered(function, "failures", sim, given[:MOST] if of_mode else given)
@@ -112,15 +113,12 @@ def seeds(
     return found if labels is not None or of_mode else _of_modes(function, sim, found, modes)
 
 
-def _of_proposal(key: jax.Array, sim: Simulator, q: Any, draws: int) -> Seeds:
-    parts = []
-    for i in range(-(-draws // DRAWS)):
-        z, o, log_w = redrawn(jax.random.fold_in(key, i), sim, q, DRAWS)
-        rows = np.asarray(o.failure) & np.isfinite(log_w)
-        parts.append((np.asarray(z)[rows], np.asarray(o.used)[rows], np.asarray(log_w)[rows]))
-    z, used, log_w = map(np.concatenate, zip(*parts, strict=True))
-    spent = -(-draws // DRAWS) * DRAWS
-    return Seeds(z, used, log_w.astype(float), np.zeros(len(z), int), ("fails",), spent)
+def _serves(sim: Simulator, kept: Draws | None) -> bool:
+    """Whether points of failures can be told from these draws."""
+    if kept is None or not kept.failure.any():
+        return False
+    of_model = isinstance(kept.source, str) and kept.source == "model"
+    return of_model or fits(sim, kept.source)
 
 
 def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
@@ -188,9 +186,9 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
         near[kept] = to[kept]
         z = np.where(o.failure[:, None], to, z)
     missed = np.flatnonzero(misses)
-    failing, played = _played(sim, z)
-    calm, more = _played(sim, near[missed]) if len(missed) else (failing, 0)
-    fails = np.flatnonzero(failing.failure)
+    bad, played = _played(sim, z)
+    calm, more = _played(sim, near[missed]) if len(missed) else (bad, 0)
+    fails = np.flatnonzero(bad.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
     take = lambda e, rows: jax.tree.map(lambda a: a[rows], e)
     label, group = s.label[seed[fails]], seed[fails]
@@ -204,7 +202,7 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
         group = np.arange(len(fails))
         near_group = len(fails) + np.arange(len(calm_rows))
     return Variants(
-        take(failing, fails),
+        take(bad, fails),
         label,
         group,
         take(calm, calm_rows),
