@@ -25,6 +25,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "cross_entropy": ["--smoke"],
     "explain": ["--smoke"],
     "fms": ["--smoke"],
+    "indices": ["--smoke"],
     "limit_states": ["--smoke"],
     "peers": "--seeds 1 --cases branin --peers random_search differential_evolution".split(),
     "probability": ["--smoke"],

@@ -20,7 +20,7 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.redrawn import failing
 from jast.explain.point import names, steps_of
-from jast.intervals import clopper_pearson
+from jast.intervals import clopper_pearson, log_normal
 from jast.judge import Judge
 from jast.outline import outline
 from jast.pytrees import count
@@ -151,13 +151,16 @@ def indices(
     w = np.exp(log_w - log_w.max())
     w /= w.sum()
     p, n_eff = float(estimate.mean), float(effective(log_w))
-    normal = NormalDist().inv_cdf(0.5 + level / 2)
+    samples = kept.samples * len(z) / np.count_nonzero(kept.failure)
     judge, picks = Judge(sim), resampled(log_w, draws, rng.random()) if draws else None
     rows = []
     for i, (called, step) in enumerate(zip(names(sim), steps_of(sim), strict=True)):
-        gain, error = _gain(z[:, i], w)
+        gain, each = _gain(z[:, i], w)
         first = p * (gain - 1) / (1 - p)
-        half = normal * math.hypot(p * error, first * float(estimate.relative_error)) / (1 - p)
+        # P and the gain are of the same draws: the influence of each draw on their product
+        c = w * (2 * each - gain - 1)
+        square = (c**2).sum() - (gain - 1) ** 2 / samples
+        error = p / (1 - p) * math.sqrt(max(square, 0.0))
         total, ends = math.nan, (math.nan, math.nan)
         if picks is not None:
             fails = int(_redrawn(judge, z[picks], i, rng))
@@ -169,10 +172,21 @@ def indices(
             total, ends = (1 - q) / (1 - p), ((1 - high) / (1 - p), min((1 - low) / (1 - p), 1.0))
         mean = float(w @ z[:, i])
         rows.append(
-            Index(called, int(step), mean, first, (first - half, first + half), total, ends)
+            Index(called, int(step), mean, first, _around(first, error, c, level), total, ends)
         )
     good = bool(estimate.reliable and n_eff >= FEW)
     return Indices(tuple(rows), p, level, n_eff, good, spent + judge.spent)
+
+
+def _around(first: float, error: float, c: np.ndarray, level: float) -> tuple[float, float]:
+    """The interval of a first-order index by its standard error and the influences ``c`` [m] of the
+    draws: log-normal where it is clearly above 0, as few failures far out may decide it.
+    """
+    if first > 3 * error > 0:
+        skewness = float((c**3).sum() / (c**2).sum() ** 1.5)
+        return log_normal(math.log(first), error / first, level, skewness)
+    half = NormalDist().inv_cdf(0.5 + level / 2) * error
+    return first - half, first + half
 
 
 def _redrawn(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> int:
@@ -182,9 +196,9 @@ def _redrawn(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> i
     return np.count_nonzero(judge(moved).failure)
 
 
-def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, float]:
+def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, np.ndarray]:
     """E[f(z | F) / phi(z) | F] of one number, from failures ``z`` [m] with weights ``w`` of sum 1,
-    and its standard error. No failure is compared with itself.
+    and f(z | F) / phi(z) of each, by the others: [m].
     """
     cells, at = np.unique(np.floor(z.astype(np.float64) / WIDTH), return_inverse=True)
     # as a tail's own number: no difference of numbers near 1
@@ -194,8 +208,7 @@ def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, float]:
     others = (np.bincount(at, w, len(cells))[at] - w) / np.maximum(phi, 1e-300)[at]
     pairs = 1 - w @ w
     gain = float(w @ others / pairs) if pairs > 0 else math.nan
-    each = others / np.maximum(1 - w, 1e-12) - gain
-    return gain, 2 * float(np.sqrt((w * w) @ each**2))
+    return gain, others / np.maximum(1 - w, 1e-12)
 
 
 def _placed(
