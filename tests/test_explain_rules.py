@@ -153,11 +153,15 @@ def test_what_is_held_out_was_not_learned_from():
 
 
 def test_groups_are_held_out_as_a_whole():
+    """Also where a group has episodes of several classes."""
     rng = np.random.default_rng(0)
-    owner, group = rng.integers(0, 2, 300), rng.integers(0, 20, 300)
-    out = parted(rng, owner, group + 20 * owner, 0.3)
-    assert not set((group + 20 * owner)[out]) & set((group + 20 * owner)[~out])
-    assert 0.15 < out.mean() < 0.45
+    owner, group = rng.integers(0, 3, 300), rng.integers(0, 20, 300)
+    out = parted(rng, owner, group, 0.3)
+    assert not set(group[out]) & set(group[~out])
+    assert all(0.1 < out[owner == k].mean() < 0.5 for k in range(3))
+    # one great group among small ones stays where it is learned from
+    group[:200] = 7
+    assert 0 < parted(rng, owner, group, 0.3).mean() < 0.35
 
 
 def test_an_early_end_tells_nothing():

@@ -8,7 +8,7 @@ import numpy as np
 __all__ = ["learner", "parted"]
 
 DISTINCT = 4
-"""Groups of a class below which its episodes are parted one by one."""
+"""Episodes of a class, the least."""
 
 
 def learner(function: str, module: str) -> Any:
@@ -28,18 +28,17 @@ def learner(function: str, module: str) -> Any:
 def parted(
     rng: np.random.Generator, owner: np.ndarray, group: np.ndarray, share: float
 ) -> np.ndarray:
-    """Which episodes [n] are held out: of each class ``owner`` [n] at most a ``share``, by groups
+    """Which episodes [n] are held out: of each class ``owner`` [n] about a ``share``, by groups
     drawn at random, so that all episodes of a ``group`` [n] are on one side; one group at least.
     """
-    out = np.zeros(len(owner), bool)
-    for k in np.unique(owner):
+    side: dict[int, bool] = {}
+    for k in np.unique(owner)[::-1]:
         groups, sizes = np.unique(group[owner == k], return_counts=True)
-        most, taken = share * sizes.sum(), 0
-        chosen = []
+        taken = sum(n for g, n in zip(groups, sizes) if side.get(g, False))
         for i in rng.permutation(len(groups)):
-            if taken + sizes[i] <= most:
-                chosen.append(groups[i])
-                taken += sizes[i]
-        chosen = chosen or [groups[np.argmin(sizes)]]
-        out |= (owner == k) & np.isin(group, chosen)
-    return out
+            if groups[i] not in side:
+                side[groups[i]] = bool(taken + sizes[i] <= share * sizes.sum())
+                taken += side[groups[i]] * sizes[i]
+        if not taken:
+            side[groups[np.argmin(sizes)]] = True
+    return np.array([side[g] for g in group])
