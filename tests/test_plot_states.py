@@ -112,7 +112,8 @@ def test_a_black_box_shows_its_disturbances_or_what_it_says():
     sim = jast.blackbox.from_python(run, horizon=3, disturbance=kinds)
     e = jast.replay(sim, {"gust": jnp.array([1.0, 2.0, 3.0]), "bias": jnp.arange(3.0)})
     calls.clear()
-    axes = drawn(plot.traces(e, sim))
+    bare = e._replace(states=None)
+    axes = drawn(plot.traces(bare, sim))
     assert labels(axes) == ["disturbance bias", "disturbance gust"]
     assert len(calls) <= 2  # the undisturbed alone
     np.testing.assert_allclose(paths(axes[1])[0].get_ydata(), [np.nan, 1, 2, 3])

@@ -27,6 +27,7 @@ __all__ = [
     "Given",
     "Lines",
     "chosen",
+    "free",
     "given",
     "kind_words",
     "kinds",
@@ -138,17 +139,18 @@ def kind_words(g: Given, kind: int, count: int) -> str:
 
 def lines(sim: Simulator, episodes: Episode) -> Lines:
     """The numbers of the states of ``episodes`` [n], their miss distance, and their disturbances as
-    "disturbance ...". Without states they are replayed; a black box is run once an episode then.
+    "disturbance ...". Without states they are replayed; a black box with states is run once an
+    episode then.
     """
-    states = episodes.states
-    if states is None:
+    like, states = outline(sim).state, episodes.states
+    if states is None and not isinstance(like, Record):
         states = (_states if hosted(sim) else _compiled_states)(sim, episodes)
     length = np.asarray(episodes.length)
     there = np.arange(sim.horizon + 1) <= length[:, None]
-    box = isinstance(states, Record | Standing)  # a record of the disturbances, then
-    state = dict(seen=states.seen) if isinstance(states, Standing) else states
-    columns = {} if isinstance(states, Record) else _columns(state, "state", there)
-    if isinstance(states, Standing):
+    box = isinstance(like, Record | Standing)  # a record of the disturbances, then
+    state = dict(seen=states.seen) if isinstance(like, Standing) else states
+    columns = {} if isinstance(like, Record) else _columns(state, "state", there)
+    if isinstance(like, Standing):
         columns[DISTANCE] = np.where(there, np.asarray(states.distance, float), np.nan)
     elif not sim.episodic and not box:
         flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), states)
@@ -159,6 +161,11 @@ def lines(sim: Simulator, episodes: Episode) -> Lines:
     for name, values in _columns(late, "disturbance", there).items():
         columns[name if name.startswith("disturbance") else f"disturbance {name}"] = values
     return Lines(columns, length, own or tuple(columns))
+
+
+def free(sim: Simulator) -> bool:
+    """Whether `lines` calls no black box."""
+    return not hosted(sim) or isinstance(outline(sim).state, Record)
 
 
 def _states(sim: Simulator, episodes: Episode) -> Any:

@@ -15,6 +15,7 @@ from jast.plot.played import (
     Given,
     Lines,
     chosen,
+    free,
     given,
     lines,
     nominal_lines,
@@ -48,7 +49,8 @@ def report(
 
     Of each mode there are two numbers of the state, those that leave their nominal bands the most
     (as `traces` draws them), and the disturbances of its likeliest failure in standard deviations
-    (as `disturbances` draws them).
+    (as `disturbances` draws them). A black box with a state at each step is called once for each
+    mode drawn, and once undisturbed.
 
     Args:
         report: of `jast.stress`.
@@ -185,11 +187,14 @@ def _modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units:
 
 
 def _failures(report: Any, sim: Any, shown: list) -> Given:
-    """The likeliest failure of each mode ``shown``, then all that the report has."""
-    each = [e._replace(states=None) for e in (*shown, *report.failures[:64])]
+    """The likeliest failure of each mode ``shown``, then those that the report has, unless each is
+    a call of a black box.
+    """
+    more = report.failures[: 64 if free(sim) else 0]
+    each = [e._replace(states=None) for e in (*shown, *more)]
     mode = np.arange(len(shown))
-    if report.modes:
-        others = given("report", report.failures, sim, report.modes, 64).mode
+    if report.modes and len(more):
+        others = given("report", more, sim, report.modes, 64).mode
     else:
         others = np.zeros(len(each) - len(shown), int)
     episodes = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
