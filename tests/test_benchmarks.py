@@ -19,6 +19,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "few_calls": ["--smoke"],
     "table1": ["--table1", "--smoke"],
     "engine": ["--smoke"],
+    "arch": ["--smoke"],
     "blackbox": ["--smoke"],
     "bridge": ["--smoke"],
     "colav": ["--smoke"],
@@ -35,6 +36,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "weakness": ["--smoke"],
 }
 QUICK = {
+    "arch": ["--quick"],
     "blackbox": ["--quick"],
     "bridge": ["--quick"],
     "colav": ["--quick"],

@@ -14,6 +14,7 @@ CALLS = {
     "rollout": lambda key: jast.rollout(key, walk1d()),
     "monte_carlo": lambda key: S.monte_carlo(key, walk1d(), episodes=1),
     "forest": lambda key: S.forest(key, walk1d(), trees=1, prunes=1, simulations=1),
+    "falsify": lambda key: S.falsify(key, walk1d()),
     "mcts": lambda key: S.mcts(key, walk1d(), simulations=1),
     "cem": lambda key: S.cem(key, walk1d(), samples=2, elites=1, iterations=1),
     "ce_method": lambda key: C.ce_method(key, jnp.sum, (jnp.zeros(1), jnp.eye(1))),

@@ -4,6 +4,7 @@ from jast._doors import listed
 from jast.search.cem import cem
 from jast.search.chain import chain
 from jast.search.failure_modes import Mode, Modes, modes
+from jast.search.falsify import falsify
 from jast.search.forest import forest
 from jast.search.go_explore import go_explore
 from jast.search.gradient import gradient
@@ -20,6 +21,7 @@ __all__ = [
     "SearchResult",
     "cem",
     "chain",
+    "falsify",
     "forest",
     "go_explore",
     "gradient",

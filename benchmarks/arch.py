@@ -1,0 +1,158 @@
+"""Falsification of the ARCH-COMP benchmarks with few simulations: ``python -m benchmarks.arch
+[--json] [--quick | --smoke] [--cases ...] [--methods ...] [--seeds N] [--budget N]``.
+
+For each requirement and method: seeds that falsified it within the budget (300, CC4 1500), and the
+mean and median number of simulations of these. A method is ``method(key, sim, budget)`` and gives
+how many simulations it took, or None. Searches of jast are called as users type them, with a batch
+that suits so few simulations; `falsify` was chosen on other requirements of the same cars. CMA-ES
+(cma, where it is installed) searches the levels of the inputs from the middle of their range.
+"""
+
+import argparse
+import importlib.util
+import json
+import time
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jast
+from benchmarks.sizes import options, size
+from jast import limit_state
+from jast.simulators.arch import chasing_cars
+
+__all__ = ["METHODS", "run"]
+
+S = jast.search
+CASES = {"CC1": 300, "CC2": 300, "CC3": 300, "CC4": 1500, "CC5": 300, "CCx": 300}
+PUBLISHED = {
+    "CC1": "FalCAuN 229 (10/10)",
+    "CC2": "FalCAuN 76 (10/10)",
+    "CC3": "FalCAuN 122 (10/10)",
+    "CC4": "FalCAuN 1257 (4/10, in another file 7/10)",
+    "CC5": "",
+    "CCx": "FalCAuN 0/10",
+}
+
+
+def falsify(key, sim, budget):
+    return S.falsify(key, sim, simulations=budget, batch=1).first_failure
+
+
+def random(key, sim, budget):
+    return S.monte_carlo(key, sim, episodes=budget, refine=0).first_failure
+
+
+def cem(key, sim, budget):
+    told = jast.rewards.lexicographic(near=1.0, rare=1.0)
+    found = S.cem(
+        key,
+        sim,
+        samples=25,
+        elites=5,
+        iterations=budget // 25,
+        reward=told,
+        actions=jast.actions.quantiles(),
+        refine=0,
+    )
+    return found.first_failure
+
+
+def mcts(key, sim, budget):
+    told = jast.rewards.lexicographic(near=1.0, rare=1.0)
+    actions = jast.actions.uniform(0.0, 1.0)
+    found = S.mcts(key, sim, simulations=budget, reward=told, actions=actions, refine=0)
+    return found.first_failure
+
+
+def cma_es(key, sim, budget):
+    import cma
+
+    d = limit_state.dimension(sim)
+    settings = dict(bounds=[0, 1], seed=int(jax.random.key_data(key)[-1]) + 1, verbose=-9)
+    search, spent = cma.CMAEvolutionStrategy(np.full(d, 0.5), 0.3, settings), 0
+    while spent < budget:
+        points = np.array(search.ask())
+        o = jax.device_get(_levels(sim, jnp.asarray(points, jnp.float32)))
+        failing = np.flatnonzero(o.failure)
+        if len(failing):
+            first = spent + int(failing[0]) + 1
+            return first if first <= budget else None
+        search.tell(points, o.distance.astype(float).tolist())
+        spent += len(points)
+    return None
+
+
+@jax.jit
+def _levels(sim, u):
+    return limit_state.outcomes(sim, jax.scipy.special.ndtri(jnp.clip(u, 1e-6, 1 - 1e-6)))
+
+
+METHODS = {f.__name__: f for f in (falsify, random, cem, mcts, cma_es)}
+
+
+def run(cases, methods, seeds, budget=None):
+    """Rows by requirement and method."""
+    report = {}
+    for name in cases:
+        limit, sim, rows = budget or CASES[name], chasing_cars(name), {}
+        for method in methods:
+            begin, took = time.process_time(), []
+            for seed in range(seeds):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    took.append(METHODS[method](jax.random.key(seed), sim, limit))
+            found = [int(n) for n in took if n is not None]
+            rows[method] = dict(
+                falsified=len(found),
+                seeds=seeds,
+                mean=float(np.mean(found)) if found else None,
+                median=float(np.median(found)) if found else None,
+                simulations=took,
+                cpu_seconds=time.process_time() - begin,
+            )
+        report[name] = dict(budget=limit, published=PUBLISHED[name], rows=rows)
+        jax.clear_caches()
+    return report
+
+
+def table(report):
+    """The report as text."""
+    number = lambda v: f"{'-':>8}" if v is None else f"{v:8.1f}"
+    lines = [
+        f"{'':<5} {'budget':>6} {'method':<9} {'falsified':>9} {'mean':>8} {'median':>8}"
+        f" {'CPU s':>7}"
+    ]
+    for name, case in report.items():
+        for method, r in case["rows"].items():
+            lines.append(
+                f"{name:<5} {case['budget']:6d} {method:<9} {r['falsified']:4d}/{r['seeds']:<4d}"
+                f" {number(r['mean'])} {number(r['median'])} {r['cpu_seconds']:7.1f}"
+            )
+        if case["published"]:
+            lines.append(f"{name:<5} {'':>6} published: {case['published']}")
+    return "\n".join(lines)
+
+
+def main(argv=None):
+    parser = options(argparse.ArgumentParser(description=__doc__), "one requirement, three seeds")
+    parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
+    parser.add_argument("--seeds", type=int, help="default: 50")
+    parser.add_argument("--budget", type=int, help="simulations (default: 300, CC4 1500)")
+    args = parser.parse_args(argv)
+    installed = [m for m in METHODS if m != "cma_es" or importlib.util.find_spec("cma")]
+    cases = args.cases or size(args, list(CASES), ["CC2"], ["CC1"])
+    methods = args.methods or size(args, installed, ["falsify", "random", "cem"], ["falsify"])
+    seeds = args.seeds or size(args, 50, 3, 2)
+    report = run(cases, methods, seeds, args.budget or size(args, None, None, 20))
+    if args.json:
+        print(json.dumps(dict(settings=dict(seeds=seeds, jast=jast.__version__), systems=report)))
+    else:
+        print(table(report))
+
+
+if __name__ == "__main__":
+    main()
