@@ -72,6 +72,7 @@ def cem(
     floor=0.05,
     fresh=0.1,
     trees=1,
+    failures=None,
     refine=None,
     top=64,
     record=False,
@@ -93,6 +94,9 @@ def cem(
     of unknown density), x_t is that of a random elite, each step with another, or with probability
     ``fresh`` a draw from p(x | s). A random start is treated likewise, but never by the box.
     Default ``actions``: wide where disturbances have a quantile function, else samples.
+
+    ``failures``: an archive, the likeliest of which the first draws lie around, as wide as without
+    it: a search then leads on from what others found. With ``quantiles()`` and ``wide()`` only.
 
     ``trees``: independent searches, side by side; tree k is the same whatever their number.
     Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
@@ -132,9 +136,10 @@ def cem(
     )
     settings = planned("cem", refine, sim, settings, usual(sim, reward))
     plan = Plan(samples, elites, P.kinds(sim, actions))
+    around = () if failures is None else P.around(sim, actions, failures, settings)
     search = partial(_iteration, tree_keys(key, trees), sim, reward, actions, real, plan)
     width = actions.width if isinstance(actions, choices.Wide) else 1.0
-    carry = _nothing(sim, plan, trees, max(elites, top), width)
+    carry = _nothing(sim, plan, trees, max(elites, top), width, around)
     if settings is None:
 
         def body(i, carry):
@@ -286,7 +291,7 @@ def _merge(pool, new):
     )
 
 
-def _nothing(sim, plan, trees, k, width):
+def _nothing(sim, plan, trees, k, width, around=()):
     """An empty `Pool` and the first proposals, of every tree."""
     about = outline(sim)
     likes = about.x0, about.x
@@ -298,6 +303,10 @@ def _nothing(sim, plan, trees, k, width):
         sequences.standard(like, steps, width) if use else ()
         for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True)
     )
+    if around:
+        proposals = tuple(
+            g._replace(mean=z) if g != () else () for g, z in zip(proposals, around, strict=True)
+        )
     z = tuple(
         jax.tree.map(lambda a: jnp.zeros((k, *a.shape), a.dtype), g.mean) if g != () else ()
         for g in proposals

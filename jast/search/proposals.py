@@ -10,10 +10,11 @@ import numpy as np
 
 from jast import actions as choices
 from jast.cross_entropy.sequences import place
+from jast.limit_state import latents
 from jast.outline import outline
 from jast.simulator import Simulator
 
-__all__ = ["copies", "drawer", "kinds"]
+__all__ = ["around", "copies", "drawer", "kinds"]
 
 # addresses of an episode's choice of parents, apart from those of its levels
 _CHOICE = np.uint32(1 << 31)
@@ -59,3 +60,21 @@ def drawer(kind, actions, anew):
         return jax.tree.map(lambda a, b: jnp.where(use, a, b), value, anew(key, dist))
 
     return latent if kind == "latent" else copied
+
+
+def around(sim, actions, failures, settings):
+    """The latents of the likeliest of ``failures``: leaves [1, ...] of x0 and [horizon, ...] of x;
+    ``()`` where there is none. ``settings``: None inside of a transformation of JAX.
+    """
+    if settings is None:
+        raise ValueError("cem: failures: cannot be given inside of jax.jit and jax.vmap")
+    if not isinstance(actions, choices.Wide | choices.Quantiles):
+        kind = type(actions).__name__
+        raise ValueError(f"cem: failures need actions quantiles() or wide(), received {kind}")
+    if not len(failures):
+        return ()
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], failures.best._replace(states=None))
+    about = outline(sim)
+    of_start = about.random_start and about.start.quantile
+    z0, z = latents(sim, (one.x0, one.disturbances, one.length), of_start)
+    return z0, jax.tree.map(lambda a: a[0], z)

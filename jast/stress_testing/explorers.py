@@ -18,14 +18,17 @@ from jast.incidents import hosted
 from jast.outline import outline
 from jast.rewards import likelihood
 from jast.search.cem import cem
+from jast.search.centred import centred
 from jast.search.forest import forest
 from jast.search.monte_carlo import monte_carlo
 from jast.simulator import Simulator
 
-__all__ = ["EXPLORERS", "Haul", "explorers_of"]
+__all__ = ["EXPLORERS", "Haul", "explorers_of", "of_points", "onward"]
 
 KEPT = 128
 """Failures that an explorer hands over, the most."""
+STEPS = 30
+"""Iterations of `onward`: half of them with twice the draws ends in worse basins."""
 
 
 class Haul(NamedTuple):
@@ -67,6 +70,25 @@ def likest(key: jax.Array, sim: Simulator, budget: int) -> Haul:
     elites = max(2, samples // 10)
     return _of_search(
         cem(key, sim, samples=samples, elites=elites, iterations=15, refine=0, top=KEPT)
+    )
+
+
+def onward(key: jax.Array, sim: Simulator, budget: int, failures: Any = None) -> Haul:
+    """The cross-entropy method in many small steps, which cross from one basin to another where
+    slopes lead nowhere; around the likeliest of ``failures``, if any are given.
+    """
+    samples = max(10, budget // STEPS)
+    return _of_search(
+        cem(
+            key,
+            centred(sim),
+            samples=samples,
+            elites=max(2, samples // 10),
+            iterations=STEPS,
+            failures=failures,
+            refine=0,
+            top=KEPT,
+        )
     )
 
 

@@ -19,7 +19,7 @@ from jast.rewards import likelihood
 from jast.search.failure_modes import Mode, Modes, modes
 from jast.search.refinement import refine
 from jast.simulator import Simulator
-from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points
+from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points, onward
 from jast.stress_testing.report import Report, Tried
 from jast.stress_testing.shares import cost as shares_cost
 from jast.stress_testing.shares import shares
@@ -99,13 +99,14 @@ class Shares(NamedTuple):
 
     nominal: float
     search: float
+    onward: float
     refine: float
 
 
 LARGE, BY_SURROGATE, NO_ESTIMATE = (
-    Shares(0.05, 0.2, 0.15),
-    Shares(0.05, 0.3, 0.35),
-    Shares(0.125, 0.5, 0.375),
+    Shares(0.05, 0.15, 0.15, 0.15),
+    Shares(0.05, 0.3, 0, 0.35),
+    Shares(0.125, 0.35, 0.2, 0.325),
 )
 
 
@@ -167,16 +168,22 @@ class _Work:
         """Call one explorer; returns by how much the likeliest failure got likelier per
         evaluation.
         """
-        haul: Haul = EXPLORERS[name](self.next_key(), self.sim, budget)
-        found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        best = float(found.best.reward) if len(found) else -np.inf
         before = float(self.pool.best.reward) if len(self.pool) else -np.inf
-        self.pool = merge(self.pool, found, top=8 * self.top)
-        self.note(name, haul.evaluations, haul.failing, best, haul.invalid)
+        haul = EXPLORERS[name](self.next_key(), self.sim, budget)
+        found = self.gather(name, haul)
+        best = float(found.best.reward) if len(found) else -np.inf
         if best <= before:
             return 0.0
         gain = 1.0 if before == -np.inf else best - before
         return gain / max(haul.evaluations, 1)
+
+    def gather(self, name: str, haul: Haul) -> Failures:
+        """The failures that an explorer brought in, which join the pool."""
+        found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
+        best = float(found.best.reward) if len(found) else -np.inf
+        self.pool = merge(self.pool, found, top=8 * self.top)
+        self.note(name, haul.evaluations, haul.failing, best, haul.invalid)
+        return found
 
     def refine(self):
         """The pool to where log p is greatest: many failures a little, then each mode's best."""
@@ -189,7 +196,9 @@ class _Work:
             return
         budget = self.parts.refine
         chosen = self.pool
-        for part in (1.0,) if budget < FEW else (0.6, 0.4):
+        for part in (1.0,) if budget < FEW else (0.5, 0.5):
+            if chosen is not self.pool:
+                chosen = self.onward(chosen)
             result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
             found = result.failures
             if len(found):
@@ -209,6 +218,16 @@ class _Work:
             chosen = self.bests()
         self.failures = merge(self.bests(), self.failures, top=self.top)
 
+    def onward(self, known: Failures) -> Failures:
+        """Likelier failures by many small steps, one half of them from the likeliest known."""
+        budget = self.parts.onward // 2
+        if budget < FEW:
+            return known
+        for name, around in (("across basins", None), ("from the likeliest", known)):
+            haul = onward(self.next_key(), self.sim, budget, around)
+            known = merge(known, self.gather(name, haul), top=8 * self.top)
+        return known
+
     def bests(self) -> Failures:
         """The likeliest failure of each mode."""
         each = [m.failure._replace(states=None) for m in self.modes]
@@ -225,7 +244,7 @@ class _Work:
             return
         known = self.known if len(self.known) else None
         if not len(self.pool):  # the estimate may find what the search did not
-            rest -= self.parts.refine
+            rest -= self.parts.refine + self.parts.onward
         rest = max(rest - self.counted(), few_calls.LEAST)
         p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
         self.probability = p
