@@ -13,12 +13,15 @@ import time
 import warnings
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jast
 from benchmarks.sizes import options, size
 from benchmarks.stress_systems import CASES, JUDGED
+from jast.limit_state import dimension, normal_numbers, policy_of
 from jast.rewards import likelihood
+from jast.search.centred import centred
 
 __all__ = ["METHODS", "run"]
 
@@ -50,7 +53,47 @@ def mcts(key, sim, budget):
     return _searched(sim, jast.search.mcts(key, sim, trees=trees, simulations=budget // trees))
 
 
-METHODS = {f.__name__: f for f in (stress, monte_carlo, cem, forest, mcts)}
+def cma_es(key, sim, budget):
+    """CMA-ES (the package cma) over the normal numbers of an episode, 128 at a time; like `stress`
+    it ranks failures first, by log p. Started anew where it has converged, and refined as the
+    searches of jast are.
+    """
+    import cma
+
+    size, rng = 128, np.random.default_rng(int(jax.random.bits(key, dtype="uint32")))
+    centre = centred(sim)
+    zeros = np.zeros(dimension(sim))
+    known, spent, es = None, 0, None
+    settings = {"verbose": -9, "popsize": size, "tolflatfitness": 10**9, "seed": np.nan}
+    settings["randn"] = lambda *shape: rng.standard_normal(shape)
+    while spent + size <= budget:
+        if es is None or es.stop():
+            es = cma.CMAEvolutionStrategy(zeros, 1.0, settings)
+        points = np.array(es.ask())
+        each = jax.device_get(_scored(centre, jnp.asarray(points, normal_numbers(sim))))
+        worth = np.where(each.failure, -1 / (1 + np.abs(each.reward)), each.distance)
+        es.tell(list(points), list(np.nan_to_num(worth, nan=1e30, posinf=1e30)))
+        both = lambda a, b: np.concatenate([a, b])
+        known = each if known is None else jax.tree.map(both, known, each)
+        value = np.where(known.failure, known.reward, -np.inf)
+        order = np.argsort(-value, kind="stable")[:64]
+        known = jax.tree.map(lambda a, order=order: a[order], known)
+        spent += size
+    known = jax.tree.map(lambda a: a[known.failure], known)
+    if not len(known.length):
+        return None, spent, None
+    more = jast.search.refine(key, sim, known, budget=max(100, budget // 10))
+    return _best(more.failures), spent + more.episodes, None
+
+
+@jax.jit
+def _scored(sim, z):
+    """The episodes [n] of the normal numbers ``z`` [n, D], by log p relative to the mode."""
+    play = lambda z: jast.rollout(jax.random.key(0), sim, policy_of(sim, z), likelihood(sim))
+    return jax.vmap(lambda z: play(z)._replace(states=None))(z)
+
+
+METHODS = {f.__name__: f for f in (stress, monte_carlo, cem, forest, mcts, cma_es)}
 
 
 def _best(failures):

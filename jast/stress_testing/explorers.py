@@ -20,6 +20,7 @@ from jast.rewards import likelihood
 from jast.search.cem import cem
 from jast.search.centred import centred
 from jast.search.forest import forest
+from jast.search.go_explore import go_explore
 from jast.search.monte_carlo import monte_carlo
 from jast.simulator import Simulator
 
@@ -101,6 +102,11 @@ def trees(key: jax.Array, sim: Simulator, budget: int) -> Haul:
     )
 
 
+def kept(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+    """Restarts from kept states, for failures that take many things one after another."""
+    return _of_search(go_explore(key, sim, episodes=budget, refine=0, top=KEPT))
+
+
 EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {
     "plain draws": plain,
     "widened noise, cooled": cooled,
@@ -108,6 +114,7 @@ EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {
     "levels of distance": levels,
     "cross-entropy": likest,
     "forest": trees,
+    "kept states": kept,
 }
 LATENT = {"widened noise, cooled", "gradients", "levels of distance"}
 LEAST = {
@@ -118,7 +125,9 @@ LEAST = {
     "cross-entropy": 600,
     "forest": 2000,
 }
-"""Evaluations below which an explorer is not worth a call; those that come first are left last."""
+"""Evaluations below which an explorer is not worth a call; those that come first are left last.
+"kept states" is called only where nothing else found a failure.
+"""
 
 
 def explorers_of(sim: Simulator, budget: int) -> dict[str, int]:

@@ -157,6 +157,8 @@ class _Work:
         gains = {name: self.explore(name, each) for name, each in first.items()}
         calls = dict.fromkeys(first, 1)
         again = int((1 - FIRST) * total / CALLS)
+        if not few and not len(self.pool):  # nothing points to failures, or they are far away
+            self.explore("kept states", end - self.spent + self.parts.onward)
         while not few and self.spent + again <= end:
             # of those that expect as much, the one that was called least
             name = max(first, key=lambda n: (gains[n], -calls[n]))
@@ -223,7 +225,7 @@ class _Work:
         budget = self.parts.onward // 2
         if budget < FEW:
             return known
-        for name, around in (("across basins", None), ("from the likeliest", known)):
+        for name, around in (("slow cross-entropy", None), ("the same, from the best", known)):
             haul = onward(self.next_key(), self.sim, budget, around)
             known = merge(known, self.gather(name, haul), top=8 * self.top)
         return known
