@@ -59,6 +59,10 @@ class Nominal(NamedTuple):
     """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
     played.
     """
+    first: int | None = None
+    """Number of the first episode that failed, which ``rollout(jax.random.fold_in(key, first),
+    sim)`` plays again; None where none did.
+    """
 
     failures = results.former("failures", "failing")
 
@@ -107,7 +111,7 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
-    episodes, (failures, invalid, mean) = _played(
+    episodes, (failures, invalid, mean, first) = _played(
         key, sim, asked, Watch("nominal", asked, "episode", progress, callback)
     )
     settings = results.asked("nominal", key, episodes=asked)
@@ -134,15 +138,16 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
         mean if invalid < episodes else math.nan,
         invalid,
         settings,
+        first if failures else None,
     )
 
 
 def _played(key, sim, episodes, watch):
     """How many episodes were played, all unless interrupted, and of these: failures, invalid ones,
-    and the mean distance of the valid ones.
+    the mean distance of the valid ones, and the number of the first failure.
     """
     zero = jnp.zeros((), jnp.int32)
-    counts = zero, zero, jnp.zeros((), outline(sim).dtype)
+    counts = zero, zero, jnp.zeros((), outline(sim).dtype), jnp.asarray(episodes, jnp.int32)
 
     played = lambda chunks: min(chunks * LANES, episodes)
 
@@ -151,8 +156,8 @@ def _played(key, sim, episodes, watch):
         return apart(lambda: jax.block_until_ready(_count(key, sim, *bounds, counts, LANES)))
 
     counts, done = in_pieces(work, counts, _ends(-(-episodes // LANES)), watch, played)
-    failures, invalid, mean = jax.device_get(counts)
-    return played(done), (int(failures), int(invalid), float(mean))
+    failures, invalid, mean, first = jax.device_get(counts)
+    return played(done), (int(failures), int(invalid), float(mean), int(first))
 
 
 def _ends(chunks: int) -> Iterator[int]:
@@ -167,12 +172,12 @@ def _ends(chunks: int) -> Iterator[int]:
 
 @partial(jax.jit, static_argnums=6)
 def _count(key, sim, episodes, begin, end, counts, lanes):
-    """``counts``, (failures, invalid episodes, mean distance of the valid ones), with the chunks
-    ``begin`` to ``end`` of ``lanes`` episodes as well.
+    """``counts``, (failures, invalid episodes, mean distance of the valid ones, number of the first
+    failure), with the chunks ``begin`` to ``end`` of ``lanes`` episodes as well.
     """
 
     def chunk(i, carry):
-        failures, invalid, mean = carry
+        failures, invalid, mean, first = carry
         index = i * lanes + jnp.arange(lanes, dtype=jnp.int32)
         live = index < episodes
         last = jax.vmap(lambda k, on: _outcome(jax.random.fold_in(key, k), sim, on))(index, live)
@@ -188,10 +193,12 @@ def _count(key, sim, episodes, begin, end, counts, lanes):
             / jnp.maximum(before + count.astype(mean.dtype), 1),
             mean,
         )
+        failing = live & last.failure
         return (
-            failures + jnp.sum(live & last.failure, dtype=jnp.int32),
+            failures + jnp.sum(failing, dtype=jnp.int32),
             invalid + jnp.sum(live & last.invalid, dtype=jnp.int32),
             mean,
+            jnp.minimum(first, jnp.min(jnp.where(failing, index, episodes))),
         )
 
     return lax.fori_loop(begin, end, chunk, counts)

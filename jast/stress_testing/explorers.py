@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
+from jast.actions import wide
 from jast.episode import Episode
 from jast.estimate.design_points import design_points
 from jast.estimate.populations import cool, explore
@@ -28,8 +29,14 @@ __all__ = ["EXPLORERS", "Haul", "explorers_of", "of_points", "onward"]
 
 KEPT = 128
 """Failures that an explorer hands over, the most."""
+PRUNES = 18
+"""Of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half as
+many trees.
+"""
 STEPS = 30
 """Iterations of `onward`: half of them with twice the draws ends in worse basins."""
+AROUND = 0.5
+"""Width of its first draws around a failure."""
 
 
 class Haul(NamedTuple):
@@ -87,6 +94,7 @@ def onward(key: jax.Array, sim: Simulator, budget: int, failures: Any = None) ->
             elites=max(2, samples // 10),
             iterations=STEPS,
             failures=failures,
+            actions=None if failures is None else wide(AROUND),
             refine=0,
             top=KEPT,
         )
@@ -95,10 +103,10 @@ def onward(key: jax.Array, sim: Simulator, budget: int, failures: Any = None) ->
 
 def trees(key: jax.Array, sim: Simulator, budget: int) -> Haul:
     """A forest of search trees."""
-    number = int(np.clip(budget // 2000, 1, 64))
-    each = max(10, budget // (10 * number))
+    number = int(np.clip(budget // 2500, 1, 64))
+    each = max(10, budget // (PRUNES * number))
     return _of_search(
-        forest(key, sim, trees=number, prunes=10, simulations=each, refine=0, top=KEPT)
+        forest(key, sim, trees=number, prunes=PRUNES, simulations=each, refine=0, top=KEPT)
     )
 
 

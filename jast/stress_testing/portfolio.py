@@ -11,6 +11,7 @@ from jast import _checks
 from jast import limit_state as latent
 from jast.contract import check
 from jast.crude import nominal
+from jast.episode import rollout
 from jast.estimate import adaptive, few_calls
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
@@ -140,14 +141,18 @@ class _Work:
 
     def look(self):
         """The system as it is."""
+        key = self.next_key()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
-            self.nominal = nominal(self.next_key(), self.sim, self.parts.nominal)
-        quiet, n = self.nominal.undisturbed, self.nominal
-        self.note("nominal", n.episodes, n.failing, invalid=n.invalid)
-        if quiet is not None and bool(quiet.failure):
-            one = jax.tree.map(lambda a: np.asarray(a)[None], quiet._replace(states=None))
-            self.pool = collect(self.sim, self.reward, one)
+            self.nominal = n = nominal(key, self.sim, self.parts.nominal)
+        found = [] if n.undisturbed is None or not bool(n.undisturbed.failure) else [n.undisturbed]
+        if n.first is not None:
+            found.append(rollout(jax.random.fold_in(key, n.first), self.sim))
+        for e in found:
+            one = jax.tree.map(lambda a: np.asarray(a)[None], e._replace(states=None))
+            self.pool = merge(self.pool, collect(self.sim, self.reward, one), top=2)
+        best = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        self.note("nominal", n.episodes, n.failing, best, n.invalid)
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
