@@ -12,6 +12,7 @@ from systems import S0, TOLD, hyperplane, ring, two_densities, walk
 import jast
 from jast import actions, rewards
 from jast.distributions import seeds
+from jast.failures import collect
 from jast.search.cem import cem
 from jast.search.monte_carlo import monte_carlo
 
@@ -235,3 +236,16 @@ def test_bad_settings(key, settings, message):
 def test_bad_simulator(key):
     with pytest.raises(ValueError, match="disturbance: log_prob has shape"):
         cem(key, two_densities())
+
+
+def test_leads_on_from_known_failures(key):
+    """Phi(-6) = 1e-9: no draw of the model is near, but a known failure at (4, 4, 4, 4) is."""
+    sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
+    one = jast.replay(sim, jnp.full((1, 4), 4.0))._replace(states=None)
+    known = collect(sim, reward, jax.tree.map(lambda a: np.asarray(a)[None], one))
+    few = SMALL | dict(reward=reward, samples=50, elites=5, iterations=1)
+    assert not len(cem(key, sim, **few).failures)
+    around = cem(key, sim, **few, failures=known)
+    assert len(around.failures) > 10 and around.settings["samples"] == 50
+    with pytest.raises(ValueError, match=r"cem: failures need actions quantiles\(\) or wide\(\)"):
+        cem(key, sim, **few | dict(actions=actions.samples()), failures=known)
