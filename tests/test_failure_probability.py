@@ -259,6 +259,14 @@ def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error < 1
 
 
+def test_points_that_are_all_anchors_leave_other_directions_to_the_model():
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((31, 180)) + 0.4
+    g = fit(rng, points, np.full(31, 1 / 31), 15.5, anchors=points)
+    assert g.values.max() >= 1 and (g.values > 1e-5).all()
+    assert np.isfinite(as_latent([(1.0, g)], np.float32).factors).all()
+
+
 def test_interrupted_before_any_batch_there_is_nothing(monkeypatch):
     for error in (KeyboardInterrupt(), jax.errors.JaxRuntimeError("... KeyboardInterrupt: ...")):
 

@@ -22,6 +22,8 @@ in nats a point.
 """
 MOST, FULL = 4000, 30
 """Points that are looked at; dimensions above which a mixture is fitted in a few of them."""
+NOTHING = 1e-6
+"""Of a variance: rounding."""
 SIZE = 40
 """Components of a `Latent`, unused ones included."""
 
@@ -55,6 +57,8 @@ def fit(rng, points, weights, count, known=None, limit=16, anchors=None):
     of_q = None if anchors is None or not len(anchors) else anchors @ q
     g = _fit(rng, points @ q, weights, count, known, limit, of_q)
     k, other = len(g.weights), weights @ ((points @ rest) ** 2).mean(axis=1)
+    if other < NOTHING:  # points that are all anchors say nothing of the others: as in the model
+        other = 1.0
     return Gaussians(
         g.weights,
         g.means @ q.T,
