@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pictures import drawn, legend, plt
-from systems import ring
+from systems import ring, walk
 
 import jast
 from jast import plot
 from jast.distributions import Joint, Normal
 from jast.fields import fields
+from jast.search.failure_modes import owners
 
 FERRY = jast.simulators.ferry()
 RING = ring()
@@ -156,3 +157,17 @@ def test_what_traces_and_portraits_refuse():
         plot.phase(few, FERRY, "x")
     with pytest.raises(ValueError, match="plot.traces: axes must be at least 2"):
         plot.traces(few, FERRY, ("x", "y"), nominal=0, axes=plt.figure().subplots())
+
+
+def test_failures_go_to_their_mode_where_they_end_sooner():
+    """Pushes to and fro, a step sooner: as they are they point to the other mode."""
+    sim = walk(horizon=12)
+    push = np.zeros((3, 12), np.float32)
+    push[0, 6:] = [1, -1] * 3
+    push[1] = -push[0]
+    push[2, :11] = push[0, 1:]
+    e = jax.device_get(jax.vmap(lambda x: jast.replay(sim, x))(jnp.asarray(push)))
+    e = e._replace(length=np.array([12, 12, 11], np.int32), states=None)
+    heads = jax.tree.map(lambda a: a[:2], e)
+    assert owners(sim, e, heads).tolist() == [0, 1, 0]
+    assert owners(sim, e, jax.tree.map(lambda a: a[:1], e)).tolist() == [0, 0, 0]

@@ -1,6 +1,5 @@
 """Failures as the model has them, and near misses: variants of failures that are known."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,9 +19,7 @@ from jast.judge import Judge
 from jast.markov import proposed
 from jast.outline import outline
 from jast.pytrees import count, in_lanes
-from jast.search.centred import centred
-from jast.search.failure_modes import Modes
-from jast.search.moves import moved_in_time
+from jast.search.failure_modes import Modes, owners
 from jast.simulator import Simulator
 
 __all__ = ["Seeds", "Variants", "seeds", "variants"]
@@ -128,13 +125,12 @@ def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
     if modes is None or len(modes) < 2:
         return s
     best = gathered(function, "modes", sim, modes[:MOST])
-    of_modes = centred(sim)
     heads = latent.normal_of(sim, best)
     judge = Judge(sim)
     o = judge(heads)
     z = np.concatenate([s.z, heads[o.failure]]).astype(heads.dtype)
     used = np.concatenate([s.used, o.used[o.failure]])
-    label = _nearest(of_modes, _played(sim, z)[0], best)
+    label = owners(sim, _played(sim, z)[0], best)
     label[len(s.z) :] = np.flatnonzero(o.failure)
     # a mode's likeliest failure counts only where nothing else is known of the mode
     log_w = np.concatenate([s.log_weight, np.full(int(o.failure.sum()), -700.0)])
@@ -144,19 +140,6 @@ def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
 
 def _numbered(k: int) -> tuple:
     return tuple(f"mode {i + 1}" for i in range(k))
-
-
-def _nearest(of_modes: Simulator, e: Episode, best: Episode) -> np.ndarray:
-    """[n] the one of ``best`` in whose direction each of ``e`` lies, as it is or moved in time so
-    that both end together.
-    """
-    there, heads = (latent.normal_of(of_modes, each) for each in (e, best))
-    move = jax.vmap(partial(moved_in_time, of_modes))
-    cosines = [latent.unit(there) @ latent.unit(heads).T]
-    for head, end in zip(heads, best.length, strict=True):
-        moved = np.asarray(move(there, jnp.asarray(end - e.length, jnp.int32)))
-        cosines.append(latent.unit(moved) @ latent.unit(head))
-    return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)
 
 
 def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:

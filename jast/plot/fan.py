@@ -40,8 +40,8 @@ def failure_fan(
         nominal: a batch of other episodes, grey and behind.
         most: of a batch are drawn, evenly taken.
         label: of the axis (default: the name of ``value``).
-        modes: `jast.search.Modes`, by which failures are told apart (by direction), or the number
-            of the mode of each, from 0. Default: those of a report.
+        modes: `jast.search.Modes`, by which failures are told apart (by their direction,
+            moved in time), or the number of the mode of each, from 0. Default: those of a report.
         units: name -> unit, for the label of a field.
 
     Returns:

@@ -90,8 +90,7 @@ def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
         samples = Modes([samples])
     if isinstance(samples, Modes) and len(samples):
         modes = np.arange(len(samples)) if modes is None else modes
-        each = [m.failure._replace(states=None) for m in samples]
-        samples = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+        samples = _heads(samples)
     if isinstance(samples, SearchResult | FailureSamples):
         samples = samples.failures
     samples = samples.episodes if isinstance(samples, Failures) else samples
@@ -113,7 +112,7 @@ def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
     if modes is None or (isinstance(modes, Modes) and not len(modes)):
         return Given(few, sim, None, 0)
     if isinstance(modes, Modes):
-        return Given(few, sim, owners(sim, few, modes), len(modes))
+        return Given(few, sim, owners(sim, few._replace(states=None), _heads(modes)), len(modes))
     numbers = np.asarray(modes)
     if numbers.shape != (n,) or numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(
@@ -121,6 +120,12 @@ def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
             f" each of {n} episodes, received {modes!r}"
         )
     return Given(few, sim, numbers[rows], int(numbers.max()) + 1)
+
+
+def _heads(modes: Modes) -> Episode:
+    """The likeliest failure of each mode, as a batch without states."""
+    each = [m.failure._replace(states=None) for m in modes]
+    return jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
 
 
 def kinds(g: Given) -> list[tuple[int, np.ndarray]]:

@@ -52,8 +52,8 @@ def traces(
             distance"; "disturbance gust". Default: the first seven numbers that go otherwise than
             undisturbed, and the miss distance; of a black box that is judged at its end, its
             disturbances.
-        modes: `jast.search.Modes`, by which failures are told apart (by direction), or the number
-            of the mode of each, from 0. Default: those of a report.
+        modes: `jast.search.Modes`, by which failures are told apart (by their direction,
+            moved in time), or the number of the mode of each, from 0. Default: those of a report.
         nominal: an `Episode` batch, or how many to draw with key 0. Default: 200; of a black box
             none.
         units: name -> unit, for the labels.

@@ -148,18 +148,21 @@ def nearest(w, v):
     return np.argmax(unit(w) @ unit(v).T, axis=1)
 
 
-def owners(sim: Simulator, episodes: Episode, modes: Modes) -> np.ndarray:
-    """Of each of the failures ``episodes`` [n] the number of the mode, from 0, whose likeliest
-    failure it points most nearly to: [n]. Paths are not looked for, so nothing is evaluated; of
-    the mode's own failure it is that mode.
+def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
+    """Of each of ``episodes`` [n] the one of ``heads`` [k] in whose direction it lies, as it is or
+    moved in time so that both end together: [n]. Nothing is judged.
     """
-    if len(modes) == 1:
+    if len(heads.length) == 1:
         return np.zeros(len(episodes.length), int)
-    sim = centred(sim)
-    each = [m.failure._replace(states=None) for m in modes]
-    heads = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-    v, w = (np.asarray(normal_of(sim, e), np.float64) for e in (heads, episodes))
-    return nearest(w, v)
+    of_modes = centred(sim)
+    there, best = (normal_of(of_modes, each) for each in (episodes, heads))
+    move = jax.vmap(partial(moved_in_time, of_modes))
+    cosines = [unit(there) @ unit(best).T]
+    ends = np.asarray(episodes.length)
+    for head, end in zip(best, heads.length, strict=True):
+        moved = np.asarray(move(there, np.asarray(end - ends, np.int32)))
+        cosines.append(unit(moved) @ unit(head))
+    return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)
 
 
 class Paths:
