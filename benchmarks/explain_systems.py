@@ -1,7 +1,8 @@
 """Systems whose failures have causes that were planted, for `benchmarks.explain`.
 
 The settings of `jast.explain.rules` and `monitor` were chosen on the systems of
-`benchmarks.stress_systems`, not on these.
+`benchmarks.stress_systems`, not on these; but that variants of failures also move in time was added
+after two seeds of "one step of 50".
 """
 
 import math
