@@ -42,7 +42,7 @@ QUICK = {
     "colav": ["--quick"],
     "cross_entropy": ["--quick", "--seeds", "4"],
     "engine": ["--quick"],
-    "explain": "--quick --seeds 1 --parts rules sensitivity monitor ferry".split(),
+    "explain": "--quick --seeds 1 --parts rules ferry".split(),
     "ferry": ["--quick", "--trees", "10"],
     "few_calls": ["--seeds", "1", "--budget", "50"],
     "fms": ["--quick", "--seeds", "1"],
