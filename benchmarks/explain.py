@@ -11,6 +11,7 @@ ferry.
 """
 
 import argparse
+import contextlib
 import json
 import math
 import time
@@ -80,12 +81,14 @@ def _ruled(seeds, given):
         for seed in range(seeds):
             p, key = planted(name, seed), jax.random.key(seed)
             failures = given(p, seed)
-            begin = time.process_time()
-            found = explain.rules(p.sim, failures, key=key)
+            begin, found = time.process_time(), None
+            with contextlib.suppress(ValueError):  # an estimate that met no failure
+                found = explain.rules(p.sim, failures, key=key)
             cost = time.process_time() - begin
             for cause in range(len(p.causes)):
-                row = dict(zip(("precision", "recall", "named"), _fresh(found, p, cause, seed)))
-                row |= dict(cpu_seconds=cost, rules=len(found.rules))
+                told = (0.0, 0.0, False) if found is None else _fresh(found, p, cause, seed)
+                row = dict(zip(("precision", "recall", "named"), told))
+                row |= dict(cpu_seconds=cost, rules=0 if found is None else len(found.rules))
                 rows.setdefault(cause, []).append(row)
         for cause, each in rows.items():
             label = name if len(rows) == 1 else f"{name}: {'the rarer' if cause else 'the other'}"
