@@ -40,6 +40,11 @@ of its last gain is expected of one that gained nothing since; evaluations below
 is called once, and what was found is pulled once.
 """
 
+SETTLED, BASINS = 1e-2, 4
+"""A residual at which a failure is locally likeliest, and as many modes as show that there is
+nothing else to find: the evaluations of `onward` are the estimate's then.
+"""
+
 
 def stress(
     key: jax.Array,
@@ -62,7 +67,7 @@ def stress(
         key: consumed.
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Below 8,334 the probability is a surrogate's (`failure_probability` with few
+            least 300. Below 10,000 the probability is a surrogate's (`failure_probability` with few
             calls), and with more than 20 numbers an episode that of the plain draws alone.
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
@@ -204,7 +209,7 @@ class _Work:
         budget = self.parts.refine
         chosen = self.pool
         for part in (1.0,) if budget < FEW else (0.5, 0.5):
-            if chosen is not self.pool:
+            if chosen is not self.pool and not self.settled():
                 chosen = self.onward(chosen)
             result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
             found = result.failures
@@ -224,6 +229,10 @@ class _Work:
             self.note("telling modes apart", self.modes.evaluations)
             chosen = self.bests()
         self.failures = merge(self.bests(), self.failures, top=self.top)
+
+    def settled(self) -> bool:
+        """Whether slopes have led to the likeliest failure, and there are few basins."""
+        return self.residual < SETTLED and len(self.modes) <= BASINS
 
     def onward(self, known: Failures) -> Failures:
         """Likelier failures by many small steps, one half of them from the likeliest known."""
