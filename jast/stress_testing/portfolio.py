@@ -67,7 +67,7 @@ def stress(
         key: consumed.
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Below 10,000 the probability is a surrogate's (`failure_probability` with few
+            least 300. Below 10,417 the probability is a surrogate's (`failure_probability` with few
             calls), and with more than 20 numbers an episode that of the plain draws alone.
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
@@ -110,7 +110,7 @@ class Shares(NamedTuple):
 
 
 LARGE, BY_SURROGATE, NO_ESTIMATE = (
-    Shares(0.05, 0.15, 0.15, 0.15),
+    Shares(0.05, 0.15, 0.14, 0.18),
     Shares(0.05, 0.3, 0, 0.35),
     Shares(0.125, 0.35, 0.2, 0.325),
 )
@@ -225,6 +225,8 @@ class _Work:
                 result.invalid,
             )
             known = found if len(found) else self.pool[:1]
+            if self.modes:  # none is lost to a second refinement that had no time for it
+                known = merge(known, self.bests(), top=8 * self.top)
             self.modes = modes(self.sim, known, self.pool, budget=int(PATHS * self.budget))
             self.note("telling modes apart", self.modes.evaluations)
             chosen = self.bests()
