@@ -65,6 +65,11 @@ def test_a_random_start_and_dictionaries(key):
     assert found.failing and bool(jast.replay(sim, found.best).failure)
 
 
+def test_a_first_batch_larger_than_the_fresh_signals(key):
+    found = falsify(key, held(), simulations=80, batch=40, stop=False)
+    assert found.episodes == 80 and found.failing
+
+
 def test_one_at_a_time_on_a_black_box(key):
     box = jast.blackbox.from_python(walk, horizon=4, disturbance=Normal(0.0, 1.0))
     found = falsify(key, box, simulations=40, batch=1)

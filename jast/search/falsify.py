@@ -171,7 +171,7 @@ def _signal(
     rng: np.random.Generator, pool: _Pool, i: int, shape: tuple[int, int], k0: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ``i``-th episode: levels of the disturbances [horizon, k] and of the start [k0]."""
-    if i < FRESH:
+    if i < FRESH or not len(pool.score):
         return _drawn(rng, *shape, k0)
     m = len(pool.score)
     parent = int(m * rng.uniform() ** 2)  # rather a near one
