@@ -171,6 +171,14 @@ def test_windows_are_seconds_and_both_ends_belong():
         assert float(robustness(eventually(X, a, b), trace, 0.1)) == SAMPLES[rows].max()
 
 
+def test_windows_are_those_of_a_dt_from_float32():
+    for dt, seconds in [(0.05, 100), (0.1, 50), (0.7, np.int64(700)), (0.3, np.float32(300))]:
+        dt, trace = float(np.float32(dt)), {"x": jnp.arange(2001.0)}
+        n = round(float(seconds) / dt)
+        assert float(robustness(eventually(X, 0, seconds), trace, dt)) == n
+        assert float(robustness(always(X, seconds, seconds), trace, dt)) == n
+
+
 def test_formulas_print_as_they_read():
     near, slow = predicate(lambda s: s["x"], "gap > 5"), predicate(lambda s: s["y"], "slow")
     f = always(implies(near, eventually(slow & ~near, 0, 3)), 0.5) | until(slow, near, 1, 2)
@@ -211,6 +219,15 @@ def test_the_parts_of_a_beginning():
     rows = parts(f, seen, 1.0, goes_on=True).rows
     assert rows[0].value == rows[2].value == -1 and rows[2].time == 1
     assert rows[3].value == math.inf and math.isnan(rows[4].time)
+
+
+def test_the_left_part_of_a_beginning_decides_an_until():
+    """Y may come true yet, but X broke at 1 s."""
+    seen = {"x": jnp.array([1.0, -1.0, 0.5]), "y": jnp.full(3, -3.0)}
+    for a in (0, 4):
+        rows = parts(until(X, Y, a, 5), seen, 1.0, goes_on=True).rows
+        assert [p.value for p in rows[:2]] == [-1, -1] and rows[1].time == 1
+        assert rows[1].decides and math.isnan(rows[2].time)
 
 
 BAD = {

@@ -9,6 +9,7 @@ in seconds from the moment at which the formula is asked, and both ends belong t
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import jax
@@ -210,6 +211,12 @@ def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> For
 def implies(f: Formula, g: Formula) -> Formula:
     """Where ``f`` holds, ``g`` does: the same as ``~f | g``.
 
+    Args:
+        f, g: `Formula`.
+
+    Returns:
+        `Formula`. Its robustness is the greater of that of ``g`` and minus that of ``f``.
+
     Raises:
         ValueError: for what is no formula.
     """
@@ -263,7 +270,7 @@ def _formula(function: str, name: str, f: Any) -> Formula:
 
 
 def _window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, float | None]:
-    number = lambda v: isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
+    number = lambda v: isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)
     if not (number(a) and (b is None or number(b)) and 0 <= a and (b is None or a <= b)):
         raise ValueError(
             f"{function} {_inner(f)}: the window must be two numbers of seconds, 0 <= a <= b (b may"

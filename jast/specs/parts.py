@@ -101,7 +101,10 @@ def _moments(f: Formula, v: R.Values, at: int | None, dt: float) -> list[int | N
     if isinstance(f, Until):
         left, right = v.parts
         sofar = np.minimum.accumulate(left.own[at:])[first : None if last is None else last + 1]
-        then = at + first + int(np.argmax(np.minimum(right.own[inside], sofar)))
+        reached = np.minimum(right.own[inside], sofar)
+        if not (reached >= v.own[at]).any():  # the right part is open yet: the left one decides
+            return [at + int(np.argmin(left.own[at:])), None]
+        then = at + first + int(np.argmax(reached))
         return [at + int(np.argmin(left.own[at : then + 1])), then]
     pick = np.argmin if f.kind == "always" else np.argmax
     return [at + first + int(pick(v.parts[0].own[inside]))]

@@ -36,7 +36,9 @@ from jast.specs.formulas import (
 __all__ = ["Values", "fits", "margins", "reach", "robustness", "samples_in", "spacing", "values"]
 
 SLACK = 1e-6
-"""Of dt: by so much a window's end may miss a sample that it is meant to have."""
+"""By so much of dt, and of itself, a window's end may miss a sample that it is meant to have: dt
+may come from float32.
+"""
 
 
 class Values(NamedTuple):
@@ -209,10 +211,10 @@ def samples_in(function: str, f: Temporal | Until, dt: float) -> tuple[int, int 
     """The first and the last sample of the window of ``f``, counted from the present one; None: to
     the trace's end. ValueError where there is none.
     """
-    first = math.ceil(f.a / dt - SLACK)
+    first = math.ceil(f.a / dt - SLACK * max(1, f.a / dt))
     if f.b is None:
         return first, None
-    last = math.floor(f.b / dt + SLACK)
+    last = math.floor(f.b / dt + SLACK * max(1, f.b / dt))
     if last < first:
         raise ValueError(f"{function}: {f}: the window holds no sample at dt = {dt:g}")
     return first, last
