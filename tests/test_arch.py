@@ -149,6 +149,7 @@ def test_as_many_fail_as_in_another_transcription(key):
         (lambda: chasing_cars("CC1", 0), "chasing_cars: segments"),
         (lambda: simulate("cars", [0], [[0, 0]]), "simulate: model"),
         (lambda: simulate("chasing cars", [1.0], [[0, 0]]), "simulate: times"),
+        (lambda: simulate("chasing cars", [0, np.inf], [[0, 0]] * 2), "simulate: times"),
         (lambda: simulate("chasing cars", [0, 5], [[0, 0]]), "simulate: inputs must have the sh"),
         (lambda: simulate("chasing cars", [0], [[0, 2]]), r"inputs: brake must be in \[0, 1\]"),
         (lambda: simulate("chasing cars", [0], [[0, 1]], "cubic"), "simulate: interpolation"),

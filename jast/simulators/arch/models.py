@@ -103,7 +103,8 @@ def simulate(
     if model != "chasing cars":
         raise ValueError(f'simulate: model must be "chasing cars", received {model!r}')
     times, inputs = np.asarray(times, np.float64), np.asarray(inputs, np.float64)
-    if times.ndim != 1 or not len(times) or times[0] != 0 or not (np.diff(times) > 0).all():
+    rising = times.ndim == 1 and len(times) and times[0] == 0 and np.isfinite(times).all()
+    if not (rising and (np.diff(times) > 0).all()):
         raise ValueError(f"simulate: times must rise from 0, received {times}")
     if inputs.shape != (len(times), len(cars.INPUTS)):
         raise ValueError(
