@@ -213,6 +213,11 @@ def test_which_part_decided_an_until():
     assert [(p.time, p.value) for p in rows] == [(0, -1), (1, -1), (1, 1)]
 
 
+def test_zero_is_no_violation():
+    rows = parts(always(X), {"x": jnp.array([1.0, 0.0]), "y": jnp.ones(2)}, 1.0).rows
+    assert [(p.value, p.held) for p in rows] == [(0, True), (0, True)]
+
+
 def test_the_parts_of_a_beginning():
     seen = {k: v[:2] for k, v in TRACE.items()}
     f = always(X, 0, 4) & eventually(Y, 0, 4)

@@ -60,7 +60,7 @@ class _Found(NamedTuple):
     counts: tuple[int, int, int, int]
     """Episodes, steps, failures, invalid ones"""
     moments: tuple
-    """After each batch: episodes, less the least distance [1], failures"""
+    """After each batch: episodes, minus the least distance [1], failures"""
 
 
 def falsify(
@@ -99,7 +99,7 @@ def falsify(
         ValueError: for a count below 1, disturbances without a quantile function, a simulator whose
             functions do not fit together, and inside of a transformation of JAX.
 
-    ``history.best_reward`` is less the least miss distance so far.
+    ``history.best_reward`` is minus the least miss distance so far.
     """
     name = "falsify"
     simulations, batch, top = E.whole(name, simulations=simulations, batch=batch, top=top)

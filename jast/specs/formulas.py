@@ -136,7 +136,7 @@ def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
 
     Args:
         fn: state -> margin, a float scalar: above 0 where it holds, and the farther from 0 the
-            clearer. In JAX. What a `jax.tree_util.Partial` binds is traced.
+            clearer; 0 is no violation. In JAX. What a `jax.tree_util.Partial` binds is traced.
         name: how it prints and is named in errors, as "gap > 7.5"; by default the function's name.
 
     Returns:

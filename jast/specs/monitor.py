@@ -100,8 +100,8 @@ def _watched(
     dt: float,
     total: int,
 ) -> tuple[Memory, jax.Array]:
-    """The memory of one window after the margins ``news``, and its bound. ``always`` is less the
-    ``eventually`` of less what it is of.
+    """The memory of one window after the margins ``news``, and its bound. ``always`` is minus
+    the ``eventually`` of minus what it is of.
     """
     known, ahead = len(news[0]), _ahead(f, dt, total)
     block = tuple(map(lambda *a: jnp.concatenate(a), memory.recent, news))

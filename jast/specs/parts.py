@@ -23,9 +23,9 @@ class Part(NamedTuple):
     value: float
     """Its robustness then."""
     held: bool
-    """It is above 0."""
+    """It is not below 0."""
     decides: bool
-    """Its robustness is the whole formula's, or less it (below ``~``, left of ``implies``)."""
+    """Its robustness is that of the whole formula, or minus it (below ``~``, ``implies``)."""
     values: np.ndarray
     """[T] its robustness at each moment, windows clipped at the trace's end."""
 
@@ -80,7 +80,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
         value = float(v.own[at]) if at is not None else float("nan")
         time = float("nan") if at is None else at * dt
         decides = abs(value) == abs(float(total)) and np.isfinite(value)
-        rows.append(Part(f, depth, time, value, value > 0, decides, v.own))
+        rows.append(Part(f, depth, time, value, value >= 0, decides, v.own))
         moments = _moments(f, v, at, dt)
         for child, part, when in zip(children(f), v.parts, moments, strict=True):
             look(child, part, when, depth + 1)

@@ -130,7 +130,8 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
 
     Returns:
         The system's states, a pytree of arrays [n, ...] up to the episode's end: with
-        ``goes_on=True`` where that came before the horizon.
+        ``goes_on=True`` where that came before the horizon. Where ``is_terminal`` ended it,
+        `parts` does not know that nothing follows: it shows windows that were cut short as open.
 
     Raises:
         ValueError: for an episode without states, or of another system.
