@@ -63,6 +63,7 @@ def test_names_in_the_tables_exist():
             "jast.explain",
             "jast.rewards",
             "jast.plot",
+            "jast.specs",
         ), name
 
 
