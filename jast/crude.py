@@ -55,13 +55,13 @@ class Nominal(NamedTuple):
     """Episodes in which the simulator returned a number that is not finite; they count as not
     failing.
     """
-    settings: Mapping = {}
-    """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
-    played.
-    """
     first: int | None = None
     """Number of the first episode that failed, which ``rollout(jax.random.fold_in(key, first),
     sim)`` plays again; None where none did.
+    """
+    settings: Mapping = {}
+    """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
+    played.
     """
 
     failures = results.former("failures", "failing")
@@ -137,8 +137,8 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
         clopper_pearson(failures, episodes),
         mean if invalid < episodes else math.nan,
         invalid,
-        settings,
         first if failures else None,
+        settings,
     )
 
 
