@@ -10,6 +10,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.stress_systems import slips
+from jast import distributions as D
 from jast import explain
 from jast.distributions import Joint, Normal, Uniform
 from jast.search.failure_modes import Mode
@@ -277,3 +278,24 @@ def test_cards_of_modes(key):
     ((alone,),) = explain.cards(key, sim, [one], 200)
     assert alone.needed.sum() == 2
     assert explain.cards(key, sim, []) == []
+
+
+def test_a_failure_at_the_edge_is_explained(key):
+    """The way to normal numbers and back may round it to the other side."""
+    law = Uniform(0.0, 1.0)
+    x = np.linspace(0.6, 0.9, 500, dtype=np.float32)
+    there_and_back = jax.vmap(lambda a: D.from_normal(law, D.to_normal(law, a)))(x)
+    edge = x[np.flatnonzero(np.asarray(there_and_back) < x)[0]]
+    sim = jast.Simulator(
+        init=lambda x0: jnp.float32(0),
+        step=lambda s, x: jnp.maximum(s, x),
+        disturbance=lambda s: Uniform(jnp.float32(0), jnp.float32(1)),
+        evaluate=lambda s: (s >= edge, jnp.maximum(edge - s, 0)),
+        horizon=2,
+    )
+    below = jnp.asarray([0.1, np.nextafter(edge, np.float32(0))], jnp.float32)
+    failing = jast.replay(sim, jnp.asarray([0.1, edge], jnp.float32))
+    assert bool(failing.failure) and not bool(jast.replay(sim, below).failure)
+    assert np.asarray(explain.minimal(sim, failing).needed).tolist() == [False, True]
+    with pytest.raises(ValueError, match="must fail when it is replayed"):
+        explain.minimal(sim, jast.replay(sim, below))
