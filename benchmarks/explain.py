@@ -345,13 +345,17 @@ def lines(report, name=""):
         yield from lines(value, f"{name}: {key}" if name else key)
 
 
+QUICK = [part for part in PARTS if part not in ("rules_of_estimates", "sensitivity")]
+"""Those that need no estimate of a system each, which takes a while to compile."""
+
+
 def main(argv=None):
     quick = "two seeds, fewer evaluations"
     parser = options(argparse.ArgumentParser(description=__doc__), quick)
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="default: all")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
-    parts = args.parts or size(args, list(PARTS), list(PARTS), ["criticality"])
+    parts = args.parts or size(args, list(PARTS), QUICK, ["criticality"])
     seeds = args.seeds or size(args, 20, 2, 1)
     budget = size(args, 20_000, 10_000, 2000)
     report = run(parts, seeds, budget)
