@@ -156,7 +156,7 @@ class _Work:
         for e in found:
             one = jax.tree.map(lambda a: np.asarray(a)[None], e._replace(states=None))
             self.pool = merge(self.pool, collect(self.sim, self.reward, one), top=2)
-        best = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        best = _best(self.pool)
         self.note("nominal", n.episodes, n.failing, best, n.invalid)
 
     def search(self):
@@ -180,10 +180,9 @@ class _Work:
         """Call one explorer; returns by how much the likeliest failure got likelier per
         evaluation.
         """
-        before = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        before = _best(self.pool)
         haul = EXPLORERS[name](self.next_key(), self.sim, budget)
-        found = self.gather(name, haul)
-        best = float(found.best.reward) if len(found) else -np.inf
+        best = _best(self.gather(name, haul))
         if best <= before:
             return 0.0
         gain = 1.0 if before == -np.inf else best - before
@@ -192,9 +191,8 @@ class _Work:
     def gather(self, name: str, haul: Haul) -> Failures:
         """The failures that an explorer brought in, which join the pool."""
         found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        best = float(found.best.reward) if len(found) else -np.inf
         self.pool = merge(self.pool, found, top=8 * self.top)
-        self.note(name, haul.evaluations, haul.failing, best, haul.invalid)
+        self.note(name, haul.evaluations, haul.failing, _best(found), haul.invalid)
         return found
 
     def refine(self):
@@ -221,7 +219,7 @@ class _Work:
                 "refine",
                 result.episodes,
                 len(found),
-                float(found.best.reward) if len(found) else -np.inf,
+                _best(found),
                 result.invalid,
             )
             known = found if len(found) else self.pool[:1]
@@ -279,7 +277,7 @@ class _Work:
         points = np.asarray(q.means)[np.isfinite(np.asarray(q.log_weights))]
         haul = of_points(self.sim, points)
         self.pool = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        best = float(self.pool.best.reward) if len(self.pool) else -np.inf
+        best = _best(self.pool)
         self.note("the estimate's failures", len(points), haul.failing, best)
         self.refine()
 
@@ -309,3 +307,8 @@ class _Work:
             settings,
             self.sim,
         )
+
+
+def _best(failures: Failures) -> float:
+    """log p relative to the mode of the likeliest; -inf where there is none."""
+    return float(failures.best.reward) if len(failures) else -np.inf
