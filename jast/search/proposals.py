@@ -10,6 +10,7 @@ import numpy as np
 
 from jast import actions as choices
 from jast.cross_entropy.sequences import place
+from jast.failures import Failures
 from jast.limit_state import latents
 from jast.outline import outline
 from jast.simulator import Simulator
@@ -68,6 +69,9 @@ def around(sim, actions, failures, settings):
     """
     if settings is None:
         raise ValueError("cem: failures: cannot be given inside of jax.jit and jax.vmap")
+    if not isinstance(failures, Failures):
+        kind = type(failures).__name__
+        raise ValueError(f"cem: failures must be an archive (result.failures), received {kind}")
     if not isinstance(actions, choices.Wide | choices.Quantiles):
         kind = type(actions).__name__
         raise ValueError(f"cem: failures need actions quantiles() or wide(), received {kind}")
