@@ -109,9 +109,11 @@ def colav(
     times (static), the adversary moves, the tracker takes in what the sensors show, and the ferry
     follows its path (`vessels`). Miss distance: least distance between the centres at substeps;
     failure below 1 m. Ends when the ferry is at the dock (99 m). Distances are in metres; the dtype
-    is JAX's default float. At the default 30 substeps the ferry's path is right to 10 cm; one
-    substep of 3 s is unstable but for small motions and serves measurements of time. The planner's
-    choice is among speeds, so the miss distance has no useful gradient in delays and noise.
+    is JAX's default float. The published code has 30 simulator steps of 0.1 s in a search step: the
+    default. The published text says 20: ``substeps=20`` are as many in the same 3 s, of 0.15 s
+    each. At 30 the ferry's path is right to 10 cm; one substep of 3 s is unstable but for small
+    motions and serves measurements of time. The planner's choice is among speeds, so the miss
+    distance has no useful gradient in delays and noise.
 
     Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has
     other shapes, a delay beyond the buffer, substeps below 1, scales that are not positive and
