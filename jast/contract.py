@@ -102,10 +102,15 @@ def _trace(sim, actions, observed):
     dist = _call("disturbance", sim.disturbance, state)
     x = _draw("disturbance", dist)
     pair = _call("evaluate", sim.evaluate, state)
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise ValueError(f"evaluate: expected a pair (event, distance), received {_kind(pair)}")
+    if not isinstance(pair, tuple | list) or len(pair) not in (2, 3):
+        raise ValueError(
+            "evaluate: expected a pair (event, distance), or (event, distance, log p), received"
+            f" {_kind(pair)}"
+        )
     _scalar("evaluate: event", pair[0], bool)
     _scalar("evaluate: distance", pair[1], float)
+    for told in pair[2:]:
+        _scalar("evaluate: log p", told, float)
     _scalar("is_terminal", _call("is_terminal", sim.is_terminal, state), bool)
     if observed:
         seen = _call("observe", sim.observe, state)
@@ -249,7 +254,7 @@ def _probe(sim, actions):
                     jax.tree.map(_any_nan, state),
                     jnp.zeros((), bool),
                 )
-            event, distance = sim.evaluate(state)
+            event, distance, *_ = sim.evaluate(state)
             return jnp.asarray(event) | jnp.asarray(sim.is_terminal(state)), (
                 jax.tree.map(_any_nan, state),
                 ~jnp.isfinite(distance),

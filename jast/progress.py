@@ -76,13 +76,15 @@ def conclude(sim: Simulator, reward: Callable, progress: Progress, live: Any = T
     if not sim.episodic:
         return progress
     live = jnp.asarray(live) & progress.done & ~progress.invalid
-    event, own = sim.evaluate(
+    event, own, *told = sim.evaluate(
         jax.tree.map(lambda a: jnp.where(live, a, jnp.zeros((), a.dtype)), progress.state)
     )
     event, own = jnp.asarray(event), jnp.asarray(own).astype(progress.reward.dtype)
-    total = _paid(reward, progress.reward, progress.owed, event, own, jnp.ones((), bool), -own)
-    invalid = ~jnp.isfinite(own) | jnp.isnan(total) | (total == jnp.inf)
-    new = dict(owed=jnp.zeros_like(progress.owed)) | _outcome(
+    told = sum(jnp.asarray(p).astype(own.dtype) for p in told)
+    owed, log_prob = progress.owed + told, progress.log_prob + told
+    total = _paid(reward, progress.reward, owed, event, own, jnp.ones((), bool), -own)
+    invalid = ~jnp.isfinite(own) | _wrong(log_prob) | _wrong(total)
+    new = dict(owed=jnp.zeros_like(progress.owed), log_prob=log_prob) | _outcome(
         total, own, event, jnp.ones((), bool), invalid
     )
     return progress._replace(
@@ -105,7 +107,6 @@ def _arrive(
     dtype = before.reward.dtype
     log_prob, counted = (jnp.asarray(p).astype(dtype) for p in log_p)
     ends = jnp.asarray(sim.is_terminal(state)) | last
-    invalid = jnp.isnan(log_prob) | (log_prob == jnp.inf)
     if sim.episodic:  # evaluated at its end, by `conclude`
         none = jnp.zeros((), dtype)
         total, owed = (
@@ -116,21 +117,29 @@ def _arrive(
         )
         event, distance, done = jnp.zeros((), bool), before.distance, ends
     else:
-        event, own = sim.evaluate(state)
+        event, own, *told = sim.evaluate(state)
         event, own = jnp.asarray(event), jnp.asarray(own).astype(dtype)
+        for p in told:
+            log_prob, counted = (a + jnp.asarray(p).astype(dtype) for a in (log_prob, counted))
         # the order at a state: failure, then is_terminal, then the horizon
         done, distance, owed = event | ends, jnp.minimum(before.distance, own), ()
         total = _paid(
             reward, before.reward, counted, event, distance, done, approach(own).astype(dtype)
         )
+    invalid = _wrong(log_prob) | _wrong(total)
+    if not sim.episodic:
         invalid |= ~jnp.isfinite(own)
-    invalid |= jnp.isnan(total) | (total == jnp.inf)
     return Progress(
         state,
         before.log_prob + log_prob,
         owed=owed,
         **_outcome(total, distance, event, done, invalid),
     )
+
+
+def _wrong(number: jax.Array) -> jax.Array:
+    """Whether a log p or a reward is NaN, or an infinity that has no meaning."""
+    return jnp.isnan(number) | (number == jnp.inf)
 
 
 def _paid(

@@ -90,7 +90,7 @@ def _three(sim: Simulator, steps: int, keys: jax.Array) -> tuple[list[Any], jax.
         )
 
     def judged(state):
-        event, distance = sim.evaluate(state)
+        event, distance, *_ = sim.evaluate(state)
         return event | sim.is_terminal(state), distance
 
     def body(carry):

@@ -63,7 +63,8 @@ class Simulator:
     """
     evaluate: Callable[[Any], tuple]
     """state -> (failure event: bool scalar, miss distance: float scalar, smaller is nearer to a
-    failure).
+    failure). A third value, float, is log p that only the system knows, on top of what
+    ``disturbance`` says: of the last disturbance, or of the whole episode where ``episodic``.
     """
     horizon: int = field(metadata=dict(static=True))
     """Greatest number of steps of an episode, at least 1; static."""

@@ -103,6 +103,44 @@ class Forgetful(Walk):
         return 4.0 - self.s
 
 
+class Sampled(Walk):
+    """`Walk` that draws its own step by a seed, and returns the step's log density."""
+
+    def drawn(self, seed):
+        return float(np.random.default_rng(int(seed)).normal())
+
+    def transition(self, seed):
+        x = self.drawn(seed)
+        super().transition(x)
+        return -0.5 * x**2 - 0.5 * np.log(2 * np.pi)
+
+
+class Likely(Sampled):
+    """`Sampled` that returns the density itself."""
+
+    def transition(self, seed):
+        return np.exp(super().transition(seed))
+
+
+class Evaluated(Sampled):
+    """`Sampled` by the <p, e, d> of its ``evaluate``."""
+
+    def initialize(self):
+        super().initialize()
+        self.log_p = 0.0
+
+    def transition(self, seed):
+        self.log_p += super().transition(seed)
+        return 100.0  # what evaluate returns stands in its place
+
+    def evaluate(self):
+        log_p, self.log_p = self.log_p, 0.0
+        return log_p, super().is_event(), super().miss_distance()
+
+    def is_event(self):
+        raise RuntimeError("not asked for")
+
+
 class Leaves(Walk):
     """Fails while it is 4 or more away from 0: it may come back."""
 

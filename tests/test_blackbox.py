@@ -2,6 +2,7 @@
 in which a system can go wrong.
 """
 
+import re
 import sys
 
 import blackboxes
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from systems import TOLD
 
 import jast
@@ -282,6 +284,68 @@ def test_seeds_are_the_disturbance_of_a_system_of_unknown_density():
     np.testing.assert_allclose(seen, [1, float(episode.disturbances[1]) / 2**32], rtol=1e-6)
 
 
+@pytest.mark.parametrize("episodic", [False, True])
+@pytest.mark.parametrize(
+    "system, likelihood",
+    [
+        (blackboxes.Sampled, None),
+        (blackboxes.Sampled, "log_prob"),
+        (blackboxes.Likely, "prob"),
+        (blackboxes.Evaluated, None),
+    ],
+)
+def test_what_a_system_says_of_its_seeds_is_their_likelihood(key, system, likelihood, episodic):
+    sim = box(system, 4, None, likelihood=likelihood, episodic=episodic)
+    episode = jast.rollout(key, sim)
+    steps = [blackboxes.Sampled().drawn(s) for s in episode.disturbances[: int(episode.length)]]
+    truth = jax.device_get(jast.replay(in_jax(), jnp.asarray(np.append(steps, [0] * 4)[:4])))
+    np.testing.assert_allclose(episode.log_prob, scipy.stats.norm.logpdf(steps).sum(), rtol=1e-5)
+    assert episode.failure == truth.failure and np.isfinite(episode.distance)
+    again = jast.replay(sim, episode.disturbances)
+    assert again.log_prob == episode.log_prob and again.reward == episode.reward
+
+
+def test_failures_by_seeds_are_ranked_by_what_the_system_says(key):
+    """The likeliest of 400 episodes comes first; without a word from the system all are alike."""
+    found = jast.search.monte_carlo(key, box(blackboxes.Sampled, 4, None), episodes=400, top=5)
+    log_p = np.asarray(found.failures.episodes.log_prob)
+    assert len(log_p) == 5 and (np.diff(log_p) <= 0).all() and found.best.log_prob == log_p[0] < -4
+    silent = jast.search.monte_carlo(
+        key, box(lambda s: (s[0] % 2 == 0, 1.0), 4, None), episodes=100, top=5
+    )
+    assert (np.asarray(silent.failures.episodes.log_prob) == 0).all()
+
+
+def test_a_requirement_keeps_what_the_system_says(key):
+    sim = box(blackboxes.Sampled, 4, None)
+    plain = jast.rollout(key, sim)
+    for formula in (
+        jast.specs.always(jast.specs.predicate(lambda s: 99 - s.seen[0]), 0, 4),
+        jast.specs.eventually(jast.specs.predicate(lambda s: 99 + s.seen[0]), 2, 4),
+    ):
+        under = jast.replay(jast.specs.under(sim, formula), plain.disturbances)
+        np.testing.assert_allclose(under.log_prob, plain.log_prob, rtol=1e-6)
+
+
+def test_a_likelihood_that_is_none_makes_an_episode_invalid(key):
+    functions = (
+        (lambda x: (3.0, True, 1.0), "prob", 0.0, np.log(3.0)),
+        (lambda x: (0.0, True, 1.0), "prob", 0.0, -np.inf),
+        (lambda x: (-1.0, True, 1.0), "prob", "gives -1.0 as p", None),
+        (lambda x: (np.nan, True, 1.0), "log_prob", "gives nan as log p", None),
+        (lambda x: ("one", True, 1.0), "log_prob", "must give log p, one number", None),
+        (lambda x: (True, 1.0), "log_prob", r"expected \(p, event, distance\)", None),
+    )
+    for function, likelihood, said, log_p in functions:
+        sim = box(function, 2, None, likelihood=likelihood)
+        episode = jast.rollout(key, sim)
+        assert np.isinf(episode.distance) == (log_p is None)
+        if log_p is None:
+            assert re.search(said, incidents(sim)[0].message)
+        else:
+            np.testing.assert_allclose(episode.log_prob, log_p, rtol=1e-6)
+
+
 def test_disturbances_may_be_trees_that_depend_on_the_past():
     def disturbance(state):
         last = state.disturbances["gust"][state.t - 1]
@@ -392,6 +456,7 @@ class Waits(blackboxes.Walk):
         ),
         (blackboxes.walk, {"episodic": False}, "episodic=False needs a class"),
         (blackboxes.walk, {"episodic": 1}, "episodic must be True, False or None"),
+        (blackboxes.walk, {"likelihood": "p"}, 'likelihood must be "log_prob", "prob" or None'),
         (blackboxes.walk, {"horizon": 0}, "from_python: horizon"),
         (blackboxes.walk, {"workers": -1}, "from_python: workers"),
         (

@@ -59,8 +59,8 @@ class Host:
         return self.done
 
     def __call__(self, dtype, size, live, t, *leaves):
-        """Outcomes (event, distance, terminal, seen [..., size]) with the leading axes of ``live``,
-        a bool a row; zeros where it is False.
+        """Outcomes (event, distance, terminal, log p, seen [..., size]) with the leading axes of
+        ``live``, a bool a row; zeros where it is False.
 
         ``t``: disturbances so far; ``leaves``: those of x0, then those of the disturbances. The
         leading axes of each may be 1 where those of another are not.
@@ -74,6 +74,7 @@ class Host:
             np.zeros(len(live), bool),
             np.zeros(len(live), dtype),
             np.zeros(len(live), bool),
+            np.zeros(len(live), dtype),
             np.zeros((len(live), size), dtype),
         )
         if len(rows):
@@ -122,7 +123,9 @@ class Host:
             wrong[i] = True
             self.log.add(kind, message, example(i))
         with np.errstate(over="ignore"):
-            distance, seen = reply.distance.astype(dtype), reply.seen.astype(dtype)
+            distance, log_p, seen = (
+                a.astype(dtype) for a in (reply.distance, reply.log_p, reply.seen)
+            )
         for i in np.flatnonzero(~np.isfinite(distance) & ~wrong):
             wrong[i] = True
             self.log.add(
@@ -131,7 +134,7 @@ class Host:
                 example(i),
             )
         event, terminal = reply.event & ~wrong, reply.terminal | wrong
-        distance[wrong] = np.nan
+        distance[wrong], log_p[wrong] = np.nan, 0
         for i in np.flatnonzero(~wrong):
             self._compare(
                 hash(
@@ -143,13 +146,14 @@ class Host:
                 ),
                 event[i],
                 reply.distance[i],
+                reply.log_p[i],
                 example(i),
             )
-        return event, distance, terminal, seen
+        return event, distance, terminal, log_p, seen
 
-    def _compare(self, key, event, distance, example):
+    def _compare(self, key, event, distance, log_p, example):
         """Remember an outcome; an incident where the same input had another one before."""
-        now = bool(event), float(distance)
+        now = bool(event), float(distance), float(log_p)
         before = self.failing.get(key) or self.others.get(key)
         if before is None:
             known = self.failing if event else self.others
@@ -157,5 +161,6 @@ class Host:
                 del known[next(iter(known))]
             known[key] = now
         elif before != now:
-            what = "a failure and no failure" if before[0] != now[0] else "two distances"
+            names = "a failure and no failure", "two distances", "two values of log p"
+            what = next(name for name, a, b in zip(names, before, now) if a != b)
             self.log.add("not deterministic", f"the same disturbances gave {what}", example)

@@ -163,13 +163,7 @@ class Pool:
         batch, which a search keeps from step to step.
         """
         n = len(t)
-        event, distance, terminal, seen = (
-            np.zeros(n, bool),
-            np.full(n, np.nan),
-            np.zeros(n, bool),
-            np.zeros((n, self.size)),
-        )
-        reply = worker.Reply(event, distance, terminal, seen, [], 0, 0, 0.0)
+        reply = worker.Reply(*worker.blank(n, self.size), [], 0, 0, 0.0)
         queues = self._pieces(lanes)
         free, busy = set(self.workers), {}
         try:
@@ -223,7 +217,7 @@ class Pool:
                     if len(rows) > 1:
                         queue.extendleft(rows[i : i + 1] for i in reversed(range(len(rows))))
                     else:
-                        terminal[rows[0]] = True
+                        reply.terminal[rows[0]] = True
                         reply.problems.append((int(rows[0]), *problem))
         except BaseException:  # an interruption: what still runs must not answer the next call
             _close(self.workers)
@@ -266,7 +260,7 @@ class Pool:
 
 
 def _merged(all, rows, part):
-    for name in ("event", "distance", "terminal", "seen"):
+    for name in ("event", "distance", "terminal", "log_p", "seen"):
         getattr(all, name)[rows] = getattr(part, name)
     all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)
     return all._replace(

@@ -18,6 +18,7 @@ from jast.blackbox.judged import compare
 from jast.blackbox.pool import Pool, packed
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
 from jast.contract import OBSERVED
+from jast.distributions.kinds import Seeds
 from jast.incidents import sources
 from jast.simulator import Simulator, fixed
 
@@ -51,6 +52,8 @@ class Standing(NamedTuple):
     """float: miss distance; NaN where something went wrong"""
     terminal: Any
     """bool: ended without a failure, or by an incident"""
+    log_p: Any
+    """float: log p of the last disturbance as the object says it; 0 where it says nothing"""
     seen: Any
     """[k] float: what the object's ``observe`` returned; empty where it has none"""
 
@@ -62,6 +65,7 @@ def from_python(
     disturbance=None,
     start=fixed,
     episodic=None,
+    likelihood=None,
     workers=0,
     time_limit=None,
     observe=None,
@@ -100,6 +104,17 @@ def from_python(
     the end, or that remembers what has happened. One that says "is it failing now" loses the
     failures that are over by then: `jast.check` looks for some and warns.
 
+    ``likelihood``: what the system says of the probability of its disturbances, on top of the
+    density of ``disturbance``. "log_prob": ``transition`` returns log p of its disturbance;
+    "prob": p itself (a density may exceed 1). Then it must return a number, and a function of whole
+    episodes returns ``(p, event, distance)``, p or log p of all. An ``evaluate`` may return
+    ``(p, event, distance)`` too, Table 3.1's <p, e, d>: they stand in place of ``is_event``,
+    ``miss_distance`` and all p that ``transition`` returned since the last ``evaluate``. None, the
+    default: where the density is unknown (``disturbance`` left out, or
+    `jast.distributions.seeds`), a number that an object returns is log p; elsewhere only
+    ``disturbance`` counts. Give ``likelihood`` with a known density only where the object's p is
+    of other things: both count.
+
     ``workers``: 0 runs the system in this process; n >= 1 in so many processes of their own (``pip
     install 'jast[blackbox]'``), started on first use and ended with this one. ``time_limit``:
     seconds for a run, or for a transition; needs a worker. One that hangs where nothing interrupts
@@ -131,6 +146,10 @@ def from_python(
                 f"{NAME}: time_limit needs workers of at least 1, received workers=0: a run in this"
                 " process cannot be stopped"
             )
+    if likelihood not in (None, "log_prob", "prob"):
+        raise ValueError(
+            f'{NAME}: likelihood must be "log_prob", "prob" or None, received {likelihood!r}'
+        )
     if observe is not None and not callable(observe):
         raise ValueError(f"{NAME}: observe must be a function of the state, received {observe!r}")
     start = _start(start)
@@ -138,11 +157,12 @@ def from_python(
     random = bool(jax.tree.leaves(like0))
     run = _is_run(system, random, episodic)
     episodic = run if episodic is None else episodic
-    spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit)
+    disturbance = D.seeds() if disturbance is None else disturbance
+    tells = likelihood or ("maybe" if isinstance(disturbance, Seeds) and not run else None)
+    spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit, tells)
     runner = Pool(packed(system, spec), workers, spec) if workers else Runner(system, spec)
     size = 0 if run else _probed(runner, start, limited=observe is None)
 
-    disturbance = D.seeds() if disturbance is None else disturbance
     constant = _is_distribution(disturbance)
     if not (constant or callable(disturbance)):
         raise ValueError(
@@ -163,12 +183,13 @@ def from_python(
         observe=_observe if observe is None else observe,
     )
     if episodic:
-        return Simulator(begin, _extended, evaluate=_Asking(host, _ended), **fields)
+        judge = _ended if tells is None else _ended_telling
+        return Simulator(begin, _extended, evaluate=_Asking(host, judge), **fields)
     init = lambda x0: _found(host, begin(x0))
     return Simulator(
         init,
         _Asking(host, _moved),
-        evaluate=_stands,
+        evaluate=_stands if tells is None else _stands_telling,
         is_terminal=lambda state: state.terminal,
         **fields,
     )
@@ -202,9 +223,14 @@ class _Asking:
 
 def _ended(host, state):
     """Event and distance of an episode; NaN before its end. A state of zeros is not asked for."""
+    return _ended_telling(host, state)[:2]
+
+
+def _ended_telling(host, state):
+    """`_ended`, and log p as the system says it."""
     live = state.begun & (state.t == host.spec.horizon)
-    event, distance, _, _ = _asked(host, 0, live, state.t, state.x0, state.disturbances)
-    return event, jnp.where(live | ~state.begun, distance, jnp.nan)
+    event, distance, _, log_p, _ = _asked(host, 0, live, state.t, state.x0, state.disturbances)
+    return event, jnp.where(live | ~state.begun, distance, jnp.nan), log_p
 
 
 def _extended(state, x):
@@ -223,14 +249,20 @@ def _moved(host, state, x):
 
 def _found(host, state, live=True):
     """``state`` with its outcome."""
-    event, distance, terminal, seen = _asked(
+    found = _asked(
         host, state.seen.shape[0], state.begun & live, state.t, state.x0, state.disturbances
     )
-    return state._replace(event=event, distance=distance, terminal=terminal, seen=seen)
+    return state._replace(
+        **dict(zip(("event", "distance", "terminal", "log_p", "seen"), found, strict=True))
+    )
 
 
 def _stands(state):
     return state.event, state.distance
+
+
+def _stands_telling(state):
+    return state.event, state.distance, state.log_p
 
 
 def _observe(state):
@@ -250,11 +282,11 @@ def _observe(state):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _asked(host, size, live, t, x0, disturbances):
-    """Event, distance, terminal and [size] observed numbers from the host, where ``live``; one call
-    for a batch, under any number of `jax.vmap`.
+    """Event, distance, terminal, log p and [size] observed numbers from the host, where ``live``;
+    one call for a batch, under any number of `jax.vmap`.
     """
     flag, number = (jax.ShapeDtypeStruct((), d) for d in (bool, jnp.zeros(()).dtype))
-    shapes = flag, number, flag, jax.ShapeDtypeStruct((size,), number.dtype)
+    shapes = flag, number, flag, number, jax.ShapeDtypeStruct((size,), number.dtype)
     return host_call(
         host.callback(number.dtype, size), shapes, live, t, *jax.tree.leaves((x0, disturbances))
     )
@@ -263,7 +295,7 @@ def _asked(host, size, live, t, x0, disturbances):
 @_asked.defjvp
 def _(host, size, primals, tangents):
     """No gradient: NaN, whatever the direction."""
-    event, distance, terminal, seen = _asked(host, size, *primals)
+    event, distance, terminal, log_p, seen = _asked(host, size, *primals)
     moved = [
         jnp.sum(a).astype(distance.dtype)
         for a in jax.tree.leaves(tangents)
@@ -271,10 +303,11 @@ def _(host, size, primals, tangents):
     ]
     unknown = sum(moved, jnp.zeros_like(distance)) * jnp.nan
     none = np.zeros((), jax.dtypes.float0)
-    return (event, distance, terminal, seen), (
+    return (event, distance, terminal, log_p, seen), (
         none,
         unknown,
         none,
+        unknown,
         jnp.broadcast_to(unknown, seen.shape),
     )
 
@@ -284,7 +317,11 @@ def _blank(episodic, horizon, like0, size, like):
     zeros = lambda tree, lead: jax.tree.map(lambda s: jnp.zeros((*lead, *s.shape), s.dtype), tree)
     no = jnp.zeros((), bool)
     record = Record(no, jnp.zeros((), jnp.int32), zeros(like0, ()), zeros(like, (horizon,)))
-    return record if episodic else Standing(*record, no, jnp.zeros(()), no, jnp.zeros((size,)))
+    return (
+        record
+        if episodic
+        else Standing(*record, no, jnp.zeros(()), no, jnp.zeros(()), jnp.zeros((size,)))
+    )
 
 
 def _shape(disturbance, blank, like):

@@ -52,6 +52,10 @@ class Spec(NamedTuple):
     """x0 is given to the system"""
     limit: float | None
     """Seconds"""
+    tells: str | None = None
+    """What the system says of the probability of its disturbances: "log_prob" or "prob"; "maybe",
+    log p where it says a number; None: nothing that counts
+    """
 
 
 class Reply(NamedTuple):
@@ -63,6 +67,10 @@ class Reply(NamedTuple):
     """[n] float64; NaN where something went wrong"""
     terminal: np.ndarray
     """[n] bool"""
+    log_p: np.ndarray
+    """[n] float64: what the system said of the last disturbance; of the whole episode where
+    episodic; 0 where it said nothing
+    """
     seen: np.ndarray
     """[n, k] float64: what ``observe`` returned"""
     problems: list
@@ -147,17 +155,12 @@ class Runner:
         [n, >= t, ...].
         """
         n = len(t)
-        event, distance, terminal, seen = (
-            np.zeros(n, bool),
-            np.full(n, np.nan),
-            np.zeros(n, bool),
-            np.zeros((n, self.size)),
-        )
+        event, distance, terminal, log_p, seen = blank(n, self.size)
         problems, self.episodes, self.transitions, begin = [], 0, 0, time.perf_counter()
         one = self._episode if self.spec.episodic else self._standing
         for i in range(n):
             try:
-                event[i], distance[i], terminal[i], observed = one(
+                event[i], distance[i], terminal[i], log_p[i], observed = one(
                     int(t[i]), [np.array(a[i]) for a in x0], [np.array(a[i, : t[i]]) for a in xs]
                 )
                 if self.size:
@@ -171,6 +174,7 @@ class Runner:
             event,
             distance,
             terminal,
+            log_p,
             seen,
             problems,
             self.episodes,
@@ -208,54 +212,81 @@ class Runner:
             with self.alarm:
                 answer = self.system(fill(self.x, xs), *self._given(x0))
             self.transitions += t
-            if not isinstance(answer, tuple | list) or len(answer) != 2:
-                raise WrongAnswer(f"expected the pair (event, distance), received {_show(answer)}")
-            return _event(answer[0]), _distance(answer[1]), False, None
+            told = self.spec.tells in ("log_prob", "prob")
+            if not isinstance(answer, tuple | list) or len(answer) != 2 + told:
+                expected = ("the pair (event, distance)", "(p, event, distance)")[told]
+                raise WrongAnswer(f"expected {expected}, received {_show(answer)}")
+            log_p = self._log_p(answer[0], "p") if told else 0.0
+            return _event(answer[-2]), _distance(answer[-1]), False, log_p, None
         thing = self._fresh()
         with self.alarm:
             thing.initialize(*self._given(x0))
+            log_p = 0.0
             for k in range(t):
-                self.transitions += 1
-                thing.transition(fill(self.x, [a[k] for a in xs]))
-            _evaluate(thing)
-            outcome = _event(thing.is_event()), _distance(thing.miss_distance())
+                log_p += self._transition(thing, fill(self.x, [a[k] for a in xs]))
+            log_p, *outcome = self._outcome(thing, log_p, _evaluate(thing))
         self.spare.append(thing)
-        return *outcome, False, None
+        return *outcome, False, log_p, None
 
     def _standing(self, t, x0, xs):
         """Event, distance, terminal and observation of the object with this history, which is moved
         on from the last one where it is kept.
         """
+        log_p, answer = 0.0, None
         thing, at = self._taken(_history(x0, xs, t - 1)) if t else None, t - 1
         if thing is None:
             thing, at = self._fresh(), 0
             self.episodes += 1
             with self.alarm:
-                self._initialize(thing, x0)
+                answer = self._initialize(thing, x0)
         for k in range(at, t):
-            self.transitions += 1
             with self.alarm:
-                thing.transition(fill(self.x, [a[k] for a in xs]))
-                _evaluate(thing)
+                log_p = self._transition(thing, fill(self.x, [a[k] for a in xs]))
+                answer = _evaluate(thing)
         with self.alarm:
-            outcome = (
-                _event(thing.is_event()),
-                _distance(thing.miss_distance()),
-                hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal"),
-            )
+            log_p, *outcome = self._outcome(thing, log_p, answer)
+            ended = hasattr(thing, "is_terminal") and _event(thing.is_terminal(), "is_terminal")
             observed = _observed(thing.observe(), self.size) if self.size else None
-        if outcome[0] or outcome[2] or t >= self.spec.horizon:
+        if outcome[0] or ended or t >= self.spec.horizon:
             self.spare.append(thing)
         else:
             self.kept.setdefault(_history(x0, xs, t), []).append(thing)
             self.count += 1
             if self.count > KEPT:
                 self.spare.append(self._taken(next(iter(self.kept))))
-        return *outcome, observed
+        return *outcome, ended, log_p, observed
 
     def _initialize(self, thing, x0):
         thing.initialize(*self._given(x0))
-        _evaluate(thing)
+        return _evaluate(thing)
+
+    def _transition(self, thing, x):
+        """log p of one disturbance, by what ``transition`` returns."""
+        self.transitions += 1
+        return self._log_p(thing.transition(x), "transition")
+
+    def _outcome(self, thing, log_p, answer):
+        """log p, event and distance; ``answer``: what ``evaluate`` returned, whose (p, event,
+        distance) stand in place of the others.
+        """
+        if isinstance(answer, tuple | list) and len(answer) == 3:
+            return self._log_p(answer[0], "evaluate"), _event(answer[1]), _distance(answer[2])
+        return log_p, _event(thing.is_event()), _distance(thing.miss_distance())
+
+    def _log_p(self, value, name):
+        tells = self.spec.tells
+        if tells is None:
+            return 0.0
+        a = _array(value)
+        if a.shape != () or a.dtype.kind not in "fiu":
+            if tells == "maybe":
+                return 0.0
+            expected = "log p" if tells == "log_prob" else "p"
+            raise WrongAnswer(f"{name} must give {expected}, one number, received {_show(value)}")
+        if np.isnan(a) or a == np.inf or (tells == "prob" and a < 0):
+            raise NotANumber(f"{name} gives {a} as {'p' if tells == 'prob' else 'log p'}")
+        with np.errstate(divide="ignore"):
+            return float(np.log(a) if tells == "prob" else a)
 
     def _given(self, x0):
         return (fill(self.spec.x0, x0),) if self.spec.random else ()
@@ -306,9 +337,19 @@ def _history(x0, xs, t):
     return t, *(a.tobytes() for a in x0), *(a[:t].tobytes() for a in xs)
 
 
+def blank(n, size):
+    """Event, distance, terminal, log p and observation of n rows that have no answer yet."""
+    return (
+        np.zeros(n, bool),
+        np.full(n, np.nan),
+        np.zeros(n, bool),
+        np.zeros(n),
+        np.zeros((n, size)),
+    )
+
+
 def _evaluate(thing):
-    if hasattr(thing, "evaluate"):
-        thing.evaluate()
+    return thing.evaluate() if hasattr(thing, "evaluate") else None
 
 
 def _event(value, name="event"):

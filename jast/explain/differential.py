@@ -103,7 +103,7 @@ def _shapes(like):
 
 def _arrived(sim, state, t):
     """(failed, over, miss distance) of one system at ``state`` after ``t`` steps."""
-    event, distance = sim.evaluate(state)
+    event, distance, *_ = sim.evaluate(state)
     over = sim.is_terminal(state) | (t >= sim.horizon)
     if sim.episodic:
         event, distance = event & over, jnp.where(over, distance, jnp.inf)

@@ -33,6 +33,9 @@ class Monitored(NamedTuple):
     """The greatest that the trace's robustness can still come to; at the trace's end, the
     robustness. Infinite where all is open yet.
     """
+    told: Any = ()
+    """``(log p,)`` of the trace so far, where the system's ``evaluate`` tells log p; else ``()``.
+    """
 
 
 @jax.tree_util.register_dataclass
@@ -118,7 +121,8 @@ def under(
     if _open_at_first(watch, shapes[0].dtype):
         end = Partial(_over, watch)
         return Simulator(evaluate=_evaluate, is_terminal=end, episodic=True, **watched)
-    return Simulator(evaluate=_evaluate, is_terminal=Partial(_ended, watch), **watched)
+    evaluate = Partial(_evaluate_step, watch)
+    return Simulator(evaluate=evaluate, is_terminal=Partial(_ended, watch), **watched)
 
 
 def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> Any:
@@ -155,22 +159,32 @@ def _init(watch: _Watch, x0: Any) -> Monitored:
     rows = jax.tree.map(lambda a: a[-1:], _rows(watch, state))
     given = margins("under", watch.formula, rows)
     memory = monitor.begin(watch.formula, watch.dt, watch.total, given[0].dtype)
-    return _pushed(watch, state, jnp.zeros((), jnp.int32), memory, given)
+    start = jnp.zeros((), jnp.int32)
+    return _pushed(watch, state, start, memory, given, _told(watch, state))
 
 
 def _step(watch: _Watch, s: Monitored, x: Any) -> Monitored:
     state = watch.sim.step(s.state, x)
     given = margins("under", watch.formula, _rows(watch, state))
-    return _pushed(watch, state, s.samples, s.memory, given)
+    told = tuple(a + b for a, b in zip(s.told, _told(watch, state), strict=True))
+    return _pushed(watch, state, s.samples, s.memory, given, told)
 
 
-def _pushed(watch: _Watch, state: Any, samples: Any, memory: Any, given: Any) -> Monitored:
+def _told(watch: _Watch, state: Any) -> tuple[jax.Array, ...]:
+    """What the system's ``evaluate`` tells of log p; an episodic one is not asked."""
+    told = () if watch.sim.episodic else watch.sim.evaluate(state)[2:]
+    return tuple(jnp.asarray(p) for p in told)
+
+
+def _pushed(
+    watch: _Watch, state: Any, samples: Any, memory: Any, given: Any, told: Any
+) -> Monitored:
     after = samples + len(given[0])
     unknown = (after < watch.total) & ~jnp.asarray(watch.sim.is_terminal(state))
     memory, bound = monitor.push(
         watch.formula, memory, given, samples, unknown, watch.dt, watch.total
     )
-    return Monitored(state, after, memory, bound)
+    return Monitored(state, after, memory, bound, told)
 
 
 def _rows(watch: _Watch, state: Any) -> Any:
@@ -187,10 +201,14 @@ def _observe(watch: _Watch, s: Monitored) -> Any:
     return watch.sim.observe(s.state)
 
 
-def _evaluate(s: Monitored) -> tuple[jax.Array, jax.Array]:
+def _evaluate_step(watch: _Watch, s: Monitored) -> tuple[jax.Array, ...]:
+    return (*_evaluate(s)[:2], *_told(watch, s.state))
+
+
+def _evaluate(s: Monitored) -> tuple[jax.Array, ...]:
     # infinite only where all is open yet, or was at an early end: finite, and sums of it are, too
     most = float(jnp.finfo(s.robustness.dtype).max) ** 0.5
-    return s.robustness < 0, jnp.clip(s.robustness, 0, most)
+    return s.robustness < 0, jnp.clip(s.robustness, 0, most), *s.told
 
 
 def _ended(watch: _Watch, s: Monitored) -> Any:
