@@ -79,9 +79,13 @@ SHAPES = {  # found by tracing
     "evaluate raises": (dict(evaluate=explode), r"evaluate: raised RuntimeError"),
     "evaluate is no pair": (
         dict(evaluate=lambda s: s >= 5),
-        r"evaluate: expected a pair \(event, distance\), received bool\[\]",
+        r"evaluate: expected a pair \(event, distance\), or .*, received bool\[\]",
     ),
-    "evaluate is a triple": (dict(evaluate=lambda s: (s >= 5, s, s)), r"evaluate: expected a pair"),
+    "evaluate has four": (dict(evaluate=lambda s: (s >= 5, s, s, s)), r"expected a pair"),
+    "log p is no float": (
+        dict(evaluate=lambda s: (s >= 5, s, s >= 5)),
+        r"evaluate: log p has dtype bool",
+    ),
     "event is a vector": (
         dict(evaluate=lambda s: (jnp.stack([s, s]) >= 5, s)),
         r"evaluate: event has shape \(2,\), expected \(\)",
