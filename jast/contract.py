@@ -17,6 +17,7 @@ from jast import distributions as D
 from jast._jax import is_traced, is_tracing
 from jast.actions import Quantiles, Samples, UniformBox, Wide
 from jast.incidents import incidents, since, sources
+from jast.memory import release
 from jast.outline import outline
 from jast.rounding import rounded
 from jast.simulator import Simulator
@@ -91,6 +92,7 @@ def contract(sim, actions=None, observed=True):
     for name in ("start", "init", "disturbance", "evaluate", "is_terminal", "observe", "step"):
         if not callable(getattr(sim, name)):
             raise ValueError(f"{name}: expected a function, received {getattr(sim, name)!r}")
+    release()  # here, as whatever compiles much for a simulator comes by first
     jax.eval_shape(lambda: _trace(sim, actions, observed))
     return sim
 

@@ -20,6 +20,7 @@ from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
+from jast.memory import require_episodes
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -77,6 +78,7 @@ def failure_samples(key, sim, source, samples=1000, *, moves=20):
             f"{name}: source must hold a proposal, received one of {source.method} without one"
         )
     n = PER_SAMPLE * samples
+    require_episodes(name, sim, n)
     if isinstance(q, latent.Latent):
         if (received := q.means.shape[1]) != latent.dimension(sim):
             raise ValueError(

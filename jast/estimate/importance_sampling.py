@@ -25,6 +25,7 @@ from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
+from jast.memory import require_episodes
 from jast.outline import outline
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
@@ -69,13 +70,10 @@ def log_weights(key, sim, proposal, samples, *, mode="default"):
     random_key("log_weights", key)
     if mode not in ("default", "paper"):
         raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
-    return traces(
-        key,
-        sim,
-        as_proposal("log_weights", sim, proposal),
-        whole("log_weights", "samples", samples),
-        mode == "paper",
-    )
+    q = as_proposal("log_weights", sim, proposal)
+    samples = whole("log_weights", "samples", samples)
+    require_episodes("log_weights", sim, samples)
+    return traces(key, sim, q, samples, mode == "paper")
 
 
 def importance(

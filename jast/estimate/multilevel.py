@@ -20,6 +20,7 @@ from jast._checks import random_key, real, whole
 from jast.contract import contract
 from jast.cross_entropy import sequences
 from jast.episode import rollout
+from jast.memory import require_episodes
 from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.simulator import Simulator
@@ -118,6 +119,7 @@ def failure_proposal(
         real("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
     )
     contract(sim, observed=False)
+    require_episodes("failure_proposal", sim, samples)
     return _search(key, sim, settings, _tilts_start(sim), samples, iterations)
 
 

@@ -11,6 +11,7 @@ from jast._checks import random_key, whole
 from jast.estimate.estimate import Estimate
 from jast.estimate.populations import LAST, QUANTILE, Explored, explore
 from jast.intervals import checked_level, log_normal
+from jast.memory import require_episodes
 from jast.results import asked
 from jast.simulator import Simulator
 
@@ -38,6 +39,7 @@ def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
     )
     level = checked_level(name, level)
     latent.check(name, sim)
+    require_episodes(name, sim, samples)
     runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
     settings = asked(name, key, samples=samples, replicates=replicates, level=level)
     return of_populations(name, runs, samples, level)._replace(settings=settings)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from jast._checks import random_key, whole
 from jast.contract import contract
+from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
 from jast.policies import training as T
@@ -153,6 +154,9 @@ def sac(
     acts = plan.nominal + plan.around + int(ALONE * plan.learning)
     phase = T.Phase(jnp.int32(0), jnp.int32(acts), jnp.float32(plan.total))
     begin = lambda: T.first(for_first, sim, shape, rates.alpha)
+    like = jax.eval_shape(begin)
+    kept = f"a buffer of {shape.capacity} steps and the networks"
+    require("sac", 2 * size(like), kept, "use a smaller buffer")
     run = lambda updates: (
         lambda training, steps: jax.block_until_ready(
             T.stretch(
@@ -168,7 +172,7 @@ def sac(
         )
     )
     book = Book("sac", checkpoint, sim, known)
-    training, rows = book.resume(jax.eval_shape(begin)) or course.look(
+    training, rows = book.resume(like) or course.look(
         begin(), run(0), plan, sim.horizon, scale, widen
     )
     training, rows = course.learn(

@@ -20,6 +20,7 @@ from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode
 from jast.incidents import hosted, incidents, since
+from jast.memory import require_episodes
 from jast.outline import outline
 from jast.search import lockstep as E
 from jast.search import proposals as P
@@ -127,6 +128,7 @@ def cem(
     share = lambda name, value: _checks.real(
         "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
     )
+    require_episodes("cem", sim, samples * trees)
     real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
     actions = default_actions(sim) if actions is None else actions
     before = incidents(sim)

@@ -12,6 +12,7 @@ from jax import lax
 from jast import actions as choices
 from jast.counter import tree_keys
 from jast.incidents import hosted, incidents, since
+from jast.memory import require
 from jast.outline import outline
 from jast.search import lockstep as E
 from jast.search.ending import ended, planned, usual
@@ -96,6 +97,11 @@ def monte_carlo(
         found, counted = _chunk(key, sim, reward, actions, _nothing(sim, 1), 0, episodes, lanes)
         best = jax.tree.map(lambda a: a[0], _rebuild(key, sim, reward, actions, found.number[None]))
         return E.finish_traced(sim, reward, counted, best, found.reward[None])
+
+    if record:
+        row = 3 * outline(sim).dtype.itemsize + 2  # three numbers and two bools
+        records = f"the records of {episodes} episodes"
+        require("monte_carlo", 2 * episodes * row, records, "use fewer, or record=False")
 
     def chunk(found, begin, end):
         if record:

@@ -26,7 +26,7 @@ from jast.search.result import SearchResult
 from jast.search.tree.guide import guide
 from jast.search.tree.harvest import result, traced_result
 from jast.search.tree.layout import Problem, levels, pages_of
-from jast.search.tree.memory import LANES, fit
+from jast.search.tree.memory import LANES, fit, keep
 from jast.search.tree.run import Harvest, Plan, grow_all, grow_traced
 from jast.search.tree.settings import problem_of
 from jast.watch import Watch
@@ -110,11 +110,12 @@ def grow_trees(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
     )
     job = job._replace(plan=fitted)
+    total = trees * job.plan.prunes * simulations
+    keep(method, sim, total, bool(record))
     job.settings.update(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.school is not None:
         job.settings.update(_of_heads(heads, job))
     settings = job.settings
-    total = trees * job.plan.prunes * simulations
     with Watch(method, total, "sim", progress, callback) as watch:
         harvests, school, interrupted = grow_rounds(job, key, threads, lanes, top, watch.more)
     if interrupted:

@@ -2,48 +2,19 @@
 
 import os
 import warnings
+from typing import Any
 
 import jax
 
+from jast.memory import available, readable, require
+from jast.outline import outline
 from jast.search.tree.layout import Problem, most_lanes, pages_of
 from jast.search.tree.run import Plan, bytes_per_tree
 
-__all__ = ["LANES", "available", "fit", "readable"]
+__all__ = ["LANES", "fit", "keep"]
 
 # in one thread: enough to fill vector units, few enough to stay near the processor
 LANES = 128
-
-
-def available() -> int | None:
-    """Bytes that are free now: of the default accelerator, or of the machine where that is a CPU;
-    None where the system does not tell.
-    """
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        stats = device.memory_stats() or {}
-        return (
-            stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
-        )
-    try:
-        with open("/proc/meminfo") as f:
-            return next(
-                int(line.split()[1]) * 1024 for line in f if line.startswith("MemAvailable")
-            )
-    except (OSError, StopIteration):
-        pass
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return None
-
-
-def readable(n: float) -> str:
-    """``n`` bytes for people."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if n < 1000:
-            return f"{n:.3g} {unit}"
-        n /= 1000
-    return f"{n:.3g} TB"
 
 
 def fit(
@@ -108,6 +79,14 @@ def fit(
             stacklevel=4,
         )
     return plan, threads, max(1, min(lanes, within))
+
+
+def keep(method: str, sim: Any, simulations: int, record: bool) -> None:
+    """ValueError where what is kept of all ``simulations`` does not fit, with the numbers."""
+    real = outline(sim).dtype.itemsize
+    # rewards and outcomes as harvested and joined, and the rewards of those that ran
+    row = 3 * real + 2 + (4 * real if record else 0)
+    require(method, simulations * row, f"the rewards of {simulations} simulations", "use fewer")
 
 
 def _cores() -> int:

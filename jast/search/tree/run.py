@@ -17,6 +17,7 @@ from jast._jax import custom_vmap
 from jast._threads import handed_on
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
+from jast.memory import size
 from jast.search.tree import simulate
 from jast.search.tree.edges import branches_of, edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
@@ -113,7 +114,7 @@ def bytes_per_tree(problem, plan):
         p, _shared(p), keys, simulations, plan.memoize, plan.pages, plan.record
     )
     tree = jax.eval_shape(build, problem, tree_keys(jax.random.key(0), 2))
-    return sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree)) // 2
+    return size(tree) // 2
 
 
 def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk, first=0):
