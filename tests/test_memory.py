@@ -64,8 +64,8 @@ def test_thirty_calls_with_fresh_simulators_do_not_grow(monkeypatch):
     """At most what one call makes beyond the limit, as a call begins with the look."""
 
     def work(key, sim):
-        jast.estimate.failure_probability(key, sim, 5000)
-        jast.search.forest(key, sim, trees=4, prunes=2, simulations=50)
+        jast.nominal(key, sim, 16)
+        jast.search.monte_carlo(key, sim, episodes=100, refine=0)
 
     seen, _ = met(1, monkeypatch, work, 10**6)
     one = seen[0] + 10**6
