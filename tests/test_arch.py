@@ -1,4 +1,9 @@
-"""jast.simulators.arch: the models against closed forms and an integrator with events."""
+"""jast.simulators.arch: the models against closed forms, integrators with events and published
+falsifying inputs.
+"""
+
+import csv
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +12,13 @@ import pytest
 
 import jast
 from jast.distributions import Beta, Independent
-from jast.simulators.arch import SPECIFICATIONS, chasing_cars, simulate
+from jast.simulators.arch import (
+    SPECIFICATIONS,
+    automatic_transmission,
+    chasing_cars,
+    simulate,
+    transmission,
+)
 from jast.specs import always, parts, predicate, robustness, trace_of
 
 CORNERS = np.random.default_rng(2).integers(0, 2, (20, 2)).astype(float)
@@ -141,12 +152,107 @@ def test_as_many_fail_as_in_another_transcription(key):
     assert abs(found - share) < 4 * np.sqrt(share * (1 - share) * (1 / n + 1 / 20_000))
 
 
+def test_published_inputs_falsify():
+    """FalCAuN's (MasWag/FalCAuN-ARCH-COMP, MIT licence). Its version of 2023 reads the outputs
+    where inputs change; its three signals for CC3 that end at 20 s do not falsify.
+    """
+    lines = (Path(__file__).parent / "arch_published.csv").read_text().splitlines()
+    kept = 0
+    for row in csv.DictReader(lines):
+        name, text = row["requirement"], row["times throttle brake"]
+        points = np.array([p.split() for p in text.split(";")], float)
+        model = "chasing cars" if name.startswith("CC") else "automatic transmission"
+        way = "linear" if name == "CC4" else "step"
+        trace, dt = simulate(model, points[:, 0], points[:, 1:], interpolation=way)
+        if name.startswith("AT6") and row["year"] == "2023":
+            dt, every = points[1, 0], round(points[1, 0] / dt)
+            trace = jax.tree.map(lambda a, n=every: a[::n], trace)
+        kept += float(robustness(SPECIFICATIONS[name], trace, dt)) >= 0
+    assert kept == 3
+
+
+def shifted(inputs, until):
+    """Engine and vehicle speed each 0.02 s by an integrator, stopped each 0.04 s for the logic."""
+    from scipy.integrate import solve_ivp
+
+    T = transmission
+
+    def at(table, place):
+        row = int(np.clip(np.floor(place), 0, len(table) - 2))
+        return table[row] + (place - row) * (table[row + 1] - table[row])
+
+    now, gear, wish, waited, out = np.array([1000.0, 0.0]), 0, 0, 0, []
+    for tick in range(round(until / 0.04)):
+        throttle, brake = inputs[int(tick * 0.04 / 5 + 1e-9)]
+        v, waited = 2 * np.pi * 60 / 5280 * now[1], waited + 1
+        up, down = at(T.UP, throttle / 5)[gear], at(T.DOWN, throttle / 5)[gear]
+        if wish == 0:
+            wish, waited = int(v > up) - int(v < down), 0
+        elif (v >= up if wish > 0 else v <= down) and waited >= 2:
+            gear, wish = gear + wish, 0
+        elif v < up if wish > 0 else v > down:
+            wish = 0
+
+        def slope(_, s, ratio=T.GEARS[gear], throttle=throttle, brake=brake):
+            v = 2 * np.pi * 60 / 5280 * s[1]
+            capacity, gain = at(T.CONVERTER, 100 * 3.23 * ratio * s[1] / s[0])
+            impeller = (s[0] / capacity) ** 2
+            rise = at(at(T.TORQUE, throttle / 10), s[0] / 400 - 2) - impeller
+            load = (40 + 0.02 * v**2 + brake) * np.sign(v)
+            return rise / 0.0219914882836, (3.23 * ratio * impeller * gain - load) / 12.0941478573
+
+        grid = np.array([0.02, 0.04])
+        found = solve_ivp(slope, (0, 0.04), now, t_eval=grid, rtol=1e-7, atol=1e-6, max_step=0.004)
+        now = found.y[:, -1]
+        out += [(rpm, 2 * np.pi * 60 / 5280 * w, gear + 1) for rpm, w in found.y.T]
+    return np.array(out)
+
+
+def test_the_transmission_is_what_its_equations_say(x64):
+    """Up to the third gear, and down again when full throttle asks for it."""
+    inputs = np.array([[50.0, 0.0], [100.0, 0.0], [10.0, 200.0]])
+    until = 12
+    expected = shifted(inputs, until)
+    trace, _ = simulate("automatic transmission", [0.0, 5.0, 10.0], inputs)
+    n = 1 + len(expected)
+    np.testing.assert_array_equal(np.asarray(trace.gear)[1:n], expected[:, 2])
+    assert set(np.diff(expected[:, 2])) == {-1, 0, 1}
+    np.testing.assert_allclose(np.asarray(trace.rpm)[1:n], expected[:, 0], atol=1)
+    np.testing.assert_allclose(np.asarray(trace.speed)[1:n], expected[:, 1], atol=0.01)
+
+
+def test_a_transmission_under_its_requirement(key):
+    sim = automatic_transmission("AT6abc")
+    assert sim.horizon == 10
+    for inputs in ([[30.0, 0.0]] * 10, [[45.0, 0.0]] + [[30.0, 100.0]] * 9, [[100.0, 0.0]] * 10):
+        trace, dt = simulate("automatic transmission", 5.0 * np.arange(10), inputs)
+        whole = float(robustness(SPECIFICATIONS["AT6abc"], trace, dt))
+        e = jast.replay(sim, jnp.asarray(inputs))
+        assert bool(e.failure) == (whole < 0) and int(e.length) <= 7
+        assert float(e.distance) == pytest.approx(max(whole, 0), rel=1e-3)
+
+
+def test_equal_settings_compile_once():
+    @jax.jit
+    def traced(sim):
+        calls.append(0)
+        return sim.init(())
+
+    calls = []
+    for _ in range(2):
+        traced(chasing_cars("CCx"))
+        traced(automatic_transmission("AT6c"))
+    assert len(calls) == 2
+
+
 @pytest.mark.parametrize(
     "call, said",
     [
         (lambda: chasing_cars("CC9"), "chasing_cars: requirement"),
         (lambda: chasing_cars("CC1", 7), "chasing_cars: segments must divide 2000"),
         (lambda: chasing_cars("CC1", 0), "chasing_cars: segments"),
+        (lambda: automatic_transmission("CC1"), "automatic_transmission: requirement"),
+        (lambda: automatic_transmission("AT1", 3), "automatic_transmission: segments must divide"),
         (lambda: simulate("cars", [0], [[0, 0]]), "simulate: model"),
         (lambda: simulate("chasing cars", [1.0], [[0, 0]]), "simulate: times"),
         (lambda: simulate("chasing cars", [0, np.inf], [[0, 0]] * 2), "simulate: times"),

@@ -6,8 +6,16 @@ failing counts; with a density of yours, also how likely a failure is.
 
 from jast._doors import listed
 from jast.simulators.arch.cars import Cars
-from jast.simulators.arch.models import chasing_cars, simulate
+from jast.simulators.arch.models import automatic_transmission, chasing_cars, simulate
 from jast.simulators.arch.specifications import SPECIFICATIONS
+from jast.simulators.arch.transmission import Transmission
 
-__all__ = ["Cars", "SPECIFICATIONS", "chasing_cars", "simulate"]
+__all__ = [
+    "Cars",
+    "SPECIFICATIONS",
+    "Transmission",
+    "automatic_transmission",
+    "chasing_cars",
+    "simulate",
+]
 __dir__ = listed(__all__)

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-__all__ = ["DT", "DURATION", "INPUTS", "Cars", "drive", "parked"]
+__all__ = ["DT", "DURATION", "INPUTS", "Cars", "drive", "observe", "start"]
 
 DT = 0.05
 """Seconds between samples."""
@@ -70,7 +70,7 @@ class _Path(NamedTuple):
     """m, up to the switch"""
 
 
-def parked() -> Cars:
+def start() -> Cars:
     """The cars at 0 s."""
     zero = jnp.zeros(())
     return Cars(jnp.full(4, 10.0), jnp.zeros(5), jnp.zeros(4, jnp.int32), zero)
@@ -98,6 +98,11 @@ def drive(cars: Cars, inputs: jax.Array) -> tuple[Cars, Cars]:
     stack = lambda columns: jnp.stack(columns, axis=-1)
     samples = Cars(stack(gaps), stack(speeds), stack(modes), first)
     return jax.tree.map(lambda a: a[-1], samples), samples
+
+
+def observe(cars: Cars) -> tuple[Any, ...]:
+    """What policies see of the cars."""
+    return cars.gaps, cars.speeds, cars.modes
 
 
 def _led(cars: Cars, inputs: jax.Array) -> tuple[_Path, tuple[Any, Any]]:

@@ -1,28 +1,34 @@
 """The models of the category: run on published inputs, or a `Simulator` under a requirement."""
 
-from functools import partial
+import math
+from functools import cache
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from jast._checks import whole
 from jast.distributions import Independent, Uniform
 from jast.simulator import Simulator
-from jast.simulators.arch import cars
+from jast.simulators.arch import cars, transmission
 from jast.simulators.arch.specifications import SPECIFICATIONS
 from jast.specs import Formula, under
+from jast.specs.robustness import reach
 
-__all__ = ["chasing_cars", "simulate"]
+__all__ = ["automatic_transmission", "chasing_cars", "simulate"]
+
+MODELS = {"chasing cars": cars, "automatic transmission": transmission}
 
 
 class Driving(NamedTuple):
-    """State of `chasing_cars`."""
+    """State of a model that inputs drive, segment by segment."""
 
-    cars: cars.Cars
-    """Now"""
-    samples: cars.Cars
+    now: Any
+    """`Cars` or `Transmission`"""
+    samples: Any
     """[k, ...]: during the last step, the last of them now"""
     step: Any
     """int32"""
@@ -36,7 +42,8 @@ def chasing_cars(
 
     A step is 100 / ``segments`` seconds in which throttle and brake are constant: instance 2 of the
     category has 20 segments. Samples are 0.05 s apart. A failure violates the requirement; the miss
-    distance is the robustness in metres (`jast.specs.under`).
+    distance is the robustness in metres (`jast.specs.under`). What comes after the requirement's
+    last window decides nothing: an episode ends there.
 
     Args:
         requirement: a name in `SPECIFICATIONS` ("CC1", .. "CC5", "CC4-20", "CCx"), or a formula of
@@ -52,80 +59,91 @@ def chasing_cars(
     Raises:
         ValueError: for an unknown name and a number of segments that does not divide the samples.
     """
-    segments = whole("chasing_cars", "segments", segments)
-    total = round(cars.DURATION / cars.DT)
-    if total % segments:
-        raise ValueError(
-            f"chasing_cars: segments must divide {total}, the samples of a run, received {segments}"
-        )
-    formula = requirement
-    if not isinstance(formula, Formula):
-        names = [name for name in SPECIFICATIONS if name.startswith("CC")]
-        if formula not in names:
-            raise ValueError(
-                f"chasing_cars: requirement must be a formula or one of {names}, received"
-                f" {requirement!r}"
-            )
-        formula = SPECIFICATIONS[formula]
-    each = total // segments
-    uniform = Independent(Uniform(jnp.zeros(2), jnp.ones(2)), 1)
-    given = uniform if disturbance is None else disturbance
-    driving = Simulator(
-        init=partial(_init, each),
-        step=_step,
-        disturbance=lambda state: given,
-        evaluate=_nothing,
-        horizon=segments,
-        observe=_observe,
-    )
-    return under(driving, formula, cars.DT, samples=_samples)
+    return _driven("chasing_cars", cars, "CC", requirement, segments, disturbance)
 
 
-def simulate(
-    model: str, times: Any, inputs: Any, interpolation: str = "step"
-) -> tuple[cars.Cars, float]:
+def automatic_transmission(
+    requirement: str | Formula = "AT1", segments: int = 10, disturbance: Any = None
+) -> Simulator:
+    """A car with an automatic transmission (`jast.simulators.arch.transmission` has the equations
+    and published results) under a requirement.
+
+    A step is 50 / ``segments`` seconds in which throttle and brake are constant: instance 2 of the
+    category has 10 segments. Samples are 0.02 s apart. A failure violates the requirement; the miss
+    distance is the robustness, in the unit of the requirement: mph, rpm or gears
+    (`jast.specs.under`). What comes after the requirement's last window decides nothing: an episode
+    ends there.
+
+    Args:
+        requirement: a name in `SPECIFICATIONS` ("AT1", "AT2", "AT51" .. "AT54", "AT6a", "AT6b",
+            "AT6c", "AT6abc"), or a formula of `Transmission`.
+        segments: steps of an episode; a divisor of 2500.
+        disturbance: p(throttle, brake) [2], a distribution of `jast.distributions`; what is outside
+            of [0, 100] and [0, 325] is clipped. None: uniform, so that log p of all episodes of a
+            length is the same.
+
+    Returns:
+        `jast.Simulator`.
+
+    Raises:
+        ValueError: for an unknown name and a number of segments that does not divide the samples.
+    """
+    return _driven("automatic_transmission", transmission, "AT", requirement, segments, disturbance)
+
+
+def simulate(model: str, times: Any, inputs: Any, interpolation: str = "step") -> tuple[Any, float]:
     """A model's trace under given inputs, such as published ones.
 
     Args:
-        model: "chasing cars".
+        model: "chasing cars" or "automatic transmission".
         times: [n] seconds, rising from 0.
-        inputs: [n, 2]: throttle and brake at these times, in [0, 1].
+        inputs: [n, 2]: throttle and brake at these times, in their ranges: [0, 1] both; [0, 100]
+            and [0, 325] of the transmission.
         interpolation: "step": each holds up to the next time, and the last to the end; "linear":
             straight between times, and the last holds to the end.
 
     Returns:
-        (`Cars` [2001, ...], 0.05): samples of 100 s, and the seconds between them.
+        (`Cars` [2001, ...], 0.05) or (`Transmission` [2501], 0.02): samples of 100 or 50 s, and the
+        seconds between them.
 
     Raises:
         ValueError: for another model, times that do not rise from 0, inputs out of their range or
             of another shape, another interpolation.
     """
-    if model != "chasing cars":
-        raise ValueError(f'simulate: model must be "chasing cars", received {model!r}')
+    if model not in MODELS:
+        raise ValueError(f"simulate: model must be one of {list(MODELS)}, received {model!r}")
+    of = MODELS[model]
     times, inputs = np.asarray(times, np.float64), np.asarray(inputs, np.float64)
     rising = times.ndim == 1 and len(times) and times[0] == 0 and np.isfinite(times).all()
     if not (rising and (np.diff(times) > 0).all()):
         raise ValueError(f"simulate: times must rise from 0, received {times}")
-    if inputs.shape != (len(times), len(cars.INPUTS)):
+    if inputs.shape != (len(times), len(of.INPUTS)):
         raise ValueError(
             f"simulate: inputs must have the shape {(len(times), 2)}, received {inputs.shape}"
         )
-    for (name, low, high), column in zip(cars.INPUTS, inputs.T, strict=True):
+    for (name, low, high), column in zip(of.INPUTS, inputs.T, strict=True):
         if not ((low <= column) & (column <= high)).all():
             raise ValueError(f"simulate: inputs: {name} must be in [{low:g}, {high:g}]")
     if interpolation not in ("step", "linear"):
         raise ValueError(
             f'simulate: interpolation must be "step" or "linear", received {interpolation!r}'
         )
-    driven = _means(times, inputs, interpolation, round(cars.DURATION / cars.DT))
-    start = cars.parked()
-    _, after = jax.jit(cars.drive)(start, jnp.asarray(driven, start.first.dtype))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, after), cars.DT
+    driven = _means(times, inputs, interpolation, of.DT, round(of.DURATION / of.DT))
+    start = of.start()
+    _, after = _drive(of)(start, jnp.asarray(driven, jnp.zeros(()).dtype))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, after), of.DT
 
 
-def _means(times: np.ndarray, inputs: np.ndarray, interpolation: str, total: int) -> np.ndarray:
+@cache
+def _drive(model: ModuleType) -> Any:
+    return jax.jit(model.drive)
+
+
+def _means(
+    times: np.ndarray, inputs: np.ndarray, interpolation: str, dt: float, total: int
+) -> np.ndarray:
     """The mean of a signal over each sample's time, [total, inputs]: by its integral."""
-    edges = cars.DT * np.arange(total + 1)
+    edges = dt * np.arange(total + 1)
     knots = np.append(times, max(edges[-1], times[-1]) + 1)
     left = inputs
     right = inputs if interpolation == "step" else np.append(inputs[1:], inputs[-1:], axis=0)
@@ -135,31 +153,78 @@ def _means(times: np.ndarray, inputs: np.ndarray, interpolation: str, total: int
     into = (edges - knots[k])[:, None]
     slope = (right - left) / np.diff(knots)[:, None]
     integral = whole_parts[k] + left[k] * into + slope[k] * into**2 / 2
-    return np.diff(integral, axis=0) / cars.DT
+    return np.diff(integral, axis=0) / dt
 
 
-def _init(each: int, x0: Any) -> Driving:
-    start = cars.parked()
-    samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), start)
-    return Driving(start, samples, jnp.zeros((), jnp.int32))
+def _driven(
+    function: str,
+    model: ModuleType,
+    prefix: str,
+    requirement: str | Formula,
+    segments: int,
+    disturbance: Any,
+) -> Simulator:
+    """A model under a requirement."""
+    segments, total = whole(function, "segments", segments), round(model.DURATION / model.DT)
+    if total % segments:
+        raise ValueError(
+            f"{function}: segments must divide {total}, the samples of a run, received {segments}"
+        )
+    formula = requirement
+    if not isinstance(formula, Formula):
+        names = [name for name in SPECIFICATIONS if name.startswith(prefix)]
+        if formula not in names:
+            raise ValueError(
+                f"{function}: requirement must be a formula or one of {names}, received"
+                f" {requirement!r}"
+            )
+        formula = SPECIFICATIONS[formula]
+    each = total // segments
+    needed = min(reach(formula, model.DT), total)
+    low, high = (jnp.array([i[side] for i in model.INPUTS], jnp.zeros(()).dtype) for side in (1, 2))
+    given = Independent(Uniform(low, high), 1) if disturbance is None else disturbance
+    functions, samples = _functions(model, each, math.ceil(needed / each))
+    driving = Simulator(**functions, disturbance=Partial(_given, given), horizon=segments)
+    return under(driving, formula, model.DT, samples=samples)
 
 
-def _step(state: Driving, x: Any) -> Driving:
-    each = state.samples.first.shape[0]
-    inputs = jnp.broadcast_to(jnp.clip(x, 0, 1).astype(state.cars.first.dtype), (each, 2))
-    return Driving(*cars.drive(state.cars, inputs), state.step + 1)
+@cache
+def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any], Any]:
+    """The functions of a simulator whose steps are ``each`` samples of a model, ``needed`` of them,
+    and what says its samples: the same objects for the same numbers, so that nothing compiles anew.
+    """
+
+    def init(x0: Any) -> Driving:
+        start = model.start()
+        samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), start)
+        return Driving(start, samples, jnp.zeros((), jnp.int32))
+
+    def step(state: Driving, x: Any) -> Driving:
+        ranges = [jnp.array([i[side] for i in model.INPUTS]) for side in (1, 2)]
+        inputs = jnp.broadcast_to(jnp.clip(x, *ranges).astype(jnp.zeros(()).dtype), (each, 2))
+        return Driving(*model.drive(state.now, inputs), state.step + 1)
+
+    def is_terminal(state: Driving) -> Any:
+        return state.step >= needed
+
+    def observe(state: Driving) -> Any:
+        dtype = jnp.zeros(()).dtype
+        parts = *model.observe(state.now), state.step[None]
+        return jnp.concatenate([part.astype(dtype) for part in parts])
+
+    functions = dict(
+        init=init, step=step, evaluate=_nothing, is_terminal=is_terminal, observe=observe
+    )
+    return functions, Partial(_samples)
 
 
-def _samples(state: Driving) -> cars.Cars:
+def _given(distribution: Any, state: Driving) -> Any:
+    return distribution
+
+
+def _samples(state: Driving) -> Any:
     return state.samples
 
 
 def _nothing(state: Driving) -> tuple[Any, Any]:
-    return jnp.zeros((), bool), jnp.zeros_like(state.cars.first)
-
-
-def _observe(state: Driving) -> Any:
-    now = state.cars
-    dtype = now.first.dtype
-    parts = now.gaps, now.speeds, now.modes.astype(dtype), state.step.astype(dtype)[None]
-    return jnp.concatenate(parts)
+    return jnp.zeros((), bool), jnp.zeros(())

@@ -2,11 +2,14 @@
 
 CC4's inner window differs between tools: 5 s in FalStar and the report of 2024 ("CC4"), 20 s in
 stgem and FReaK ("CC4-20", which asks for 115 s of 100: windows are clipped at the end). CC3 has the
-inequality of the category's reports.
+inequality of the category's reports. AT1 to AT6c as in the reports of 2019 to 2024; AT6abc is all
+three of AT6. The robustness of "in gear i" is half a gear where it holds.
 """
 
 from collections.abc import Mapping
 from types import MappingProxyType
+
+import jax.numpy as jnp
 
 from jast.specs import Formula, always, eventually, implies, predicate
 
@@ -32,6 +35,25 @@ def _ccx() -> Formula:
     return apart[0] & apart[1] & apart[2] & apart[3]
 
 
+def _slower(mph: float) -> Formula:
+    return predicate(lambda s: mph - s.speed, f"v < {mph:g}")
+
+
+def _calmer(rpm: float) -> Formula:
+    return predicate(lambda s: rpm - s.rpm, f"omega < {rpm:g}")
+
+
+def _at5(i: int) -> Formula:
+    """Who shifts into gear i stays in it."""
+    in_gear = predicate(lambda s: 0.5 - jnp.abs(s.gear - i).astype(s.rpm.dtype), f"gear = {i}")
+    shifts = ~in_gear & eventually(in_gear, 0.001, 0.1)
+    return always(implies(shifts, eventually(always(in_gear, 0, 2.5), 0.001, 0.1)), 0, 30)
+
+
+def _at6(mph: float, until: float) -> Formula:
+    return implies(always(_calmer(3000), 0, 30), always(_slower(mph), 0, until))
+
+
 SPECIFICATIONS: Mapping[str, Formula] = MappingProxyType(
     {
         "CC1": always(_narrower(3, 40.0), 0, 100),
@@ -47,6 +69,13 @@ SPECIFICATIONS: Mapping[str, Formula] = MappingProxyType(
             72,
         ),
         "CCx": _ccx(),
+        "AT1": always(_slower(120), 0, 20),
+        "AT2": always(_calmer(4750), 0, 10),
+        **{f"AT5{i}": _at5(i) for i in (1, 2, 3, 4)},
+        "AT6a": _at6(35, 4),
+        "AT6b": _at6(50, 8),
+        "AT6c": _at6(65, 20),
+        "AT6abc": _at6(35, 4) & _at6(50, 8) & _at6(65, 20),
     }
 )
 """Name -> formula of the trace of its model, at seconds."""
