@@ -4,42 +4,44 @@ started from.
 
 import concurrent.futures
 import contextlib
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 
+SETTINGS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_device": jax.default_device,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+    "jax_numpy_rank_promotion": jax.numpy_rank_promotion,
+    "jax_debug_nans": jax.debug_nans,
+}
+"""What ``with`` statements set, which JAX keeps for each thread apart."""
 
-def handed_on():
-    """A context manager's maker: in another thread it sets what ``with`` statements have set in
-    this one, which JAX keeps for each thread apart.
-    """
-    config = jax.config
-    settings = (
-        (jax.enable_x64, config.jax_enable_x64),
-        (jax.default_device, config.jax_default_device),
-        (jax.default_matmul_precision, config.jax_default_matmul_precision),
-        (jax.numpy_dtype_promotion, config.jax_numpy_dtype_promotion),
-        (jax.numpy_rank_promotion, config.jax_numpy_rank_promotion),
-        (jax.debug_nans, config.jax_debug_nans),
-    )
 
-    @contextlib.contextmanager
-    def surroundings():
-        with contextlib.ExitStack() as stack:
-            for setting, value in settings:
-                stack.enter_context(setting(value))
-            yield
+def settings() -> dict[str, Any]:
+    """`SETTINGS` as they are in this thread."""
+    return {name: getattr(jax.config, name) for name in SETTINGS}
 
-    return surroundings
+
+@contextlib.contextmanager
+def under(values: dict[str, Any]) -> Iterator[None]:
+    """A context in which the settings have these ``values``."""
+    with contextlib.ExitStack() as stack:
+        for name, value in values.items():
+            stack.enter_context(SETTINGS[name](value))
+        yield
 
 
 def apart(function, *args):
     """``function(*args)`` in another thread. A KeyboardInterrupt meets this one, which waits for
     it: not a callback in the middle of a program of XLA's.
     """
-    surroundings = handed_on()
+    now = settings()
 
     def run():
-        with surroundings():
+        with under(now):
             return function(*args)
 
     with concurrent.futures.ThreadPoolExecutor(1) as pool:

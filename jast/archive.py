@@ -19,11 +19,13 @@ import numpy as np
 __all__ = ["write"]
 
 
-def write(path, format, version, header, arrays):
+def write(path, format, version, header, arrays, *, quick=False):
     """Write ``arrays``, a dict of NumPy arrays, and ``header``, a dict that JSON can hold, to the
     one file ``path``.
 
-    An older file of that name stays whole until the new one is.
+    An older file of that name stays whole until the new one is. ``quick``: it is neither compressed
+    nor waited for until it is on the disk, so it outlives the end of the process but perhaps not
+    that of the machine.
     """
     from jast import __version__  # not at import: the package imports this module
 
@@ -40,11 +42,11 @@ def write(path, format, version, header, arrays):
     part = f"{path}.{os.getpid()}.part"
     try:
         with open(part, "wb") as file:
-            np.savez_compressed(
-                file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits
-            )
+            save = np.savez if quick else np.savez_compressed
+            save(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
             file.flush()
-            os.fsync(file.fileno())
+            if not quick:
+                os.fsync(file.fileno())
         os.replace(part, path)
     finally:
         if os.path.exists(part):

@@ -3,34 +3,36 @@ is compared with.
 """
 
 import math
-import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast import results, rewards
+from jast import results, rewards, units
 from jast._checks import random_key
-from jast._threads import apart
+from jast.checkpoints import stored
 from jast.contract import contract
 from jast.episode import Episode, rollout
-from jast.incidents import incidents, since
+from jast.incidents import incidents, merged, since
 from jast.intervals import clopper_pearson
 from jast.outline import outline
+from jast.places import Post, Task
 from jast.policy import undisturbed
 from jast.progress import advance, begin, conclude
-from jast.watch import Watch, in_pieces
+from jast.watch import Watch
 
 __all__ = ["nominal"]
 
 LANES = 1024
-PIECE = 0.2
-"""Seconds between two looks at the keyboard, about; at least `LANES` episodes."""
+"""Episodes of a chunk."""
+UNITS, CHUNKS = 64, 64
+"""Units of a call, about, and chunks of a unit at most."""
 
 
 @results.result("episodes")
@@ -86,7 +88,17 @@ class Nominal(NamedTuple):
         return "\n".join(f"{name:<14} {text}" for name, text in rows)
 
 
-def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
+def nominal(
+    key,
+    sim,
+    episodes=100_000,
+    *,
+    progress=False,
+    callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
+):
     """How does the system do when nobody searches? Simulate it under its own disturbance model:
     `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
 
@@ -98,7 +110,14 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
     grow with ``episodes``. ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
     now and then. Warns (UserWarning) where the system fails undisturbed and where
     episodes are invalid. A KeyboardInterrupt ends it with the result of the episodes played by
-    then, and is raised where there are none. Raises ValueError for ``episodes`` below 1 and where
+    then, and is raised where there are none.
+
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+
+    Raises ValueError for ``episodes`` below 1 and where
     the simulator's functions do not fit together.
     """
     random_key("nominal", key)
@@ -107,16 +126,21 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
     contract(sim, observed=False)
+    ways = units.ways("nominal", executor, devices)
     asked, before = int(episodes), incidents(sim)
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
-    episodes, (failures, invalid, mean, first) = _played(
-        key, sim, asked, Watch("nominal", asked, "episode", progress, callback)
-    )
+    with (
+        stored("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
+        Watch("nominal", asked, "episode", progress, callback) as watch,
+    ):
+        ran = _played(key, sim, asked, watch, ways._replace(store=store))
+    episodes, failures, invalid, mean, first = ran.state
+    before = since(before, incidents(sim)), ran.incidents
     settings = results.asked("nominal", key, episodes=asked)
-    if episodes < asked:
-        settings["interrupted"] = f"after {episodes} of {asked} episodes"
+    if short := units.note("episodes", ran, episodes, asked):
+        settings["interrupted"] = short
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
             "the system fails undisturbed: its likeliest disturbances already lead to a failure, so"
@@ -128,79 +152,113 @@ def nominal(key, sim, episodes=100_000, *, progress=False, callback=None):
             f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number"
             " that is not finite; they count as not failing"
         )
-        warnings.warn("\n  ".join([said, *map(str, since(before, incidents(sim)))]), stacklevel=2)
+        warnings.warn("\n  ".join([said, *map(str, merged(*before))]), stacklevel=2)
     return Nominal(
         quiet,
         failures,
         episodes,
         failures / episodes,
         clopper_pearson(failures, episodes),
-        mean if invalid < episodes else math.nan,
+        float(mean) if invalid < episodes else math.nan,
         invalid,
-        first if failures else None,
+        first,
         settings,
     )
 
 
-def _played(key, sim, episodes, watch):
-    """How many episodes were played, all unless interrupted, and of these: failures, invalid ones,
-    the mean distance of the valid ones, and the number of the first failure.
+class Job(NamedTuple):
+    """What all units of a call have in common."""
+
+    key: Any
+    sim: Any
+    episodes: int
+    chunks: int
+    """Of a unit."""
+
+
+class Counts(NamedTuple):
+    """Of the chunks of a unit, [CHUNKS]; zeros where it has fewer."""
+
+    failures: Any
+    invalid: Any
+    valid: Any
+    distance: Any
+    """Sum over the valid ones."""
+    first: Any
+    """Number of the first failure; that of all episodes where there is none."""
+
+
+class Seen(NamedTuple):
+    """What is known of the first episodes."""
+
+    episodes: int
+    failures: int
+    invalid: int
+    mean: Any
+    """Miss distance of the valid ones."""
+    first: int | None
+
+
+def _played(key: Any, sim: Any, episodes: int, watch: Watch, ways: units.Ways) -> units.Ran:
+    """`jast.units.Ran` with `Seen` of all episodes, unless interrupted."""
+    chunks = -(-episodes // LANES)
+    job = Job(key, sim, episodes, min(-(-chunks // UNITS), CHUNKS))
+    seen = Seen(0, 0, 0, np.zeros((), outline(sim).dtype), None)
+    played = lambda done: min(done * job.chunks * LANES, episodes)
+    task, n = Task(_unit, job, lambda: Counts(*Counts._fields)), -(-chunks // job.chunks)
+    return units.run(task, n, _with, seen, watch, ways, size=played)
+
+
+def _unit(job: Job, number: int, post: Post) -> Counts:
+    end = min((number + 1) * job.chunks, -(-job.episodes // LANES))
+    bounds = job.episodes, number * job.chunks, end
+    return _count(job.key, job.sim, *(np.int32(n) for n in bounds), LANES, CHUNKS)
+
+
+def _with(seen: Seen, number: int, counts: Counts) -> Seen:
+    """``seen`` with the chunks of a unit as well."""
+    mean, valid = seen.mean, seen.episodes - seen.invalid
+    for count, total in zip(counts.valid, counts.distance, strict=True):
+        if count:
+            valid += int(count)
+            # a running mean: a running sum would lose digits in float32
+            step = (total - mean.dtype.type(count) * mean) / mean.dtype.type(valid)
+            mean = mean + step
+    failures, invalid = int(counts.failures.sum()), int(counts.invalid.sum())
+    first = seen.first
+    if first is None and failures:
+        first = int(counts.first[counts.failures > 0].min())
+    return Seen(
+        valid + seen.invalid + invalid,
+        seen.failures + failures,
+        seen.invalid + invalid,
+        mean,
+        first,
+    )
+
+
+@partial(jax.jit, static_argnames=("lanes", "most"))
+def _count(key, sim, episodes, begin, end, lanes, most):
+    """`Counts` of the chunks ``begin`` to ``end - 1`` of ``lanes`` episodes, of ``most`` at the
+    most.
     """
-    zero = jnp.zeros((), jnp.int32)
-    counts = zero, zero, jnp.zeros((), outline(sim).dtype), jnp.asarray(episodes, jnp.int32)
 
-    played = lambda chunks: min(chunks * LANES, episodes)
-
-    def work(counts, begin, end):
-        bounds = (jnp.asarray(n, jnp.int32) for n in (episodes, begin, end))
-        return apart(lambda: jax.block_until_ready(_count(key, sim, *bounds, counts, LANES)))
-
-    counts, done = in_pieces(work, counts, _ends(-(-episodes // LANES)), watch, played)
-    failures, invalid, mean, first = jax.device_get(counts)
-    return played(done), (int(failures), int(invalid), float(mean), int(first))
-
-
-def _ends(chunks: int) -> Iterator[int]:
-    """Ends of pieces that take about `PIECE`: more chunks at a time while they are quick."""
-    done, more = 0, 1
-    while done < chunks:
-        begin, done = time.perf_counter(), min(done + more, chunks)
-        yield done
-        if time.perf_counter() - begin < PIECE:
-            more *= 2
-
-
-@partial(jax.jit, static_argnums=6)
-def _count(key, sim, episodes, begin, end, counts, lanes):
-    """``counts``, (failures, invalid episodes, mean distance of the valid ones, number of the first
-    failure), with the chunks ``begin`` to ``end`` of ``lanes`` episodes as well.
-    """
-
-    def chunk(i, carry):
-        failures, invalid, mean, first = carry
+    def chunk(i, counts):
         index = i * lanes + jnp.arange(lanes, dtype=jnp.int32)
-        live = index < episodes
+        live = (index < episodes) & (index >= 0)
         last = jax.vmap(lambda k, on: _outcome(jax.random.fold_in(key, k), sim, on))(index, live)
-        valid = live & ~last.invalid
-        before = (i * lanes - invalid).astype(mean.dtype)
-        count = jnp.sum(valid, dtype=jnp.int32)
-        total = jnp.sum(jnp.where(valid, last.distance, 0))
-        # a running mean: a running sum would lose digits in float32
-        mean = jnp.where(
-            count > 0,
-            mean
-            + (total - count.astype(mean.dtype) * mean)
-            / jnp.maximum(before + count.astype(mean.dtype), 1),
-            mean,
+        valid, failing = live & ~last.invalid, live & last.failure
+        new = Counts(
+            jnp.sum(failing, dtype=jnp.int32),
+            jnp.sum(live & last.invalid, dtype=jnp.int32),
+            jnp.sum(valid, dtype=jnp.int32),
+            jnp.sum(jnp.where(valid, last.distance, 0)).astype(counts.distance.dtype),
+            jnp.min(jnp.where(failing, index, episodes)),
         )
-        failing = live & last.failure
-        return (
-            failures + jnp.sum(failing, dtype=jnp.int32),
-            invalid + jnp.sum(live & last.invalid, dtype=jnp.int32),
-            mean,
-            jnp.minimum(first, jnp.min(jnp.where(failing, index, episodes))),
-        )
+        return jax.tree.map(lambda a, b: a.at[i - begin].set(b), counts, new)
 
+    none = jnp.zeros((most,), jnp.int32)
+    counts = Counts(none, none, none, jnp.zeros((most,), outline(sim).dtype), none)
     return lax.fori_loop(begin, end, chunk, counts)
 
 

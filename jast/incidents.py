@@ -34,6 +34,10 @@ KINDS = {
         "seed every random number generator at the start of a run, or make what it draws a"
         " disturbance"
     ),
+    "unit left out": (
+        "a part of the work failed three times in the processes of the executor, and what it would"
+        " have added is missing; mend what it says, and make the same call again"
+    ),
     "other": "mend those listed first: their examples say how",
 }
 """The kinds of incidents, and what to do."""
@@ -119,6 +123,19 @@ def incidents(sim):
     `Incident`; ``()`` for a simulator in JAX.
     """
     return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
+
+
+def merged(some, more):
+    """``some`` incidents and ``more`` as one tuple: those of one kind and message are counted
+    together.
+    """
+    groups = {(i.kind, i.message): i for i in some}
+    for i in more:
+        known = groups.get((i.kind, i.message))
+        groups[i.kind, i.message] = (
+            i if known is None else known._replace(count=known.count + i.count)
+        )
+    return tuple(groups.values())
 
 
 def since(before, after):

@@ -44,7 +44,7 @@ class Watch:
         Raises:
             ValueError: for a callback that cannot be called.
         """
-        self.done, self.total = done, total
+        self.name, self.done, self.total = name, done, total
         self._callback = None if callback is None else _of_three(name, callback, former)
         self._bar = None
         if progress:

@@ -1,7 +1,6 @@
 import dataclasses
 import random
 import warnings
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -388,38 +387,31 @@ def test_nominal_is_a_loop_of_rollouts(key):
 
 
 def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeypatch):
-    """And the pieces in which it is done change nothing."""
-    calls = []
-
-    def apart(function, stop_at=None):
-        calls.append(1)
-        if len(calls) == stop_at:
-            raise KeyboardInterrupt
-        return function()
-
-    monkeypatch.setattr(crude, "PIECE", 0.0)
-    monkeypatch.setattr(crude, "apart", apart)
+    """And the units in which it is done change nothing."""
     whole = jast.nominal(key, walk1d(), episodes=2100)
     seed = jax.random.key_data(key).tolist()
-    assert len(calls) == 3
     assert whole.settings == dict(method="nominal", episodes=2100, seed=seed)
-    calls.clear()
-    monkeypatch.setattr(crude, "PIECE", np.inf)
+    monkeypatch.setattr(crude, "UNITS", 1)  # of two chunks or three, else of one
     equal(jast.nominal(key, walk1d(), episodes=2100)[:-1], whole[:-1])
-    assert len(calls) == 2  # a chunk, then two
-    calls.clear()
-    monkeypatch.setattr(crude, "PIECE", 0.0)
-    monkeypatch.setattr(crude, "apart", partial(apart, stop_at=3))
-    part = jast.nominal(key, walk1d(), episodes=2100)
+    of_two = jast.nominal(key, walk1d(), episodes=2048)
+    monkeypatch.undo()
+    real = crude._unit
+
+    def interrupted(stop_at):
+        def unit(job, number, post):
+            if number == stop_at:
+                raise KeyboardInterrupt
+            return real(job, number, post)
+
+        monkeypatch.setattr(crude, "_unit", unit)
+        return jast.nominal(key, walk1d(), episodes=2100)
+
+    part = interrupted(2)
     assert part.settings == whole.settings | dict(interrupted="after 2048 of 2100 episodes")
-    calls.clear()
-    monkeypatch.setattr(crude, "apart", apart)
-    equal(part[:-1], jast.nominal(key, walk1d(), episodes=2048)[:-1])
+    equal(part[:-1], of_two[:-1])
     assert str(part).endswith("interrupted    after 2048 of 2100 episodes")
-    calls.clear()
-    monkeypatch.setattr(crude, "apart", partial(apart, stop_at=1))
     with pytest.raises(KeyboardInterrupt):
-        jast.nominal(key, walk1d(), episodes=2100)
+        interrupted(0)
 
 
 def test_nominal_says_when_the_system_fails_undisturbed(key):

@@ -46,6 +46,9 @@ def forest(
     available=None,
     progress=False,
     callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
 ):
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each:
     `SearchResult`. The reward is maximised.
@@ -99,6 +102,12 @@ def forest(
     with the simulations of all trees. A KeyboardInterrupt ends the search with an honest result of
     what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
 
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+    A unit is a group of ``lanes`` trees, smaller by default with a checkpoint or an executor.
+
     ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw,
     "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier
     result (``result.heads``), also of another start of the same system. The trees then grow in
@@ -138,4 +147,7 @@ def forest(
         available=available,
         progress=progress,
         callback=callback,
+        checkpoint=checkpoint,
+        executor=executor,
+        devices=devices,
     )

@@ -32,6 +32,9 @@ __all__ = [
     "finish",
     "finish_traced",
     "fold",
+    "in_words",
+    "logged",
+    "note",
     "nothing",
     "play",
     "tally",
@@ -253,29 +256,53 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
     """
 
     def work(kept, done, end):
-        carry, total, moments = kept
+        carry, noted = kept
         run = lambda: jax.block_until_ready(chunk(carry, done, end))
-        carry, counted, best, record = apart(run) if host else run()
-        counted, best, record = jax.device_get((counted, best, record))
-        # Python's ints do not overflow
-        counted = Tally(*(int(v) for v in counted[:5]), counted.failing)
-        if total is not None:
-            sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
-            counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
-        return carry, counted, [*moments, (end, best, counted.failures, record)]
-
-    def words(kept):
-        _, total, moments = kept
-        return dict(failures=total.failures, best=f"{moments[-1][1].max():.4g}")
+        carry, *news = apart(run) if host else run()
+        return carry, note(noted, end, *jax.device_get(news))
 
     whole = ends[-1] * trees
     watch = Watch(name, whole, "sim", progress, callback)
-    kept, done = in_pieces(work, (carry, None, []), ends, watch, lambda end: end * trees, words)
-    carry, total, moments = kept
-    *moments, records = zip(*moments, strict=True)
-    record = None if records[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *records)
+    words = lambda kept: in_words(kept[1])
+    kept, done = in_pieces(work, (carry, NOTHING), ends, watch, lambda end: end * trees, words)
+    carry, noted = kept
     interrupted = f"after {done * trees} of {whole} episodes" if done < ends[-1] else None
-    return carry, Log(total, History(*(np.array(v) for v in moments)), interrupted, record)
+    return carry, logged(noted, interrupted)
+
+
+class Noted(NamedTuple):
+    """What is known of the first chunks of a search."""
+
+    tally: Tally | None
+    moments: tuple
+    """Of each chunk: (its end, the best rewards so far, failures so far, trials or None)"""
+
+
+NOTHING = Noted(None, ())
+
+
+def note(noted, end, counted, best, record):
+    """`Noted` with one chunk more, which ends at ``end``: of its `Tally`, the best rewards so far
+    [trees] and its `Trials`, if any.
+    """
+    # Python's ints do not overflow
+    counted, total = Tally(*(int(v) for v in counted[:5]), counted.failing), noted.tally
+    if total is not None:
+        sums = (a + b for a, b in zip(total[:4], counted[:4], strict=True))
+        counted = Tally(*sums, min(total.first, counted.first), total.failing | counted.failing)
+    return Noted(counted, (*noted.moments, (end, best, counted.failures, record)))
+
+
+def in_words(noted):
+    """What the bar says of `Noted`."""
+    return dict(failures=noted.tally.failures, best=f"{noted.moments[-1][1].max():.4g}")
+
+
+def logged(noted, interrupted=None):
+    """The `Log` of `Noted`."""
+    *moments, records = zip(*noted.moments, strict=True)
+    record = None if records[0] is None else jax.tree.map(lambda *a: np.concatenate(a), *records)
+    return Log(noted.tally, History(*(np.array(v) for v in moments)), interrupted, record)
 
 
 def finish(sim, reward, log, best, candidates, tree, simulation, counts, settings, top):

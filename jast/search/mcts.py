@@ -43,6 +43,9 @@ def mcts(
     available=None,
     progress=False,
     callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
 ):
     """Grow ``trees`` independent trees of ``simulations`` from their first root: `SearchResult`.
     The reward is maximised.
@@ -76,4 +79,7 @@ def mcts(
         available=available,
         progress=progress,
         callback=callback,
+        checkpoint=checkpoint,
+        executor=executor,
+        devices=devices,
     )

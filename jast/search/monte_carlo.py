@@ -7,16 +7,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jast import actions as choices
+from jast import units
+from jast.checkpoints import stored
 from jast.counter import tree_keys
-from jast.incidents import hosted, incidents, since
+from jast.incidents import hosted, incidents, merged, since
 from jast.memory import require
 from jast.outline import outline
+from jast.places import Task
 from jast.search import lockstep as E
 from jast.search.ending import ended, planned, usual
 from jast.search.prepare import prepare
+from jast.watch import Watch
 
 __all__ = ["monte_carlo"]
 
@@ -56,6 +61,9 @@ def monte_carlo(
     record=False,
     progress=False,
     callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
 ):
     """What are the likeliest failures that chance alone finds? Simulate ``episodes`` independent
     episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree.
@@ -75,11 +83,17 @@ def monte_carlo(
     which there are about 200 (a black box has one each 64 episodes); KeyboardInterrupt ends the
     search with the result of the whole chunks, and ``settings["interrupted"]``.
 
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+
     Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError
     for a count below 1, a ``refine`` that cannot be, and where the simulator's functions or the
     actions do not fit together.
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
+    asked = dict(sim=sim, reward=reward, actions=actions, episodes=episodes, record=bool(record))
     before = incidents(sim)
     # the episodes that scale the reward are the same for every key: no part of a random sample
     reward, actions, settings, _ = prepare(
@@ -89,6 +103,7 @@ def monte_carlo(
     lanes = HOSTED if hosted(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
     own, key = key, tree_keys(key, 1)[0]
     if settings is None:
+        units.not_traced("monte_carlo", checkpoint=checkpoint, executor=executor, devices=devices)
         if episodes * sim.horizon >= 2**31:
             raise ValueError(
                 "monte_carlo: episodes times the horizon must be below 2^31 inside a"
@@ -103,30 +118,26 @@ def monte_carlo(
         records = f"the records of {episodes} episodes"
         require("monte_carlo", 2 * episodes * row, records, "use fewer, or record=False")
 
-    def chunk(found, begin, end):
-        if record:
-            found, counted, rows = _block(key, sim, reward, actions, found, begin, end, lanes)
-            return (
-                found,
-                counted,
-                found.reward[None],
-                jax.tree.map(lambda a: a[: end - begin, None], E.trials(rows)),
-            )
-        found, counted = _chunk(key, sim, reward, actions, found, begin, end, lanes)
-        return found, counted, found.reward[None], None
-
     most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
     blocks = 1 if record or hosted(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
-    ends = [*range(blocks * lanes, episodes, blocks * lanes), episodes]
-    found, log = E.drive(
-        chunk,
-        _nothing(sim, top),
-        ends,
-        host=hosted(sim),
-        progress=progress,
-        callback=callback,
-        name="monte_carlo",
-    )
+    stride = blocks * lanes
+    job = Job(key, sim, reward, actions, _nothing(sim, top), episodes, stride, lanes, bool(record))
+    with (
+        stored("monte_carlo", checkpoint, own, top=top, **asked) as store,
+        Watch("monte_carlo", episodes, "sim", progress, callback) as watch,
+    ):
+        ran = units.run(
+            Task(_unit, job, lambda: _like(job)),
+            -(-episodes // stride),
+            partial(_with, job),
+            (jax.device_get(job.nothing), E.NOTHING),
+            watch,
+            units.ways("monte_carlo", executor, devices, store),
+            size=lambda done: min(done * stride, episodes),
+            words=lambda kept: E.in_words(kept[1]),
+        )
+    found, noted = ran.state
+    log = E.logged(noted, units.note("episodes", ran, noted.tally.episodes, episodes))
     rebuilt = _rebuild(
         key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number])
     )
@@ -149,7 +160,73 @@ def monte_carlo(
         top,
     )
     found = ended(own, sim, reward, found, top)
-    return found._replace(incidents=since(before, incidents(sim)))
+    here = since(before, incidents(sim))
+    return found._replace(incidents=merged(here, ran.incidents))
+
+
+class Job(NamedTuple):
+    """What all chunks of a search have in common."""
+
+    key: Any
+    sim: Any
+    reward: Any
+    actions: Any
+    nothing: Found
+    """What each begins with."""
+    episodes: int
+    stride: int
+    """Episodes of a chunk; the last one has what is left."""
+    lanes: int
+    record: bool
+
+
+def _unit(job, number, post):
+    """Chunk ``number``: (`Found`, `Tally`, `Trials` or None)."""
+    begin = number * job.stride
+    end = min(begin + job.stride, job.episodes)
+    about = job.key, job.sim, job.reward, job.actions, job.nothing, begin, end
+    if not job.record:
+        return *_chunk(*about, job.lanes), None
+    found, counted, played = _block(*about, job.lanes)
+    rows = jax.tree.map(lambda a: a[: end - begin, None], E.trials(played))
+    return found, counted, rows
+
+
+def _like(job):
+    return job.nothing, E.nothing(), E.Trials(*E.Trials._fields) if job.record else None
+
+
+def _with(job, kept, number, news):
+    """(`Found`, `Noted`) with chunk ``number`` as well."""
+    found, noted = kept
+    new, counted, rows = news
+    if (new.top_reward > -np.inf).any():
+        found = jax.device_get(_joined(found, new))
+    elif new.reward > found.reward and not found.failure:
+        found = Found(*new[:3], *found[3:])
+    end = min((number + 1) * job.stride, job.episodes)
+    return found, E.note(noted, end, counted, found.reward[None], rows)
+
+
+@jax.jit
+def _joined(found, new):
+    """The `Found` of two, of which ``new`` is of later episodes."""
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), found[3:], new[3:])
+    top_reward, top_number, top_tag, top_count = both
+    (k,) = found.top_reward.shape
+    everywhere = jnp.ones(top_reward.shape, bool)
+    places, counts = E.distinct(everywhere, top_reward, top_tag, top_number, top_count, k)
+    better = (new.failure & ~found.failure) | (
+        (new.failure == found.failure) & (new.reward > found.reward)
+    )
+    best = jax.tree.map(lambda a, b: jnp.where(better, b, a), found[:3], new[:3])
+    return Found(*best, *_picked(places, top_reward, top_number, top_tag), counts)
+
+
+def _picked(places, reward, number, tag):
+    """These at ``places``; where there are no more, a reward of -inf."""
+    pairs = ((reward, -jnp.inf), (number, 0), (tag, 0))
+    return [a.at[places].get(mode="fill", fill_value=fill) for a, fill in pairs]
 
 
 def _nothing(sim, top):
@@ -235,19 +312,7 @@ def _keep(found, played, number, live):
         counts = jnp.concatenate([found.top_count, jnp.ones_like(number)])
         (k,) = found.top_reward.shape
         places, counts = E.distinct(jnp.ones(values.shape, bool), values, tags, numbers, counts, k)
-        taken = [
-            a.at[places].get(mode="fill", fill_value=fill)
-            for a, fill in ((values, -jnp.inf), (numbers, 0), (tags, 0))
-        ]
-        return found._replace(
-            **dict(
-                zip(
-                    ("top_reward", "top_number", "top_tag", "top_count"),
-                    (*taken, counts),
-                    strict=True,
-                )
-            )
-        )
+        return Found(*found[:3], *_picked(places, values, numbers, tags), counts)
 
     # rarely anything enters, and sorting is dear; a repetition of the least kept one is to be
     # counted, too

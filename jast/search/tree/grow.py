@@ -10,13 +10,15 @@ from typing import Any, NamedTuple
 
 import jax
 
+from jast import units
 from jast._jax import is_traced
 from jast.actions import samples
+from jast.checkpoints import stored
 from jast.counter import tree_keys
 from jast.heads.rounds import School, enrol, teach
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import HeadSettings, checked
-from jast.incidents import hosted, incidents, since
+from jast.incidents import hosted, incidents, merged, since
 from jast.rewards import STANDARD, Lexicographic, lexicographic
 from jast.search.ending import ended, planned, usual
 from jast.search.lockstep import whole
@@ -27,7 +29,7 @@ from jast.search.tree.guide import guide
 from jast.search.tree.harvest import result, traced_result
 from jast.search.tree.layout import Problem, levels, pages_of
 from jast.search.tree.memory import LANES, fit, keep
-from jast.search.tree.run import Harvest, Plan, grow_all, grow_traced
+from jast.search.tree.run import Plan, Round, grow_all, grow_traced
 from jast.search.tree.settings import problem_of
 from jast.watch import Watch
 
@@ -36,6 +38,8 @@ __all__ = ["grow_trees"]
 MEMOIZE = ("auto", "node", "root", "none")
 PUBLISHED = ("paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
+GROUPS, LEAST = 16, 8
+"""Groups of a round that are worth a checkpoint, and the trees of each at least."""
 BOUNDED = 1.0
 """``exploration`` for `jast.rewards.lexicographic`, whose range is (-1, 1]."""
 CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
@@ -81,6 +85,9 @@ def grow_trees(
     available: int | None,
     progress: bool,
     callback: Callable | None,
+    checkpoint: Any,
+    executor: Any,
+    devices: Any,
     heads: Any = None,
     head_settings: HeadSettings | None = None,
 ) -> SearchResult:
@@ -90,7 +97,23 @@ def grow_trees(
     counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
     given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
     trees, prunes, simulations, top, *_ = whole(method, **counts, **given)
-    before = incidents(sim)
+    before, ways = incidents(sim), units.ways(method, executor, devices)
+    asked = (
+        counts
+        | given
+        | dict(
+            sim=sim,
+            chosen=chosen,
+            reward=reward,
+            actions=actions,
+            exploration=exploration,
+            memoize=memoize,
+            record=bool(record),
+            keep_trees=bool(keep_trees),
+            heads=heads,
+            head_settings=head_settings,
+        )
+    )
     job = plan(
         method, key, sim, chosen, trees, prunes, simulations, reward, actions, exploration, memoize
     )
@@ -99,6 +122,7 @@ def grow_trees(
     if heads is not None:
         job = enlist(job, key, heads, head_settings, chosen, memoize)
     if job.settings is None:
+        units.not_traced(method, checkpoint=checkpoint, executor=executor, devices=devices)
         found = traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
         return joined(sim, job.problem.reward, job.pilot, found, top)
     if keep_trees and memoize in ("root", "none"):
@@ -106,26 +130,33 @@ def grow_trees(
             f"{method}: keep_trees needs states at every node, received memoize={memoize!r}"
         )
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
+    if lanes is None and (checkpoint, executor) != (None, None):
+        lanes = min(job.at_once, LANES, max(LEAST, -(-job.at_once // GROUPS)))
+    if devices is not None:
+        threads = len(ways.devices)
     fitted, threads, lanes = fit(
         method, job.problem, wanted, job.at_once, threads, lanes, available, memoize == "auto"
     )
-    job = job._replace(plan=fitted)
-    total = trees * job.plan.prunes * simulations
+    total = trees * fitted.prunes * simulations
     keep(method, sim, total, bool(record))
-    job.settings.update(prunes=job.plan.prunes, memoize=job.plan.memoize)
+    with (
+        stored(method, checkpoint, key, **asked) as store,
+        Watch(method, total, "sim", progress, callback) as watch,
+    ):
+        if store is not None:  # what was free when it began may not be now
+            first = store.settled(lambda: dict(memoize=fitted.memoize, lanes=lanes))
+            fitted, lanes = fitted._replace(memoize=first["memoize"]), first["lanes"]
+        job = job._replace(plan=fitted)
+        ran, school = grow_rounds(job, key, threads, lanes, top, watch, ways._replace(store=store))
+    settings = job.settings | dict(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.school is not None:
-        job.settings.update(_of_heads(heads, job))
-    settings = job.settings
-    with Watch(method, total, "sim", progress, callback) as watch:
-        harvests, school, interrupted = grow_rounds(job, key, threads, lanes, top, watch.more)
-    if interrupted:
-        settings = settings | dict(interrupted=f"after {watch.done} of {watch.total} simulations")
-    if not harvests:
-        raise KeyboardInterrupt
-    found = result(sim, job.problem.reward, harvests, settings, top, school)
+        settings |= _of_heads(heads, job)
+    if short := units.note("simulations", ran, watch.done, watch.total):
+        settings = settings | dict(interrupted=short)
+    found = result(sim, job.problem.reward, ran.state, settings, top, school)
     found = joined(sim, job.problem.reward, job.pilot, found, top)
     found = ended(key, sim, job.problem.reward, found, top)
-    return found._replace(incidents=since(before, incidents(sim)))
+    return found._replace(incidents=merged(since(before, incidents(sim)), ran.incidents))
 
 
 def plan(
@@ -218,8 +249,8 @@ def enlist(
 
 
 def grow_rounds(
-    job: Job, key: jax.Array, threads: int, lanes: int, top: int, more: Callable[[int], None]
-) -> tuple[list[Harvest], School | None, bool]:
+    job: Job, key: jax.Array, threads: int, lanes: int, top: int, watch: Watch, ways: units.Ways
+) -> tuple[units.Ran, School | None]:
     """Grow all trees, a round at a time, and teach the heads between two rounds.
 
     Args:
@@ -228,39 +259,34 @@ def grow_rounds(
         threads: that trees grow in.
         lanes: trees in lockstep in each of them.
         top: failures that the archive is to hold.
-        more: is told how many simulations were done since it was last called.
+        watch: is told of the simulations.
+        ways: how groups of trees are run.
 
     Returns:
-        The harvests in the order of the trees, the heads as they are now, and whether a
-        KeyboardInterrupt ended it early.
+        `jast.units.Ran` with the harvests in the order of the trees, and the heads as they are now.
     """
     problem, school, sim = job.problem, job.school, job.problem.sim
     chunk = max(1, min(job.plan.simulations, HOST_CHUNK if hosted(sim) else CHUNK))
-    keys, harvests = tree_keys(key, job.trees), []
+    keys, ran = tree_keys(key, job.trees), units.Ran((), 0)
     for first in range(0, job.trees, job.at_once):
-        new, interrupted = grow_all(
-            problem,
-            keys[first : first + job.at_once],
-            job.plan,
-            threads=threads,
-            lanes=lanes,
-            chunk=chunk,
-            candidates=max(256, 4 * top),
-            on_chunk=more,
-            first=first,
-        )
-        harvests += new
-        if interrupted:
-            return harvests, school, True
-        if school is not None and job.head_settings.train:
-            own = jax.random.fold_in(key, job.trees + 1 + first)
-            actions = problem.choice.actions
-            try:
-                school = teach(own, school, sim, actions, job.head_settings, new)
-            except KeyboardInterrupt:
-                return harvests, school, True
-            problem = problem._replace(guide=guide(school.heads, job.head_settings))
-    return harvests, school, False
+        own = keys[first : first + job.at_once]
+        turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * top), first)
+        try:
+            new = grow_all(turn, watch, ways, threads)
+            ran = units.joined(ran, new)
+            if new.ended is not None:
+                break
+            if school is not None and job.head_settings.train:
+                own = jax.random.fold_in(key, job.trees + 1 + first)
+                actions = problem.choice.actions
+                school = teach(own, school, sim, actions, job.head_settings, new.state)
+                problem = problem._replace(guide=guide(school.heads, job.head_settings))
+        except KeyboardInterrupt:
+            if not ran.state:
+                raise
+            ran = ran._replace(ended="")
+            break
+    return ran, school
 
 
 def _of_heads(heads: Any, job: Job) -> dict[str, Any]:

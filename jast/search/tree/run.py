@@ -1,10 +1,8 @@
-"""Running a tree search: trees in groups over threads, in chunks that can be watched and
-interrupted; or all in one traced program.
+"""Running a tree search: groups of trees as units of work (`jast.units`), in chunks that can be
+watched and interrupted; or all in one traced program.
 """
 
-import concurrent.futures
 import functools
-import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,18 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast import units
 from jast._jax import custom_vmap
-from jast._threads import handed_on
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
 from jast.memory import size
+from jast.places import Post, Task
 from jast.search.tree import simulate
 from jast.search.tree.edges import branches_of, edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
 from jast.search.tree.prune import prune
 from jast.search.tree.rebuild import rebuild
+from jast.watch import Watch
 
-__all__ = ["Plan", "Harvest", "bytes_per_tree", "grow_all", "grow_traced"]
+__all__ = ["Harvest", "Plan", "Round", "bytes_per_tree", "grow_all", "grow_traced"]
 
 
 class Plan(NamedTuple):
@@ -117,65 +117,70 @@ def bytes_per_tree(problem, plan):
     return size(tree) // 2
 
 
-def grow_all(problem, keys, plan, *, threads, lanes, chunk, candidates, on_chunk, first=0):
-    """Grow one tree a key, ``lanes`` at a time in each of ``threads`` threads: a list of `Harvest`
-    in the order of the keys, and whether it was interrupted.
+class Round(NamedTuple):
+    """What the groups of a round of trees have in common."""
 
-    ``first``: the number of the first tree. ``on_chunk(simulations)`` is called from the main
-    thread when so many more simulations are done; a KeyboardInterrupt there, or from the keyboard,
-    ends all trees at their next chunk.
+    problem: Any
+    keys: Any
+    """[trees] of the round."""
+    plan: Plan
+    lanes: int
+    """Trees of a group."""
+    chunk: int
+    """Simulations between two looks at whether to stop."""
+    candidates: int
+    """Failures of a group that are handed on."""
+    first: int
+    """Number of the first tree."""
+
+
+def grow_all(turn: Round, watch: Watch, ways: units.Ways, threads: int) -> units.Ran:
+    """Grow one tree a key, a group of lanes at a time: `jast.units.Ran` with a tuple of `Harvest`
+    in the order of the keys. ``watch`` counts simulations; an interruption ends all trees at their
+    next chunk.
     """
-    trees = keys.shape[0]
-    groups = [np.arange(start, min(start + lanes, trees)) for start in range(0, trees, lanes)]
-    done, lock, stop = [0], threading.Lock(), threading.Event()
-
-    def report(n):
-        with lock:
-            done[0] += n
-
-    surroundings = handed_on()
-
-    def one(group):
-        if stop.is_set():
-            return None
-        with surroundings():
-            try:
-                return _one_group(
-                    problem,
-                    keys[np.resize(group, lanes)],
-                    group + first,
-                    plan,
-                    chunk,
-                    candidates,
-                    report,
-                    stop,
-                )
-            except BaseException:
-                stop.set()  # the other groups need not finish either
-                raise
-
-    told, interrupted = 0, False
-    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(one, group) for group in groups]
-        waiting = set(futures)
-        while waiting:
-            try:
-                _, waiting = concurrent.futures.wait(
-                    waiting, timeout=0.05, return_when=concurrent.futures.FIRST_EXCEPTION
-                )
-                if done[0] > told:
-                    told, news = done[0], done[0] - told
-                    on_chunk(news)
-            except KeyboardInterrupt:
-                stop.set()
-                interrupted = True
-            except BaseException:  # of the callback: it need not wait for the rest of the search
-                stop.set()
-                raise
-    return [h for h in (f.result() for f in futures) if h is not None], interrupted
+    trees, lanes = turn.keys.shape[0], turn.lanes
+    each = turn.plan.prunes * turn.plan.simulations
+    return units.run(
+        Task(_one_group, turn, lambda: _like(turn)),
+        -(-trees // lanes),
+        lambda harvests, number, new: (*harvests, new),
+        (),
+        watch,
+        ways._replace(name=f"trees-{turn.first}"),
+        size=lambda done: (turn.first + min(done * lanes, trees)) * each,
+        threads=threads,
+        cut=True,
+    )
 
 
-def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
+def _like(turn: Round) -> Harvest:
+    """The shapes of what `_one_group` returns."""
+    problem, _, plan = turn[:3]
+    keys = turn.keys[np.zeros(turn.lanes, int)]
+    simulations = plan.prunes * plan.simulations
+    tree = _make.eval_shape(problem, keys, simulations, plan.memoize, plan.pages, plan.record)
+    _, roots = _prune.eval_shape(problem, tree, plan.children, plan.memoize)
+    rows = np.zeros(turn.candidates + turn.lanes, np.int32)
+    found = _rebuild.eval_shape(problem, tree, rows, rows, plan.memoize)
+    return Harvest(
+        log=0,
+        outcome=0,
+        steps=0,
+        roots=roots,
+        found=found,
+        tree=0,
+        simulation=0,
+        edges=_edges.eval_shape(problem, tree, plan.children) if plan.edges else (),
+        trials=0 if plan.record else (),
+        branches=_branches.eval_shape(problem, tree, plan.children) if plan.branches else (),
+    )
+
+
+def _one_group(turn: Round, number: int, post: Post) -> Harvest:
+    problem, keys, plan, lanes, chunk, candidates, before = turn
+    group = np.arange(number * lanes, min((number + 1) * lanes, keys.shape[0]))
+    keys, group = keys[np.resize(group, lanes)], group + before
     tree = _make(
         problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record
     )
@@ -186,12 +191,12 @@ def _one_group(problem, keys, group, plan, chunk, candidates, report, stop):
             tree = jax.block_until_ready(
                 _grow(problem, tree, at, min(at + chunk, end), plan.memoize)
             )
-            report((min(at + chunk, end) - at) * len(group))
-            if stop.is_set():
+            post.more((min(at + chunk, end) - at) * len(group))
+            if post.stopped():
                 break
         tree, roots = _prune(problem, tree, plan.children, plan.memoize)
         turns.append(jax.device_get(jax.tree.map(lambda a: a[: len(group)], roots)))
-        if stop.is_set() or not bool(jnp.any(tree.alive)):
+        if post.stopped() or not bool(jnp.any(tree.alive)):
             break
     log, outcome, steps = (
         np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps)

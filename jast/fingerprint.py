@@ -1,0 +1,125 @@
+"""What a call was about, in words that can be stored and compared: the numbers of a simulator, its
+functions by name and code, settings and versions.
+"""
+
+import dataclasses
+import hashlib
+import inspect
+import sys
+import types
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+__all__ = ["differences", "fingerprint"]
+
+TOLD = 3
+"""Differences that a message names."""
+
+
+def fingerprint(**parts: Any) -> dict[str, str]:
+    """``parts`` as a flat dict "part.field.field" -> words, with the versions that results depend
+    on.
+
+    Arrays enter by their type, shape and a hash of their values, functions by their name and code
+    and what they close over, other objects by their class alone.
+    """
+    return dict(_versions()) | {
+        name: words for part, value in parts.items() for name, words in _words(part, value, ())
+    }
+
+
+def differences(there: dict[str, str], here: dict[str, str]) -> str:
+    """In words, where two fingerprints differ; "" where they do not."""
+    names = [*here, *(n for n in there if n not in here)]
+    unlike = [n for n in names if there.get(n) != here.get(n)]
+    said = [
+        f"{n} is {there.get(n, 'nothing')} there, {here.get(n, 'nothing')} here" for n in unlike
+    ]
+    more = [f"and {len(said) - TOLD} more differences"] if len(said) > TOLD else []
+    return "; ".join(said[:TOLD] + more)
+
+
+def versions() -> dict[str, str]:
+    """What must be alike wherever a part of one result is made."""
+    from jast import __version__  # not at import: the package imports this module
+
+    return {
+        "jast": __version__,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "platform": jax.default_backend(),
+    }
+
+
+def _versions() -> Iterator[tuple[str, str]]:
+    yield from versions().items()
+    yield "python", "{}.{}".format(*sys.version_info)
+    yield "jax_enable_x64", str(jax.config.jax_enable_x64)
+
+
+def _words(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
+    """(name, words) of ``value`` and what is in it; ``above``: functions that it is part of."""
+    inside = lambda pairs: (
+        pair for key, part in pairs for pair in _words(f"{name}.{key}", part, above)
+    )
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        yield name, repr(value)
+    elif isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+        yield name, f"{value.dtype} {np.asarray(jax.random.key_data(value)).tolist()}"
+    elif isinstance(value, np.ndarray | np.generic | jax.Array):
+        yield name, _of_array(np.asarray(value))
+    elif isinstance(value, partial):  # also jax.tree_util.Partial
+        yield from _words(name, value.func, above)
+        yield from inside([*enumerate(value.args), *value.keywords.items()])
+    elif isinstance(value, dict):
+        yield from inside(value.items())
+    elif hasattr(value, "_fields"):
+        yield from inside((f, getattr(value, f)) for f in value._fields)
+    elif isinstance(value, tuple | list):
+        yield name, f"{len(value)} parts"
+        yield from inside(enumerate(value))
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield name, type(value).__qualname__
+        yield from inside((f.name, getattr(value, f.name)) for f in dataclasses.fields(value))
+    elif inspect.isroutine(function := inspect.unwrap(value) if callable(value) else value):
+        yield from _of_function(name, function, above)
+    else:
+        kind = value if isinstance(value, type) else type(value)
+        yield name, f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _of_array(array: np.ndarray) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    value = f"= {array}" if array.size == 1 else f"with hash {digest[:12]}"
+    return f"{array.dtype}{list(array.shape)} {value}"
+
+
+def _of_function(name: str, function: Any, above: tuple) -> Iterator[tuple[str, str]]:
+    function = getattr(function, "__func__", function)
+    words = f"{getattr(function, '__module__', '')}.{function.__qualname__}"
+    code = getattr(function, "__code__", None)
+    ours = words.startswith(("jast.", "jax."))  # their versions say what they are
+    if code is None or ours or function in above:
+        yield name, words
+    else:
+        yield name, f"{words} with code {_of_code(code).hexdigest()[:12]}"
+    if code is not None and function not in above:
+        cells = zip(code.co_freevars, function.__closure__ or ())
+        for variable, cell in cells:
+            try:
+                held = cell.cell_contents
+            except ValueError:  # not yet assigned
+                continue
+            yield from _words(f"{name}.{variable}", held, (*above, function))
+
+
+def _of_code(code: types.CodeType) -> Any:
+    digest = hashlib.sha256(code.co_code)
+    for part in (*code.co_names, *code.co_consts):
+        inner = isinstance(part, types.CodeType)
+        digest.update(_of_code(part).digest() if inner else repr(part).encode())
+    return digest

@@ -1,0 +1,368 @@
+"""Units of work: where they run, and what ended the call before, changes no result; what goes wrong
+on the way is told.
+"""
+
+import concurrent.futures
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jast
+from jast import places, units
+from jast.fingerprint import differences, fingerprint
+from jast.places import Task
+from jast.search import forest, mcts, monte_carlo
+from jast.simulators import ferry, walk1d
+from jast.watch import Watch
+
+ROOT = Path(__file__).parents[1]
+EPISODES = 3000
+CALLS = {
+    "nominal": lambda key, **how: jast.nominal(key, walk1d(), EPISODES, **how),
+    "monte_carlo": lambda key, **how: monte_carlo(
+        key, walk1d(), episodes=EPISODES, refine=0, record=True, **how
+    ),
+    "forest": lambda key, **how: forest(
+        key, walk1d(), trees=6, prunes=2, simulations=20, lanes=2, refine=0, **how
+    ),
+    "mcts": lambda key, **how: mcts(
+        key, walk1d(), trees=3, simulations=30, lanes=1, refine=0, keep_trees=True, **how
+    ),
+}
+"""A call of each kind, of a few units."""
+
+
+@pytest.fixture(autouse=True)
+def small_units(monkeypatch):
+    monkeypatch.setattr(sys.modules["jast.search.monte_carlo"], "LANES", 512)
+
+
+@pytest.fixture
+def same(equal):
+    """Asserts that two results are the same to the bit."""
+
+    def check(a, b):
+        assert a.settings == b.settings
+        equal(a._replace(settings=None), b._replace(settings=None))
+
+    return check
+
+
+def square(shared, number, post):
+    """A unit that needs no simulator."""
+    return np.array(number**2)
+
+
+def fails(shared, number, post):
+    """Unit 1 never comes to its end."""
+    if number == 1:
+        raise ZeroDivisionError("one")
+    return square(shared, number, post)
+
+
+class Flaky:
+    """An executor of this process, in which all units fail the first times."""
+
+    def __init__(self, times):
+        self.pool, self.times, self.tries = ThreadPoolExecutor(1), times, {}
+
+    def submit(self, function, *args):
+        number = args[-1]
+        self.tries[number] = self.tries.get(number, 0) + 1
+        if self.tries[number] <= self.times:
+            return self.pool.submit(lambda: 1 / 0)
+        return self.pool.submit(function, *args)
+
+
+class Closing:
+    """One that is shut down after a few units."""
+
+    def __init__(self, after):
+        self.pool, self.left = ThreadPoolExecutor(1), after
+
+    def submit(self, function, *args):
+        self.left -= 1
+        if self.left == 0:
+            self.pool.shutdown()
+        return self.pool.submit(function, *args)
+
+
+def squares(n=5, function=square, executor=None, **how):
+    watch = Watch("squares", n, "unit", False, how.pop("callback", None))
+    ways = units.ways("squares", executor, how.pop("devices", None))
+    like = lambda: 0
+    fold = lambda state, number, result: (*state, int(result))
+    return units.run(Task(function, None, like), n, fold, (), watch, ways, **how)
+
+
+# --- where units run, and from where they go on
+
+
+@pytest.mark.parametrize(
+    "name", [n if n != "mcts" else pytest.param(n, marks=pytest.mark.long) for n in CALLS]
+)
+def test_no_place_changes_a_result(name, key, same, tmp_path):
+    call = CALLS[name]
+    alone = call(key)
+    same(call(key, checkpoint=tmp_path / "run.jast"), alone)
+    parts = sorted(p for p in (tmp_path / "run.jast").glob("*-0*.jast"))
+    assert len(parts) > 2
+    parts[1].unlink()
+    parts[2].write_bytes(parts[2].read_bytes()[:-40])  # damaged: done again
+    with ThreadPoolExecutor(2) as executor:
+        same(call(key, checkpoint=tmp_path / "run.jast", executor=executor), alone)
+        same(call(key, checkpoint=tmp_path / "run.jast"), alone)
+    same(call(key, devices=jax.devices()), alone)
+
+
+def test_what_is_done_is_not_done_again(key, tmp_path, monkeypatch, same):
+    call, done = CALLS["nominal"], []
+    real = sys.modules["jast.crude"]._unit
+
+    def unit(job, number, post):
+        done.append(number)
+        return real(job, number, post)
+
+    monkeypatch.setattr(sys.modules["jast.crude"], "_unit", unit)
+
+    def stop(done, total, _):
+        raise KeyboardInterrupt
+
+    part = call(key, checkpoint=tmp_path, callback=stop)
+    assert part.episodes < EPISODES and "interrupted" in part.settings
+    on_disk = len(list(tmp_path.glob("unit-*")))
+    done.clear()
+    whole = call(key, checkpoint=tmp_path)
+    assert len(done) == 3 - on_disk < 3
+    same(whole, call(key))
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_a_call_with_what_is_done(key, ended_by):
+    found = CALLS["nominal"](key, callback=lambda *_: os.kill(os.getpid(), ended_by))
+    assert 0 < found.episodes < EPISODES and found.settings["interrupted"].startswith("after ")
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def child(name, folder, **more):
+    """A process that makes a call of `CALLS` with a checkpoint."""
+    code = (
+        "import sys; sys.path.insert(0, 'tests'); import conftest, jax, test_units as t;"
+        f"t.EPISODES = {EPISODES};"
+        f"t.CALLS[{name!r}](jax.random.key(7), checkpoint={str(folder)!r}, **{more})"
+    )
+    env = os.environ | dict(PYTHONPATH=str(ROOT))
+    return subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, env=env)
+
+
+def killed(name, folder, delay):
+    """How many units a call had finished when its process was killed, ``delay`` seconds after the
+    first; None where it had come to its end.
+    """
+    process = child(name, folder)
+    while not list(folder.glob("*-0*.jast")) and process.poll() is None:
+        time.sleep(0.002)
+    time.sleep(delay)
+    process.kill()
+    return None if process.wait() == 0 else len(list(folder.glob("*-0*.jast")))
+
+
+def test_a_killed_call_goes_on_to_the_same_result(tmp_path, same, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "EPISODES", 400_000)
+    folder = tmp_path / "run.jast"
+    folder.mkdir()
+    units_done = killed("nominal", folder, 0.05)
+    assert units_done is None or units_done >= 1
+    key = jax.random.key(7)
+    same(CALLS["nominal"](key, checkpoint=folder), CALLS["nominal"](key))
+
+
+# --- what goes wrong
+
+
+def test_a_unit_that_fails_elsewhere_is_tried_again():
+    flaky = Flaky(2)
+    ran = squares(executor=flaky)
+    assert ran.state == (0, 1, 4, 9, 16) and ran.left_out == () and ran.incidents == ()
+    assert set(flaky.tries.values()) == {3}
+
+
+def test_a_unit_that_goes_on_failing_is_left_out_and_told():
+    with ThreadPoolExecutor(2) as executor:
+        ran = squares(function=fails, executor=executor)
+    assert ran.state == (0, 4, 9, 16) and ran.left_out == (1,) and ran.done == 5
+    (incident,) = ran.incidents
+    assert "ZeroDivisionError: one" in str(incident) and "make the same call again" in str(incident)
+    assert "units 1 are left out" in units.note("units", ran, 4, 5)
+
+
+def test_where_all_units_fail_the_call_says_why():
+    with pytest.raises(RuntimeError, match="squares: units fail in the executor, 3 times.*Zero"):
+        squares(executor=Flaky(9))
+    with pytest.raises(ZeroDivisionError):  # in this process, at once
+        squares(function=fails)
+
+
+def test_an_executor_that_is_shut_down_leaves_what_is_done():
+    ran = squares(n=600, executor=Closing(after=300))
+    assert 0 < len(ran.state) < 600 and list(ran.state) == [i**2 for i in range(len(ran.state))]
+    assert "cannot schedule new futures" in units.note("units", ran, ran.done, 600)
+    with pytest.raises(RuntimeError, match="squares: the executor takes no more work"):
+        squares(executor=Closing(after=1))
+
+
+def test_an_executor_with_other_versions_is_refused(monkeypatch):
+    here = places.versions()
+    answers = iter([here, here | {"jax": "0.1.0"}])
+    monkeypatch.setattr(places, "versions", lambda: next(answers))
+    with ThreadPoolExecutor(1) as executor:
+        with pytest.raises(ValueError, match="squares: .*other versions.*jax is 0.1.0 there"):
+            squares(n=1, executor=executor)
+
+
+def test_what_cannot_be_sent_is_named(monkeypatch):
+    held = threading.Lock()
+    with ThreadPoolExecutor(1) as executor:
+        with pytest.raises(ValueError, match="squares: .*cannot be sent.*lock.*in a module"):
+            squares(function=lambda *_: held, executor=executor)
+        assert squares(function=lambda s, n, p: np.array(n), n=2, executor=executor).state == (0, 1)
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+        with pytest.raises(ValueError, match="lambda.*define the simulator's.*install cloudpickle"):
+            squares(function=lambda s, n, p: np.array(n), executor=executor)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_bad_places_are_named(name, key, tmp_path):
+    call, other = CALLS[name], CALLS["monte_carlo" if name == "nominal" else "nominal"]
+    other(key, checkpoint=tmp_path / "other")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.tex").write_text("")
+    for how, match in [
+        (dict(executor=3), "executor must have submit"),
+        (dict(devices=[]), "devices must be of jax.devices"),
+        (dict(devices="cpu"), "devices must be of jax.devices"),
+        (dict(devices=jax.devices(), executor=Flaky(0)), "devices must be None where"),
+        (dict(checkpoint=3), "checkpoint must be the path of a folder, received 3"),
+        (dict(checkpoint=tmp_path / "file"), "checkpoint must be a folder, received the file"),
+        (dict(checkpoint=tmp_path / "full"), ".* other files in it, such as thesis.tex"),
+        (dict(checkpoint=tmp_path / "other"), f".* another call: function is '.*' there, '{name}'"),
+    ]:
+        with pytest.raises(ValueError, match=f"{name}: {match}"):
+            call(key, **how)
+    with pytest.raises(OSError, match=f"{name}: checkpoint .* cannot be written: Not a directory"):
+        call(key, checkpoint=tmp_path / "file/run.jast")
+
+
+def test_a_checkpoint_of_another_key_or_in_use_is_refused(key, tmp_path):
+    call = CALLS["nominal"]
+
+    def again(*_):
+        with pytest.raises(ValueError, match=f"in use by another call .process {os.getpid()}."):
+            call(key, checkpoint=tmp_path)
+
+    call(key, checkpoint=tmp_path, callback=again)
+    with pytest.raises(ValueError, match="another call: key is .* there, .* here; give another"):
+        call(jax.random.fold_in(key, 1), checkpoint=tmp_path)
+
+
+def test_a_full_disk_is_told(key, tmp_path, monkeypatch):
+    def full(*args, **how):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="nominal: checkpoint .* cannot be written: No space left"):
+        CALLS["nominal"](key, checkpoint=tmp_path)
+
+
+def test_places_are_refused_inside_of_transformations(key, tmp_path):
+    run = lambda key: monte_carlo(key, walk1d(), episodes=8, refine=0, checkpoint=tmp_path).steps
+    with pytest.raises(ValueError, match="checkpoint must be None inside of jax.jit"):
+        jax.jit(run)(key)
+
+
+def test_a_fingerprint_tells_functions_and_numbers_apart():
+    def made(gain):
+        return lambda x: gain * x
+
+    same = fingerprint(sim=walk1d(), f=made(2.0)), fingerprint(sim=walk1d(), f=made(2.0))
+    assert differences(*same) == ""
+    assert "f.gain is 2.0 there, 3.0 here" == differences(
+        same[0], fingerprint(sim=walk1d(), f=made(3.0))
+    )
+    assert "code" in differences(fingerprint(f=lambda x: x + 1), fingerprint(f=lambda x: x - 1))
+    assert "sim" in differences(fingerprint(sim=walk1d()), fingerprint(sim=ferry()))
+
+
+# --- long: processes, devices, many kills
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["nominal", "forest"])
+def test_four_devices_are_as_good_as_one(name, tmp_path, same):
+    """And a checkpoint that was begun on four goes on where there is one."""
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    code = (
+        "import sys; sys.path.insert(0, 'tests'); import jax, test_units as t;"
+        "assert len(jax.devices()) == 4;"
+        f"t.CALLS[{name!r}](jax.random.key(7), checkpoint={str(tmp_path)!r},"
+        " devices=jax.devices())"
+    )
+    env = os.environ | dict(PYTHONPATH=str(ROOT), XLA_FLAGS=flags)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, env=env, check=True)
+    key = jax.random.key(7)
+    same(CALLS[name](key, checkpoint=tmp_path), CALLS[name](key))
+
+
+def spawned():
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(2, mp_context=context)
+
+
+def of_loky():
+    return pytest.importorskip("loky").ProcessPoolExecutor(2)
+
+
+def dask():
+    distributed = pytest.importorskip("distributed")
+    return distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ).get_client()
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore")  # of other packages
+@pytest.mark.parametrize("make", [spawned, of_loky, dask])
+def test_processes_of_an_executor_are_as_good_as_this_one(make, key, same, tmp_path):
+    with make() as made:
+        executor = made.get_executor() if make is dask else made
+        for call in CALLS.values():
+            same(call(key, executor=executor), call(key))
+        if make is dask:
+            made.cluster.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["nominal", "forest"])
+def test_twenty_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "EPISODES", 2_000_000)
+    key, rng = jax.random.key(7), np.random.default_rng(0)
+    whole, lasting = CALLS[name](key), 0
+    for i, delay in enumerate(rng.uniform(0, 0.3, 20)):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        lasting += killed(name, folder, delay) is not None
+        same(CALLS[name](key, checkpoint=folder), whole)
+    assert lasting > 0
