@@ -16,13 +16,10 @@ import warnings
 
 import numpy as np
 
+from benchmarks import cma_es as driver
 from benchmarks.cases import CASES
 
 __all__ = ["PEERS", "run", "summary"]
-
-
-class Spent(Exception):
-    """The budget is used up."""
 
 
 def _record(objective, budget, dimension, search):
@@ -33,7 +30,7 @@ def _record(objective, budget, dimension, search):
     def evaluate(point):
         nonlocal n
         if n == budget:
-            raise Spent
+            raise driver.Stop
         x[n] = point
         value[n] = objective(x[n])
         n += 1
@@ -43,7 +40,7 @@ def _record(objective, budget, dimension, search):
         warnings.simplefilter("ignore")
         try:
             search(evaluate)
-        except Spent:
+        except driver.Stop:
             pass
     return x[:n], value[:n]
 
@@ -61,27 +58,12 @@ def cma_es(seed, objective, mean, sd, budget):
     ``tolfun`` and ``tolfunhist`` (1e-11, absolute) are off: in sierra's flat far field they end a
     run after one generation, on 1B five times a seed.
     """
-    import cma
-
     rng = np.random.default_rng(seed)
-    options = {
-        "CMA_stds": list(sd),
-        "verbose": -9,
-        "verb_log": 0,
-        "tolfun": 0,
-        "tolfunhist": 0,
-        "seed": np.nan,
-        "randn": lambda *shape: rng.standard_normal(shape),
-    }
 
     def search(evaluate):
-        start = mean
-        while True:
-            es = cma.CMAEvolutionStrategy(start, 1.0, options)
-            while not es.stop():
-                points = es.ask()
-                es.tell(points, [evaluate(p) for p in points])
-            start = mean + sd * rng.standard_normal(len(mean))
+        again = lambda: mean + sd * rng.standard_normal(len(mean))
+        each = lambda points: [evaluate(p) for p in points]
+        driver.cma_es(rng, each, mean, sd, again, tolfun=0, tolfunhist=0)
 
     return _record(objective, budget, len(mean), search)
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
+from benchmarks import cma_es as driver
 from benchmarks.sizes import options, size
 from benchmarks.stress_systems import CASES, JUDGED
 from jast.limit_state import dimension, normal_numbers, policy_of
@@ -59,27 +60,28 @@ def cma_es(key, sim, budget):
     it ranks failures first, by log p. Started anew where it has converged, and refined as the
     searches of jast are.
     """
-    import cma
-
     size, rng = 128, np.random.default_rng(int(jax.random.bits(key, dtype="uint32")))
-    centre = centred(sim)
-    zeros = np.zeros(dimension(sim))
-    known, spent, es = None, 0, None
-    settings = {"verbose": -9, "popsize": size, "tolflatfitness": 10**9, "seed": np.nan}
-    settings["randn"] = lambda *shape: rng.standard_normal(shape)
-    while spent + size <= budget:
-        if es is None or es.stop():
-            es = cma.CMAEvolutionStrategy(zeros, 1.0, settings)
-        points = np.array(es.ask())
+    centre, zeros = centred(sim), np.zeros(dimension(sim))
+    known, spent = None, 0
+
+    def evaluate(points):
+        nonlocal known, spent
+        if spent + size > budget:
+            raise driver.Stop
         each = jax.device_get(_scored(centre, jnp.asarray(points, normal_numbers(sim))))
-        worth = np.where(each.failure, -1 / (1 + np.abs(each.reward)), each.distance)
-        es.tell(list(points), list(np.nan_to_num(worth, nan=1e30, posinf=1e30)))
         both = lambda a, b: np.concatenate([a, b])
         known = each if known is None else jax.tree.map(both, known, each)
         value = np.where(known.failure, known.reward, -np.inf)
         order = np.argsort(-value, kind="stable")[:64]
-        known = jax.tree.map(lambda a, order=order: a[order], known)
+        known = jax.tree.map(lambda a: a[order], known)
         spent += size
+        worth = np.where(each.failure, -1 / (1 + np.abs(each.reward)), each.distance)
+        return np.nan_to_num(worth, nan=1e30, posinf=1e30)
+
+    again = lambda: zeros
+    driver.cma_es(
+        rng, evaluate, zeros, np.ones(len(zeros)), again, popsize=size, tolflatfitness=10**9
+    )
     known = jax.tree.map(lambda a: a[known.failure], known)
     if not len(known.length):
         return None, spent, None

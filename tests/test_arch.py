@@ -243,6 +243,8 @@ def test_equal_settings_compile_once():
         traced(chasing_cars("CCx"))
         traced(automatic_transmission("AT6c"))
     assert len(calls) == 2
+    # trees map over simulators: these hold no arrays, and no distribution as a leaf
+    assert not jax.tree.leaves(automatic_transmission("AT6c"))
 
 
 @pytest.mark.parametrize(

@@ -181,11 +181,10 @@ def _driven(
         formula = SPECIFICATIONS[formula]
     each = total // segments
     needed = min(reach(formula, model.DT), total)
-    low, high = (jnp.array([i[side] for i in model.INPUTS], jnp.zeros(()).dtype) for side in (1, 2))
-    given = Independent(Uniform(low, high), 1) if disturbance is None else disturbance
     functions, samples = _functions(model, each, math.ceil(needed / each))
-    driving = Simulator(**functions, disturbance=Partial(_given, given), horizon=segments)
-    return under(driving, formula, model.DT, samples=samples)
+    if disturbance is not None:
+        functions = functions | dict(disturbance=lambda state: disturbance)
+    return under(Simulator(**functions, horizon=segments), formula, model.DT, samples=samples)
 
 
 @cache
@@ -199,9 +198,15 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), start)
         return Driving(start, samples, jnp.zeros((), jnp.int32))
 
+    def ranges() -> list[Any]:
+        dtype = jnp.zeros(()).dtype
+        return [jnp.array([i[side] for i in model.INPUTS], dtype) for side in (1, 2)]
+
+    def disturbance(state: Driving) -> Any:
+        return Independent(Uniform(*ranges()), 1)
+
     def step(state: Driving, x: Any) -> Driving:
-        ranges = [jnp.array([i[side] for i in model.INPUTS]) for side in (1, 2)]
-        inputs = jnp.broadcast_to(jnp.clip(x, *ranges).astype(jnp.zeros(()).dtype), (each, 2))
+        inputs = jnp.broadcast_to(jnp.clip(x, *ranges()).astype(jnp.zeros(()).dtype), (each, 2))
         return Driving(*model.drive(state.now, inputs), state.step + 1)
 
     def is_terminal(state: Driving) -> Any:
@@ -213,13 +218,14 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         return jnp.concatenate([part.astype(dtype) for part in parts])
 
     functions = dict(
-        init=init, step=step, evaluate=_nothing, is_terminal=is_terminal, observe=observe
+        init=init,
+        step=step,
+        disturbance=disturbance,
+        evaluate=_nothing,
+        is_terminal=is_terminal,
+        observe=observe,
     )
     return functions, Partial(_samples)
-
-
-def _given(distribution: Any, state: Driving) -> Any:
-    return distribution
 
 
 def _samples(state: Driving) -> Any:
