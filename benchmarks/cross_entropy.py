@@ -25,6 +25,7 @@ from benchmarks.engine import cpu  # noqa: E402
 from benchmarks.ferry import timed  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast import cross_entropy as ce  # noqa: E402
+from jast.cross_entropy.surrogates import RADIAL  # noqa: E402
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
 METHODS = ("ce_method", "ce_surrogate", "ce_mixture")
@@ -154,6 +155,22 @@ def schedules(seeds, rates=(0.1, 0.2, 0.3), forms=("before", "after"), modes=("t
     return out
 
 
+def surrogates(seeds, cases=("sierra 1A", "paraboloid 2")):
+    """CE-surrogate in mode "thesis" with each model of the objective, the published code's default
+    first.
+    """
+    models = {"gaussian process": {}}
+    models |= {f"basis={name}": dict(basis=name) for name in RADIAL}
+    models |= {
+        f"polynomial, degree {k}": dict(surrogate="polynomial", degree=k) for k in (1, 2, 3, 4)
+    }
+    return {
+        f"{case}, {name}": ours("ce_surrogate", case, seeds, mode="thesis", **how)
+        for case in cases
+        for name, how in models.items()
+    }
+
+
 def say_row(name, r, published=None):
     far = f"   d {r['distance']:6.2f}   F {r['F']:6.1f}" if "F" in r else ""
     note = f"   thesis {published[0]:.4f} / {published[1]:.2f}" if published else ""
@@ -176,6 +193,7 @@ def main(argv=None):
         default=24,
         help="runs of the expected-improvement optimiser, 2 to 5 CPU seconds each",
     )
+    parser.add_argument("--surrogates", action="store_true", help="only the kinds of surrogate")
     parser.add_argument("--picture", metavar="PATH", help="draw the mean best value by evaluations")
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
@@ -185,6 +203,15 @@ def main(argv=None):
         methods, modes = ("ce_surrogate",), ("default",)
     say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
     show = (lambda *a: None) if args.json else say_row
+    if args.surrogates:
+        report = surrogates(seeds, *(((SIERRA[0],),) if args.smoke else ()))
+        for name, r in report.items():
+            show(name, r) if name.startswith("sierra") else say(
+                f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
+            )
+        if args.json:
+            print(json.dumps(report))
+        return
     report = {
         "seeds": seeds,
         "speed": speed(seeds, methods),

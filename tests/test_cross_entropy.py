@@ -453,6 +453,20 @@ def test_singular_elites_leave_the_proposal(key):
     )
 
 
+def test_the_call_that_the_thesis_prints(key, x64):
+    """``ce_surrogate(paraboloid, M; basis=:squared)`` finds the bottom: squared distances to
+    points span a paraboloid.
+    """
+    proposal = ce.normal(jnp.zeros(2), 200 * jnp.eye(2))
+    run = lambda **how: ce.ce_surrogate(key, ce.paraboloid, proposal, mode="thesis", **how)
+    squared = run(basis="squared")
+    assert (
+        squared.best_value < 2
+        and squared.best_value == run(surrogate="radial basis", basis="squared").best_value
+    )
+    assert squared.best_value != run(basis="linear").best_value
+
+
 BAD = {
     "elites must be at most the samples of an iteration, 10, received 11": dict(elites=11),
     "elites must be a whole number of at least 1, received 0": dict(elites=0),
@@ -461,6 +475,10 @@ BAD = {
     "surrogate must be one of ['gaussian process', 'linear', 'polynomial', 'radial basis'],"
     " received 'forest'": dict(surrogate="forest"),
     "kernel must be one of ": dict(kernel="cubic"),
+    "basis must be one of ['gaussian', 'linear', 'squared', 'multiquadratic']": dict(basis="cubic"),
+    "degree must be a whole number of at least 1, received 0": dict(
+        surrogate="polynomial", degree=0
+    ),
     "warp must be one of ['raw', 'standard', 'rank'], received 'log'": dict(warp="log"),
     "frame must be one of ": dict(frame=3),
     "evaluated must be a share from 0 to 0.5, received 0.7": dict(evaluated=0.7),

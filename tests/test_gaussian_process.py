@@ -147,19 +147,33 @@ def test_bad_input_is_named():
         gp.fit(x, y[:3], y == 0, (1.0,))
 
 
-@pytest.mark.parametrize("kind", ["linear", "polynomial", "radial basis"])
-def test_least_squares_are_those_of_numpy(kind, x64):
+@pytest.mark.parametrize(
+    "kind, detail",
+    [
+        ("linear", None),
+        ("polynomial", None),
+        ("polynomial", 3),
+        ("radial basis", None),
+        ("radial basis", "linear"),
+        ("radial basis", "squared"),
+        ("radial basis", "multiquadratic"),
+    ],
+)
+def test_least_squares_are_those_of_numpy(kind, detail, x64):
     x, y = data(40, 2)
     frame = surrogates.Frame(jnp.zeros(2), jnp.eye(2))
-    a, b = x.T
+    r2 = lambda a, b: (a[None] - x[:, :1]) ** 2 + (b[None] - x[:, 1:]) ** 2
+    second = lambda a, b: [a**0, a, b, a * a, a * b, b * b]
     features = {
-        "linear": lambda a, b: np.stack([a**0, a, b]),
-        "polynomial": lambda a, b: np.stack([a**0, a, b, a * a, a * b, b * b]),
-        "radial basis": lambda a, b: np.exp(
-            -((a[None] - x[:, :1]) ** 2 + (b[None] - x[:, 1:]) ** 2) / 4
-        ),
-    }[kind]
-    m = features(a, b).T
+        ("linear", None): lambda a, b: np.stack([a**0, a, b]),
+        ("polynomial", None): lambda a, b: np.stack(second(a, b)),
+        ("polynomial", 3): lambda a, b: np.stack([*second(a, b), a**3, a * a * b, a * b * b, b**3]),
+        ("radial basis", None): lambda a, b: np.exp(-r2(a, b) / 4),
+        ("radial basis", "linear"): lambda a, b: np.sqrt(r2(a, b)),
+        ("radial basis", "squared"): r2,
+        ("radial basis", "multiquadratic"): lambda a, b: np.sqrt(r2(a, b) + 1),
+    }[kind, detail]
+    m = features(*x.T).T
     normal = m.T @ m
     weights = np.linalg.solve(
         normal + surrogates.RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal)), m.T @ y
@@ -170,7 +184,7 @@ def test_least_squares_are_those_of_numpy(kind, x64):
         jnp.asarray(np.concatenate([x, np.full((5, 2), np.nan)])),
         jnp.asarray(np.concatenate([y, np.full(5, np.nan)])),
     )
-    fitted = surrogates.fit(kind, *padded, mask, frame)
+    fitted = surrogates.fit(kind, *padded, mask, frame, detail)
     np.testing.assert_allclose(
         surrogates.predict(kind, fitted, jnp.asarray(new)), features(*new.T).T @ weights, rtol=2e-4
     )

@@ -43,7 +43,8 @@ class Plan(NamedTuple):
     current: bool = False
     """Those searches have the current covariance, not the initial one"""
     surrogate: str = ""
-    kernel: str = ""
+    detail: Any = None
+    """Of the surrogate: see `surrogates.DETAILS`"""
     warp: str = ""
     frame: str = ""
     """Of the surrogate: "window", that of the points it sees, or "initial", the scale of the

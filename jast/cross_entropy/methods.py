@@ -82,7 +82,11 @@ def ce_surrogate(
     where it is not given):
 
     - ``surrogate``: "gaussian process" (with a ``kernel``: "squared exponential", "matern12",
-      "matern32", "matern52"), "linear", "polynomial" (of degree 2) or "radial basis".
+      "matern32", "matern52"), "linear", "polynomial" (of ``degree``, by default 2) or "radial
+      basis" around the points it is fitted to.
+    - ``basis``: of the distance r in the ``frame``: "gaussian", exp(-r^2 / 2 d); "linear", r;
+      "squared", r^2; "multiquadratic", sqrt(r^2 + 1). Given alone, as in the thesis's printed call
+      ``ce_surrogate(f, M; basis=:squared)``, it chooses "radial basis".
     - ``memory``, ``best``: it is fitted to the evaluations of so many of the last iterations, and
       so many of the best before them.
     - ``warp``: to values "raw", "standard" (mean 0, variance 1), or "rank" (normal scores, which no

@@ -94,7 +94,7 @@ def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
     x, y, mask = seen
     y, mask = surrogates.warped(plan.warp, y, mask)
     at = surrogates.frame(x, mask) if plan.frame == "window" else _round(moments(first))
-    model = surrogates.fit(plan.surrogate, x, y, mask, at, plan.kernel)
+    model = surrogates.fit(plan.surrogate, x, y, mask, at, plan.detail)
     mean = partial(surrogates.predict, plan.surrogate, model)
     aim = (
         partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)

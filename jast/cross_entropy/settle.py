@@ -13,12 +13,18 @@ from jast.cross_entropy.gaussian_process import KERNELS
 from jast.cross_entropy.loop import Plan, Settings
 from jast.cross_entropy.mixture import Mixture, as_mixture
 from jast.cross_entropy.schedules import counts
-from jast.cross_entropy.surrogates import SURROGATES, WARPS
+from jast.cross_entropy.surrogates import RADIAL, SURROGATES, WARPS
 from jast.rewards import as_pytree
 
 __all__ = ["MODES", "settled"]
 
-_MODEL = dict(surrogate="gaussian process", kernel="squared exponential", alpha=1.0)
+_MODEL = dict(
+    surrogate="gaussian process",
+    kernel="squared exponential",
+    basis="gaussian",
+    degree=2,
+    alpha=1.0,
+)
 _THESIS = dict(
     elitism=False,
     memory=3,
@@ -72,6 +78,8 @@ def settled(
         name: value if given.get(name) is None else given[name]
         for name, value in MODES[method][mode].items()
     }
+    if given.get("basis") is not None and given.get("surrogate") is None:
+        chosen["surrogate"] = "radial basis"  # as in the thesis's call
     sizes = counts(schedule, samples, iterations)
     mean_size = max(1, round(sum(sizes) / len(sizes)))
     sizes = tuple(n for n in sizes if n)  # an iteration without evaluations teaches nothing
@@ -87,6 +95,7 @@ def settled(
     for name, allowed in dict(
         surrogate=SURROGATES,
         kernel=KERNELS,
+        basis=RADIAL,
         warp=WARPS,
         frame=("initial", "window"),
         start=("elites", "searches"),
@@ -131,7 +140,7 @@ def settled(
             method,
             sizes,
             tuple(kept),
-            **{name: value for name, value in chosen.items() if name != "selection"},
+            **{name: value for name, value in chosen.items() if name in Plan._fields},
         ),
         settings,
         proposal,
@@ -159,7 +168,11 @@ def _model(method, chosen, optimism, most, each, kept, d):
             max(fewest, round(s * judged))
             for s in _selection(method, chosen["selection"], each, kept, d)
         ),
-        kernel=chosen["kernel"] if chosen["surrogate"] == "gaussian process" else "",
+        detail={
+            "gaussian process": chosen["kernel"],
+            "polynomial": whole(method, "degree", chosen["degree"], 1),
+            "radial basis": chosen["basis"],
+        }.get(chosen["surrogate"]),
     )
 
 

@@ -5,16 +5,18 @@ Points are centred and scaled first, and values may be warped. What is predicted
 ranking points, which is all that a cross-entropy method does.
 """
 
+from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jax.scipy.special import ndtri
+from jax.tree_util import register_dataclass
 
 from jast.cross_entropy import gaussian_process
 
-__all__ = ["SURROGATES", "WARPS", "frame", "fit", "predict", "warped"]
+__all__ = ["RADIAL", "SURROGATES", "WARPS", "frame", "fit", "predict", "warped"]
 
 
 class Frame(NamedTuple):
@@ -34,7 +36,9 @@ class Surrogate(NamedTuple):
     """A `GaussianProcess`, or a `Basis`."""
 
 
-class Basis(NamedTuple):
+@register_dataclass
+@dataclass(frozen=True)
+class Basis:
     """Least squares on basis functions, which `predict` finds by the kind of the model."""
 
     x: Any
@@ -43,30 +47,49 @@ class Basis(NamedTuple):
     """[n] bool"""
     weights: Any
     """[features]"""
+    detail: Any = field(default=None, metadata=dict(static=True))
+    """The degree of a polynomial, the name of a radial function."""
 
 
-def _linear(x, centres, mask):
-    return jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1)
+RADIAL = {
+    "gaussian": lambda r2, d: jnp.exp(-0.5 * r2 / d),
+    "linear": lambda r2, d: jnp.sqrt(r2 + jnp.finfo(r2.dtype).tiny),
+    "squared": lambda r2, d: r2,
+    "multiquadratic": lambda r2, d: jnp.sqrt(r2 + 1),
+}
+"""Radial functions of the squared distance r^2 in the frame, in d dimensions (Kochenderfer and
+Wheeler 2019, section 14.4; the names are those of the thesis's code).
+"""
 
 
-def _quadratic(x, centres, mask):
-    pairs = [
-        x[:, i : i + 1] * x[:, j : j + 1]
-        for i, j in combinations_with_replacement(range(x.shape[1]), 2)
+def _linear(x, centres, mask, detail):
+    return _polynomial(x, centres, mask, 1)
+
+
+def _polynomial(x, centres, mask, degree):
+    """All monomials up to the degree: [m, C(d + degree, degree)]."""
+    products = [
+        jnp.prod(x[:, jnp.asarray(which)], axis=1, keepdims=True)
+        for k in range(1, degree + 1)
+        for which in combinations_with_replacement(range(x.shape[1]), k)
     ]
-    return jnp.concatenate([_linear(x, centres, mask), *pairs], axis=1)
+    return jnp.concatenate([jnp.ones_like(x[:, :1]), *products], axis=1)
 
 
-def _radial(x, centres, mask):
-    return jnp.where(
-        mask[None, :],
-        jnp.exp(-0.5 * gaussian_process.squared_distances(x, centres) / x.shape[1]),
-        0,
-    )
+def _radial(x, centres, mask, name):
+    r2 = gaussian_process.squared_distances(x, centres)
+    return jnp.where(mask[None, :], RADIAL[name](r2, x.shape[1]), 0)
 
 
-BASES = {"linear": _linear, "polynomial": _quadratic, "radial basis": _radial}
-SURROGATES = ("gaussian process", *BASES)
+BASES = {"linear": _linear, "polynomial": _polynomial, "radial basis": _radial}
+DETAILS = {
+    "gaussian process": "squared exponential",
+    "linear": None,
+    "polynomial": 2,
+    "radial basis": "gaussian",
+}
+"""Of each kind: the kernel, nothing, the degree, the radial function where none is given."""
+SURROGATES = tuple(DETAILS)
 RIDGE = 1e-4
 """Of the least squares, as a share of the features' mean square."""
 
@@ -124,26 +147,25 @@ def frame(x, mask):
     return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))
 
 
-def fit(kind, x, y, mask, frame, kernel="squared exponential"):
+def fit(kind, x, y, mask, frame, detail=None):
     """The `Surrogate` of this kind (of `SURROGATES`) for points ``x`` [n, d] with warped values
-    ``y`` [n], where ``mask`` [n].
+    ``y`` [n], where ``mask`` [n]; ``detail``: see `DETAILS`.
     """
+    detail = DETAILS[kind] if detail is None else detail
     z = jnp.where(mask[:, None], _framed(frame, jnp.where(mask[:, None], x, 0)), 0)
     if kind == "gaussian process":
         return Surrogate(
-            frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=kernel)
+            frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=detail)
         )
-    features = jnp.where(mask[:, None], BASES[kind](z, z, mask), 0)
+    features = jnp.where(mask[:, None], BASES[kind](z, z, mask, detail), 0)
     normal = features.T @ features
     # a masked centre is no feature
     live = jnp.maximum(jnp.sum(jnp.diagonal(normal) > 0, dtype=x.dtype), 1)
     ridge = jnp.maximum(RIDGE * jnp.trace(normal) / live, jnp.finfo(x.dtype).tiny) * jnp.eye(
         len(normal), dtype=x.dtype
     )
-    return Surrogate(
-        frame,
-        Basis(z, mask, cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))),
-    )
+    weights = cho_solve(cho_factor(normal + ridge), features.T @ jnp.where(mask, y, 0))
+    return Surrogate(frame, Basis(z, mask, weights, detail))
 
 
 def predict(kind, surrogate, x):
@@ -152,7 +174,7 @@ def predict(kind, surrogate, x):
     if kind == "gaussian process":
         return gaussian_process.predict(surrogate.model, z)
     model = surrogate.model
-    return BASES[kind](z, model.x, model.mask) @ model.weights
+    return BASES[kind](z, model.x, model.mask, model.detail) @ model.weights
 
 
 def lower_bound(kind, surrogate, optimism, x):

@@ -9,9 +9,9 @@ readers; what matters is told by shape or words as well.
 Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
 `trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
 `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
-`proposal_contours`, `surrogate_samples`. Of failure probabilities: `probability`, `exceedance`,
-`weights`, `levels`. Of failure policies: `training`. Of weakness recognition: `failures_found`,
-`roc`, `failure_grid`, `influence`.
+`proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
+`exceedance`, `weights`, `levels`. Of failure policies: `training`. Of weakness recognition:
+`failures_found`, `roc`, `failure_grid`, `influence`.
 """
 
 from jast._doors import listed
@@ -26,6 +26,7 @@ from jast.plot.general import distances, disturbances, history
 from jast.plot.learning import levels, training
 from jast.plot.probability import probability, weights
 from jast.plot.report import report
+from jast.plot.sierra import sierra
 from jast.plot.states import phase, traces
 from jast.plot.style import COLOURS, STYLE
 from jast.plot.tree import tree, tree_page
@@ -55,6 +56,7 @@ __all__ = [
     "report",
     "proposal_contours",
     "roc",
+    "sierra",
     "surrogate_samples",
     "traces",
     "training",
