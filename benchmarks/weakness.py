@@ -32,6 +32,9 @@ from benchmarks.ferry import timed
 from benchmarks.fms import mean
 from benchmarks.sizes import options, size
 from jast import plot, weakness
+from jast.weakness.measures import precision_recall
+from jast.weakness.thesis import halves
+from jast.weakness.validation import iteration_key
 
 SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
 ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precision")
@@ -181,6 +184,46 @@ def adaptive(result, failed):
     )
 
 
+def table(result, failed, replacement):
+    """Table 4.1: the means over iterations of precision and recall in the halves that the adversary
+    proposes from, of its candidates and of as many chosen there at random.
+    """
+    rng, rows = np.random.default_rng(0), []
+    sample = json.loads(result.state.selector)[1]["sample"]
+    for i, scores in enumerate(result.history.scores, 1):
+        key = iteration_key(result.state.key, i)
+        _, rest = halves(key, len(failed), sample, replacement)
+        picked = scores[rest] >= 0.5
+        chance = rng.permutation(picked)
+        rows.append([precision_recall(p, failed[rest]) for p in (picked, chance)])
+    own, chance = np.nanmean(rows, axis=0)
+    return dict(
+        precision=own[0], recall=own[1], chance_precision=chance[0], chance_recall=chance[1]
+    )
+
+
+def tables(systems, seeds, out):
+    """Table 4.1 without and with replacement, of each system."""
+    for name, images, labels, predicted in systems:
+        failed = predicted != labels
+        for replacement in (False, True):
+            chosen = weakness.thesis(replacement=replacement)
+            done = runs(images, labels, predicted, chosen, seeds)
+            rows = over(
+                [
+                    table(r, failed, replacement)
+                    | {"all_precision": weakness.judge(r, failed).precision[-1], "calls": r.calls}
+                    for r, *_ in done
+                ]
+            )
+            out[f"{name}, replacement={replacement}"] = rows
+            print(
+                f"  {name}, replacement={replacement}: "
+                + ", ".join(f"{k} {say(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
+                flush=True,
+            )
+
+
 def thesis(result, failed):
     """A row of the thesis's adversary: after each iteration, and at its threshold of 0.5 on all
     inputs at the end.
@@ -266,11 +309,17 @@ def main(argv=None):
     parser.add_argument(
         "--picture", help="draw the first system's failures found against calls into this file"
     )
+    parser.add_argument("--table", action="store_true", help="only Table 4.1 of the thesis")
     given = parser.parse_args(argv)
     seeds = given.seeds or size(given, 10, 2, 1)
     one = given.quick or given.smoke
     systems = mnist(given.data, one) if given.data else digits(one)
     out = {}
+    if given.table:
+        tables([next(iter(systems))], seeds, out)
+        if given.json:
+            print(json.dumps(out))
+        return
     for name, images, labels, predicted in systems:
         if given.smoke:
             images, labels, predicted = images[:80], labels[:80], predicted[:80]

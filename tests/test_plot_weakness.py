@@ -220,7 +220,7 @@ def test_the_legend_lies_beyond_the_diagonal_and_a_truth_of_one_kind_has_no_area
 def test_the_grid_shows_the_first_failures_in_the_order_found():
     order = NUMBERS.permutation(N)
     result = made(order)
-    axes = drawn(plot.failure_grid(result, IMAGES, LABELS, count=7))
+    axes = drawn(plot.first_failures(result, IMAGES, LABELS, count=7))
     first = order[FAILED[order]][:7]
     assert titles(axes) == [f"said {(LABELS[i] + 1) % CLASSES}, is {LABELS[i]}" for i in first]
     assert [ax.get_xlabel() for ax in axes] == [f"input {i}" for i in first]
@@ -229,42 +229,42 @@ def test_the_grid_shows_the_first_failures_in_the_order_found():
         assert ax.images[0].get_clim() == (IMAGES.min(), IMAGES.max())  # one grey for all tiles
     assert axes[0].figure.get_suptitle() == "The first 7 of 12 failures found"
     assert [ax.axison for ax in axes[0].figure.axes] == [True] * 7 + [False] * 3
-    everything = drawn(plot.failure_grid(result, IMAGES, LABELS))
+    everything = drawn(plot.first_failures(result, IMAGES, LABELS))
     assert len(everything) == 12 and everything[0].figure.get_suptitle() == "12 failures found"
     assert (
-        drawn(plot.failure_grid(result, IMAGES, LABELS, count=1))[0].figure.get_suptitle()
+        drawn(plot.first_failures(result, IMAGES, LABELS, count=1))[0].figure.get_suptitle()
         == "The first of 12 failures found"
     )
     assert (
-        drawn(plot.failure_grid(made(BEST[:1]), IMAGES, LABELS))[0].figure.get_suptitle()
+        drawn(plot.first_failures(made(BEST[:1]), IMAGES, LABELS))[0].figure.get_suptitle()
         == "1 failure found"
     )
 
 
 def test_the_grid_takes_names_and_colours():
     i, names = BEST[0], ["cat", "dog", "aeroplane", "horse"]
-    [ax] = drawn(plot.failure_grid(made(BEST[:1]), IMAGES[..., None], LABELS, names=names))
+    [ax] = drawn(plot.first_failures(made(BEST[:1]), IMAGES[..., None], LABELS, names=names))
     assert titles([ax]) == [f"said {names[ANSWERS[i]]}\nis {names[LABELS[i]]}"]
     np.testing.assert_allclose(ax.images[0].get_array(), IMAGES[i])
     colours = NUMBERS.random((N, 6, 5, 3))
     for given, whole in ((colours, 1), ((255 * colours).astype(np.uint8), 255)):
-        [ax] = drawn(plot.failure_grid(made(BEST[:1]), given, LABELS))
+        [ax] = drawn(plot.first_failures(made(BEST[:1]), given, LABELS))
         np.testing.assert_allclose(ax.images[0].get_array(), given[i] / whole)
     # normalised images, say
-    [ax] = drawn(plot.failure_grid(made(BEST[:1]), 4 * colours - 2, LABELS))
+    [ax] = drawn(plot.first_failures(made(BEST[:1]), 4 * colours - 2, LABELS))
     shown = ax.images[0].get_array()
     assert shown.min() >= 0 and shown.max() <= 1
-    drawn(plot.failure_grid(made(BEST[:1]), np.zeros((N, 6, 5), bool), LABELS))
+    drawn(plot.first_failures(made(BEST[:1]), np.zeros((N, 6, 5), bool), LABELS))
 
 
 def test_the_grid_of_no_failure_says_so():
-    [ax] = drawn(plot.failure_grid(NOTHING, IMAGES, LABELS))
+    [ax] = drawn(plot.first_failures(NOTHING, IMAGES, LABELS))
     assert words(ax) == ["no failure found"] and not ax.axison and not ax.images
 
 
 def test_the_influence_of_columns_is_bars_from_the_greatest():
     values = np.array([[1.0, -2.0, 0.1, 0.0], [3.0, -4.0, -0.5, 0.0]])
-    ax = drawn(plot.influence(values, names=["age", "height", "speed", "colour"]))
+    ax = drawn(plot.contributions(values, names=["age", "height", "speed", "colour"]))
     assert [text.get_text() for text in ax.get_yticklabels()] == [
         "height",
         "age",
@@ -280,16 +280,16 @@ def test_the_influence_of_columns_is_bars_from_the_greatest():
 
 def test_the_influence_of_many_columns_is_that_of_fifteen():
     values = NUMBERS.normal(size=(9, 40)) * np.arange(1, 41)
-    ax = drawn(plot.influence(values))
+    ax = drawn(plot.contributions(values))
     chosen = np.argsort(-np.abs(values).mean(0))[:15]
     assert [text.get_text() for text in ax.get_yticklabels()] == [f"column {i}" for i in chosen]
     assert titles([ax]) == ["Which columns mark the failures: the 15 greatest of 40"]
-    drawn(plot.influence(np.zeros((1, 3))))
+    drawn(plot.contributions(np.zeros((1, 3))))
 
 
 def test_the_influence_of_pixels_is_a_map_over_the_background():
     values = NUMBERS.normal(size=(7, 6, 5))
-    ax = drawn(plot.influence(values))
+    ax = drawn(plot.contributions(values))
     [heat] = ax.images
     np.testing.assert_allclose(heat.get_array(), np.abs(values).mean(0))
     assert heat.get_clim() == (0, np.abs(values).mean(0).max())
@@ -298,18 +298,18 @@ def test_the_influence_of_pixels_is_a_map_over_the_background():
         bar.get_ylabel().replace("\n", " ")
         == "mean magnitude of the contribution to the log odds of failure, 7 inputs"
     )
-    ax = drawn(plot.influence(np.stack([values, -2 * values], -1), background=IMAGES.mean(0)))
+    ax = drawn(plot.contributions(np.stack([values, -2 * values], -1), background=IMAGES.mean(0)))
     beneath, heat = ax.images
     np.testing.assert_allclose(beneath.get_array(), IMAGES.mean(0))
     np.testing.assert_allclose(heat.get_array(), 3 * np.abs(values).mean(0))
     # seen where nothing contributes
     assert beneath.get_zorder() < heat.get_zorder() and heat.cmap(0.0)[3] == 0
-    drawn(plot.influence(np.zeros((1, 6, 5)), background=np.ones((6, 5, 3))))
+    drawn(plot.contributions(np.zeros((1, 6, 5)), background=np.ones((6, 5, 3))))
 
 
 def test_the_influence_of_no_inputs_says_so():
     for shape in ((0, 3), (0, 6, 5)):
-        ax = drawn(plot.influence(np.zeros(shape)))
+        ax = drawn(plot.contributions(np.zeros(shape)))
         assert words(ax) == ["no inputs to explain"] and not ax.axison
 
 
@@ -320,19 +320,19 @@ def test_given_axes_are_used_and_settings_left_alone():
     drawers = (
         lambda ax: plot.failures_found(result, FAILED, ax),
         lambda ax: plot.roc(result, FAILED, ax=ax),
-        lambda ax: plot.influence(np.ones((2, 3)), ax=ax),
-        lambda ax: plot.influence(np.ones((2, 3, 3)), ax=ax),
+        lambda ax: plot.contributions(np.ones((2, 3)), ax=ax),
+        lambda ax: plot.contributions(np.ones((2, 3, 3)), ax=ax),
     )
     for ax, draw in zip(axes, drawers, strict=True):
         assert draw(ax) is ax
     drawn(axes)
     axes = plt.figure().subplots(2, 3)
     assert (
-        drawn(plot.failure_grid(result, IMAGES, LABELS, count=4, axes=axes))
+        drawn(plot.first_failures(result, IMAGES, LABELS, count=4, axes=axes))
         == axes.ravel().tolist()[:4]
     )
     assert axes[1, 2].axison and not axes[0, 0].figure.get_suptitle()
-    assert plot.failure_grid(NOTHING, IMAGES, LABELS, axes=axes[1, 2]) == [axes[1, 2]]
+    assert plot.first_failures(NOTHING, IMAGES, LABELS, axes=axes[1, 2]) == [axes[1, 2]]
     assert len(plt.get_fignums()) == 2 and dict(matplotlib.rcParams) == before
 
 
@@ -397,9 +397,9 @@ def test_what_cannot_be_drawn_is_refused():
 
 def test_a_grid_that_cannot_be_drawn_is_refused():
     result = made(BEST[:30])
-    grid = plot.failure_grid
+    grid = plot.first_failures
     refused(
-        "plot.failure_grid: result must be a jast.weakness.Result, received dict",
+        "plot.first_failures: result must be a jast.weakness.Result, received dict",
         grid,
         {"a": result},
         IMAGES,
@@ -420,14 +420,18 @@ def test_a_grid_that_cannot_be_drawn_is_refused():
         LABELS,
     )
     refused(
-        "plot.failure_grid: inputs must be those of the result, 60, received 50",
+        "plot.first_failures: inputs must be those of the result, 60, received 50",
         grid,
         result,
         IMAGES[:50],
         LABELS[:50],
     )
     refused(
-        r"plot.failure_grid: labels must be whole numbers \[60\]", grid, result, IMAGES, LABELS[:5]
+        r"plot.first_failures: labels must be whole numbers \[60\]",
+        grid,
+        result,
+        IMAGES,
+        LABELS[:5],
     )
     refused(
         "labels must be those of the result, received some by which 12 of its 12 failures are none",
@@ -438,7 +442,7 @@ def test_a_grid_that_cannot_be_drawn_is_refused():
     )
     for wrong in (0, 2.5, True):
         refused(
-            "plot.failure_grid: count must be a whole number of at least 1",
+            "plot.first_failures: count must be a whole number of at least 1",
             grid,
             result,
             IMAGES,
@@ -463,7 +467,7 @@ def test_a_grid_that_cannot_be_drawn_is_refused():
     )
     with pytest.raises(
         ValueError,
-        match="plot.failure_grid: axes must be at least 12, one for each failure, received 1",
+        match="plot.first_failures: axes must be at least 12, one for each failure, received 1",
     ):
         grid(result, IMAGES, LABELS, axes=plt.figure().subplots())
 
@@ -472,46 +476,52 @@ def test_an_influence_that_cannot_be_drawn_is_refused():
     values = np.ones((2, 3, 3))
     for wrong in (np.ones(3), np.ones((1, 2, 3, 4, 5)), np.zeros((3, 0)), 1.0):
         refused(
-            r"plot.influence: values must be \[k, columns\], .* received shape",
-            plot.influence,
+            r"plot.contributions: values must be \[k, columns\], .* received shape",
+            plot.contributions,
             wrong,
         )
-    refused("plot.influence: values must be .* received no such array", plot.influence, ["a", "b"])
-    refused("plot.influence: values must be finite, 1 are not", plot.influence, [[1.0, np.nan]])
     refused(
-        "plot.influence: names must be 3, one for each column, received 1",
-        plot.influence,
+        "plot.contributions: values must be .* received no such array",
+        plot.contributions,
+        ["a", "b"],
+    )
+    refused(
+        "plot.contributions: values must be finite, 1 are not", plot.contributions, [[1.0, np.nan]]
+    )
+    refused(
+        "plot.contributions: names must be 3, one for each column, received 1",
+        plot.contributions,
         values[0],
         names=["a"],
     )
     refused(
-        "plot.influence: names must be None for images, received list",
-        plot.influence,
+        "plot.contributions: names must be None for images, received list",
+        plot.contributions,
         values,
         names=["a"],
     )
     refused(
-        "plot.influence: background must be None for rows of a table, received ndarray",
-        plot.influence,
+        "plot.contributions: background must be None for rows of a table, received ndarray",
+        plot.contributions,
         values[0],
         background=values[0],
     )
     refused(
-        r"plot.influence: background must be finite \[3, 3\] or with channels, received shape"
+        r"plot.contributions: background must be finite \[3, 3\] or with channels, received shape"
         r" \(2, 2\)",
-        plot.influence,
+        plot.contributions,
         values,
         background=np.ones((2, 2)),
     )
     refused(
         r"background must be finite .* with numbers that are not",
-        plot.influence,
+        plot.contributions,
         values,
         background=np.full((3, 3), np.inf),
     )
     refused(
         r"background must be finite .* received no such array",
-        plot.influence,
+        plot.contributions,
         values,
         background="mean",
     )

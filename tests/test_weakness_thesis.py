@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from jast.weakness import auc, digits, from_idx, judge, load, save, thesis, validate
+from jast import plot
+from jast.weakness import auc, digits, encoded, from_idx, judge, load, save, thesis, validate
 from jast.weakness.contract import Seen
 from jast.weakness.data import arrays
 from jast.weakness.networks import (
@@ -18,11 +19,13 @@ from jast.weakness.networks import (
     _fit,
     adversary,
     autoencoder,
+    codes_of,
     fit_adversary,
     fit_autoencoder,
     logits,
     sizes,
 )
+from jast.weakness.thesis import halves
 from jast.weakness.views import scaled
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
@@ -196,11 +199,90 @@ def test_other_sizes_in_the_same_room_compile_nothing(key):
     assert _fit._cache_size() == programs
 
 
+def test_draws_with_replacement_repeat(key):
+    """The published loop's; without, as many different inputs as were drawn."""
+    for replacement, least, most in ((False, 240, 240), (True, 150, 239)):
+        lesson, rest = halves(key, 300, 240, replacement)
+        assert len(lesson) == len(rest) == 120
+        assert least <= len(set([*lesson, *rest])) <= most
+    with pytest.raises(ValueError, match="replacement must be True or False, received 1"):
+        thesis(replacement=1)
+    assert (
+        "replacement" not in thesis().settings and thesis(replacement=True).settings["replacement"]
+    )
+
+
+@pytest.fixture(scope="module")
+def encoded_digits():
+    """A result on digits with replacement, what fails, and the networks."""
+    inputs, labels = digits()
+    inputs, labels = inputs[:240], labels[:240]
+    predict = lambda x: np.where(x.mean((1, 2)) > inputs.mean() * 1.15, 0, labels_of(x))
+    table = {x.tobytes(): y for x, y in zip(inputs, labels, strict=True)}
+    labels_of = lambda x: np.array([table[row.tobytes()] for row in x])
+    result = validate(
+        jax.random.key(0),
+        predict,
+        inputs,
+        labels,
+        selector=thesis(iterations=2, replacement=True, **QUICK),
+    )
+    return result, inputs, labels, predict(inputs) != labels, encoded(result, inputs, labels)
+
+
+def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
+    """To the weights that made the codes, and the scores that the result ended with."""
+    result, inputs, labels, _, networks = encoded_digits
+    rows = scaled(arrays("test", inputs, labels))
+    np.testing.assert_array_equal(networks.codes, result.state.memory["codes"])
+    np.testing.assert_allclose(networks.score(rows), result.scores, atol=1e-6)
+    np.testing.assert_allclose(networks.scores, result.scores, atol=1e-6)
+    assert networks.decode(networks.codes[:3]).shape == (3, 8, 8)
+    with pytest.raises(ValueError, match="inputs and labels are not those of the result"):
+        encoded(result, inputs[:-1], labels[:-1])
+    other = validate(jax.random.key(0), lambda x: np.zeros(len(x), int), inputs, labels, budget=9)
+    with pytest.raises(ValueError, match="must be of the selector thesis, received one of default"):
+        encoded(other, inputs, labels)
+
+
+def test_the_thesis_figures(encoded_digits):
+    result, inputs, _, failed, networks = encoded_digits
+    middle = float(np.median(result.scores))
+    ax = plot.confusion(result, failed, middle)
+    numbers = [int(text.get_text()) for text in ax.texts]
+    chosen = result.scores >= middle
+    assert sum(numbers) == 240 and numbers[3] == np.sum(failed & chosen)
+    assert f"recall {numbers[3] / failed.sum():.3f}" in ax.get_title("left")
+    precision, recall = plot.threshold_sweep(result, failed, thresholds=5).lines[:2]
+    assert recall.get_ydata()[0] == 1 and precision.get_ydata()[0] == np.mean(failed)
+    axes = plot.likely_failures(networks, inputs, failed, "likely failures", count=4)
+    assert len(axes) == 12 and axes[0].get_title("left").startswith(f"{networks.scores.max():.3f}")
+    np.testing.assert_allclose(
+        axes[8].images[0].get_array(),
+        networks.decode(networks.codes)[np.argmax(networks.scores)],
+        atol=1e-5,
+    )
+    lone = np.zeros((1, 64), np.float32)
+    lone[0, 9] = 1
+    shown = plot.pixel_likelihood(networks).images[0].get_array()
+    np.testing.assert_allclose(shown[1, 1], networks.score(lone)[0], rtol=1e-5)
+    for refused, message in (
+        (lambda: plot.pixel_likelihood(result), "networks must be jast.weakness.encoded"),
+        (lambda: plot.likely_failures(networks, inputs, failed, "all"), "kind must be one of"),
+        (lambda: plot.likely_failures(networks, inputs[0], failed), "inputs must be the images"),
+        (lambda: plot.confusion(result, failed, 2.0), "threshold must be a number in 0 .. 1"),
+        (lambda: plot.threshold_sweep(result, failed, 1), "thresholds must be a whole number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            refused()
+
+
 @pytest.mark.long
 def test_training_lowers_the_losses(key):
     inputs, _ = digits()
     rows = inputs[:600].reshape(600, -1)
-    codes, losses = fit_autoencoder(key, rows, (32, 16), epochs=10, batch=60)
+    params, losses = fit_autoencoder(key, rows, (32, 16), epochs=10, batch=60)
+    codes = codes_of(params, rows, (32, 16))
     assert codes.shape == (600, 16) and codes.dtype == np.float32 and losses.shape == (10,)
     assert losses[-1] < 0.6 * losses[0] and losses[-1] < rows.var()
     most = np.asarray(codes)[:, np.argmax(np.std(codes, axis=0))]

@@ -11,14 +11,25 @@ Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of
 `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
 `proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
 `exceedance`, `weights`, `levels`. Of failure policies: `training`. Of weakness recognition:
-`failures_found`, `roc`, `failure_grid`, `influence`.
+`failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's adversary also
+`confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
 """
 
 from jast._doors import listed
+from jast.plot.adversary import (
+    confusion,
+    likely_failures,
+    pixel_likelihood,
+    threshold_sweep,
+)
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.exceedance import exceedance
-from jast.plot.failing_inputs import failure_grid, influence
+from jast.plot.failing_inputs import contributions, first_failures
+
+# their earlier names
+from jast.plot.failing_inputs import contributions as influence  # noqa: F401
+from jast.plot.failing_inputs import first_failures as failure_grid  # noqa: F401
 from jast.plot.fan import failure_fan
 from jast.plot.ferry import ferry
 from jast.plot.fms import fms
@@ -39,25 +50,29 @@ __all__ = [
     "colav",
     "colav_animation",
     "colav_story",
+    "confusion",
+    "contributions",
     "convergence",
     "disturbances",
     "distances",
     "exceedance",
     "failure_fan",
-    "failure_grid",
     "failures_found",
+    "first_failures",
     "ferry",
     "fms",
     "history",
-    "influence",
     "levels",
+    "likely_failures",
     "phase",
+    "pixel_likelihood",
     "probability",
     "report",
     "proposal_contours",
     "roc",
     "sierra",
     "surrogate_samples",
+    "threshold_sweep",
     "traces",
     "training",
     "tree",

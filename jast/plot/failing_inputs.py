@@ -7,19 +7,18 @@ from jast.plot import style
 from jast.plot.weakness import checked_result
 from jast.weakness.data import arrays
 
-__all__ = ["failure_grid", "influence"]
+__all__ = ["contributions", "first_failures"]
 
 HEAT = ("#E69F0000", "#E69F00B0", "#D55E00", "#5A1A00")  # from nothing, which shows what is beneath
 BARS = 15  # features of a table
 EFFECTS = {1: ("raises", style.VERMILION), -1: ("lowers", style.BLUE), 0: ("neither", style.GREY)}
 
 
-def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
+def first_failures(result, inputs, labels, count=20, names=None, axes=None):
     """The first failures found, a tile each: what the system said, what it is, and the input's
-    number (figure 4.5 of the thesis).
+    number. The thesis's figure 4.5 is `likely_failures`.
 
-    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
-    4. ``inputs`` and ``labels`` [n]: those of the validation; images [n, height, width], or [n,
+    ``inputs`` and ``labels`` [n]: those of the validation; images [n, height, width], or [n,
     height, width, channels] of 1, 3 or 4 channels. Numbers of colours are shares of 1, or of 255
     where whole. ``names``: of the classes. Returns the list of Axes, one a tile; a single one that
     says so where no failure was found.
@@ -29,7 +28,7 @@ def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
     """
     import matplotlib.pyplot as plt
 
-    caller = "failure_grid"
+    caller = "first_failures"
     failures, n = np.asarray(checked_result(caller, result).failures), len(result.scores)
     count = whole(f"plot.{caller}", "count", count)
     inputs, labels, _ = arrays(f"plot.{caller}", inputs, labels)
@@ -89,12 +88,11 @@ def failure_grid(result, inputs, labels, count=20, names=None, axes=None):
     return axes
 
 
-def influence(values, names=None, background=None, ax=None):
+def contributions(values, names=None, background=None, ax=None):
     """Which features mark the weakness: the mean magnitude of their contributions to the log odds
-    of failure (figure 4.6 of the thesis). Returns the Axes.
+    of failure. Returns the Axes. The thesis's figure 4.6 is `pixel_likelihood`.
 
-    R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
-    4. ``values`` [k, ...]: the signed contributions of each feature, for k inputs
+    ``values`` [k, ...]: the signed contributions of each feature, for k inputs
     (`jast.weakness.influence`). Of images [k, height, width] or [k, height, width, channels], whose
     magnitudes are summed over the channels: a map, over ``background`` [height, width(, channels)],
     in grey, for example the mean image. Of rows of a table [k, columns]: the 15 columns of the
@@ -105,7 +103,7 @@ def influence(values, names=None, background=None, ax=None):
     ValueError for values of another shape or that are not finite, names or a background that do not
     fit or are for the other kind of inputs.
     """
-    caller = "influence"
+    caller = "contributions"
     values = _numbers(values)
     if values is None or values.ndim not in (2, 3, 4) or 0 in values.shape[1:]:
         received = "no such array" if values is None else f"shape {values.shape}"
@@ -125,7 +123,7 @@ def influence(values, names=None, background=None, ax=None):
 
 
 def _bars(caller, values, names, background, ax):
-    """`influence` of the columns of a table."""
+    """`contributions` of the columns of a table."""
     k, d = values.shape
     if background is not None:
         raise ValueError(
@@ -170,7 +168,7 @@ def _bars(caller, values, names, background, ax):
 
 
 def _map(caller, values, names, background, ax):
-    """`influence` of the pixels of images."""
+    """`contributions` of the pixels of images."""
     from matplotlib.colors import LinearSegmentedColormap
 
     if names is not None:

@@ -27,7 +27,7 @@ def failures_found(results, failed=None, ax=None):
     caller = "failures_found"
     rows = _rows(caller, results)
     n = _same_n(caller, rows)
-    truth = None if failed is None else _truth(caller, failed, n)
+    truth = None if failed is None else truth_of(caller, failed, n)
     for result in [] if truth is None else [result for row in rows.values() for result in row]:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
@@ -98,7 +98,7 @@ def roc(result, failed, iterations=None, ax=None):
     """
     caller = "roc"
     made = len(checked_result(caller, result).history.scores)
-    truth = _truth(caller, failed, len(result.scores))
+    truth = truth_of(caller, failed, len(result.scores))
     if not made:
         raise ValueError(f"plot.{caller}: result must have iterations, received none")
     chosen = (
@@ -211,7 +211,7 @@ def _same_n(caller, rows):
     return sizes[0]
 
 
-def _truth(caller, failed, n):
+def truth_of(caller, failed, n):
     """``failed`` as an array, or a ValueError."""
     truth = np.asarray(failed)
     if truth.shape != (n,) or truth.dtype != bool:

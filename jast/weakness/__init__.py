@@ -5,6 +5,7 @@ a classifier gets wrong, found with few calls of it.
 from jast._doors import listed
 from jast.weakness.contract import Seen, Selector, Step
 from jast.weakness.data import Data, digits, from_idx, idx
+from jast.weakness.encoded import Encoded, encoded
 from jast.weakness.influence import influence
 from jast.weakness.measures import Judgement, Roc, auc, judge, roc
 from jast.weakness.result import History, Result, State
@@ -14,6 +15,7 @@ from jast.weakness.validation import validate
 
 __all__ = [
     "Data",
+    "Encoded",
     "History",
     "Judgement",
     "Result",
@@ -25,6 +27,7 @@ __all__ = [
     "auc",
     "default",
     "digits",
+    "encoded",
     "from_idx",
     "idx",
     "influence",

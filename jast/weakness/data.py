@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast._checks import whole
+from jast.weakness.result import Result
 
 __all__ = ["Data", "arrays", "digits", "from_idx", "idx"]
 
@@ -98,6 +99,18 @@ def arrays(function, inputs, labels, classes=None):
 def within(at, n):
     """Whether all of the array ``at`` are numbers of inputs, 0 ... ``n`` - 1."""
     return not at.size or bool(at.dtype.kind in "iu" and at.min() >= 0 and at.max() < n)
+
+
+def of_result(function, result, inputs, labels, classes=None):
+    """The `Data` of a ``result``; ValueError for other inputs or labels than its own."""
+    if not isinstance(result, Result):
+        raise ValueError(f"{function}: result must be a Result, received {type(result).__name__}")
+    if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":
+        classes = max(2, int(np.max(result.predicted)) + 1, int(np.max(labels)) + 1)
+    data = arrays(function, inputs, labels, classes)
+    if fingerprint(data) != result.state.data:
+        raise ValueError(f"{function}: inputs and labels are not those of the result")
+    return data
 
 
 def fingerprint(data):

@@ -7,9 +7,8 @@ import numpy as np
 from jast._checks import random_key
 from jast.counter import generator
 from jast.weakness import committee
-from jast.weakness.data import arrays, fingerprint, within
+from jast.weakness.data import of_result, within
 from jast.weakness.default import PASSES, STRENGTH
-from jast.weakness.result import Result
 from jast.weakness.views import centred, scaled
 
 __all__ = ["influence"]
@@ -30,13 +29,7 @@ def influence(key, result, inputs, labels, *, at=None, classes=None):
     ValueError for other inputs or labels than the result's, and indices out of range.
     """
     random_key("influence", key)
-    if not isinstance(result, Result):
-        raise ValueError(f"influence: result must be a Result, received {type(result).__name__}")
-    if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":
-        classes = max(2, int(np.max(result.predicted)) + 1, int(np.max(labels)) + 1)
-    data = arrays("influence", inputs, labels, classes)
-    if fingerprint(data) != result.state.data:
-        raise ValueError("influence: inputs and labels are not those of the result")
+    data = of_result("influence", result, inputs, labels, classes)
     at = np.asarray(result.failures if at is None else at)
     if at.ndim != 1 or not within(at, data.size):
         raise ValueError(

@@ -109,15 +109,20 @@ def judge(result, failed, *, threshold=0.5, top=None):
             if top is None
             else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
         )
-        hits, k, all_ = int(np.sum(failed & chosen)), int(np.sum(chosen)), int(np.sum(failed))
-        rows.append(
-            (auc(scores, failed), hits / k if k else np.nan, hits / all_ if all_ else np.nan, k)
-        )
+        rows.append((auc(scores, failed), *precision_recall(chosen, failed), int(np.sum(chosen))))
     return (
         Judgement(*(np.asarray(column) for column in zip(*rows, strict=True)))
         if rows
         else Judgement(*(np.zeros(0) for _ in range(4)))
     )
+
+
+def precision_recall(chosen, failed):
+    """Share of failures among the ``chosen`` [n] bool, and share of the failures that are chosen;
+    NaN where there are none to share.
+    """
+    hits, k, every = (int(np.sum(a)) for a in (failed & chosen, chosen, failed))
+    return hits / k if k else np.nan, hits / every if every else np.nan
 
 
 def _pair(function, scores, failed):

@@ -13,7 +13,15 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-__all__ = ["adversary", "autoencoder", "fit_adversary", "fit_autoencoder", "logits", "sizes"]
+__all__ = [
+    "adversary",
+    "autoencoder",
+    "codes_of",
+    "fit_adversary",
+    "fit_autoencoder",
+    "logits",
+    "sizes",
+]
 
 ADVERSARY = (128, 64)
 LEAK = 0.01  # of the autoencoder's leaky ReLU; Flux's default, which the published code takes
@@ -32,6 +40,8 @@ class Network(NamedTuple):
     """
     encode: Any
     """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; None of the adversary"""
+    decode: Any
+    """``decode(params, code [..., hidden[-1]])``: [..., inputs]; None of the adversary"""
 
 
 def sizes(inputs):
@@ -47,8 +57,11 @@ def autoencoder(inputs, hidden):
     same backwards, leaky ReLU after every one, also the last.
     """
     module = _modules()[0](inputs, hidden)
-    encode = Partial(lambda params, x: module.apply(params, x, method="encode"))
-    return Network(_init(module, inputs), Partial(module.apply), encode)
+    encode, decode = (
+        Partial(lambda params, x, method=method: module.apply(params, x, method=method))
+        for method in ("encode", "decode")
+    )
+    return Network(_init(module, inputs), Partial(module.apply), encode, decode)
 
 
 @functools.cache
@@ -57,7 +70,7 @@ def adversary(inputs):
     its logits, whose sigmoid is the score.
     """
     module = _modules()[1](ADVERSARY)
-    return Network(_init(module, inputs), Partial(module.apply), None)
+    return Network(_init(module, inputs), Partial(module.apply), None, None)
 
 
 def _init(module, inputs):
@@ -67,7 +80,7 @@ def _init(module, inputs):
 
 def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
     """Train an autoencoder on ``rows`` [n, d] float32, by Adam on the mean squared error, shuffled
-    each epoch: (codes [n, hidden[-1]], losses [epochs]).
+    each epoch: (params, losses [epochs]). `codes_of` has the codes.
 
     Minibatches of ``batch``, at most n; the last of an epoch may be smaller.
     """
@@ -75,7 +88,7 @@ def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
     first, then = jax.random.split(key)
     n = len(rows)
     number = np.arange(n, dtype=np.int32)
-    params, losses = _fit(
+    return _fit(
         then,
         network.init(first),
         rows,
@@ -88,7 +101,13 @@ def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
         _squared,
         min(batch, n),
     )
-    return _codes(network.encode, params, rows), losses
+
+
+def codes_of(params, rows, hidden):
+    """The codes [n, hidden[-1]] of ``rows`` [n, d] by an autoencoder that `fit_autoencoder`
+    trained.
+    """
+    return _codes(autoencoder(rows.shape[1], hidden).encode, params, rows)
 
 
 def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=1, rate=3e-5):
@@ -198,7 +217,9 @@ def _modules():
             return x
 
         def __call__(self, x):
-            x = self.encode(x)
+            return self.decode(self.encode(x))
+
+        def decode(self, x):
             for layer in self.decoder:
                 x = nn.leaky_relu(layer(x), LEAK)
             return x

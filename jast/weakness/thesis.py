@@ -30,6 +30,7 @@ def thesis(
     encoder_epochs=20,
     encoder_rate=1e-3,
     batch=None,
+    replacement=False,
 ):
     """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes
     of the inputs, without their labels.
@@ -42,7 +43,8 @@ def thesis(
     at ``rate``, row by row, shuffled each epoch, each failure there and ``copies`` more times; its
     weights go on to the next iteration, Adam starts anew. Those of the second half with a score of
     at least ``threshold`` are the candidates, and are run. What was run before is not run again; it
-    is learned from again only if drawn again.
+    is learned from again only if drawn again. ``replacement=True`` draws with replacement, as the
+    published code does: an input may come twice, also once in each half.
 
     Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's
     output, on inputs it was trained on too, as published. ``expected``: the failure rate of the
@@ -62,6 +64,8 @@ def thesis(
     encoder_rate = number(
         "thesis", "encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0"
     )
+    if not isinstance(replacement, bool):
+        raise ValueError(f"thesis: replacement must be True or False, received {replacement!r}")
     hidden = (
         None
         if hidden is None
@@ -81,47 +85,68 @@ def thesis(
         encoder_rate=encoder_rate,
         batch=batch,
     )
+    if replacement:  # named only then, so that earlier states go on
+        settings["replacement"] = True
     start = functools.partial(_start, hidden, encoder_epochs, encoder_rate, batch)
     return Selector(
         "thesis",
         settings,
         start,
-        functools.partial(_step, iterations, sample, threshold, copies, epochs, rate),
+        functools.partial(_step, iterations, sample, replacement, threshold, copies, epochs, rate),
+    )
+
+
+def halves(key, size, sample, replacement):
+    """The ``sample`` inputs of an iteration, by its key and the ``size`` of the data: (those that
+    the adversary learns from, those that it proposes from), indices.
+    """
+    rng = generator(jax.random.split(key)[0])
+    drawn = rng.integers(size, size=sample) if replacement else rng.permutation(size)[:sample]
+    half = (len(drawn) + 1) // 2
+    return drawn[:half], drawn[half:]
+
+
+def encoder(key, rows, hidden, epochs, rate, batch):
+    """The autoencoder trained on ``rows`` [n, d]: (its widths, params, losses [epochs]); None for
+    the default widths and batch.
+    """
+    hidden = tuple(hidden) if hidden else networks.sizes(rows.shape[1])
+    batch = batch or max(1, min(1000, len(rows) // 10))
+    return hidden, *networks.fit_autoencoder(
+        key, rows, hidden, epochs=epochs, batch=batch, rate=rate
     )
 
 
 def _start(hidden, epochs, rate, batch, key, data):
     first, then = jax.random.split(key)
     rows = scaled(data)
-    hidden = hidden or networks.sizes(rows.shape[1])
-    batch = batch or max(1, min(1000, data.size // 10))
-    codes, losses = networks.fit_autoencoder(
-        first, rows, hidden, epochs=epochs, batch=batch, rate=rate
-    )
-    params = networks.adversary(codes.shape[1]).init(then)
+    hidden, params, losses = encoder(first, rows, hidden, epochs, rate, batch)
+    codes = networks.codes_of(params, rows, hidden)
+    adversary = networks.adversary(codes.shape[1]).init(then)
     counts = {name: np.zeros((), np.int64) for name in ("iteration", "drawn", "failed")}
-    return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(params)}
+    return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(adversary)}
 
 
-def _step(iterations, sample, threshold, copies, epochs, rate, key, data, memory, seen, ask):
+def _step(
+    iterations, sample, replacement, threshold, copies, epochs, rate, key, data, memory, seen, ask
+):
     if memory["iteration"] >= iterations:
         return None
-    pick, train = jax.random.split(key)
-    drawn = generator(pick).permutation(data.size)[:sample]
-    half = (len(drawn) + 1) // 2
-    lesson, rest = drawn[:half], drawn[half:]
+    _, train = jax.random.split(key)
+    lesson, rest = halves(key, data.size, sample, replacement)
 
     now = ask(lesson)
-    new = ~seen.tried[lesson] & now.tried[lesson]
-    params = _taught(train, _nested(memory), memory["codes"], lesson, now, copies, epochs, rate)
+    once = np.unique(lesson)
+    new = once[~seen.tried[once] & now.tried[once]]
+    params = _taught(train, nested(memory), memory["codes"], lesson, now, copies, epochs, rate)
     scores = np.asarray(jax.nn.sigmoid(networks.logits(params, memory["codes"])))
 
     candidates = rest[scores[rest] >= threshold]
     now = ask(candidates)
     counts = dict(
         iteration=memory["iteration"] + 1,
-        drawn=memory["drawn"] + new.sum(),
-        failed=memory["failed"] + now.failed[lesson[new]].sum(),
+        drawn=memory["drawn"] + len(new),
+        failed=memory["failed"] + now.failed[new].sum(),
     )
     expected = counts["failed"] / max(counts["drawn"], 1) * np.sum(~now.tried)
     return Step(
@@ -169,7 +194,8 @@ def _flat(params):
     }
 
 
-def _nested(memory):
+def nested(memory):
+    """The adversary's parameters in the ``memory`` of a state."""
     from flax.traverse_util import unflatten_dict
 
     return unflatten_dict(

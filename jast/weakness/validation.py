@@ -124,7 +124,7 @@ def _begin(key, data, selector):
     numbers = np.asarray(jax.random.key_data(key))
     if numbers.shape != (2,):  # of another generator
         numbers = generator(key).integers(0, 2**32, 2, np.uint32)
-    memory = selector.start(_key(numbers, 0), data)
+    memory = selector.start(iteration_key(numbers, 0), data)
     return State(
         _described(selector),
         fingerprint(data),
@@ -138,7 +138,8 @@ def _begin(key, data, selector):
     )
 
 
-def _key(numbers, iteration):
+def iteration_key(numbers, iteration):
+    """The key of an iteration, from 1; of the selector's start, 0. ``numbers``: of a `State`."""
     return jax.random.fold_in(jax.random.wrap_key_data(numbers, impl="threefry2x32"), iteration)
 
 
@@ -217,7 +218,9 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
     try:
         while not finished and len(seen.order) < budget:
             current = seen
-            step = selector.step(_key(state.key, 1 + len(history.calls)), data, memory, seen, ask)
+            step = selector.step(
+                iteration_key(state.key, 1 + len(history.calls)), data, memory, seen, ask
+            )
             if step is None:
                 finished = True
                 break

@@ -1,0 +1,84 @@
+"""The networks that the thesis's selector ended with, for pictures of what they have learned."""
+
+import json
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast import results
+from jast.weakness import networks
+from jast.weakness.data import of_result
+from jast.weakness.thesis import encoder, nested
+from jast.weakness.validation import iteration_key
+from jast.weakness.views import scaled
+
+__all__ = ["Encoded", "encoded"]
+
+
+@results.shown()
+class Encoded(NamedTuple):
+    """The autoencoder and the adversary of a result (`encoded`); n inputs, codes of h numbers."""
+
+    codes: Any
+    """[n, h]: E(x) of each input"""
+    scores: Any
+    """[n]: A(E(x)), how suspect the adversary finds each input, in [0, 1]"""
+    shape: tuple
+    """Of an input"""
+    autoencoder: Any
+    """Parameters"""
+    adversary: Any
+    """Parameters"""
+    hidden: tuple
+    """The autoencoder's widths"""
+
+    def score(self, rows):
+        """A(E(x)) [m] of ``rows`` [m, d] in the scale of the autoencoder, 0 to 1."""
+        codes = self._network.encode(self.autoencoder, np.asarray(rows, np.float32))
+        return np.asarray(jax.nn.sigmoid(networks.logits(self.adversary, codes)))
+
+    def decode(self, codes):
+        """What the decoder makes of ``codes`` [m, h]: [m, ...] in the shape of the inputs."""
+        rows = self._network.decode(self.autoencoder, np.asarray(codes, np.float32))
+        return np.asarray(rows).reshape(-1, *self.shape)
+
+    @property
+    def _network(self):
+        return networks.autoencoder(int(np.prod(self.shape)), self.hidden)
+
+
+def encoded(result, inputs, labels, *, classes=None):
+    """The `Encoded` networks of a result of the thesis's selector.
+
+    A result keeps the codes and the adversary, not the autoencoder, which is trained here once more
+    from the result's key, to the same weights.
+
+    Args:
+        result: of `validate` with ``selector="thesis"`` or `thesis`.
+        inputs, labels, classes: those of the validation.
+
+    Returns:
+        `Encoded`.
+
+    Raises:
+        ValueError: for a result of another selector, and for inputs or labels that are not its own.
+    """
+    data = of_result("encoded", result, inputs, labels, classes)
+    name, settings = json.loads(result.state.selector)
+    if name != "thesis":
+        raise ValueError(f"encoded: result must be of the selector thesis, received one of {name}")
+    first, _ = jax.random.split(iteration_key(result.state.key, 0))
+    hidden, params, _ = encoder(
+        first,
+        scaled(data),
+        settings["hidden"],
+        settings["encoder_epochs"],
+        settings["encoder_rate"],
+        settings["batch"],
+    )
+    memory = result.state.memory
+    adversary = nested(memory)
+    codes = np.asarray(memory["codes"])
+    scores = np.asarray(jax.nn.sigmoid(networks.logits(adversary, codes)))
+    return Encoded(codes, scores, data.inputs.shape[1:], params, adversary, hidden)
