@@ -27,14 +27,13 @@ def held():
 
 
 def run(names, budget):
-    """{name: what `held` says after `jast.stress` of that system}, one after the other; first
+    """(name, what `held` says after `jast.stress` of that system), one after the other; first
     "nothing", before all.
     """
-    rows = {"nothing": held()}
+    yield "nothing", held()
     for name in names:
         jast.stress(jax.random.key(0), CASES[name].make(), budget)
-        rows[name] = held()
-    return rows
+        yield name, held()
 
 
 def main(argv=None):
@@ -46,14 +45,14 @@ def main(argv=None):
     kept, memory.MAPS = memory.MAPS, 10**9 if args.keep else memory.MAPS
     try:
         rows = run(names, size(args, 5000, 1000, 300))
+        if args.json:
+            print(json.dumps(dict(rows)))
+            return
+        print(f"{'after':<16}{'mappings':>9}{'megabytes':>11}")
+        for name, (mappings, megabytes) in rows:
+            print(f"{name:<16}{mappings:>9}{megabytes:>11}", flush=True)
     finally:
         memory.MAPS = kept
-    if args.json:
-        print(json.dumps(rows))
-        return
-    print(f"{'after':<16}{'mappings':>9}{'megabytes':>11}")
-    for name, (mappings, megabytes) in rows.items():
-        print(f"{name:<16}{mappings:>9}{megabytes:>11}")
 
 
 if __name__ == "__main__":

@@ -10,9 +10,9 @@ Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of
 `trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
 `ferry`; `fms`; `colav`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
 `proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
-`exceedance`, `weights`, `levels`. Of failure policies: `training`. Of weakness recognition:
-`failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's adversary also
-`confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
+`exceedance`, `weights`, `levels`; against a setting: `sweep`. Of failure policies: `training`. Of
+weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's
+adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
 """
 
 from jast._doors import listed
@@ -40,6 +40,7 @@ from jast.plot.report import report
 from jast.plot.sierra import sierra
 from jast.plot.states import phase, traces
 from jast.plot.style import COLOURS, STYLE
+from jast.plot.sweep import sweep
 from jast.plot.tree import tree, tree_page
 from jast.plot.trials import trial_distances, trials
 from jast.plot.weakness import failures_found, roc
@@ -71,6 +72,7 @@ __all__ = [
     "proposal_contours",
     "roc",
     "sierra",
+    "sweep",
     "surrogate_samples",
     "threshold_sweep",
     "traces",

@@ -1,0 +1,179 @@
+"""sweep: one function on many systems."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast._checks import random_key
+from jast._jax import was_interrupted
+from jast.estimate import failure_probability
+from jast.results import asked
+from jast.simulator import Simulator
+from jast.sweeping.batch import batch, kinds
+from jast.sweeping.table import Sweep
+from jast.watch import Watch
+
+__all__ = ["sweep"]
+
+
+def sweep(
+    key: jax.Array,
+    simulators: Callable[..., Simulator] | Sequence[Simulator],
+    values: Mapping[str, Iterable],
+    function: Callable[..., Any] = failure_probability,
+    *,
+    executor: Any = None,
+    progress: bool = False,
+    callback: Callable[[int, int, Any], Any] | None = None,
+    **options: Any,
+) -> Sweep:
+    """How does a result depend on a setting? ``function`` on a system for each of N values::
+
+        def make(gain):
+            ...
+            return jast.Simulator(...)
+
+        table = jast.sweep(jax.random.key(0), make, {"gain": np.linspace(0.2, 0.4, 50)})
+        print(table)
+        print(table.crossing(1e-6))  # the gain at which the probability of failure is 1e-6
+        table.plot().figure.savefig("gains.png")
+
+    Where ``make`` can be traced by `jax.jit` it is called inside of the compiled programs, with its
+    settings as arguments: they are compiled once for all values, also where ``make`` builds new
+    functions at each call. Where it cannot (it branches on a setting, or a setting is no number, or
+    changes a shape or the horizon), each value compiles its own; ``settings["programs"]`` says how
+    many kinds there are.
+
+    Args:
+        key: consumed; row i has ``jax.random.fold_in(key, i)``.
+        simulators: a pure function of the settings by keyword that returns a `jast.Simulator`; or N
+            simulators.
+        values: name of a setting -> its N values. Names and numbers only label the rows where
+            simulators are given.
+        function: ``function(key, simulator, **options)`` returns an `Estimate`, a `jast.Nominal`, a
+            `SearchResult`, a `Report`, or anything else, which is kept.
+        executor: where rows run, anything with ``submit(function, *args)`` that returns an object
+            with ``result()``, as of `concurrent.futures`; default: one after the other, here.
+            Processes need a ``make`` and a ``function`` that can be pickled: those of a module.
+        progress: whether there is a bar.
+        callback: called as ``callback(done, N, None)`` after each row.
+        **options: settings of ``function``, such as ``budget``.
+
+    Returns:
+        `Sweep`, a table with a row for each value. A value for which ``simulators`` or ``function``
+        raises has the error in its row. A KeyboardInterrupt ends it with the rows that are done,
+        and is raised where there is none.
+
+    Raises:
+        ValueError: for no values, values of unequal numbers, a number of simulators that is not
+            theirs, and what is no function; and what the first row raised where all raise.
+    """
+    random_key("sweep", key)
+    columns, rows = _rows(values)
+    if not callable(function):
+        raise ValueError(f"sweep: function must be callable, received {function!r}")
+    made = batch(_checked(simulators, len(rows)), rows)
+    keys = [jax.random.fold_in(key, i) for i in range(len(rows))]
+    found: list[tuple[Any, Exception | None]] = []
+    with Watch("sweep", len(rows), "value", progress, callback) as watch:
+        try:
+            for each in _outcomes(executor, function, keys, made, options):
+                found.append(each)
+                watch.more(1)
+                if _ended_early(each[0]):
+                    raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            if not found:
+                raise
+    outcomes, errors = zip(*found, strict=True)
+    if all(e is not None for e in errors) and len(found) == len(rows):
+        raise errors[0]
+    settings = asked("sweep", key, function=_name(function), programs=kinds(made))
+    if len(found) < len(rows):
+        settings["interrupted"] = f"after {len(found)} of {len(rows)} values"
+    return Sweep(
+        {k: v[: len(found)] for k, v in columns.items()},
+        outcomes,
+        tuple(None if e is None else f"{type(e).__name__}: {e}" for e in errors),
+        tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
+        settings,
+    )
+
+
+def _outcomes(executor, function, keys, made, options):
+    """(result or None, error or None) of each row, in order."""
+    work = list(zip(keys, made, strict=True))
+    if executor is None:
+        yield from (_tried(_row, function, k, s, options) for k, s in work)
+        return
+    futures = [executor.submit(_row, function, k, s, options) for k, s in work]
+    try:
+        yield from (_tried(future.result) for future in futures)
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _tried(work, *args):
+    try:
+        return work(*args), None
+    except Exception as error:
+        if was_interrupted(error):
+            raise KeyboardInterrupt from error
+        return None, error
+
+
+def _row(function, key, sim, options):
+    if isinstance(sim, Exception):
+        raise sim
+    return function(key, sim, **options)
+
+
+def _ended_early(result):
+    """Whether a KeyboardInterrupt ended a row, which returned what it had by then."""
+    settings = getattr(result, "settings", None) or {}
+    notes = getattr(result, "warnings", None) or ()
+    return "interrupted" in settings or any(str(n).startswith("interrupted") for n in notes)
+
+
+def _rows(values):
+    """(name -> tuple of N values, N dicts of name -> value), of Python's own numbers."""
+    if not isinstance(values, Mapping) or not values:
+        raise ValueError(
+            'sweep: values must be a dict of name -> values, such as {"gain": [0.1, 0.2]}, received'
+            f" {values!r:.80}"
+        )
+    columns = {}
+    for name, given in values.items():
+        if isinstance(given, str) or not isinstance(given, Iterable) or np.ndim(given) == 0:
+            raise ValueError(f"sweep: {name} must be a sequence of values, received {given!r}")
+        columns[name] = tuple(v.item() if _scalar(v) else v for v in given)
+    sizes = {name: len(column) for name, column in columns.items()}
+    if len(set(sizes.values())) > 1 or not all(sizes.values()):
+        raise ValueError(f"sweep: values must be as many for each setting, 1 or more: {sizes}")
+    return columns, [dict(zip(columns, row)) for row in zip(*columns.values(), strict=True)]
+
+
+def _scalar(value):
+    return isinstance(value, np.generic | jax.Array | np.ndarray) and np.ndim(value) == 0
+
+
+def _checked(simulators, n):
+    if callable(simulators):
+        return simulators
+    if isinstance(simulators, Simulator) or not isinstance(simulators, Sequence):
+        raise ValueError(
+            "sweep: simulators must be a function of the settings that returns a jast.Simulator, or"
+            f" one for each value, received {type(simulators).__name__}"
+        )
+    if len(simulators) != n:
+        raise ValueError(
+            f"sweep: simulators must be one for each of {n} values, received {len(simulators)}"
+        )
+    return simulators
+
+
+def _name(function):
+    return getattr(function, "__name__", type(function).__name__)

@@ -1,0 +1,237 @@
+"""What `jast.sweep` returns: one row for each value, as a table and as a picture, and where a
+probability crosses a level.
+"""
+
+import math
+from textwrap import shorten
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jast import results
+from jast._checks import number
+from jast.crude import Nominal
+from jast.estimate import Estimate
+from jast.search import SearchResult
+from jast.stress_testing import Report
+
+__all__ = ["Answer", "Crossing", "Sweep", "answer"]
+
+NOTE, WIDE = "note", 60
+"""The last column of a table, and the characters of a cell at most."""
+
+
+class Answer(NamedTuple):
+    """The probability of failure that a result speaks of; NaN where no failure was seen."""
+
+    probability: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    reliable: bool = False
+
+
+class Crossing(NamedTuple):
+    """Where the probability of failure crosses ``level``."""
+
+    name: str
+    """Of the setting"""
+    value: float
+    """By interpolation of log probabilities"""
+    interval: tuple[float, float]
+    """Where the intervals of the rows, interpolated likewise, hold ``level``; infinite where they
+    still do at the last value of the sweep
+    """
+    level: float
+
+    def __str__(self):
+        low, high = self.interval
+        return f"{self.name} {self.value:.6g} [{low:.6g}, {high:.6g}] at probability {self.level:g}"
+
+
+@results.result("episodes")
+class Sweep(NamedTuple):
+    """A table: what a function said of each of N systems. Row i is ``function(key_i,
+    simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``.
+    """
+
+    values: dict[str, tuple]
+    """The settings: name -> N values"""
+    results: tuple
+    """[N] what the function returned; None where it raised"""
+    errors: tuple
+    """[N] texts of what was raised; None where nothing was"""
+    simulators: tuple
+    """[N] `jast.Simulator`; None where it could not be made"""
+    settings: dict
+    """What was asked for; ``programs``: how many kinds of systems there were, which compile apart;
+    ``interrupted`` where the last rows are missing
+    """
+
+    @property
+    def answers(self) -> tuple:
+        """[N] `Answer` of each row."""
+        return tuple(map(answer, self.results))
+
+    @property
+    def probability(self) -> np.ndarray:
+        """[N] probabilities of failure; NaN where a row has none, or saw no failure."""
+        return np.array([a.probability for a in self.answers])
+
+    @property
+    def interval(self) -> np.ndarray:
+        """[N, 2] their intervals, at the level of each result."""
+        return np.array([(a.low, a.high) for a in self.answers])
+
+    @property
+    def reliable(self) -> np.ndarray:
+        """[N] bool: there is a probability, and nothing is known against it."""
+        return np.array([a.reliable for a in self.answers])
+
+    @property
+    def episodes(self) -> int:
+        """Episodes simulated in all."""
+        return sum(r.episodes for r in self.results if hasattr(r, "episodes"))
+
+    def crossing(
+        self, level: float = 1e-6, against: str | None = None, unreliable: bool = False
+    ) -> Crossing:
+        """Where the probability of failure crosses ``level``, as a setting varies: between two
+        rows, log p is a straight line.
+
+        Args:
+            level: probability, above 0 and below 1.
+            against: the setting, of numbers; default: the only one that varies.
+            unreliable: whether rows that are UNRELIABLE serve as well.
+
+        Returns:
+            `Crossing`, with the interval in which the rows' own intervals hold ``level``.
+
+        Raises:
+            ValueError: where the rows do not cross it, or cross it in several places which their
+                intervals tell apart; for a level outside (0, 1), and without a setting of numbers.
+        """
+        level = number("crossing", "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+        name, x = self.axis("crossing", against)
+        p, (low, high) = self.probability, self.interval.T
+        used = np.isfinite(x) & (p > 0) & (self.reliable | unreliable)
+        rows = np.flatnonzero(used)[np.argsort(x[used], kind="stable")]
+        if len(rows) < 2:
+            raise ValueError(
+                f"crossing: needs two rows with a reliable probability, received {len(rows)} of"
+                f" {len(x)}; unreliable=True takes the others"
+            )
+        with np.errstate(divide="ignore"):
+            x, *logs = x[rows], *(np.log(a[rows]) - math.log(level) for a in (p, low, high))
+        at = _zeros(x, logs[0])
+        if not at:
+            raise ValueError(
+                f"crossing: no crossing of {level:g}: for {name} from {x[0]:.6g} to {x[-1]:.6g}"
+                f" the probability lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
+            )
+        ends = [*_zeros(x, logs[1]), *_zeros(x, logs[2])]
+        left = max((e for e in ends if e <= at[0]), default=-math.inf)
+        right = min((e for e in ends if e >= at[0]), default=math.inf)
+        if at[-1] > right:
+            places = ", ".join(f"{v:.6g}" for v in at)
+            raise ValueError(
+                f"crossing: {level:g} is crossed at several values of {name}: {places}"
+            )
+        return Crossing(name, (at[0] + at[-1]) / 2, (left, right), level)
+
+    def plot(self, **how: Any) -> Any:
+        """`jast.plot.sweep` of this: the probability of failure against the setting."""
+        from jast.plot import sweep
+
+        return sweep(self, **how)
+
+    def axis(self, caller: str, against: str | None = None) -> tuple[str, np.ndarray]:
+        """(name, values [N]) of a setting that is a number in each row; ``caller``: of messages.
+
+        Raises:
+            ValueError: where ``against`` is none, or not given and not the only one that varies.
+        """
+        numeric = {k: np.array(v, float) for k, v in self.values.items() if all(map(_number, v))}
+        varying = [k for k, v in numeric.items() if len(set(v)) > 1]
+        name = varying[0] if against is None and len(varying) == 1 else against
+        if name not in numeric:
+            raise ValueError(
+                f"{caller}: against must name a setting of numbers, one of {list(numeric)},"
+                f" received {against!r}"
+            )
+        return name, numeric[name]
+
+    def __str__(self):
+        rows = [_row(*each) for each in zip(self.results, self.errors)]
+        columns = {k: [_text(v) for v in values] for k, values in self.values.items()}
+        names = dict.fromkeys(k for row in rows for k in row if k != NOTE)
+        names = [*names, NOTE]
+        columns |= {k: [row.get(k, "") for row in rows] for k in names}
+        widths = {k: max(len(k), *map(len, v)) for k, v in columns.items()}
+        line = lambda cells: "  ".join(
+            c if k == NOTE else c.rjust(widths[k]) for k, c in zip(columns, cells)
+        ).rstrip()
+        head = [k for k in columns if k != NOTE or any(columns[NOTE])]
+        lines = [line(head), *map(line, zip(*columns.values(), strict=True))]
+        if "interrupted" in self.settings:
+            lines.append(f"interrupted {self.settings['interrupted']}")
+        return "\n".join(lines)
+
+
+def answer(result: Any) -> Answer:
+    """The `Answer` of a result; one of NaN where it speaks of no probability."""
+    if isinstance(result, Report):
+        result = result.probability
+    if isinstance(result, Estimate):
+        return Answer(result.mean, *result.interval, result.reliable)
+    if isinstance(result, Nominal):
+        seen = result.failing > 0
+        return Answer(result.rate if seen else math.nan, *result.interval, seen)
+    return Answer()
+
+
+def _row(result, error):
+    """The cells of a row: name of the column -> text."""
+    if error is not None:
+        return {NOTE: shorten(error, WIDE, placeholder=" ...")}
+    cells, a = {}, answer(result)
+    if not math.isnan(a.high):
+        seen = not math.isnan(a.probability)
+        cells["probability"] = f"{a.probability:.4g}" if seen else "not seen"
+        cells["interval"] = f"[{a.low:.4g}, {a.high:.4g}]"
+    found = result.failures if isinstance(result, Report) else None
+    best = result.best if isinstance(result, SearchResult) else found.best if found else None
+    if best is not None:
+        cells["best log p"] = f"{float(best.log_prob):.6g}"
+        cells["fails"] = "yes" if best.failure else "no"
+    if hasattr(result, "episodes"):
+        cells["episodes"] = f"{result.episodes}"
+    elif not cells:
+        cells["result"] = shorten(str(result), WIDE, placeholder=" ...")
+    if "probability" in cells and not a.reliable:
+        cells[NOTE] = _against(result)
+    return cells
+
+
+def _against(result):
+    """The first reason not to believe a result."""
+    estimate = result.probability if isinstance(result, Report) else result
+    reasons = getattr(estimate, "warnings", ())
+    return shorten(": ".join(["UNRELIABLE", *reasons[:1]]), WIDE, placeholder=" ...")
+
+
+def _zeros(x, y):
+    """Where the line through (x, y) is 0, x rising; from a y of -inf on, at the finite end."""
+    out = []
+    for x0, x1, a, b in zip(x, x[1:], y, y[1:]):
+        if (a < 0) != (b < 0):
+            share = 1.0 if a == -math.inf else 0.0 if b == -math.inf else a / (a - b)
+            out.append(float(x0 + share * (x1 - x0)))
+    return out
+
+
+def _number(value):
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def _text(value):
+    return f"{value:.6g}" if _number(value) else shorten(str(value), 24, placeholder=" ...")

@@ -1,0 +1,280 @@
+"""jast.sweep: one function on many systems, the table that comes of it, and where it crosses a
+level.
+"""
+
+import concurrent.futures
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import jast
+from jast.crude import Nominal
+from jast.distributions import Normal
+from jast.intervals import clopper_pearson
+from jast.sweeping import Sweep
+from jast.sweeping.batch import batch, kinds
+
+LIMITS = (0.5, 1.0, 1.5, 2.0)
+
+
+def make(limit, horizon=1):
+    """Fails where the sum of its steps is above ``limit``; new functions at every call."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
+        horizon=horizon,
+    )
+
+
+def crude(key, limits=LIMITS, simulators=make, **how):
+    return jast.sweep(key, simulators, {"limit": limits}, jast.nominal, episodes=200, **how)
+
+
+def test_a_row_is_the_call_with_its_key(key, equal):
+    table = crude(key)
+    assert table.settings["programs"] == 1 and table.errors == (None,) * 4
+    for i, limit in enumerate(LIMITS):
+        own = jax.random.fold_in(key, i)
+        equal(table.results[i][:7], jast.nominal(own, table.simulators[i], episodes=200)[:7])
+        # the same as of the simulator that a user would build
+        alone = jast.nominal(own, make(limit), episodes=200)
+        assert alone.failing == table.results[i].failing
+    np.testing.assert_array_equal(table.probability, [r.rate for r in table.results])
+    assert table.episodes == 800 and table.reliable.all()
+    assert table.values == {"limit": LIMITS}
+
+
+def test_one_program_serves_all_values_and_the_next_sweep(key, monkeypatch):
+    crude(key)
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
+    )
+    try:
+        crude(key, np.linspace(0.3, 0.9, 5))
+        assert not compiled
+        jast.nominal(key, make(0.5), episodes=200)
+        assert compiled  # the listener hears
+    finally:
+        jax.monitoring.clear_event_listeners()
+
+
+def branches(limit):
+    return make(0.5 if limit < 1 else limit)
+
+
+def horizons(limit):
+    return make(limit, horizon=1 if limit < 1 else 2)
+
+
+def of_words(limit):
+    return make({"low": 0.5, "high": 1.5}[limit])
+
+
+@pytest.mark.parametrize(
+    "of, limits, n",
+    [
+        (make, LIMITS, 1),
+        (make, (1, 2), 1),
+        (branches, LIMITS, 4),
+        (horizons, LIMITS, 4),
+        (of_words, ("low", "high"), 2),
+    ],
+)
+def test_what_cannot_be_traced_compiles_apart(of, limits, n):
+    made = batch(of, [{"limit": v} for v in limits])
+    assert kinds(made) == n
+
+
+def test_simulators_of_one_kind_are_taken_as_they_are():
+    sims = [jast.simulators.walk1d(threshold=v) for v in (3.0, 4.0)]
+    assert all(a is b for a, b in zip(batch(sims, [{}, {}]), sims)) and kinds(sims) == 1
+    shared = lambda limit: jast.simulators.walk1d(threshold=limit)
+    made = batch(shared, [{"limit": 3.0}, {"limit": 4.0}])
+    assert made[0].evaluate.func is sims[0].evaluate.func
+
+
+def test_a_row_that_raises_does_not_lose_the_others(key):
+    def fragile(limit):
+        if limit is None:
+            raise RuntimeError("no such limit")
+        return "no simulator" if limit == "text" else make(limit)
+
+    table = crude(key, [0.5, None, "text"], fragile)
+    assert [e is None for e in table.errors] == [True, False, False]
+    assert "no such limit" in table.errors[1] and "received str" in table.errors[2]
+    assert table.simulators[1] is None and np.isnan(table.probability[1:]).all()
+    text = str(table)
+    assert "RuntimeError: no such limit" in text and text.splitlines()[0].split()[-1] == "note"
+    with pytest.raises(RuntimeError, match="no such limit"):  # as no row has a result
+        crude(key, [None, None], fragile)
+
+
+def test_a_row_of_nan_is_one_row(key):
+    with pytest.warns(UserWarning, match="invalid"):
+        table = crude(key, (0.5, math.nan))
+    assert table.results[1].failing == 0 or table.results[1].invalid
+    assert table.results[0].failing > 0
+
+
+def test_rows_run_on_an_executor(key, equal):
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        equal(crude(key, executor=pool).interval, crude(key).interval)
+
+
+def test_an_interruption_keeps_the_rows_that_are_done(key):
+    def stop(done, total, _):
+        assert total == 4
+        if done == 2:
+            raise KeyboardInterrupt
+
+    table = crude(key, callback=stop)
+    assert len(table.results) == len(table.simulators) == len(table.values["limit"]) == 2
+    assert table.settings["interrupted"] == "after 2 of 4 values"
+    assert "interrupted after 2 of 4 values" in str(table)
+
+    def never(key, sim):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jast.sweep(key, make, {"limit": LIMITS}, never)
+
+
+def test_a_row_that_was_interrupted_is_the_last(key):
+    cut = lambda key, sim: jast.nominal(key, sim, 200)._replace(settings={"interrupted": "early"})
+    table = jast.sweep(key, make, {"limit": LIMITS}, cut)
+    assert len(table.results) == 1
+
+
+def test_results_of_any_kind_have_a_row(key):
+    table = jast.sweep(
+        key,
+        lambda limit, name: make(limit),
+        {"limit": [1.0, 1.5], "name": ["a", "b"]},
+        jast.search.monte_carlo,
+        episodes=256,
+        refine=0,
+    )
+    head, first, _ = str(table).splitlines()
+    assert head.split() == ["limit", "name", "best", "log", "p", "fails", "episodes"]
+    assert first.split()[:2] == ["1", "a"] and first.split()[-2:] == ["yes", "256"]
+    assert "3" in str(jast.sweep(key, make, {"limit": [1.0]}, lambda key, sim: 3))
+    with pytest.raises(ValueError, match="plot.sweep: table must hold a probability"):
+        table.plot()
+
+
+def table_of(xs, counts, n=1000, **more):
+    """A table of so many failures in ``n`` episodes at each value."""
+    found = tuple(
+        Nominal(None, k, n, k / n, clopper_pearson(k, n), 0.0, 0, None, {}) for k in counts
+    )
+    none = (None,) * len(counts)
+    return Sweep({"gain": tuple(xs), **more}, found, none, none, {})
+
+
+def test_the_crossing_of_a_straight_line_and_its_interval():
+    """log p falls by log 10 a unit: the crossing of .01 lies at 1, and that of the intervals where
+    theirs does.
+    """
+    n = 10**6
+    table = table_of([2.0, 0.0], [1000, 100_000], n)
+    found = table.crossing(0.01)
+    assert found.name == "gain" and found.level == 0.01
+    assert found.value == pytest.approx(1.0, abs=1e-12)
+    ends = [[math.log(v) for v in clopper_pearson(k, n)] for k in (100_000, 1000)]
+    for i, side in ((0, 0), (1, 1)):
+        a, b = ends[0][side], ends[1][side]
+        assert found.interval[i] == pytest.approx(2 * (a - math.log(0.01)) / (a - b), abs=1e-9)
+    assert "gain 1 [0.9" in str(found)
+
+
+def test_a_crossing_is_covered_as_often_as_the_rows_are():
+    """Binomial rows about p = exp(-3 - x): the interval of the crossing of exp(-4.5) holds 1.5 in
+    95 % of 150 tables, less 3 standard errors of 1.8 %, and Clopper and Pearson's are wider.
+    """
+    rng, x = np.random.default_rng(0), np.arange(4.0)
+    hits = 0
+    for _ in range(150):
+        found = table_of(x, rng.binomial(3000, np.exp(-3 - x)), 3000).crossing(math.exp(-4.5))
+        hits += found.interval[0] <= 1.5 <= found.interval[1]
+    assert hits / 150 > 0.95 - 3 * 0.018
+
+
+def test_where_there_is_no_crossing_the_error_says_why():
+    table = table_of([0.0, 1.0, 2.0], [100, 10, 0])
+    with pytest.raises(
+        ValueError, match="no crossing of 1e-06: for gain from 0 to 1 .* 0.01 and 0"
+    ):
+        table.crossing()
+    with pytest.raises(ValueError, match="level must be a number between 0 and 1, received 1"):
+        table.crossing(1)
+    with pytest.raises(ValueError, match="two rows with a reliable probability, received 1 of 2"):
+        table_of([0.0, 1.0], [100, 0]).crossing(0.05)
+    many = table_of([0.0, 1.0, 2.0, 3.0], [900, 10, 900, 10])
+    with pytest.raises(ValueError, match="0.1 is crossed at several values of gain: 0.4"):
+        many.crossing(0.1)
+    # within the noise of the rows it is one crossing
+    one = table_of([0.0, 1.0, 2.0, 3.0], [200, 101, 99, 20]).crossing(0.1)
+    assert 1 < one.value < 2
+    noisy = table_of([0.0, 1.0, 2.0, 3.0], [120, 98, 103, 80]).crossing(0.1)
+    assert 0.5 < noisy.value < 2.5 and noisy.interval[0] < 1 and noisy.interval[1] > 2
+    assert math.isinf(table_of([0.0, 1.0], [11, 9]).crossing(0.01).interval[0])
+
+
+def test_the_setting_must_be_numbers():
+    named = table_of([1.0, 1.0], [100, 10], name=("a", "b"), other=(1, 2))
+    assert named.crossing(0.05).name == "other"
+    for against in ("name", "none"):
+        with pytest.raises(ValueError, match=r"one of \['gain', 'other'\], received '" + against):
+            named.crossing(0.05, against)
+    both = table_of([1.0, 2.0], [100, 10], other=(1, 2))
+    with pytest.raises(ValueError, match="crossing: against must name a setting"):
+        both.crossing(0.05)
+    assert both.crossing(0.05, "other").value == pytest.approx(both.crossing(0.05, "gain").value)
+
+
+BAD = {
+    'values must be a dict of name -> values, such as {"gain"': dict(values=[1.0, 2.0]),
+    "values must be a dict of name -> values, .*received {}": dict(values={}),
+    "limit must be a sequence of values, received 'text'": dict(values={"limit": "text"}),
+    "limit must be a sequence of values, received 3": dict(values={"limit": 3}),
+    r"as many for each setting, 1 or more: {'limit': 2, 'other': 1}": dict(
+        values={"limit": [1, 2], "other": [1]}
+    ),
+    r"as many for each setting, 1 or more: {'limit': 0}": dict(values={"limit": []}),
+    "one for each of 2 values, received 1": dict(simulators=[make(1.0)]),
+    "one for each value, received Simulator": dict(simulators=make(1.0)),
+    "one for each value, received int": dict(simulators=3),
+    "function must be callable, received 3": dict(function=3),
+    "key must be a jax.random.key": dict(key=3),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_named(message, key):
+    asked = dict(key=key, simulators=make, values={"limit": [1.0, 2.0]}) | BAD[message]
+    with pytest.raises(ValueError, match=f"sweep: .*{message}"):
+        jast.sweep(**asked)
+
+
+def test_the_picture(key):
+    table = table_of([0.0, 1.0, 2.0, 3.0], [300, 100, 30, 0])
+    ax = table.plot(level=0.05, truth=lambda x: 0.3 * np.exp(-1.1 * x))
+    labels = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert labels[0] == "probability" and "no failure seen: below" in labels and "truth" in labels
+    assert ax.get_yscale() == "log" and ax.get_xlabel() == "gain"
+    with pytest.raises(ValueError, match="plot.sweep: table must be a Sweep, received int"):
+        jast.plot.sweep(3)
+
+
+def test_partials_of_make_are_equal():
+    rows = [{"limit": v} for v in LIMITS]
+    a, b = batch(make, rows), batch(make, rows[:2])
+    assert jax.tree.structure(a[0]) == jax.tree.structure(b[1])
+    assert isinstance(a[0].step, Partial)
