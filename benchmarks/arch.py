@@ -1,5 +1,6 @@
 """Falsification of the ARCH-COMP benchmarks with few simulations: ``python -m benchmarks.arch
-[--json] [--quick | --smoke] [--cases ...] [--methods ...] [--seeds N] [--budget N]``.
+[--json] [--quick | --smoke] [--cases ...] [--methods ...] [--seeds N] [--budget N]
+[--probability [CASE]]``.
 
 For each requirement and method: seeds that falsified it within the budget (300; CC4 and AT 1500),
 and the mean and median number of simulations of these. A method is ``method(key, sim, budget)`` and
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks import peers
+from benchmarks import arch_probability, peers
 from benchmarks.cma_es import Stop
 from benchmarks.sizes import options, size
 from jast import limit_state
@@ -46,6 +47,11 @@ PUBLISHED = {
     "AT6c": "FalCAuN 898 (10/10)",
     "AT6abc": "FalCAuN 1232 (10/10)",
 }
+
+
+def system(name):
+    """The simulator of a requirement."""
+    return chasing_cars(name) if name.startswith("CC") else automatic_transmission(name)
 
 
 def falsify(key, sim, budget):
@@ -122,8 +128,7 @@ def run(cases, methods, seeds, budget=None):
     """Rows by requirement and method."""
     report = {}
     for name in cases:
-        limit, rows = budget or CASES[name], {}
-        sim = chasing_cars(name) if name.startswith("CC") else automatic_transmission(name)
+        limit, sim, rows = budget or CASES[name], system(name), {}
         for method in methods:
             begin, took = time.process_time(), []
             for seed in range(seeds):
@@ -168,7 +173,23 @@ def main(argv=None):
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all but bayesian")
     parser.add_argument("--seeds", type=int, help="default: 50")
     parser.add_argument("--budget", type=int, help="simulations (default: 300; CC4 and AT 1500)")
+    parser.add_argument(
+        "--probability",
+        nargs="?",
+        const="CCx",
+        choices=CASES,
+        help="instead: how probable it is that uniform inputs break one (default: CCx), by"
+        " estimates of 20,000 episodes (or --budget) and crude Monte Carlo of 1,000,000",
+    )
     args = parser.parse_args(argv)
+    if args.probability:
+        budget = args.budget or size(args, 20_000, 5_000, 500)
+        crude = size(args, 1_000_000, 20_000, 500)
+        found = arch_probability.rows(system(args.probability), budget, crude)
+        settings = dict(case=args.probability, jast=jast.__version__)
+        said = json.dumps(dict(settings=settings, rows=found))
+        print(said if args.json else arch_probability.table(found))
+        return
     there = lambda m: m not in NEEDED or importlib.util.find_spec(NEEDED[m])
     installed = [m for m in METHODS if there(m) and m != "bayesian"]
     cases = args.cases or size(args, list(CASES), ["CC2"], ["CC1"])
