@@ -207,6 +207,13 @@ def test_which_part_broke_and_when():
     assert "does not" in text and "x > 0" in text and len(text.splitlines()) == 8
 
 
+def test_a_long_formula_prints_whole():
+    f = always(X & ~Y, 0, 1) | always(Y & ~X, 0, 1) | eventually(X & Y, 0, 2) | until(X, Y, 0, 2)
+    lines = str(parts(f, TRACE, 1.0)).splitlines()
+    words = lambda text: "".join(text.split())
+    assert len(str(f)) > 70 and words(str(f)) in words("".join(line[:70] for line in lines))
+
+
 def test_which_part_decided_an_until():
     rows = parts(until(X, Y, 1, 5), TRACE, 1.0).rows
     # x is below 0 at 1 s: that decides for any later moment of y, and the first is named

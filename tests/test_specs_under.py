@@ -10,7 +10,17 @@ import pytest
 import jast
 from jast.distributions import Normal
 from jast.simulators import autoregression
-from jast.specs import always, eventually, implies, parts, predicate, robustness, trace_of, under
+from jast.specs import (
+    always,
+    eventually,
+    goes_on,
+    implies,
+    parts,
+    predicate,
+    robustness,
+    trace_of,
+    under,
+)
 from tests.blackboxes import Walk
 
 S = jast.search
@@ -196,7 +206,12 @@ def test_a_system_that_ends_early_has_a_shorter_trace():
     for formula, event, distance in [(low, False, 1e19), (end, True, 0)]:
         e = jast.replay(under(sim, formula), x)
         assert (int(e.length), bool(e.failure)) == (2, event)
-        assert float(e.distance) >= distance
+        assert float(e.distance) >= distance and not goes_on(e)
+    calm = under(sim, always(high(-1.0), 0, 6))
+    certain, whole = jast.replay(calm, x), jast.replay(calm, 0 * x)
+    assert goes_on(certain) and int(certain.length) == 1 and not goes_on(whole)
+    with pytest.raises(ValueError, match="goes_on: episode must be a jast.replay"):
+        goes_on(jast.replay(sim, x))
 
 
 def test_numbers_that_are_none_make_an_episode_invalid():

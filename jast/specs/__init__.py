@@ -6,7 +6,7 @@ from jast._doors import listed
 from jast.specs.formulas import Formula, always, eventually, implies, predicate, until
 from jast.specs.parts import Part, Parts, parts
 from jast.specs.robustness import robustness
-from jast.specs.simulator import Monitored, trace_of, under
+from jast.specs.simulator import Monitored, goes_on, trace_of, under
 
 __all__ = [
     "Formula",
@@ -15,6 +15,7 @@ __all__ = [
     "Parts",
     "always",
     "eventually",
+    "goes_on",
     "implies",
     "parts",
     "predicate",

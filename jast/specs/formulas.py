@@ -169,7 +169,7 @@ def always(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
     Raises:
         ValueError: for what is no formula, and for a window that is negative or reversed.
     """
-    return Temporal(_formula("always", "f", f), "always", *_window("always", f, a, b))
+    return _temporal("always", f, a, b)
 
 
 def eventually(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
@@ -185,7 +185,7 @@ def eventually(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
     Raises:
         ValueError: for what is no formula, and for a window that is negative or reversed.
     """
-    return Temporal(_formula("eventually", "f", f), "eventually", *_window("eventually", f, a, b))
+    return _temporal("eventually", f, a, b)
 
 
 def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> Formula:
@@ -245,6 +245,10 @@ def window(f: Temporal | Until) -> str:
     if f.b is None:
         return f"[{f.a:g}, end]" if f.a else ""
     return f"[{f.a:g}, {f.b:g}]"
+
+
+def _temporal(kind: str, f: Formula, a: Any, b: Any) -> Formula:
+    return Temporal(_formula(kind, "f", f), kind, *_window(kind, f, a, b))
 
 
 def _joined(kind: str, *parts: Formula) -> Formula:

@@ -1,5 +1,6 @@
 """Which part of a formula broke, and when: every sub-formula asked at the moment that decides."""
 
+from textwrap import wrap
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ class Part(NamedTuple):
 
 @results.shown()
 class Parts(NamedTuple):
-    """What `parts` found: prints as a table."""
+    """What `parts` found: prints as a table, a long formula on several lines."""
 
     rows: tuple[Part, ...]
     """The formula itself first, each formula before its parts."""
@@ -43,11 +44,14 @@ class Parts(NamedTuple):
         width = max(min(width, 70), 10)
         lines = [f"{'':<{width}}  {'at s':>8}  {'robustness':>11}"]
         for p in self.rows:
-            text = "  " * p.depth + str(p.formula)
-            text = text if len(text) <= width else text[: width - 3] + "..."
+            margin = "  " * p.depth
+            room = max(width, len(margin) + 20)
+            first, *rest = wrap(
+                str(p.formula), room, initial_indent=margin, subsequent_indent=margin + "    "
+            )
             when = "-" if np.isnan(p.time) else f"{p.time:g}"
             said = ("holds" if p.held else "does not") + (", decides" if p.decides else "")
-            lines.append(f"{text:<{width}}  {when:>8}  {p.value:11.5g}  {said}")
+            lines += [f"{first:<{width}}  {when:>8}  {p.value:11.5g}  {said}", *rest]
         return "\n".join(lines)
 
 
@@ -62,7 +66,7 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
         trace: a pytree of arrays [T, ...], as for `robustness`.
         dt: seconds between samples.
         goes_on: as for `robustness`: for the trace of an episode that ended where the violation
-            was certain.
+            was certain (`jast.specs.goes_on` says whether it did).
 
     Returns:
         `Parts`: a row for each sub-formula, with its trace of robustness. On the host.

@@ -17,7 +17,7 @@ from jast.specs import monitor
 from jast.specs.formulas import Formula, predicates
 from jast.specs.robustness import fits, margins, spacing
 
-__all__ = ["Monitored", "trace_of", "under"]
+__all__ = ["Monitored", "goes_on", "trace_of", "under"]
 
 
 class Monitored(NamedTuple):
@@ -33,6 +33,8 @@ class Monitored(NamedTuple):
     """The greatest that the trace's robustness can still come to; at the trace's end, the
     robustness. Infinite where all is open yet.
     """
+    goes_on: Any
+    """bool: the trace goes on. False at the horizon, and where ``is_terminal`` ended it."""
     told: Any = ()
     """``(log p,)`` of the trace so far, where the system's ``evaluate`` tells log p; else ``()``.
     """
@@ -133,18 +135,13 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
         samples: as for `under`.
 
     Returns:
-        The system's states, a pytree of arrays [n, ...] up to the episode's end: with
-        ``goes_on=True`` where that came before the horizon. Where ``is_terminal`` ended it,
-        `parts` does not know that nothing follows: it shows windows that were cut short as open.
+        The system's states, a pytree of arrays [n, ...] up to the episode's end. Where that was the
+        first moment of certainty, the trace is a beginning: `parts` wants to know (`goes_on`).
 
     Raises:
         ValueError: for an episode without states, or of another system.
     """
-    if not isinstance(getattr(episode, "states", None), Monitored):
-        raise ValueError(
-            "trace_of: episode must be a jast.replay of a simulator of jast.specs.under, received"
-            f" {type(episode).__name__} with states {type(getattr(episode, 'states', None))}"
-        )
+    _monitored("trace_of", episode)
     n = int(episode.length) + 1
     states = jax.tree.map(lambda a: np.asarray(a)[:n], episode.states.state)
     if samples is None:
@@ -152,6 +149,30 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
     rows = jax.vmap(samples)(states)
     flat = lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])])
     return jax.tree.map(lambda a: flat(np.asarray(a)), rows)
+
+
+def goes_on(episode: Episode) -> bool:
+    """Whether an episode of a system `under` a formula ended with its trace open, because a
+    violation was certain: what `jast.specs.parts` and `robustness` call ``goes_on``. False where
+    the trace ended by itself, at the horizon or by ``is_terminal``.
+
+    Args:
+        episode: as for `trace_of`.
+
+    Raises:
+        ValueError: as `trace_of`.
+    """
+    return bool(np.asarray(_monitored("goes_on", episode).goes_on)[int(episode.length)])
+
+
+def _monitored(function: str, episode: Any) -> Monitored:
+    states = getattr(episode, "states", None)
+    if not isinstance(states, Monitored):
+        raise ValueError(
+            f"{function}: episode must be a jast.replay of a simulator of jast.specs.under,"
+            f" received {type(episode).__name__} with states {type(states)}"
+        )
+    return states
 
 
 def _init(watch: _Watch, x0: Any) -> Monitored:
@@ -184,7 +205,7 @@ def _pushed(
     memory, bound = monitor.push(
         watch.formula, memory, given, samples, unknown, watch.dt, watch.total
     )
-    return Monitored(state, after, memory, bound, told)
+    return Monitored(state, after, memory, bound, unknown, told)
 
 
 def _rows(watch: _Watch, state: Any) -> Any:

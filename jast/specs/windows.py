@@ -66,7 +66,8 @@ def until(pair: Pair, f: Any, g: Any, first: int, last: int, beyond: Any) -> Any
 
     both = f, pair.least(f, g)
     ends = beyond[0], jnp.minimum(*beyond)
-    _, found = over(op, both, first, last, ends, False)
+    # stretches that overlap do no harm: what they share counts in the first, and less in the second
+    _, found = over(op, both, first, last, ends, pair.overlap)
     if first:
         found = pair.least(over(pair.least, f, 0, first - 1, beyond[0], pair.overlap), found)
     return found
