@@ -68,7 +68,9 @@ def quick(function: Callable[..., Any]) -> Callable[..., Any]:
         cpu = jax.default_backend() == "cpu"
         return jax.jit(function, compiler_options=_QUICKLY if cpu else None)
 
-    return functools.wraps(function)(lambda *args: jitted()(*args))
+    # inside of another program there are no options of its own
+    run = lambda *args: (function if is_tracing() else jitted())(*args)
+    return functools.wraps(function)(run)
 
 
 def was_interrupted(error: BaseException) -> bool:

@@ -5,12 +5,14 @@ Each part is a file of `jast.archive`: whole or not there, with a checksum, with
 """
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jast import archive
@@ -31,16 +33,25 @@ class Store:
     def get(self, number: int, name: str) -> list[np.ndarray] | None:
         """The arrays of a part; None where there is no whole one."""
         try:
-            _, arrays = archive.read(
-                self._path(number, name), PART, VERSION, "part of a checkpoint"
-            )
+            path = self._path(number, name)
+            header, arrays = archive.read(path, PART, VERSION, "a part of a checkpoint")
         except (FileNotFoundError, ValueError):  # not there, or damaged with the machine
             return None
-        return archive.arrays_of(arrays, "part")
+        out, at = [], 0
+        for name, shape in header["arrays"]:
+            dtype = jnp.dtype(name)
+            end = at + math.prod(shape) * dtype.itemsize
+            out.append(arrays["data"][at:end].view(dtype).reshape(shape))
+            at = end
+        return out
 
     def put(self, number: int, arrays: list[Any], name: str) -> None:
         """Keep the arrays of a part. OSError where they cannot be written."""
-        self._write(self._path(number, name), PART, {}, archive.named(dict(part=list(arrays))))
+        arrays = [np.asarray(a) for a in arrays]
+        header = dict(arrays=[[a.dtype.name, a.shape] for a in arrays])
+        # as one, since each array of a file takes time of its own
+        data = np.frombuffer(b"".join(a.tobytes() for a in arrays), np.uint8)
+        self._write(self._path(number, name), PART, header, dict(data=data))
 
     def settled(self, choose: Any) -> dict[str, Any]:
         """``choose()``, a dict that JSON can hold, as the first call chose: what depends on the

@@ -11,6 +11,7 @@ from jax import lax
 
 from jast import limit_state as latent
 from jast.incidents import hosted
+from jast.journal import answered
 from jast.simulator import Simulator
 
 __all__ = ["Judge", "judged"]
@@ -36,7 +37,7 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
     box runs once a point, in batches of ``n``.
     """
     if hosted(sim):
-        return jax.device_get(latent.outcomes(sim, jnp.asarray(z)))
+        return answered(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
     n, d = z.shape
     lanes = max(min(LANES, HELD // d // BLOCK * BLOCK), BLOCK)
     out = []
@@ -44,8 +45,8 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
         part = z[i : i + lanes]
         padded = np.zeros((lanes, d), z.dtype)
         padded[: len(part)] = part
-        o = jax.device_get(_in_blocks(sim, padded, np.int32(len(part))))
-        out.append(latent.Outcomes(*(a[: len(part)] for a in o)))
+        run = partial(_in_blocks, sim)
+        out.append(answered(run, padded, np.int32(len(part)), rows=len(part)))
     return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
 
 

@@ -30,6 +30,7 @@ from jast.estimate import (
 from jast.estimate.importance_sampling import LANES, chunks, even, played
 from jast.policy import Policy, recorded
 from jast.simulators import landing, landing_probability, walk1d
+from jast.watch import Watch
 
 norm = scipy.stats.norm
 VARIANCE, MU = 0.019, 4.0236721906842e-13
@@ -524,7 +525,8 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         and "importance" in capsys.readouterr().err
     )
     with pytest.raises(KeyboardInterrupt):
-        chunks(lambda i: stop(0, 0, None), LANES, MORE)
+        watch = Watch("importance", MORE, "episode", False, None)
+        chunks(lambda shared, i, post: stop(0, 0, None), None, LANES, watch)
 
 
 # Refusals

@@ -9,7 +9,6 @@ failure at these. A quarter of each batch looks where nobody has looked.
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,6 +17,7 @@ from jast.counter import generator
 from jast.estimate.gaussians import Gaussians
 from jast.estimate.surrogate import Surrogate, covariance, fit, normal_cdf, predict
 from jast.estimate.surrogate_failures import DOUBT, Pool, expected, pool
+from jast.journal import answered
 from jast.watch import Watch
 
 __all__ = ["CANDIDATES", "Learner", "learn"]
@@ -49,7 +49,8 @@ class Learner:
         out = []
         for i in range(0, len(z), self.batch):
             rows = np.asarray(z[i : i + self.batch], self.dtype)
-            out.append(jax.device_get(latent.outcomes(self.sim, jnp.asarray(rows))))
+            run = lambda rows: latent.outcomes(self.sim, jnp.asarray(rows))
+            out.append(answered(run, rows))
             o = out[-1]
             self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
             self.learn(rows, o.distance, o.failure, o.invalid)

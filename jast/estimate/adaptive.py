@@ -8,28 +8,32 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
+from jast import units
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
+from jast.checkpoints import stored
 from jast.contract import contract
 from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
 from jast.estimate.batches import balanced, drawn, of_chunk, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import estimate, of_counts
 from jast.estimate.gaussians import effective, together
-from jast.estimate.importance_sampling import Traces, chunks, even, importance, traces
+from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
 from jast.estimate.proposals import as_proposal
 from jast.estimate.seek import Seeker, seek
 from jast.estimate.subset import by_levels
 from jast.intervals import checked_level
+from jast.journal import kept
 from jast.judge import judged
 from jast.policy import nominal_policy
 from jast.results import asked
 from jast.rounding import rounded
+from jast.watch import Watch
 
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo"]
 
-LEAST = 5000
+NAME, LEAST = "failure_probability", 5000
 APART = 0.6
 SEEN, LOST = 100, 2.0
 """Failures of the model from which plain draws tell a probability; what may be lost, as a multiple
@@ -56,6 +60,9 @@ def failure_probability(
     level=0.95,
     progress=False,
     callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
 ):
     """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its
     own finding: `Estimate`.
@@ -98,20 +105,41 @@ def failure_probability(
     The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
     total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. One that comes
     before it ends in an UNRELIABLE estimate from the batches of the search, and is raised where
-    there is none yet. Raises ValueError for a budget below 50, a level outside (0, 1),
+    there is none yet.
+
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+    Units are of the last part; of what comes before it the checkpoint keeps what the system
+    answered, so that it is not asked again.
+
+    Raises ValueError for a budget below 50, a level outside (0, 1),
     disturbances without a quantile function, and where the simulator's functions do not fit
     together.
     """
-    name = "failure_probability"
+    name = NAME
     random_key(name, key)
     budget = whole(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
-    if budget < LEAST:
-        found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
-        return found._replace(settings=settings)
+    ways = units.ways(name, executor, devices)
+    about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known)
+    with stored(name, checkpoint, key, **about) as store, kept(store):
+        if budget < LEAST:
+            found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
+        else:
+            ways, watched = ways._replace(store=store), (progress, callback)
+            found = _sought(key, sim, budget, known, gradients, level, watched, ways)
+    return found._replace(settings=settings)
+
+
+def _sought(key, sim, budget, known, gradients, level, watched, ways):
+    """The `Estimate` by a proposal that is sought within the budget; ``watched``: progress and
+    callback.
+    """
     s = Seeker(key, sim, budget)
     if (coarse := rounded(sim)) is not None:
         s.coarse.append(coarse)
@@ -121,14 +149,13 @@ def failure_probability(
         t = tilt_estimate.first(s)
         if t is None or not t.serves(tilt_estimate.SERVES):
             t = _beside_gaussians(s, t, gradients)
-        found = _with_the_rest(key, s, t, level, progress, callback)
+        return _with_the_rest(key, s, t, level, watched, ways)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
             raise
         if not s.batches:
             raise KeyboardInterrupt from error
-        found = _of_the_search(s, level)
-    return found._replace(settings=settings)
+        return _of_the_search(s, level)
 
 
 def _beside_gaussians(s, t, gradients):
@@ -152,15 +179,16 @@ def _beside_gaussians(s, t, gradients):
     return t if t is not None and t.serves(gaussian) else None
 
 
-def _with_the_rest(key, s, t, level, progress, callback):
+def _with_the_rest(key, s, t, level, watched, ways):
     """The `Estimate` of what is left of the budget, by the proposal that was found: that of the
     `TiltSeeker` ``t`` where there is one.
     """
     if t is not None and t.promised * (s.budget - s.spent) > diagnostics.ESS:
         tilt_estimate.guarded(s, t)
-        share = _of_the_model(t.promised * (s.budget - s.spent))
-        return tilt_estimate.estimated(key, s, t, share, level, progress, callback)
-    name, sim, n = "failure_probability", s.sim, s.budget - s.spent
+        n = s.budget - s.spent
+        share, watch = _of_the_model(t.promised * n), Watch(NAME, n, "episode", *watched)
+        return tilt_estimate.estimated(key, s, t, share, level, watch, ways)
+    sim, n = s.sim, s.budget - s.spent
     lanes = s.batch
     about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
     astray, log_p = _astray(s, n), _about(s)
@@ -172,22 +200,23 @@ def _with_the_rest(key, s, t, level, progress, callback):
                 episodes=s.spent + found.episodes, history=(*about["history"], *found.history)
             )
     if s.log_mean is None or (astray and enough) or _plain_is_better(s):
-        simulate = lambda i: _plain(key, sim, i, min(lanes, n - i * lanes))
-        total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
-        about["reasons"] = s.coarse  # the others are about the proposal
+        watch = Watch(NAME, n, "episode", *watched)
+        total, notes, lost = chunks(_plain, (key, sim, lanes, n), lanes, watch, ways)
+        about["reasons"] = [*s.coarse, *lost]  # the others are about the proposal
         found = of_counts(
-            name, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
+            NAME, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
         )
         return found._replace(draws=drawn_by(found.draws, key, lanes, "model"))
     share = _of_the_model(_promised(s, n))
     q = together(s.q, s.model(), share)
     modes = _by_direction(q)
     member = np.eye(len(q.means))[_owner(modes, len(q.means))]
-    simulate = lambda i: _traces(key, sim, q, member, i, min(lanes, n - i * lanes))
-    total, notes = chunks(simulate, lanes, n, progress=progress, callback=callback, name=name)
+    watch = Watch(NAME, n, "episode", *watched)
+    total, notes, lost = chunks(_traces, (key, sim, q, member, lanes, n), lanes, watch, ways)
+    about["reasons"] += lost
     groups = _groups(q, modes, total) if total.first > 0 else []
     found = estimate(
-        name,
+        NAME,
         total,
         notes=notes,
         evaluations=s.spent + total.samples,
@@ -239,7 +268,7 @@ def _of_the_search(s, level):
         " chosen the proposal"
     )
     return estimate(
-        "failure_probability",
+        NAME,
         sums.add(sums.nothing(rows), seen),
         level=level,
         reasons=[*s.coarse, against],
@@ -249,7 +278,18 @@ def _of_the_search(s, level):
     )
 
 
-def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callback=None):
+def monte_carlo(
+    key,
+    sim,
+    samples=100_000,
+    *,
+    level=0.95,
+    progress=False,
+    callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
+):
     """How probable is a failure, by counting alone? Crude Monte Carlo, the baseline of estimators:
     `Estimate` with an exact interval, and Chernoff's and Jeffreys' upper bounds also where no
     failure was seen. `jast.nominal` is for a first look at a system, and
@@ -264,10 +304,13 @@ def monte_carlo(key, sim, samples=100_000, *, level=0.95, progress=False, callba
     level = checked_level(name, level)
     contract(sim, observed=False)
     proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), even(samples)
-    simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes)
-    total, notes = chunks(simulate, lanes, samples, progress=progress, callback=callback, name=name)
+    ways = units.ways(name, executor, devices)
+    with stored(name, checkpoint, key, sim=sim, samples=samples) as store:
+        watch = Watch(name, samples, "episode", progress, callback)
+        shared = key, sim, proposal, lanes
+        total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
     settings = asked(name, key, samples=samples, level=level)
-    found = of_counts(name, total, level=level, notes=notes)
+    found = of_counts(name, total, level=level, notes=notes, reasons=lost)
     draws = drawn_by(found.draws, key, lanes, "policy")
     return found._replace(settings=settings, draws=draws)
 
@@ -356,17 +399,21 @@ def _by_direction(q):
     return out
 
 
-def _traces(key, sim, q, member, i, n):
-    """`Traces` [n] of chunk ``i`` of ``q``; ``member`` [K, K]: the mode of each component, of which
-    are shares.
+def _traces(shared, i, post):
+    """`Traces` of chunk ``i`` of a mixture ``q``; ``member`` [K, K]: the mode of each component, of
+    which are shares.
     """
+    key, sim, q, member, lanes, samples = shared
+    n = min(lanes, samples - i * lanes)
     _, o, log_w, shares = drawn(sim, q, *of_chunk(key, i, n, q))
     with np.errstate(divide="ignore"):
         shares = np.log(np.exp(shares) @ member)
     return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
 
 
-def _plain(key, sim, i, n):
-    """`Traces` [n] of chunk ``i`` of the model itself."""
+def _plain(shared, i, post):
+    """`Traces` of chunk ``i`` of the model itself."""
+    key, sim, lanes, samples = shared
+    n = min(lanes, samples - i * lanes)
     o, none = judged(sim, plain_chunk(key, i, n, sim)), np.zeros(n)
     return Traces(none, none[:, None], o.failure, o.invalid, o.length, o.distance)

@@ -5,7 +5,6 @@ from many starts (`jast.boundary`).
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -13,6 +12,7 @@ from jax import lax
 from jast._jax import quick
 from jast.boundary import EPISODES, STEPS, descents
 from jast.counter import generator
+from jast.journal import answered
 from jast.limit_state import dimension, normal_numbers
 
 __all__ = ["design_points", "distinct"]
@@ -39,7 +39,7 @@ def design_points(key, sim, starts=MOST, limit=16):
     """
     z = np.zeros((-(-starts // MOST) * MOST, dimension(sim)), normal_numbers(sim))
     z[:starts] = generator(key).standard_normal((starts, z.shape[1]))
-    found = jax.device_get(_in_blocks(sim, z, np.int32(starts)))
+    found = answered(partial(_in_blocks, sim), z, np.int32(starts))
     points, failing = (a[:starts] for a in found)
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
     return DesignPoints(distinct(points, limit), starts * (STEPS * GRADIENT + EPISODES))

@@ -16,8 +16,9 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jast import distributions as D
-from jast import results
+from jast import results, units
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
@@ -27,11 +28,12 @@ from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
 from jast.memory import require_episodes
 from jast.outline import outline
+from jast.places import Task
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
 from jast.results import asked
 from jast.rewards import log_likelihood
-from jast.watch import Watch, in_pieces
+from jast.watch import Watch
 
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played"]
 
@@ -86,6 +88,9 @@ def importance(
     level=0.95,
     progress=False,
     callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
 ):
     """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal:
     `Estimate`.
@@ -99,6 +104,11 @@ def importance(
     a KeyboardInterrupt ends it with the estimate of the whole chunks, and a word in ``warnings``.
     Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
 
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+
     Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
     without a density, and where the simulator's functions do not fit together.
     """
@@ -110,12 +120,17 @@ def importance(
     contract(sim, observed=False)
     proposal = as_proposal("importance", sim, proposal)
     settings = asked("importance", key, samples=samples, mode=mode, level=level)
+    whole_key = key
     key, for_probes = jax.random.split(key)
+    ways = units.ways("importance", executor, devices)
+    about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = even(samples)
-    simulate = lambda i: traces(jax.random.fold_in(key, i), sim, proposal, lanes, mode == "paper")
-    total, stopped = chunks(simulate, lanes, samples, progress=progress, callback=callback)
-    found = estimate("importance", total, level=level, reasons=reasons, notes=stopped)
+    with stored("importance", checkpoint, whole_key, **about) as store:
+        shared = key, sim, proposal, lanes, mode == "paper"
+        watch = Watch("importance", samples, "episode", progress, callback)
+        total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
+    found = estimate("importance", total, level=level, reasons=[*reasons, *lost], notes=notes)
     draws = drawn_by(found.draws, key, lanes, "policy")
     return found._replace(settings=settings, draws=draws)
 
@@ -125,25 +140,36 @@ def even(samples):
     return -(-samples // -(-samples // LANES))
 
 
-def chunks(simulate, lanes, samples, progress=False, callback=None, name="importance"):
-    """(`Sums`, notes) of ``samples`` episodes, ``lanes`` at a time, of ``simulate(i) -> Traces``
-    [lanes]; of the last chunk the first ones count.
+def chunks(simulate, shared, lanes, watch, ways=units.HERE):
+    """(`Sums`, notes, reasons against them) of all episodes of ``watch``, ``lanes`` at a time, as
+    units of work.
+
+    ``simulate(shared, i, post)``: `Traces` of chunk i, a function of a module; of the last chunk
+    the first rows count.
     """
+    samples = watch.total
 
-    def work(kept, done, end):
-        total, now = kept
-        now = simulate(0) if now is None else now
-        # the device goes on while the host sums
-        ahead = simulate(end // lanes) if end < samples else None
-        rows = jax.tree.map(lambda a: a[: end - done], jax.device_get(now))
-        return sums.add(total, rows), ahead
+    def fold(kept, i, rows):
+        total, done = kept
+        rows = jax.tree.map(lambda a: a[: samples - i * lanes], rows)
+        return sums.add(total, rows), done + len(rows.failure)
 
-    watch = Watch(name, samples, "episode", progress, callback)
-    ends = [*range(lanes, samples, lanes), samples]
-    (total, _), done = in_pieces(work, (sums.nothing(samples), None), ends, watch)
-    if done < samples:
-        return total, (f"interrupted after {done} of {samples} episodes",)
-    return total, ()
+    task = Task(simulate, shared, lambda: Traces(*Traces._fields))
+    size = lambda done: min(done * lanes, samples)
+    start = sums.nothing(samples), 0
+    with watch:
+        ran = units.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
+    total, done = ran.state
+    short = units.note("episodes", ran, done, samples)
+    if ran.left_out:
+        return total, (), (short, *map(str, ran.incidents))
+    return total, () if short is None else (f"interrupted {short}",), ()
+
+
+def of_policies(shared, i, post):
+    """`Traces` of chunk ``i``, of (key, simulator, proposal, its size, whether to the horizon)."""
+    key, *about = shared
+    return traces(jax.random.fold_in(key, i), *about)
 
 
 @partial(jax.jit, static_argnames=("n", "to_horizon"))

@@ -21,6 +21,7 @@ from jast.counter import generator
 from jast.distributions.parts import Parts, parts
 from jast.estimate.gaussians import log_sum
 from jast.incidents import hosted
+from jast.journal import answered
 from jast.limit_state import Outcomes, normal_numbers
 from jast.outline import ask, outline
 from jast.progress import advance, begin, conclude
@@ -303,17 +304,20 @@ def played(sim, q, u, first, noise):
         of_steps = tuple(a[:, rows] for a in noise)
         return _played(sim, q, at(u), tuple(map(at, first)), of_steps)
 
-    return _in_lanes(sim, len(u), run)
+    return _in_lanes(sim, len(u), run, (q, u))
 
 
-def _in_lanes(sim, n, run):
-    """What ``run(rows)`` returns of all ``n`` rows, `LANES` at a time, so that one program serves
-    every n; of a black box, which no row may run in vain, all at once.
+def _in_lanes(sim, n, run, given):
+    """Of episodes that are ``given``: what ``run(rows)`` returns of all ``n`` rows, `LANES` at a
+    time, so that one program serves every n; of a black box, which no row may run in vain, all at
+    once.
     """
     lanes, out = n if hosted(sim) else LANES, []
     for i in range(0, n, lanes):
         m = min(lanes, n - i)
-        o, x, trace = jax.device_get(run(np.minimum(np.arange(i, i + lanes), n - 1)))
+        o, x, trace = answered(
+            lambda rows, _: run(rows), np.minimum(np.arange(i, i + lanes), n - 1), given
+        )
         of_steps = (a[:, :m] for a in trace[3:])
         out.append(((*(a[:m] for a in o), x[:m], *(a[:m] for a in trace[:3])), (*of_steps,)))
     rows = [np.concatenate(a) for a in zip(*(a for a, _ in out), strict=True)]
@@ -402,7 +406,8 @@ def of_the_model(sim, q, z):
     (`Outcomes`, log q - log p [n], `Trace`), on the host.
     """
     z = np.asarray(z)
-    return _in_lanes(sim, len(z), lambda rows: _of_the_model(sim, q, z[rows]))
+    run = lambda rows: _of_the_model(sim, q, z[rows])
+    return _in_lanes(sim, len(z), run, (q, z))
 
 
 @jax.jit

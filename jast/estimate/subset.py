@@ -7,42 +7,90 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
+from jast import units
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.estimate.estimate import Estimate
 from jast.estimate.populations import LAST, QUANTILE, Explored, explore
 from jast.intervals import checked_level, log_normal
 from jast.memory import require_episodes
+from jast.places import Task
 from jast.results import asked
 from jast.simulator import Simulator
+from jast.watch import Watch
 
 __all__ = ["subset_simulation"]
 
 LOST = "a mode that few members of a population reach is lost at times, and nothing shows it"
-REPLICATES, LEAST = 5, 100
+REPLICATES, FEWEST, LEAST = 5, 3, 100
 
 
-def subset_simulation(key, sim, samples=1000, *, replicates=10, level=0.95):
+def subset_simulation(
+    key,
+    sim,
+    samples=1000,
+    *,
+    replicates=10,
+    level=0.95,
+    progress=False,
+    callback=None,
+    checkpoint=None,
+    executor=None,
+    devices=None,
+):
     """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
     ``samples``: `Estimate`, the mean of theirs.
 
     The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too,
     ``samples`` counts the members of the last populations. It needs a miss distance that leads to
     failures, and no gradient; a mode that few members reach is lost at times, and the others do not
-    show it. A population gives up below a probability of 1e-300. Raises ValueError for fewer than
-    100 samples or 3 replicates, and as `failure_probability`.
+    show it. A population gives up below a probability of 1e-300. ``progress=True`` shows a bar,
+    ``callback(done, total, None)`` is called after each population; a KeyboardInterrupt ends it
+    with the estimate of those that are done, UNRELIABLE, and is raised where they are fewer than 3.
+
+    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
+    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
+    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
+    Neither changes a result (`jast.units`; docs/scale.md).
+
+    Raises ValueError for fewer than 100 samples or 3 replicates, and as `failure_probability`.
     """
     name = "subset_simulation"
     random_key(name, key)
     samples, replicates = (
         whole(name, "samples", samples, 100),
-        whole(name, "replicates", replicates, 3),
+        whole(name, "replicates", replicates, FEWEST),
     )
     level = checked_level(name, level)
     latent.check(name, sim)
     require_episodes(name, sim, samples)
-    runs = [explore(k, sim, samples, least=-690.0) for k in jax.random.split(key, replicates)]
+    ways = units.ways(name, executor, devices)
+    about = dict(sim=sim, samples=samples, replicates=replicates)
+    with (
+        stored(name, checkpoint, key, **about) as store,
+        Watch(name, replicates, "population", progress, callback) as watch,
+    ):
+        task = Task(_unit, (jax.random.split(key, replicates), sim, samples), lambda: (0,) * 7)
+        add = lambda runs, number, parts: (*runs, _explored(*parts))
+        ran = units.run(task, replicates, add, (), watch, ways._replace(store=store))
+    runs, short = ran.state, units.note("populations", ran, len(ran.state), replicates)
+    if len(runs) < FEWEST:
+        raise KeyboardInterrupt if ran.ended == "" else RuntimeError(f"{name}: {short}")
+    reasons = [] if short is None else [short, *map(str, ran.incidents)]
     settings = asked(name, key, samples=samples, replicates=replicates, level=level)
-    return of_populations(name, runs, samples, level)._replace(settings=settings)
+    return of_populations(name, runs, samples, level, reasons)._replace(settings=settings)
+
+
+def _unit(shared, number, post):
+    """The `Explored` of a population, as arrays."""
+    keys, sim, samples = shared
+    return tuple(map(np.asarray, explore(keys[number], sim, samples, least=-690.0)))
+
+
+def _explored(points, used, log_mean, levels, evaluations, invalid, complete):
+    """`Explored` of its arrays."""
+    numbers = float(log_mean), tuple(levels.tolist()), int(evaluations), int(invalid)
+    return Explored(points, used, *numbers, bool(complete))
 
 
 def of_populations(

@@ -13,9 +13,11 @@ from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.guard import LOST
 from jast.estimate.importance_sampling import Traces, chunks
-from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
+from jast.estimate.markov_tilts import log_weight, numbers, of_the_model, played
 from jast.estimate.populations import LAST, QUANTILE, explore
 from jast.estimate.tilt_search import TiltSeeker, seek_tilts
+from jast.units import Ways
+from jast.watch import Watch
 
 __all__ = ["estimated", "first"]
 
@@ -112,26 +114,25 @@ def _lost(s, t, takes):
 
 
 def estimated(
-    key: Any, s: Any, t: TiltSeeker, share: float, level: float, progress: Any, callback: Any
+    key: Any, s: Any, t: TiltSeeker, share: float, level: float, watch: Watch, ways: Ways
 ) -> Estimate:
     """The `Estimate` of what is left of the budget, ``share`` of it the model's own draws."""
-    name, n = "failure_probability", s.budget - s.spent
     tilts, weights, frame = t.q
     weights = np.asarray(weights) * (1 - share) / (1 - weights[0])
     weights[0] = share
     q = t.tilts((tilts, weights, frame))
-    simulate = lambda i: _traces(generator(key, 2, i), s.sim, q, t)
-    total, notes = chunks(simulate, t.batch, n, progress=progress, callback=callback, name=name)
+    shared = key, s.sim, q, t.batch, t.about, t.dtype
+    total, notes, lost = chunks(_traces, shared, t.batch, watch, ways)
     groups = [list(range(1, len(tilts)))] if total.first > 0 else []
     if groups and total.by_component[0] / total.first >= diagnostics.MATTERS:
         groups.append([0])
     elif groups:
         groups[0].append(0)
     found = estimate(
-        name,
+        watch.name,
         total,
         level=level,
-        reasons=[*s.coarse, *s.reasons],
+        reasons=[*s.coarse, *s.reasons, *lost],
         notes=notes,
         evaluations=s.spent + total.samples,
         groups=groups,
@@ -142,8 +143,10 @@ def estimated(
     return found._replace(draws=drawn_by(found.draws, key, t.batch, q))
 
 
-def _traces(key, sim, q: Tilts, t: TiltSeeker):
-    drawn = numbers(key, t.batch, t.about, sim.horizon, t.dtype)
+def _traces(shared, i, post):
+    """`Traces` of chunk ``i``."""
+    key, sim, q, batch, about, dtype = shared
+    drawn = numbers(generator(key, 2, i), batch, about, sim.horizon, dtype)
     o, ratio, _ = played(sim, q, *drawn)
     log_w, shares = log_weight(q, ratio)
     return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
