@@ -34,6 +34,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
     "stress": ["--smoke"],
+    "sweep": ["--smoke"],
     "weakness": ["--smoke"],
 }
 QUICK = {
@@ -51,6 +52,7 @@ QUICK = {
     "memory": ["--quick"],
     "probability": ["--quick", "--seeds", "1"],
     "stress": ["--quick"],
+    "sweep": ["--quick"],
     "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }

@@ -16,11 +16,12 @@ from jast.contract import contract
 from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
 from jast.estimate.batches import balanced, drawn, of_chunk, plain_chunk
 from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import estimate, of_counts
+from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
 from jast.estimate.proposals import as_proposal
+from jast.estimate.redrawn import fits
 from jast.estimate.seek import Seeker, seek
 from jast.estimate.subset import by_levels
 from jast.intervals import checked_level
@@ -56,6 +57,7 @@ def failure_probability(
     budget=100_000,
     *,
     failures=None,
+    near=None,
     gradients=True,
     level=0.95,
     progress=False,
@@ -97,6 +99,10 @@ def failure_probability(
     ``failures``: known ones (an archive, `jast.failures`), which join what the explorers find, so
     that no mode among them is lost. They lead to a proposal and never enter the estimate.
 
+    ``near``: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
+    fitted to two or three batches, takes the place of the search where it serves; the guard and the
+    last draws are as ever. One without a proposal that fits changes nothing.
+
     A failure mode below ``unseen`` that all explorers miss is missing without a sign. ``modes`` are
     parts of the estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`;
     ``history`` tells how the search went. ``evaluations`` counts each episode, and three for one
@@ -125,26 +131,27 @@ def failure_probability(
     latent.check(name, sim)
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
+    if near is not None and not isinstance(near, Estimate):
+        raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
+    similar = near.proposal if near is not None and fits(sim, near.proposal) else None
     ways = units.ways(name, executor, devices)
-    about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known)
+    about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     with stored(name, checkpoint, key, **about) as store, kept(store):
         if budget < LEAST:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             ways, watched = ways._replace(store=store), (progress, callback)
-            found = _sought(key, sim, budget, known, gradients, level, watched, ways)
+            s = Seeker(key, sim, budget, known, similar)
+            found = _sought(key, s, gradients, level, watched, ways)
     return found._replace(settings=settings)
 
 
-def _sought(key, sim, budget, known, gradients, level, watched, ways):
-    """The `Estimate` by a proposal that is sought within the budget; ``watched``: progress and
-    callback.
+def _sought(key, s, gradients, level, watched, ways):
+    """The `Estimate` by a proposal that the `Seeker` ``s`` seeks within the budget; ``watched``:
+    progress and callback.
     """
-    s = Seeker(key, sim, budget)
-    if (coarse := rounded(sim)) is not None:
+    if (coarse := rounded(s.sim)) is not None:
         s.coarse.append(coarse)
-    if known is not None:
-        s.known = known
     try:
         t = tilt_estimate.first(s)
         if t is None or not t.serves(tilt_estimate.SERVES):

@@ -38,6 +38,10 @@ COVERED = 50.0
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
+NEAR, GOOD, SERVES = 2, 0.2, 0.05
+"""Of the proposal of a similar system: the batches that it is fitted to; effective draws of a draw
+with which it is taken as it is, and with which it serves once it is fitted.
+"""
 RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
 
 
@@ -46,7 +50,7 @@ class Seeker:
     cost, and in words how it went.
     """
 
-    def __init__(self, key, sim, budget):
+    def __init__(self, key, sim, budget, known=None, near=None):
         self.root, self.sim, self.budget = generator(key, 1), sim, budget
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.size, self.batch = max(budget // 100, 100), budget // 25
@@ -54,7 +58,9 @@ class Seeker:
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
         self.anchors = np.zeros((0, self.dimension))
-        self.known = self.anchors  # failures that came with the call
+        # what came with the call: failures, and the proposal of a similar system
+        self.known = self.anchors if known is None else known
+        self.near = near
         self.seeds = self.anchors  # failures of many places, whatever their probability
         self.spent, self.reasons, self.history = 0, [], []
         self.lost = 0.0  # a share that the proposal may have lost
@@ -114,18 +120,44 @@ def seek(s, gradients=True, instead=lambda s: False):
     failure was found. ``instead``: asked before each search for lost failures, ends it by True.
     """
     _look(s)
-    parts = _explore(s, gradients and not hosted(s.sim))
-    if not parts:
-        return
-    if s.populations:
-        s.rare = max(p.log_mean for p in s.populations) < RARE
-    for i, g in enumerate(parts, 1):
-        s.add(g, 1 / i)
-    _refine(s, REFITS)
+    if not _from_near(s):
+        parts = _explore(s, gradients and not hosted(s.sim))
+        if not parts:
+            return
+        if s.populations:
+            s.rare = max(p.log_mean for p in s.populations) < RARE
+        for i, g in enumerate(parts, 1):
+            s.add(g, 1 / i)
+        _refine(s, REFITS)
     for i in range(GUARDS):
         if s.log_mean is None or instead(s) or guarded(s, i, GUARDS - 1):
             break
         _refine(s, 2)
+
+
+def _from_near(s):
+    """Whether the proposal of a similar system serves, once it was fitted to a few batches; if not,
+    these are all that is left of it.
+    """
+    if not isinstance(s.near, latent.Latent):
+        return False
+    s.q = s.near
+    s.anchors = s.centres()
+    b, own = _drawn(s, s.q), 0.0
+    if b.failure.any():
+        s.batches.append(b)
+        own = _own(s)
+        _weigh(s)
+    s.note(f"proposal of a similar system: {b.failure.mean():.1%} fail, ESS {own:.4g}", s.batch)
+    if own > GOOD * s.batch:
+        return True
+    if own:
+        _fit(s)
+        _refine(s, NEAR)
+        if _own(s) > SERVES * s.batch:
+            return True
+    s.q, s.anchors = None, s.known
+    return False
 
 
 def _explore(s, gradients):
@@ -199,7 +231,7 @@ def _refine(s, most):
             s.note("batch: no failure", s.batch)
             return
         s.batches.append(b)
-        own, (name, ess) = effective(b.log_weight[b.failure]), _fit(s)
+        own, (name, ess) = _own(s), _fit(s)
         s.note(
             f"batch: {b.failure.mean():.1%} fail, ESS {own:.4g}; of all: log p {s.log_mean:.3f},"
             f" ESS {ess:.4g}; next: {name}",
@@ -210,14 +242,27 @@ def _refine(s, most):
         before = own
 
 
+def _own(s):
+    """The effective sample size of the last batch."""
+    b = s.batches[-1]
+    return effective(b.log_weight[b.failure])
+
+
+def _weigh(s):
+    """The log weights of the failures of all batches, which say about what the probability is."""
+    log_w, _ = balanced(s.batches)
+    total = np.exp(log_w - log_w.max()).sum()
+    s.log_mean = log_w.max() + math.log(total / sum(len(b.z) for b in s.batches))
+    s.rare = s.log_mean < RARE
+    return log_w
+
+
 def _fit(s):
     """The proposal becomes what promises the least variance: a mixture for all failures, one with
     parts for each mode, a sphere, or itself.
     """
-    log_w, _ = balanced(s.batches)
+    log_w = _weigh(s)
     w = np.exp(log_w - log_w.max())
-    s.log_mean = log_w.max() + math.log(w.sum() / sum(len(b.z) for b in s.batches))
-    s.rare = s.log_mean < RARE
     points, centres = s.filled(*_failing(s.batches)), s.centres()
     owner = nearest(points, centres)
     many = np.bincount(owner, minlength=len(centres)) >= FEW

@@ -13,9 +13,9 @@ from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.guard import LOST
 from jast.estimate.importance_sampling import Traces, chunks
-from jast.estimate.markov_tilts import log_weight, numbers, of_the_model, played
+from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
 from jast.estimate.populations import LAST, QUANTILE, explore
-from jast.estimate.tilt_search import TiltSeeker, seek_tilts
+from jast.estimate.tilt_search import TiltSeeker, from_near, seek_tilts
 from jast.units import Ways
 from jast.watch import Watch
 
@@ -38,8 +38,14 @@ by all batches, where the proposal does not cover it; standard errors that may b
 
 def first(s: Any) -> TiltSeeker | None:
     """The `TiltSeeker` of a system of many steps or with choices, after its search; None for
-    another system. ``s``: the `Seeker`, which pays.
+    another system, and where Gaussians served a similar one. ``s``: the `Seeker`, which pays.
     """
+    if isinstance(s.near, Tilts):
+        t = _sought(s, from_near(s.next_key(), s.sim, s.near), SHARE * s.budget)
+        if t.serves(SERVES):
+            return t
+    elif s.near is not None:
+        return None
     t = TiltSeeker(s.next_key(), s.sim, 0)
     if not (t.about.choices or t.about.choices0 or s.sim.horizon >= LONG):
         return None

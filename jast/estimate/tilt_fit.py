@@ -24,7 +24,7 @@ from jast.estimate.markov_tilts import (
     surprise,
 )
 
-__all__ = ["Tilt", "as_tilts", "fit", "frame_of", "ratios"]
+__all__ = ["Tilt", "as_tilts", "fit", "frame_of", "of_tilts", "ratios"]
 
 PROJECTED, WITHIN, FAR, LITTLE = 6, 0.05, 4.0, 0.01
 """Numbers that features are made of, at most; how far beyond what was met, in parts of its span,
@@ -329,6 +329,17 @@ def scaled(tilt: Tilt, by: float) -> Tilt:
     """A tilt that moves ``by`` of the way."""
     some = lambda b: Block(by * b.means, b.gates, by * b.shifts, 0 * b.scales)
     return Tilt(some(tilt.first), some(tilt.steps))
+
+
+def of_tilts(q: Tilts) -> tuple[list[Tilt], np.ndarray, Frame]:
+    """What `as_tilts` made ``q`` of: those of its components that are used, their weights, and the
+    `Frame`; in double precision.
+    """
+    q = jax.tree.map(lambda a: np.asarray(a, np.float64), q)
+    weights = np.exp(q.log_weights)
+    one = lambda k: Tilt(*jax.tree.map(lambda a: a[k], (q.first, q.steps)), q.floors[k])
+    used = np.flatnonzero(weights)
+    return [one(k) for k in used], weights[used], q.frame
 
 
 def as_tilts(tilts: list[Tilt], weights: Any, frame: Frame, size: int, dtype: Any) -> Tilts:

@@ -19,6 +19,7 @@ from jast.estimate.tilt_fit import (
     fit,
     frame_of,
     nothing,
+    of_tilts,
     ratios,
     scaled,
     steps_of,
@@ -30,7 +31,7 @@ __all__ = ["TiltSeeker", "seek_tilts"]
 
 COMPONENTS = (3, 5)
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
-REFITS, KEPT = 8, 1200
+REFITS, NEAR, KEPT = 8, 2, 1200
 ENOUGH = 0.2
 """Effective draws of a draw of which no better ones are looked for twice."""
 
@@ -60,6 +61,7 @@ class TiltSeeker:
         self.mixture = ([self.model], [1.0], frame)
         self.batches, self.history, self.spent = [], [], 0
         self.promised, self.log_mean, self.q = 0.0, None, None
+        self.near = False  # the mixture is that of a similar system
         self.ratios = {}  # of the mixture of a batch on the episodes of another
 
     def tilts(self, mixture: tuple) -> Tilts:
@@ -109,6 +111,12 @@ class TiltSeeker:
         """Take in the failures of a batch; the next mixture is fitted to those of all. How many
         effective ones the batch has.
         """
+        own, used = self.weigh(b)
+        self.mixture = mixture_of(self, used, used.log_weight, self.groups(used))
+        return own
+
+    def weigh(self, b: Drawn) -> tuple[float, Drawn]:
+        """Take in the failures of a batch: how many effective ones it has, and those of all."""
         own = effective(b.log_weight[b.score == -np.inf])
         self.batches.append(rows_of(b, -np.inf))
         used = together(self)
@@ -120,8 +128,7 @@ class TiltSeeker:
         self.q = self.batches[best].mixture
         self.promised = math.exp(2 * self.log_mean - second[best] + math.log(used.size))
         self.note(b, f"log p {self.log_mean:.3f}, own ESS {own:.4g}", used.log_weight)
-        self.mixture = mixture_of(self, used, used.log_weight, self.groups(used))
-        return own
+        return own, used
 
     def refit(self, most: int, times: int) -> None:
         """Batches, at most ``times``, for as long as they get better."""
@@ -240,8 +247,27 @@ def _log_sum(a, axis):
     return (top + np.log(np.exp(a - top).sum(axis=axis, keepdims=True))).squeeze(axis)
 
 
+def from_near(key: Any, sim: Any, q: Tilts) -> TiltSeeker:
+    """The `TiltSeeker` that goes on from the proposal of a similar system."""
+    tilts, weights, frame = of_tilts(q)
+    s = TiltSeeker(key, sim, 0, gates=q.steps.means.shape[-1])
+    weights *= (1 - MODEL) / weights[1:].sum()
+    weights[0] = MODEL
+    s.mixture, s.near = (tilts, list(weights), frame), True
+    return s
+
+
 def seek_tilts(s: TiltSeeker, most: int) -> None:
     """Take the `TiltSeeker` ``s`` to its mixture, for at most ``most`` episodes."""
+    if s.near:
+        b = s.draw()
+        if np.mean(b.score == -np.inf) <= ELITE / 2:
+            return
+        own, used = s.weigh(b)
+        if own < ENOUGH * s.batch:
+            s.mixture = mixture_of(s, used, used.log_weight, s.groups(used))
+            s.refit(most, NEAR)
+        return
     if s.about.choices or s.about.choices0:
         floor = math.log(min(2.0 / s.sim.horizon, 0.25))
         s.mixture = ([s.model, s.model._replace(floor=floor)], [0.5, 0.5], s.mixture[2])

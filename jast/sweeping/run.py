@@ -24,6 +24,7 @@ def sweep(
     values: Mapping[str, Iterable],
     function: Callable[..., Any] = failure_probability,
     *,
+    follow: bool | None = None,
     executor: Any = None,
     progress: bool = False,
     callback: Callable[[int, int, Any], Any] | None = None,
@@ -54,6 +55,10 @@ def sweep(
             simulators are given.
         function: ``function(key, simulator, **options)`` returns an `Estimate`, a `jast.Nominal`, a
             `SearchResult`, a `Report`, or anything else, which is kept.
+        follow: whether each row starts from the one before: ``function`` is also given ``near``,
+            the last result. `jast.estimate.failure_probability` then looks for no proposal of its
+            own where that of the neighbour serves; its draws are new. So put values in order.
+            Default: with this function, where rows run one after the other.
         executor: where rows run, anything with ``submit(function, *args)`` that returns an object
             with ``result()``, as of `concurrent.futures`; default: one after the other, here.
             Processes need a ``make`` and a ``function`` that can be pickled: those of a module.
@@ -68,18 +73,23 @@ def sweep(
 
     Raises:
         ValueError: for no values, values of unequal numbers, a number of simulators that is not
-            theirs, and what is no function; and what the first row raised where all raise.
+            theirs, ``follow`` with an executor, and what is no function; and what the first row
+            raised where all raise.
     """
     random_key("sweep", key)
     columns, rows = _rows(values)
     if not callable(function):
         raise ValueError(f"sweep: function must be callable, received {function!r}")
+    if follow is None:
+        follow = function is failure_probability and executor is None
+    if follow and executor is not None:
+        raise ValueError("sweep: follow must be False with an executor, whose rows do not wait")
     made = batch(_checked(simulators, len(rows)), rows)
     keys = [jax.random.fold_in(key, i) for i in range(len(rows))]
     found: list[tuple[Any, Exception | None]] = []
     with Watch("sweep", len(rows), "value", progress, callback) as watch:
         try:
-            for each in _outcomes(executor, function, keys, made, options):
+            for each in _outcomes(executor, follow, function, keys, made, options):
                 found.append(each)
                 watch.more(1)
                 if _ended_early(each[0]):
@@ -90,7 +100,9 @@ def sweep(
     outcomes, errors = zip(*found, strict=True)
     if all(e is not None for e in errors) and len(found) == len(rows):
         raise errors[0]
-    settings = asked("sweep", key, function=_name(function), programs=kinds(made))
+    settings = asked(
+        "sweep", key, function=_name(function), follow=bool(follow), programs=kinds(made)
+    )
     if len(found) < len(rows):
         settings["interrupted"] = f"after {len(found)} of {len(rows)} values"
     return Sweep(
@@ -102,11 +114,16 @@ def sweep(
     )
 
 
-def _outcomes(executor, function, keys, made, options):
+def _outcomes(executor, follow, function, keys, made, options):
     """(result or None, error or None) of each row, in order."""
     work = list(zip(keys, made, strict=True))
     if executor is None:
-        yield from (_tried(_row, function, k, s, options) for k, s in work)
+        near = {}
+        for k, s in work:
+            result, error = _tried(_row, function, k, s, options | near)
+            if follow and error is None:
+                near = {"near": result}
+            yield result, error
         return
     futures = [executor.submit(_row, function, k, s, options) for k, s in work]
     try:

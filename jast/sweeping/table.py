@@ -51,7 +51,8 @@ class Crossing(NamedTuple):
 @results.result("episodes")
 class Sweep(NamedTuple):
     """A table: what a function said of each of N systems. Row i is ``function(key_i,
-    simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``.
+    simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``; where ``settings["follow"]``
+    holds, with ``near``, the result of the last row before it that has one.
     """
 
     values: dict[str, tuple]
