@@ -3,7 +3,9 @@ level.
 """
 
 import concurrent.futures
+import dataclasses
 import math
+from statistics import NormalDist
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,9 @@ from jax.tree_util import Partial
 import jast
 from jast.crude import Nominal
 from jast.distributions import Normal
+from jast.estimate import failure_probability
+from jast.estimate.markov_tilts import Tilts
+from jast.estimate.tilt_fit import as_tilts, of_tilts
 from jast.intervals import clopper_pearson
 from jast.sweeping import Sweep
 from jast.sweeping.batch import batch, kinds
@@ -278,3 +283,99 @@ def test_partials_of_make_are_equal():
     a, b = batch(make, rows), batch(make, rows[:2])
     assert jax.tree.structure(a[0]) == jax.tree.structure(b[1])
     assert isinstance(a[0].step, Partial)
+
+
+# --- each row from the one before
+# ----------------------------------------------------------------------------
+
+
+def after_five(limit):
+    """The sum of five steps is above ``limit`` at the end: Phi(-limit / sqrt(5))."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
+        horizon=5,
+        episodic=True,
+    )
+
+
+def test_a_row_that_follows_is_the_call_with_its_neighbour(key, equal):
+    limits = [8.0, 8.3, 14.0]
+    table = jast.sweep(key, after_five, {"limit": limits}, budget=5000)
+    assert table.settings["follow"] is True and table.settings["programs"] == 1
+    for i, limit in enumerate(limits):
+        own = jax.random.fold_in(key, i)
+        near = table.results[i - 1] if i else None
+        alone = failure_probability(own, table.simulators[i], 5000, near=near)
+        assert alone.log_mean == table.results[i].log_mean
+        assert alone.history == table.results[i].history
+        truth = NormalDist().cdf(-limit / math.sqrt(5))
+        error = 4 * table.results[i].relative_error * truth  # 4 standard errors
+        assert table.probability[i] == pytest.approx(truth, abs=error)
+    first, near, far = (" ".join(r.history) for r in table.results)
+    assert "proposal of a similar system" not in first and "cooling" in first
+    assert "proposal of a similar system" in near and "cooling" not in near
+    assert "proposal of a similar system" in far
+    # where the neighbour's proposal does not lead to failures, the search is as ever
+    away = failure_probability(
+        key, after_five(0.5), 5000, near=table.results[2]._replace(proposal=opposite(table))
+    )
+    assert "cooling" in " ".join(away.history)
+    equal(
+        failure_probability(key, make(2.0), 5000, near=table.results[0]).interval,
+        failure_probability(key, make(2.0), 5000).interval,  # of another system: changes nothing
+    )
+    with pytest.raises(ValueError, match="failure_probability: near must be an Estimate, received"):
+        failure_probability(key, after_five(8.0), 5000, near=3)
+
+
+def opposite(table):
+    """The proposal of the last row, on the other side."""
+    q = table.results[2].proposal
+    return q._replace(means=-q.means)
+
+
+def test_rows_of_an_executor_do_not_follow(key):
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        with pytest.raises(ValueError, match="follow must be False with an executor"):
+            crude(key, executor=pool, follow=True)
+
+
+def test_follow_skips_rows_that_raise(key):
+    seen = []
+
+    def function(key, sim, near=None):
+        seen.append(near)
+        if len(seen) == 2:
+            raise RuntimeError("once")
+        return len(seen)
+
+    table = jast.sweep(key, make, {"limit": LIMITS}, function, follow=True)
+    assert seen == [None, 1, 1, 3] and table.results == (1, None, 3, 4)
+
+
+@pytest.mark.long
+def test_tilts_go_on_from_those_of_a_neighbour(key):
+    """Systems of 40 steps, whose proposals are tilts: Phi(-limit / sqrt(40)), within 4 standard
+    errors.
+    """
+
+    def long(limit):
+        sim = after_five(limit)
+        return dataclasses.replace(sim, horizon=40)
+
+    limits = (24.0, 24.5, 25.0)
+    table = jast.sweep(key, long, {"limit": limits}, budget=20_000)
+    for limit, result in zip(limits, table.results):
+        assert isinstance(result.proposal, Tilts)
+        truth = NormalDist().cdf(-limit / math.sqrt(40))
+        assert result.mean == pytest.approx(truth, abs=4 * result.relative_error * truth)
+    sought = [sum("tilts: level" in line for line in r.history) for r in table.results]
+    assert sought[0] > 0 == sought[1] == sought[2]
+    tilts, weights, frame = of_tilts(table.results[0].proposal)
+    again = as_tilts(tilts, weights, frame, len(table.results[0].proposal.floors), np.float32)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), again, table.results[0].proposal
+    )

@@ -37,7 +37,15 @@ def fits(sim: Any, q: Any) -> bool:
     """Whether ``q`` is a proposal of `jast.estimate.failure_probability` for this simulator."""
     if isinstance(q, latent.Latent):
         return q.means.shape[1] == latent.dimension(sim)
-    return isinstance(q, tilts.Tilts) and q.frame.centre.shape[0] == tilts.shape(sim).seen
+    if not isinstance(q, tilts.Tilts):
+        return False
+    about = tilts.shape(sim)
+    sizes = lambda block: (block.means.shape[3], *block.shifts.shape[2:])
+    return (
+        q.frame.centre.shape[0] == about.seen
+        and sizes(q.steps) == (about.normals, about.choices, about.categories)
+        and sizes(q.first) == (about.normals0, about.choices0, about.categories0)
+    )
 
 
 def points(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.ndarray:
