@@ -123,44 +123,34 @@ def _here(task: Task, devices: Sequence[jax.Device] | None, threads: int) -> Pla
     post = Post()
     post.more, post.stopped = news.put, end.is_set
     if devices is None:
-        pools = [(_pool(threads, now), task.shared)]
+        pools = [(ThreadPoolExecutor(threads), now, task.shared)]
     else:
         pools = [
-            (_pool(1, now | dict(jax_default_device=d)), _put(task.shared, d)) for d in devices
+            (ThreadPoolExecutor(1), now | dict(jax_default_device=d), _put(task.shared, d))
+            for d in devices
         ]
 
-    def work(shared, number):
+    def work(values, shared, number):
         if end.is_set():
             return
         try:
-            answer = Answer(number, jax.device_get(task.function(shared, number, post)))
+            with under(values):  # not once a thread: whoever frees it last would leave it
+                answer = Answer(number, jax.device_get(task.function(shared, number, post)))
         except BaseException as error:  # also a KeyboardInterrupt that met a system
             answer = Answer(number, error=error)
         news.put(answer)
 
     def submit(number):
-        pool, shared = pools[number % len(pools)]
-        pool.submit(work, shared, number)
+        pool, *given = pools[number % len(pools)]
+        pool.submit(work, *given, number)
 
     def stop():
         end.set()
-        for pool, _ in pools:
+        for pool, *_ in pools:
             pool.shutdown(cancel_futures=True)
 
     count = threads if devices is None else len(devices)
     return Place(submit, stop, news, AHEAD * count, False)
-
-
-def _pool(threads: int, values: dict) -> ThreadPoolExecutor:
-    """Threads in which JAX's settings have these ``values``."""
-    held = []  # contexts, for as long as the threads live
-
-    def enter():
-        context = under(values)
-        context.__enter__()
-        held.append(context)
-
-    return ThreadPoolExecutor(threads, initializer=enter)
 
 
 def _put(shared: Any, device: jax.Device) -> Any:

@@ -3,6 +3,7 @@ on the way is told.
 """
 
 import concurrent.futures
+import gc
 import importlib.util
 import os
 import signal
@@ -387,3 +388,12 @@ def test_twenty_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monk
         lasting += killed(name, folder, delay) is not None
         same(CALLS[name](key, checkpoint=folder), whole)
     assert lasting > 0
+
+
+def test_the_settings_of_the_caller_stay_as_they_are(key):
+    """Also when what the threads held is freed."""
+    with jax.enable_x64(True):
+        jast.nominal(key, jast.simulators.walk1d(), episodes=64)
+        gc.collect()
+        assert jax.config.jax_enable_x64
+    assert not jax.config.jax_enable_x64

@@ -1,0 +1,108 @@
+"""Table 1 of the MCFS-AP paper over seeds: the share of failing trees of each seed, its mean and
+standard deviation, by the published code and by the published text.
+
+``python -m benchmarks.table1_seeds [--json] [--quick | --smoke] [--seeds N] [--trees N] [--rows
+NAME ...]``. A row is a variant and a mode of its heads (`jast.heads.settings`); "tree" behind it:
+statistics of roots are counted at the end of the tree. The trees of a seed with heads are one
+sequence, taught after each tree, so they are not independent: a run is one figure. Every tree has
+18 x 500 simulations.
+"""
+
+import argparse
+import json
+
+import jax
+import numpy as np
+
+import jast
+from benchmarks.ferry import BOX, REWARD, TABLE, timed
+from benchmarks.sizes import options, size
+
+VARIANTS = {"RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
+ROWS = {
+    "-/-": (None, "code", "turn"),
+    **{
+        f"{name}, {mode}": (heads, mode, "turn")
+        for mode in ("code", "text")
+        for name, heads in VARIANTS.items()
+    },
+    "RP/-, code, tree": ("rollout", "code", "tree"),
+}
+
+
+def search(row, trees, simulations):
+    """The search of a row, by its key."""
+    heads, mode, counted = ROWS[row]
+    more = (
+        {}
+        if heads is None
+        else dict(heads=heads, head_settings=jast.heads.settings(mode, counted=counted))
+    )
+    sim = jast.simulators.ferry(observation=mode)
+    return lambda key: jast.search.forest(
+        key,
+        sim,
+        trees=trees,
+        prunes=18,
+        simulations=simulations,
+        mode=mode,
+        reward=REWARD,
+        actions=BOX,
+        **more,
+    )
+
+
+def summary(bests, cpu):
+    """The row of several seeds, by the best rewards [seeds, trees]."""
+    rates = np.mean(bests > 0, axis=1)
+    over = lambda values: {
+        "mean": float(values.mean()),
+        "sd": float(values.std(ddof=1)) if len(values) > 1 else None,
+    }
+    return {
+        "rates": rates.tolist(),
+        "rate": over(rates),
+        "mean_best": over(bests.mean(axis=1)),
+        "best": float(bests.max()),
+        "cpu_s_a_seed": cpu / len(bests),
+    }
+
+
+def main(argv=None):
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.table1_seeds", description=__doc__.splitlines()[0]
+    )
+    options(parser, "2 seeds of 8 trees: under two minutes")
+    parser.add_argument("--seeds", type=int, help="default 10")
+    parser.add_argument("--trees", type=int, help="of a seed; default 200, as published")
+    parser.add_argument("--rows", nargs="+", choices=[*ROWS], help="only these")
+    args = parser.parse_args(argv)
+    seeds, trees = args.seeds or size(args, 10, 2, 2), args.trees or size(args, 200, 8, 2)
+    rows = args.rows or size(args, [*ROWS], [*ROWS], ["RP/-, code, tree"])
+    simulations = 10 if args.smoke else 500
+    print(f"{seeds} seeds of {trees} trees, 18 x {simulations} simulations; % of failing trees")
+    out = {}
+    for row in rows:
+        find, bests, cpu = search(row, trees, simulations), [], 0.0
+        for seed in range(seeds):
+            result, seconds, _ = timed(lambda seed=seed, find=find: find(jax.random.key(seed)))
+            bests.append(np.asarray(result.best_reward_per_tree, np.float64))
+            cpu += seconds
+        r = out[row] = summary(np.stack(bests), cpu)
+        spread = "" if r["rate"]["sd"] is None else f" +- {100 * r['rate']['sd']:.1f} (SD)"
+        printed = TABLE[row.split(",")[0]]
+        print(
+            f"  {row:17} {100 * r['rate']['mean']:5.1f}{spread},"
+            f" {100 * min(r['rates']):.1f} to {100 * max(r['rates']):.1f};"
+            f" mean best {r['mean_best']['mean']:.2f}, best {r['best']:.2f};"
+            f" printed {printed[0]}, {printed[1]:.2f}, {printed[2]:.2f};"
+            f" {r['cpu_s_a_seed']:.0f} CPU s a seed",
+            flush=True,
+        )
+    if args.json:
+        print(json.dumps(out))
+
+
+if __name__ == "__main__":
+    main()
