@@ -109,6 +109,7 @@ def recorded(distance, ran=None):
             np.linspace(-9, -2, distance.size).reshape(distance.shape),
             failure,
             ran,
+            np.zeros_like(failure),
         )
     )
 

@@ -182,7 +182,8 @@ def tally(played, live, order, tree=None, trees=1):
 def trials(played):
     """The `Trials` of played episodes, all of them live."""
     e = played.episode
-    return Trials(e.reward, e.distance, e.log_prob, e.failure, jnp.ones_like(e.failure))
+    every, none = jnp.ones_like(e.failure), jnp.zeros_like(e.failure)
+    return Trials(e.reward, e.distance, e.log_prob, e.failure, every, none)
 
 
 def add(a, b):

@@ -46,6 +46,10 @@ class Trials(NamedTuple):
     """bool: it was simulated; a search tree that comes to an episode's end again has its outcome
     already.
     """
+    repeated: Any = None
+    """bool: a failure that a tree came to again, which ``failure`` counts once; None in files of
+    versions that did not keep it.
+    """
 
 
 @results.result("episodes")

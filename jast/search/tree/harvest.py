@@ -83,6 +83,7 @@ def _trials(harvests: list[Harvest], value, failed, fresh) -> Trials | None:
         log_prob,
         failed & fresh,
         fresh,
+        failed & ~fresh,
     )
 
 
