@@ -26,6 +26,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "cross_entropy": ["--smoke"],
     "explain": ["--smoke"],
     "fms": ["--smoke"],
+    "fms_readings": ["--smoke"],
     "indices": ["--smoke"],
     "limit_states": ["--smoke"],
     "memory": ["--smoke"],
@@ -35,6 +36,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
     "stress": ["--smoke"],
     "sweep": ["--smoke"],
+    "table1_seeds": ["--smoke"],
     "weakness": ["--smoke"],
 }
 QUICK = {
@@ -48,11 +50,13 @@ QUICK = {
     "ferry": ["--quick", "--trees", "10"],
     "few_calls": ["--seeds", "1", "--budget", "50"],
     "fms": ["--quick", "--seeds", "1"],
+    "fms_readings": ["--quick", "--seeds", "1"],
     "limit_states": ["--seeds", "1"],
     "memory": ["--quick"],
     "probability": ["--quick", "--seeds", "1"],
     "stress": ["--quick"],
     "sweep": ["--quick"],
+    "table1_seeds": ["--trees", "2", "--seeds", "1", "--rows", "RP/VN, text"],
     "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }

@@ -62,34 +62,51 @@ class HeadSettings(NamedTuple):
     """
     train: bool
     """False: heads are used as they are given."""
+    counted: str = "turn"
+    """When the statistics of a root are taken: at the end of its "turn", or of its "tree", when the
+    simulations of all later roots have gone through one child of it as well.
+    """
 
 
+CODE = HeadSettings(
+    round=1,
+    bins=10,
+    hidden=(64, 124, 64),
+    activation=("gelu", "relu"),
+    first_activation=False,
+    normalise=False,
+    loss="squared_shares",
+    learning_rate=(0.005, 0.001),
+    batch=(1, 1),
+    steps=(None, None),
+    replay=(0, 0),
+    elite=1.0,
+    episodes=False,
+    target="parent",
+    edges="all",
+    untrained_alone=True,
+    from_start=True,
+    power=2.0,
+    share=1.0,
+    q_weight=0.6,
+    v_weight=0.4,
+    candidates="all",
+    train=True,
+)
+"""The published code of MCFS-AP."""
+TEXT = CODE._replace(
+    first_activation=True,
+    target="own",
+    edges="roots",
+    untrained_alone=False,
+    power=1.0,
+    q_weight=1.0,
+)
+"""Its text, section 3.3 and eq. 3; what the text leaves open is as in the code, c2 too."""
 MODES = {
-    "paper": HeadSettings(
-        round=1,
-        bins=10,
-        hidden=(64, 124, 64),
-        activation=("gelu", "relu"),
-        first_activation=False,
-        normalise=False,
-        loss="squared_shares",
-        learning_rate=(0.005, 0.001),
-        batch=(1, 1),
-        steps=(None, None),
-        replay=(0, 0),
-        elite=1.0,
-        episodes=False,
-        target="parent",
-        edges="all",
-        untrained_alone=True,
-        from_start=True,
-        power=2.0,
-        share=1.0,
-        q_weight=0.6,
-        v_weight=0.4,
-        candidates="all",
-        train=True,
-    ),
+    "code": CODE,
+    "text": TEXT,
+    "paper": CODE,  # the earlier name of "code"
     "default": HeadSettings(
         round=None,
         bins=40,
@@ -122,13 +139,31 @@ CHOICES = dict(
     loss=("cross_entropy", "squared_shares"),
     target=("own", "parent"),
     edges=("roots", "all"),
+    counted=("turn", "tree"),
     candidates=("one", "all"),
 )
 
 
 def settings(mode="default", **changes):
-    """`HeadSettings` of a mode, with changes: ``settings("paper", round=8)``. ValueError names an
-    unknown mode or setting, and one that is out of range.
+    """`HeadSettings` of a mode, with changes: ``settings("code", round=8)``.
+
+    "default" is what works. "code" is the published code of MCFS-AP, of which "paper" is the
+    earlier name; "text" is what its text says (section 3.3, eq. 3), which departs from the code:
+
+    | | "code" | "text" |
+    |---|---|---|
+    | ``target`` of the value head | "parent": the Q of the edge that leads to s | "own": Q(s, a) |
+    | ``edges`` that it learns from | "all" of the tree | "roots" |
+    | it is trained without a policy head | no (``untrained_alone``) | yes |
+    | weights in eq. 3 | 0.6 Q + 0.4 v | Q + 0.4 v (the text has c2 and no number) |
+    | a bin is drawn in proportion to | p^2 (``power``) | p |
+    | activation after the first layer | no (``first_activation``) | yes |
+    | the networks see | five numbers, `jast.simulators.ferry` | six, its ``observation="text"`` |
+
+    Both sum the logs of likelihoods where eq. 1 has a product.
+
+    Raises:
+        ValueError: names an unknown mode or setting, and one that is out of range.
     """
     if mode not in MODES:
         raise ValueError(f"heads.settings: mode must be one of {sorted(MODES)}, received {mode!r}")

@@ -7,9 +7,12 @@ from jast.search.tree.settings import PLAIN, settled
 
 __all__ = ["MODES", "forest"]
 
+CODE = PLAIN | dict(widening=(0.5, 0.6))
 MODES = {
     "default": PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None),
-    "paper": PLAIN | dict(widening=(0.5, 0.6)),
+    "code": CODE,
+    "text": CODE,  # they differ in their heads
+    "paper": CODE,  # the earlier name of "code"
     "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
     "episodic": (
         PLAIN | dict(widening=(2.0, 0.5), spread=True, focus=None, follow=True, urgent=True)
@@ -59,21 +62,21 @@ def forest(
     reward up as a mean. After ``simulations`` of them the most visited child becomes the root and
     keeps its subtree; a tree ends early when its root is an episode's end.
 
-    ``mode="paper"`` is the published search: ``widening`` (0.5, 0.6), every action drawn
-    independently. ``mode="default"`` is what works: (2, 0.5); ``spread``: the children of a node
-    cover the action space evenly; ``focus``: every second child, and in half of the trees every
-    second rollout step, is drawn closer to the mode of the disturbance by this factor: 0.2 for a
-    uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches into
-    the tails, for failures too rare for the model's own draws; where failures lie at the edge of a
-    tight box, 1 finds more. Each may be given on its own.
+    ``mode="code"`` (earlier: "paper") is the published search: ``widening`` (0.5, 0.6), every
+    action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``: the children
+    of a node cover the action space evenly; ``focus``: every second child, and in half of the trees
+    every second rollout step, is drawn closer to the mode of the disturbance by this factor: 0.2
+    for a uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches
+    into the tails, for failures too rare for the model's own draws; where failures lie at the edge
+    of a tight box, 1 finds more. Each may be given on its own.
 
     Default ``reward``: `jast.rewards.lexicographic`, any failure above all misses, then the
     likeliest failure, the nearest miss. Default ``actions``: `jast.actions.wide` where disturbances
     have a quantile function, else draws of the model. Their scales come from up to 768 episodes of
     the system (60 of a black box) before the first tree, the same for every key; these count among
     the episodes, and their failures are tree -1's. ``exploration``: default 1 with the
-    lexicographic reward, else the published 10. Modes "paper" and "thesis" have the published
-    `jast.rewards.standard` and draws of the model.
+    lexicographic reward, else the published 10. Modes "code", "text" and "thesis" have the
+    published `jast.rewards.standard` and draws of the model.
 
     ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none":
     the same trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``:
@@ -84,8 +87,9 @@ def forest(
     ``refine``: evaluations of `jast.search.refine` at the end, on top of the trees, as a share of
     their episodes. It pulls the archived failures to where they are likeliest; ``result.refined``
     says what came of that, ``result.evaluations`` counts both. Default: 0.1 with the lexicographic
-    reward, else 0; also 0 in modes "paper" and "thesis", under `jax.jit` and `jax.vmap`, and where
-    a disturbance has no quantile function. A share of fewer than 100 evaluations is not spent.
+    reward, else 0; also 0 in modes "code", "text" and "thesis", under `jax.jit` and `jax.vmap`, and
+    where a disturbance has no quantile function. A share of fewer than 100 evaluations is not
+    spent.
 
     ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of
     systems that are judged at their end only: ``urgent`` and ``follow``. ``urgent``: a child that
@@ -112,10 +116,11 @@ def forest(
     "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier
     result (``result.heads``), also of another start of the same system. The trees then grow in
     rounds, and between two rounds the heads learn from the statistics of the roots and, the policy,
-    from the best episodes; no untrained head guides the first round. With ``mode="paper"`` they are
-    the published ones, a tree a round. ``head_settings``: `jast.heads.settings`, if not the mode's;
-    ``settings(train=False)`` uses heads as they are, which is what `jax.jit` and `jax.vmap` do.
-    ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
+    from the best episodes; no untrained head guides the first round. With ``mode="code"`` they are
+    those of the published code, with ``mode="text"`` those of the published text, a tree a round
+    (`jast.heads.settings` has what differs). ``head_settings``: `jast.heads.settings`, if not the
+    mode's; ``settings(train=False)`` uses heads as they are, which is what `jax.jit` and `jax.vmap`
+    do. ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
 
     Raises ValueError for counts below 1, a negative ``refine`` and one above 0 where it cannot be,
     a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not

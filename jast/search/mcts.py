@@ -9,6 +9,7 @@ __all__ = ["MODES", "mcts"]
 
 MODES = {
     "default": PLAIN | dict(widening=(1.0, 0.5), spread=True, focus=None),
+    "code": PLAIN | dict(widening=(0.5, 0.6)),
     "paper": PLAIN | dict(widening=(0.5, 0.6)),
     "thesis": PLAIN | dict(widening=(10.0, 0.3), feed=True, urgent=True),
     "episodic": (

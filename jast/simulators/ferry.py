@@ -38,16 +38,23 @@ class FerryState(NamedTuple):
     moving: jax.Array
 
 
-def ferry(adversary=(16.0, 0.0)):
+def ferry(adversary=(16.0, 0.0), observation="code"):
     """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts
-    ((17, 0) is the easier S0b).
+    ((17, 0) is the easier S0b). ``observation``: what networks see. "code": the five numbers of the
+    published code, the ferry's x and the adversary's x and y over 100, and half of the sine and
+    cosine of its heading plus a half; "text": x and y over 100 and heading (radians) of both
+    vessels, the six numbers that the published text names.
 
     A step turns the adversary by (10 a - 5) pi / 100 radians, a in [0, 1] its seed (0.5: straight
     on), then moves both vessels by 5. The first seed is uniform, each next one tent-shaped around
     the last: mode-normalised log p is ln(1 - |a_t - a_{t-1}|). Failure: centres closer than 5 at a
     step's end. Ends after 21 steps, when the ferry has left the plane (x > 100). ValueError unless
-    ``adversary`` is two numbers.
+    ``adversary`` is two numbers, and for another observation.
     """
+    if observation not in OBSERVATIONS:
+        raise ValueError(
+            f"ferry: observation must be one of {list(OBSERVATIONS)}, received {observation!r}"
+        )
     try:
         start = jnp.asarray(adversary)
     except (TypeError, ValueError):
@@ -64,7 +71,7 @@ def ferry(adversary=(16.0, 0.0)):
         evaluate=_evaluate,
         horizon=21,
         is_terminal=_is_terminal,
-        observe=_observe,
+        observe=OBSERVATIONS[observation],
     )
 
 
@@ -103,7 +110,7 @@ def _is_terminal(s):
 
 
 def _observe(s):
-    """The five numbers of the paper's networks."""
+    """The five numbers of the published code's networks."""
     return jnp.stack(
         [
             s.ferry_x / 100,
@@ -113,3 +120,13 @@ def _observe(s):
             jnp.cos(s.heading) / 2 + 0.5,
         ]
     )
+
+
+def _observe_text(s):
+    """Six numbers: x, y and heading of both vessels. The ferry's heading, to +x, is pi / 2."""
+    east = jnp.full_like(s.heading, jnp.pi / 2)
+    x, y = s.x / 100, s.y / 100
+    return jnp.stack([s.ferry_x / 100, s.ferry_y / 100, east, x, y, s.heading])
+
+
+OBSERVATIONS = {"code": _observe, "text": _observe_text}

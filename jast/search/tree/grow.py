@@ -36,7 +36,7 @@ from jast.watch import Watch
 __all__ = ["grow_trees"]
 
 MEMOIZE = ("auto", "node", "root", "none")
-PUBLISHED = ("paper", "thesis")
+PUBLISHED = ("code", "text", "paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
 GROUPS, LEAST = 16, 8
 """Groups of a round that are worth a checkpoint, and the trees of each at least."""
@@ -226,6 +226,7 @@ def enlist(
     problem = job.problem._replace(guide=guide(school.heads, head_settings))
     learns = head_settings.train
     edges = learns and head_settings.edges == "all" and school.value is not None
+    recount = learns and head_settings.counted == "tree"
     if job.settings is None and isinstance(heads, str):
         raise ValueError(
             f"{job.method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot"
@@ -240,7 +241,9 @@ def enlist(
     return job._replace(
         problem=problem,
         plan=job.plan._replace(
-            pages=pages_of(problem, job.plan.prunes * job.plan.simulations), edges=edges
+            pages=pages_of(problem, job.plan.prunes * job.plan.simulations),
+            edges=edges,
+            recount=recount,
         ),
         at_once=min(job.trees, head_settings.round or usual) if learns else job.trees,
         school=school,

@@ -24,7 +24,7 @@ from jast.search.tree.layout import (
 from jast.search.tree.packing import unpack
 from jast.search.tree.simulate import child_state, replay_to, select_lanes
 
-__all__ = ["Roots", "prune"]
+__all__ = ["Roots", "prune", "recounted"]
 
 
 @results.shown()
@@ -107,6 +107,24 @@ def prune(problem, axes, tree, children, memoize="node"):
         )
         tree = tree._replace(base=select_lanes(move, after, state))
     return tree, roots
+
+
+def recounted(problem, tree, roots, children, memoize="node"):
+    """`Roots` [turns, B] of a finished tree with the visits and means that their children have at
+    its end, when the simulations of later roots have gone through one child of each.
+    """
+    lane = jnp.arange(len(tree.root), dtype=jnp.int32)
+    like = node_shapes(tree, memoize)
+
+    def one(root):
+        node = tree.trail[root.depth, lane]
+        reward = jax.vmap(lambda w: unpack(w, like).reward)(tree.nodes[node, lane])
+        _, visits, total, *_ = _children(tree._replace(root=node), children)
+        q = problem.onward(total, visits, reward[:, None])
+        count = jnp.where(root.valid[:, None], visits, 0).astype(jnp.int32)
+        return root._replace(visits=count, q=q)
+
+    return lax.map(one, roots)
 
 
 def _settle(tree):

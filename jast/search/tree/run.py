@@ -20,7 +20,7 @@ from jast.places import Post, Task
 from jast.search.tree import simulate
 from jast.search.tree.edges import branches_of, edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
-from jast.search.tree.prune import prune
+from jast.search.tree.prune import prune, recounted
 from jast.search.tree.rebuild import rebuild
 from jast.watch import Watch
 
@@ -44,6 +44,8 @@ class Plan(NamedTuple):
     """Whether the numbers of all episodes are kept."""
     branches: bool = False
     """Whether the trees are kept."""
+    recount: bool = False
+    """Whether the statistics of roots are those at the end of the tree, not of their turn."""
 
 
 class Harvest(NamedTuple):
@@ -85,6 +87,11 @@ def _grow(problem, tree, begin_at, end_at, memoize):
 @functools.partial(jax.jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
 def _prune(problem, tree, children, memoize):
     return prune(problem, _shared(problem), tree, children, memoize)
+
+
+@functools.partial(jax.jit, static_argnames=("children", "memoize"))
+def _recounted(problem, tree, roots, children, memoize):
+    return recounted(problem, tree, roots, children, memoize)
 
 
 @functools.partial(jax.jit, static_argnames=("children",))
@@ -195,7 +202,7 @@ def _one_group(turn: Round, number: int, post: Post) -> Harvest:
             if post.stopped():
                 break
         tree, roots = _prune(problem, tree, plan.children, plan.memoize)
-        turns.append(jax.device_get(jax.tree.map(lambda a: a[: len(group)], roots)))
+        turns.append(jax.device_get(roots))
         if post.stopped() or not bool(jnp.any(tree.alive)):
             break
     log, outcome, steps = (
@@ -215,6 +222,9 @@ def _one_group(turn: Round, number: int, post: Post) -> Harvest:
         lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]),
         *turns,
     )
+    if plan.recount:
+        roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
+    roots = jax.tree.map(lambda a: a[:, : len(group)], roots)
     kept = lambda of: jax.device_get(
         jax.tree.map(lambda a: a[:, : len(group)], of(problem, tree, plan.children))
     )
