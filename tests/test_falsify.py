@@ -1,5 +1,7 @@
 """jast.search.falsify: a failure with few simulations."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,6 +76,16 @@ def test_one_at_a_time_on_a_black_box(key):
     box = jast.blackbox.from_python(walk, horizon=4, disturbance=Normal(0.0, 1.0))
     found = falsify(key, box, simulations=40, batch=1)
     assert found.first_failure == found.episodes <= 40
+
+
+def test_what_came_after_an_episodes_end_is_left_as_it_is():
+    module = importlib.import_module("jast.search.falsify")
+    rows = np.random.default_rng(0).uniform(size=(1, 8, 2))
+    pool = module._Pool(np.ones(1), rows, np.zeros((1, 0)), np.array([3]))
+    rng = np.random.default_rng(1)
+    children = np.stack([module._signal(rng, pool, 99, (8, 2), 0)[0] for _ in range(200)])
+    assert (children[:, 3:] == rows[0, 3:]).mean() == 1
+    assert ((children[:, :3] != rows[0, :3]).any(axis=(0, 2))).all()
 
 
 def test_none_is_found_where_there_is_none(key):

@@ -49,6 +49,8 @@ class _Pool(NamedTuple):
     """[m, horizon, k]: u of the disturbances"""
     first: np.ndarray
     """[m, k0]: u of the start"""
+    length: np.ndarray
+    """[m] steps: what is beyond decided nothing"""
 
 
 class _Found(NamedTuple):
@@ -78,8 +80,9 @@ def falsify(
 
     30 signals of few pieces, half of them at the ends of the disturbances' ranges, then children of
     the ten nearest episodes: of two of them, one up to a step and the other from there on, or of
-    one, with a stretch of steps moved, held at another level or at an end of its range. The ends
-    are the levels 3e-5 and 1 - 3e-5. The likeliest failure is the business of the other searches.
+    one, with a stretch of the steps that it took moved, held at another level or at an end of its
+    range. The ends are the levels 3e-5 and 1 - 3e-5. The likeliest failure is the business of the
+    other searches.
 
     Args:
         key: consumed.
@@ -127,7 +130,7 @@ class _Work:
 
     def nothing(self) -> _Found:
         rows, first = np.zeros((0, self.sim.horizon, self.k)), np.zeros((0, self.k0))
-        return _Found(_Pool(np.zeros(0), rows, first), (), (0, 0, 0, 0), ())
+        return _Found(_Pool(np.zeros(0), rows, first, np.zeros(0, int)), (), (0, 0, 0, 0), ())
 
     def ends(self, simulations: int) -> Iterator[int]:
         for begin in range(0, simulations, self.batch):
@@ -145,7 +148,8 @@ class _Work:
         ask = lambda: jax.device_get(_judged(self.sim, jnp.asarray(lanes, self.dtype)))
         o = jax.tree.map(lambda a: a[:n], apart(ask) if hosted(self.sim) else ask())
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
-        every = (np.concatenate(p) for p in zip(pool, (score, rows, first), strict=True))
+        new = score, rows, first, o.length
+        every = (np.concatenate(p) for p in zip(pool, new, strict=True))
         every = _Pool(*every)
         best = np.argsort(every.score, kind="stable")[:POOL]
         pool = jax.tree.map(lambda a: a[best], every)
@@ -176,13 +180,13 @@ def _signal(
     m = len(pool.score)
     parent = int(m * rng.uniform() ** 2)  # rather a near one
     rows, first = pool.rows[parent].copy(), pool.first[parent].copy()
-    horizon, k = shape
-    if rng.uniform() < CROSSED and horizon > 1:
-        at = rng.integers(1, horizon)
+    length, k = max(int(pool.length[parent]), 1), shape[1]
+    if rng.uniform() < CROSSED and length > 1:
+        at = rng.integers(1, length)
         rows[at:] = pool.rows[rng.integers(m)][at:]
     for _ in range(1 + rng.poisson(0.7)):
-        begin = rng.integers(horizon)
-        end = begin + 1 + int(horizon / 3 * rng.uniform() ** 2)
+        begin = rng.integers(length)
+        end = begin + 1 + int(length / 3 * rng.uniform() ** 2)
         columns = [rng.integers(k)] if rng.uniform() < 0.6 else range(k)
         kind = rng.uniform()
         for c in columns:
