@@ -18,15 +18,16 @@ import jast
 from benchmarks.ferry import BOX, REWARD, TABLE, timed
 from benchmarks.sizes import options, size
 
-VARIANTS = {"RP/-": "rollout", "-/VN": "value", "RP/VN": "both"}
+VARIANTS = {"none": "-/-", "rollout": "RP/-", "value": "-/VN", "both": "RP/VN"}
+"""Heads: the paper's name of the row."""
 ROWS = {
-    "-/-": (None, "code", "turn"),
+    "none": (None, "code", "turn"),
     **{
-        f"{name}, {mode}": (heads, mode, "turn")
+        f"{heads}, {mode}": (heads, mode, "turn")
         for mode in ("code", "text")
-        for name, heads in VARIANTS.items()
+        for heads in [*VARIANTS][1:]
     },
-    "RP/-, code, tree": ("rollout", "code", "tree"),
+    "rollout, code, tree": ("rollout", "code", "tree"),
 }
 
 
@@ -79,7 +80,7 @@ def main(argv=None):
     parser.add_argument("--rows", nargs="+", choices=[*ROWS], help="only these")
     args = parser.parse_args(argv)
     seeds, trees = args.seeds or size(args, 10, 2, 2), args.trees or size(args, 200, 8, 2)
-    rows = args.rows or size(args, [*ROWS], [*ROWS], ["RP/-, code, tree"])
+    rows = args.rows or size(args, [*ROWS], [*ROWS], ["rollout, code, tree"])
     simulations = 10 if args.smoke else 500
     print(f"{seeds} seeds of {trees} trees, 18 x {simulations} simulations; % of failing trees")
     out = {}
@@ -91,9 +92,9 @@ def main(argv=None):
             cpu += seconds
         r = out[row] = summary(np.stack(bests), cpu)
         spread = "" if r["rate"]["sd"] is None else f" +- {100 * r['rate']['sd']:.1f} (SD)"
-        printed = TABLE[row.split(",")[0]]
+        printed = TABLE[VARIANTS[row.split(",")[0]]]
         print(
-            f"  {row:17} {100 * r['rate']['mean']:5.1f}{spread},"
+            f"  {row:20} {100 * r['rate']['mean']:5.1f}{spread},"
             f" {100 * min(r['rates']):.1f} to {100 * max(r['rates']):.1f};"
             f" mean best {r['mean_best']['mean']:.2f}, best {r['best']:.2f};"
             f" printed {printed[0]}, {printed[1]:.2f}, {printed[2]:.2f};"

@@ -56,7 +56,7 @@ QUICK = {
     "probability": ["--quick", "--seeds", "1"],
     "stress": ["--quick"],
     "sweep": ["--quick"],
-    "table1_seeds": ["--trees", "2", "--seeds", "1", "--rows", "RP/VN, text"],
+    "table1_seeds": ["--trees", "2", "--seeds", "1", "--rows", "both, text"],
     "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }
