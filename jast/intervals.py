@@ -4,7 +4,7 @@ import math
 
 from jast._checks import real
 
-__all__ = ["chernoff", "clopper_pearson", "jeffreys", "log_normal"]
+__all__ = ["chernoff", "clopper_pearson", "delta_bound", "jeffreys", "log_normal", "normal"]
 
 
 SKEWED = 0.4
@@ -98,6 +98,32 @@ def chernoff(k, n, level=0.95):
     m, bound = k / n, -math.log1p(-level) / n
     kl = lambda u: (m * math.log(m / u) if m else 0.0) + (1 - m) * (math.log1p(-m) - math.log1p(-u))
     return _solve(lambda u: 1.0 if u >= 1 else (kl(u) - bound if u > m else -1.0))
+
+
+def delta_bound(k, n, level=0.95):
+    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided, as
+    Lipkis and Agogino print it (eq. 17): k/n + delta with exp(-n delta^2) = 1 - level, at most 1.
+
+    Valid and loose: Hoeffding's inequality has exp(-2 n delta^2), and `chernoff` is sharp. Raises
+    ValueError as `clopper_pearson`.
+    """
+    _counts("delta_bound", k, n, level)
+    return min(1.0, int(k) / int(n) + math.sqrt(-math.log1p(-level) / int(n)))
+
+
+def normal(mean, standard_error, level=0.95):
+    """(low, high) of a normal distribution, mean -+ z standard_error, as Lipkis and Agogino print
+    it (eq. 15 and 16). ``low`` may be below 0: `jast.estimate.Estimate` has a log-normal interval.
+
+    Raises ValueError for a mean that is not finite, a standard error that is negative or not
+    finite, and a level outside (0, 1).
+    """
+    from statistics import NormalDist  # here: slow to import
+
+    real("normal", "mean", mean, math.isfinite, "that is finite")
+    real("normal", "standard_error", standard_error, lambda v: 0 <= v < math.inf, "of at least 0")
+    half = NormalDist().inv_cdf((1 + checked_level("normal", level)) / 2) * float(standard_error)
+    return float(mean) - half, float(mean) + half
 
 
 def jeffreys(k, n, level=0.95):

@@ -20,6 +20,7 @@ from jast.distributions.mixtures import blend
 from jast.estimate import (
     chernoff,
     clopper_pearson,
+    double_loop,
     importance,
     jeffreys,
     log_weights,
@@ -28,7 +29,7 @@ from jast.estimate import (
     trace_proposal,
 )
 from jast.estimate.importance_sampling import LANES, chunks, even, played
-from jast.policy import Policy, recorded
+from jast.policy import Policy, nominal_policy, recorded
 from jast.simulators import landing, landing_probability, walk1d
 from jast.watch import Watch
 
@@ -663,3 +664,24 @@ def test_monte_carlo(key):
         and none.chernoff == pytest.approx(-np.expm1(np.log(0.1) / MORE), rel=1e-5)
     )
     assert "UNRELIABLE: no failure in 20000 episodes" in str(none) and "Chernoff" in str(none)
+
+
+def test_a_double_loop_is_unbiased_and_as_sure_as_its_starts(key):
+    """P(abs(s0) > .2) = 4.55 % is decided by the start: as many traces from fewer starts know less.
+    Bounds: 4 standard errors of a share of 400 starts, and a fifth of its own spread.
+    """
+    sim = jast.simulators.landing(b=0.2, sigma_t=1e-6)
+    policy = nominal_policy(sim)
+    found = double_loop(key, sim, policy, starts=400, samples=5)
+    truth = float(jast.simulators.landing_probability(b=0.2, sigma_t=1e-6))
+    error = np.sqrt(truth * (1 - truth) / 400)
+    assert abs(found.mean - truth) < 4 * error
+    assert found.standard_error == pytest.approx(error, rel=0.5)
+    assert (found.samples, found.evaluations) == (400, 2000)
+    for bad, match in (
+        (dict(starts=1), "starts must be a whole number of at least 2"),
+        (dict(samples=20_000), "samples must be at most 16384"),
+        (dict(level=2.0), "double_loop: level must be"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            double_loop(key, sim, policy, **bad)

@@ -10,6 +10,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jast import intervals
 from jast.estimate import chernoff, clopper_pearson, jeffreys
 from jast.intervals import log_normal
 
@@ -135,3 +136,22 @@ def test_log_normal():
 def test_bad_counts(bound, bad, match):
     with pytest.raises(ValueError, match=f"{bound.__name__}: {match}"):
         bound(*bad)
+
+
+def test_the_intervals_as_printed():
+    """Eq. 15 to 17 of Lipkis and Agogino."""
+    low, high = intervals.normal(3.0, 2.0, 0.9)
+    assert low < 0 and (low + high) / 2 == pytest.approx(3.0)
+    assert high == pytest.approx(3.0 + 2.0 * 1.6448536269514722)
+    delta = intervals.delta_bound(3, 100) - 0.03
+    assert np.exp(-100 * delta**2) == pytest.approx(0.05)
+    assert intervals.delta_bound(3, 100) > intervals.chernoff(3, 100)
+    assert intervals.delta_bound(100, 100) == 1
+    for bad, match in (
+        (lambda: intervals.delta_bound(3, 2), "delta_bound: k must be a whole number"),
+        (lambda: intervals.normal(np.nan, 1.0), "normal: mean must be"),
+        (lambda: intervals.normal(1.0, -1.0), "normal: standard_error must be"),
+        (lambda: intervals.normal(1.0, 1.0, 1.0), "normal: level must be"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            bad()

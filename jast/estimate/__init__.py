@@ -16,6 +16,7 @@ from jast.estimate.answers import (
     failure_times,
 )
 from jast.estimate.diagnostics import pareto_k
+from jast.estimate.double_loop import double_loop
 from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
 from jast.estimate.events import Event, GivenStart, events, given_start
@@ -24,7 +25,7 @@ from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
 from jast.estimate.subset import subset_simulation
-from jast.intervals import chernoff, clopper_pearson, jeffreys
+from jast.intervals import chernoff, clopper_pearson, delta_bound, jeffreys, normal
 
 __all__ = [
     "Draws",
@@ -40,7 +41,9 @@ __all__ = [
     "adaptive_cross_entropy",
     "chernoff",
     "clopper_pearson",
+    "delta_bound",
     "distance_quantile",
+    "double_loop",
     "events",
     "exceedance",
     "failure_probability",
@@ -52,6 +55,7 @@ __all__ = [
     "jeffreys",
     "log_weights",
     "monte_carlo",
+    "normal",
     "pareto_k",
     "policy_proposal",
     "subset_simulation",

@@ -175,12 +175,13 @@ def of_policies(shared, i, post):
 @partial(jax.jit, static_argnames=("n", "to_horizon"))
 def traces(key, sim, proposal, n, to_horizon=False):
     """`log_weights` without its checks."""
-    return jax.vmap(lambda k: _trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
+    return jax.vmap(lambda k: one_trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
 
 
-def _trace(key, sim, proposal, to_horizon, drawn=None):
-    """One `Traces` row; ``drawn``: another policy that draws it."""
+def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
+    """One `Traces` row; ``drawn``: another policy that draws it; ``start_key``: of its x0."""
     own, for_start, for_steps = component(key, proposal)
+    for_start = for_start if start_key is None else start_key
     own = own if drawn is None else drawn
     dtype, (components,) = outline(sim).dtype, proposal.log_weights.shape
 
@@ -277,7 +278,7 @@ def played(key, sim, proposal, n):
 @partial(jax.jit, static_argnums=3)
 def _probe(key, sim, proposal, n):
     drawn = nominal_policy(sim)
-    return jax.vmap(lambda k: _trace(k, sim, proposal, False, drawn))(jax.random.split(key, n))
+    return jax.vmap(lambda k: one_trace(k, sim, proposal, False, drawn))(jax.random.split(key, n))
 
 
 def _uncovered(key, sim, proposal):

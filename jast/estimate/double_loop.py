@@ -1,0 +1,105 @@
+"""The double-loop estimate (Lipkis and Agogino, section 5): many starts, and from each of them many
+traces.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import logsumexp
+
+from jast._checks import random_key, whole
+from jast.contract import contract
+from jast.estimate.estimate import estimate
+from jast.estimate.importance_sampling import Traces, chunks, one_trace
+from jast.estimate.proposals import as_proposal
+from jast.intervals import checked_level
+from jast.results import asked
+from jast.watch import Watch
+
+__all__ = ["double_loop"]
+
+LANES = 16384
+
+
+def double_loop(
+    key, sim, proposal, starts=1000, samples=100, *, level=0.95, progress=False, callback=None
+):
+    """Estimate the failure probability of ``sim`` as a mean over starts of the probability given
+    each: `Estimate`.
+
+    The outer loop draws ``starts`` times an x0, the inner one ``samples`` traces from each, whose
+    weights are averaged. An inner mean is unbiased for the start's weight times the failure
+    probability given it, so the mean of all is unbiased; the standard error is that of the outer
+    mean. `importance` draws a start for each trace, so it sees more starts at equal cost: with a
+    good policy, where what is left of the variance comes from the start, this one is worse.
+
+    Args:
+        key: random key, consumed.
+        sim: `jast.Simulator`.
+        proposal: a `Proposal` of one component (of one trace, or of `policy_proposal` with
+            ``mixing="step"``), or a `jast.Policy` with densities.
+        starts: outer draws, at least 2; the ``samples`` of the `Estimate`.
+        samples: inner draws from each start, at most 16384.
+        level: of the interval, in (0, 1).
+        progress: show a bar.
+        callback: ``callback(done, total, None)`` after each chunk of starts.
+
+    Returns:
+        `Estimate`, whose ``evaluations`` are ``starts`` x ``samples``. A start counts as failing
+        where one of its traces fails.
+
+    Raises:
+        ValueError: for counts out of range, a level outside (0, 1), a proposal of several
+            components or without a density, and where the simulator's functions do not fit.
+    """
+    random_key("double_loop", key)
+    starts = whole("double_loop", "starts", starts, 2)
+    samples = whole("double_loop", "samples", samples)
+    if samples > LANES:
+        raise ValueError(f"double_loop: samples must be at most {LANES}, received {samples!r}")
+    level = checked_level("double_loop", level)
+    contract(sim, observed=False)
+    proposal = as_proposal("double_loop", sim, proposal)
+    if len(proposal.log_weights) > 1:
+        raise ValueError(
+            "double_loop: proposal must have one component, as its traces share their start,"
+            f" received {len(proposal.log_weights)}"
+        )
+    settings = asked("double_loop", key, starts=starts, samples=samples, level=level)
+    lanes = max(1, min(starts, LANES // samples))
+    watch = Watch("double_loop", starts, "start", progress, callback)
+    total, notes, lost = chunks(_chunk, (key, sim, proposal, lanes, samples), lanes, watch)
+    found = estimate(
+        "double_loop",
+        total,
+        level=level,
+        reasons=lost,
+        notes=notes,
+        evaluations=total.samples * samples,
+    )
+    return found._replace(settings=settings, draws=None)
+
+
+def _chunk(shared, i, post):
+    key, *about = shared
+    return _outer(jax.random.fold_in(key, i), *about)
+
+
+@partial(jax.jit, static_argnames=("lanes", "samples"))
+def _outer(key, sim, proposal, lanes, samples):
+    """`Traces` [lanes], a row a start: its weight is the mean over its traces."""
+
+    def one(key):
+        for_start, for_traces = jax.random.split(key)
+        keys = jax.random.split(for_traces, samples)
+        rows = jax.vmap(lambda k: one_trace(k, sim, proposal, start_key=for_start))(keys)
+        hits = jnp.where(rows.failure, rows.log_weight, -jnp.inf)
+        fails, bad = jnp.any(rows.failure), jnp.any(rows.invalid)
+        everything = logsumexp(rows.log_weight)
+        log_weight = jnp.where(fails, logsumexp(hits), everything) - jnp.log(samples)
+        return Traces(
+            log_weight, rows.shares[0], fails, bad, jnp.sum(rows.length), jnp.min(rows.distance)
+        )
+
+    return jax.vmap(one)(jax.random.split(key, lanes))
