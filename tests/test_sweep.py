@@ -5,6 +5,7 @@ level.
 import concurrent.futures
 import dataclasses
 import math
+import pickle
 from statistics import NormalDist
 
 import jax
@@ -278,11 +279,13 @@ def test_the_picture(key):
         jast.plot.sweep(3)
 
 
-def test_partials_of_make_are_equal():
+def test_partials_of_make_are_equal_in_other_sweeps_and_processes():
     rows = [{"limit": v} for v in LIMITS]
     a, b = batch(make, rows), batch(make, rows[:2])
     assert jax.tree.structure(a[0]) == jax.tree.structure(b[1])
     assert isinstance(a[0].step, Partial)
+    sent = pickle.loads(pickle.dumps(a[0]))  # as to another process
+    assert jax.tree.structure(sent) == jax.tree.structure(a[0])
 
 
 # --- each row from the one before
@@ -341,6 +344,12 @@ def test_rows_of_an_executor_do_not_follow(key):
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         with pytest.raises(ValueError, match="follow must be False with an executor"):
             crude(key, executor=pool, follow=True)
+
+
+def test_each_row_has_a_checkpoint_of_its_own(key, tmp_path):
+    given = lambda key, sim, checkpoint: checkpoint
+    table = jast.sweep(key, make, {"limit": [1.0, 2.0]}, given, checkpoint=tmp_path)
+    assert table.results == (tmp_path / "row-0", tmp_path / "row-1")
 
 
 def test_follow_skips_rows_that_raise(key):

@@ -31,7 +31,7 @@ __all__ = ["TiltSeeker", "seek_tilts"]
 
 COMPONENTS = (3, 5)
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
-REFITS, NEAR, KEPT = 8, 2, 1200
+REFITS, NEAR, KEPT = 8, 1, 1200
 ENOUGH = 0.2
 """Effective draws of a draw of which no better ones are looked for twice."""
 

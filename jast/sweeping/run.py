@@ -1,6 +1,7 @@
 """sweep: one function on many systems."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -64,7 +65,8 @@ def sweep(
             Processes need a ``make`` and a ``function`` that can be pickled: those of a module.
         progress: whether there is a bar.
         callback: called as ``callback(done, N, None)`` after each row.
-        **options: settings of ``function``, such as ``budget``.
+        **options: settings of ``function``, such as ``budget``; ``checkpoint``, a folder, has one
+            in it for each row.
 
     Returns:
         `Sweep`, a table with a row for each value. A value for which ``simulators`` or ``function``
@@ -85,11 +87,13 @@ def sweep(
     if follow and executor is not None:
         raise ValueError("sweep: follow must be False with an executor, whose rows do not wait")
     made = batch(_checked(simulators, len(rows)), rows)
+    each_with = [_options(options, i) for i in range(len(rows))]
     keys = [jax.random.fold_in(key, i) for i in range(len(rows))]
+    work = list(zip(keys, made, each_with, strict=True))
     found: list[tuple[Any, Exception | None]] = []
     with Watch("sweep", len(rows), "value", progress, callback) as watch:
         try:
-            for each in _outcomes(executor, follow, function, keys, made, options):
+            for each in _outcomes(executor, follow, function, work):
                 found.append(each)
                 watch.more(1)
                 if _ended_early(each[0]):
@@ -114,18 +118,26 @@ def sweep(
     )
 
 
-def _outcomes(executor, follow, function, keys, made, options):
-    """(result or None, error or None) of each row, in order."""
-    work = list(zip(keys, made, strict=True))
+def _options(options, i):
+    """What row ``i`` gives the function."""
+    if options.get("checkpoint") is None:
+        return options
+    return options | {"checkpoint": Path(options["checkpoint"]) / f"row-{i}"}
+
+
+def _outcomes(executor, follow, function, work):
+    """(result or None, error or None) of each row, in order; ``work``: the key, the simulator and
+    the options of each.
+    """
     if executor is None:
         near = {}
-        for k, s in work:
-            result, error = _tried(_row, function, k, s, options | near)
+        for key, sim, options in work:
+            result, error = _tried(_row, function, key, sim, options | near)
             if follow and error is None:
                 near = {"near": result}
             yield result, error
         return
-    futures = [executor.submit(_row, function, k, s, options) for k, s in work]
+    futures = [executor.submit(_row, function, *each) for each in work]
     try:
         yield from (_tried(future.result) for future in futures)
     finally:
