@@ -15,7 +15,7 @@ import numpy as np
 
 from jast.checkpoints import Store
 
-__all__ = ["answered", "kept"]
+__all__ = ["answered", "kept", "stepped"]
 
 # of the call under way: what asks a system is many calls below the one that the user made
 _STORE = contextvars.ContextVar("store", default=None)
@@ -36,16 +36,22 @@ def answered(function: Callable[..., Any], *asked: Any, rows: int | None = None)
     It is from the journal, where that holds the answer to this question: to its number, with the
     arrays in ``asked``.
     """
-    ask = lambda: jax.tree.map(lambda a: a[:rows], jax.device_get(function(*asked)))
+    answer = lambda: jax.tree.map(lambda a: a[:rows], jax.device_get(function(*asked)))
+    return stepped(answer, *asked, like=lambda: function(*asked))
+
+
+def stepped(step: Callable[[], Any], *asked: Any, like: Callable[[], Any]) -> Any:
+    """``step()``, likewise, of a method whose steps depend on the arrays in ``asked``; without a
+    journal it is left where it is. ``like``: traced for the structure of what ``step`` returns.
+    """
     if _STORE.get() is None:
-        return ask()
+        return step()
     store, numbers = _STORE.get()
     number, question = next(numbers), _digest(asked)
     known = store.get(number, "answer")
     if known is not None and (known[0] == question).all():
-        like = jax.eval_shape(lambda: function(*asked))
-        return jax.tree.structure(like).unflatten(known[1:])
-    answer = ask()
+        return jax.tree.structure(jax.eval_shape(like)).unflatten(known[1:])
+    answer = jax.device_get(step())
     store.put(number, [question, *jax.tree.leaves(answer)], "answer")
     return answer
 

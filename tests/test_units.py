@@ -6,6 +6,7 @@ import concurrent.futures
 import gc
 import importlib.util
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from systems import line
 
 import jast
 from jast import places, units
+from jast.checkpoints import Store
 from jast.estimate import (
     Estimate,
     failure_probability,
@@ -32,7 +34,7 @@ from jast.estimate import (
 from jast.fingerprint import differences, fingerprint
 from jast.places import Task
 from jast.policy import nominal_policy
-from jast.search import forest, mcts, monte_carlo
+from jast.search import cem, forest, mcts, monte_carlo
 from jast.simulators import ferry, walk1d
 from jast.watch import Watch
 
@@ -57,6 +59,7 @@ CALLS = {
     ),
 }
 """A call of each kind, of a few units."""
+long = lambda name: pytest.param(name, marks=pytest.mark.long)
 LATER = ("mcts", "importance", "failure_probability")
 
 
@@ -130,9 +133,7 @@ def squares(n=5, function=square, executor=None, **how):
 # --- where units run, and from where they go on
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n in LATER)) for n in CALLS]
-)
+@pytest.mark.parametrize("name", [long(n) if n in LATER else n for n in CALLS])
 def test_no_place_changes_a_result(name, key, same, tmp_path):
     call = CALLS[name]
     alone = call(key)
@@ -207,6 +208,33 @@ def test_a_killed_call_goes_on_to_the_same_result(tmp_path, same, monkeypatch):
     assert units_done is None or units_done >= 1
     key = jax.random.key(7)
     same(CALLS["nominal"](key, checkpoint=folder), CALLS["nominal"](key))
+
+
+SEQUENTIAL = {
+    "cem": lambda key, **how: cem(
+        key, walk1d(), samples=40, elites=8, iterations=4, refine=0, record=True, **how
+    ),
+    "failure_probability": CALLS["failure_probability"],
+    "few calls": lambda key, **how: failure_probability(key, LINE, 60, **how),
+}
+"""Calls whose steps depend on one another."""
+
+
+@pytest.mark.parametrize("name", ["failure_probability", *map(long, ("cem", "few calls"))])
+def test_a_system_is_not_asked_again(name, key, same, tmp_path, monkeypatch):
+    """A journal with its second half gone is the same as none, and so is one with other answers."""
+    call, folder = SEQUENTIAL[name], tmp_path / "run.jast"
+    alone = call(key)
+    same(call(key, checkpoint=folder), alone)
+    answers = sorted(folder.glob("answer-*"))
+    assert len(answers) > 3
+    for answer in answers[len(answers) // 2 :]:
+        answer.unlink()
+    shutil.copy(answers[0], answers[1])
+    same(call(key, checkpoint=folder), alone)
+    assert sorted(folder.glob("answer-*")) == answers
+    monkeypatch.setattr(Store, "put", lambda *_: pytest.fail("asked again"))
+    same(call(key, checkpoint=folder), alone)
 
 
 # --- what goes wrong

@@ -52,6 +52,9 @@ class Host:
         # one callable for each kind of answer, as it is part of what a compiled program is known by
         self.callback = functools.cache(lambda dtype, size: functools.partial(self, dtype, size))
 
+    def __reduce__(self):  # another process counts for itself
+        return Host, (self.runner, self.spec, self.x, self.starts)
+
     def incidents(self):
         return self.log.all()
 

@@ -114,6 +114,13 @@ def _close(workers):
         each.kill()
 
 
+def _configured(payload, workers, spec, x, size):
+    """A `Pool`."""
+    made = Pool(payload, workers, spec)
+    made.configure(x, size)
+    return made
+
+
 class Pool:
     """A `worker.Runner` whose rows are shared out over processes.
 
@@ -125,9 +132,13 @@ class Pool:
     """
 
     def __init__(self, payload, workers, spec):
-        self.spec, self.workers = spec, [Worker(payload) for _ in range(workers)]
+        self.payload, self.spec = payload, spec
+        self.workers = [Worker(payload) for _ in range(workers)]
         self.x, self.size, self.pace = 0, 0, None
         weakref.finalize(self, _close, self.workers)
+
+    def __reduce__(self):  # another process has workers of its own
+        return _configured, (self.payload, len(self.workers), self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """As `worker.Runner.configure`, for all workers."""

@@ -104,6 +104,13 @@ def takes(function, count):
     return True
 
 
+def _configured(kind, system, spec, x, size):
+    """A `Runner`."""
+    made = kind(system, spec)
+    made.configure(x, size)
+    return made
+
+
 class Runner:
     """A system and the objects that it has made."""
 
@@ -113,6 +120,9 @@ class Runner:
         self.x, self.size = 0, 0
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
+
+    def __reduce__(self):  # another process makes objects of its own
+        return _configured, (Runner, self.system, self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers

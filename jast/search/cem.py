@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jast import _checks
+from jast import _checks, units
 from jast import actions as choices
+from jast.checkpoints import stored
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode
 from jast.incidents import hosted, incidents, since
+from jast.journal import kept
 from jast.memory import require_episodes
 from jast.outline import outline
 from jast.search import lockstep as E
@@ -79,6 +81,7 @@ def cem(
     record=False,
     progress=False,
     callback=None,
+    checkpoint=None,
 ):
     """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the
     ``elites`` best distinct ones so far; maximises ``reward``.
@@ -107,7 +110,9 @@ def cem(
     ``top``: distinct failures kept; ``record=True`` keeps the numbers of every episode
     (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
     after every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
-    result of the whole iterations, and ``settings["interrupted"]``. Works under `jax.jit` and
+    result of the whole iterations, and ``settings["interrupted"]``. ``checkpoint``: a folder that
+    keeps the iterations; the same call goes on where it was ended, by whatever, to the same result
+    (docs/scale.md). Works under `jax.jit` and
     `jax.vmap`, without archive, history and callbacks.
 
     A reward whose log p outweighs the distance, as `jast.rewards.standard` of many steps, has its
@@ -139,10 +144,13 @@ def cem(
     settings = planned("cem", refine, sim, settings, usual(sim, reward))
     plan = Plan(samples, elites, P.kinds(sim, actions))
     around = () if failures is None else P.around(sim, actions, failures, settings)
+    asked = counts | dict(sim=sim, reward=reward, actions=actions, real=real, around=around)
+    asked |= dict(top=top, record=bool(record))
     search = partial(_iteration, tree_keys(key, trees), sim, reward, actions, real, plan)
     width = actions.width if isinstance(actions, choices.Wide) else 1.0
     carry = _nothing(sim, plan, trees, max(elites, top), width, around)
     if settings is None:
+        units.not_traced("cem", checkpoint=checkpoint)
 
         def body(i, carry):
             inner, counted = carry
@@ -159,16 +167,17 @@ def cem(
         return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
 
     ends = [samples * (i + 1) for i in range(iterations)]
-    (pool, _), log = E.drive(
-        chunk,
-        carry,
-        ends,
-        host=hosted(sim),
-        trees=trees,
-        progress=progress,
-        callback=callback,
-        name="cem",
-    )
+    with stored("cem", checkpoint, key, **asked) as store, kept(store):
+        (pool, _), log = E.drive(
+            chunk,
+            carry,
+            ends,
+            host=hosted(sim),
+            trees=trees,
+            progress=progress,
+            callback=callback,
+            name="cem",
+        )
     found, tree, number, count = jax.device_get(_archive(pool, top))
     n = int((found.reward > -jnp.inf).sum())
     found = E.finish(

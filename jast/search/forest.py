@@ -110,7 +110,8 @@ def forest(
     was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
     those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
     Neither changes a result (`jast.units`; docs/scale.md).
-    A unit is a group of ``lanes`` trees, smaller by default with a checkpoint or an executor.
+    A unit is a group of ``lanes`` trees, with a checkpoint or an executor 64 to 128 by default:
+    fewer are less to lose and to wait for, but cost more each.
 
     ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw,
     "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier

@@ -38,8 +38,8 @@ __all__ = ["grow_trees"]
 MEMOIZE = ("auto", "node", "root", "none")
 PUBLISHED = ("code", "text", "paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
-GROUPS, LEAST = 16, 8
-"""Groups of a round that are worth a checkpoint, and the trees of each at least."""
+LEAST = 64
+"""Trees of a group with a checkpoint or an executor, at least: fewer in lockstep cost more each."""
 BOUNDED = 1.0
 """``exploration`` for `jast.rewards.lexicographic`, whose range is (-1, 1]."""
 CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
@@ -131,7 +131,7 @@ def grow_trees(
         )
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
     if lanes is None and (checkpoint, executor) != (None, None):
-        lanes = min(job.at_once, LANES, max(LEAST, -(-job.at_once // GROUPS)))
+        lanes = min(LANES, -(-job.at_once // max(job.at_once // LEAST, 1)))
     if devices is not None:
         threads = len(ways.devices)
     fitted, threads, lanes = fit(
