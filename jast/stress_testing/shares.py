@@ -9,7 +9,8 @@ from jast import limit_state as latent
 from jast.estimate.batches import resampled
 from jast.estimate.redrawn import redrawn
 from jast.search.centred import centred
-from jast.search.failure_modes import Modes, Paths, assigned, nearest
+from jast.search.failure_modes import Modes
+from jast.search.paths import Paths, assigned, nearest
 from jast.simulator import Simulator
 
 __all__ = ["cost", "shares"]

@@ -1,0 +1,197 @@
+"""Paths between failures that keep to the failures: what makes two of them one mode."""
+
+from functools import partial
+
+import jax
+import numpy as np
+
+from jast.judge import Judge
+from jast.limit_state import unit
+from jast.search.moves import moved_in_time
+from jast.simulator import Simulator
+
+__all__ = ["Paths", "assigned", "components", "nearest"]
+
+PLACES = 7
+LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
+"""Points of a path between two failures, and how much farther out than the line between the two a
+path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
+least of those that are alike.
+"""
+RARER, NATS = 0.21, 1.0
+"""How much rarer than the rarer of two modes' likeliest failures one on the way between them may
+be: this share of its log p, which is what a tenth of the way makes in normal numbers, or so many
+nats.
+"""
+PAIRS, LEAST, IN_VAIN = 32, 2, 4
+"""Paths looked for at a time, of all modes together and at least of each; times in a row that join
+no two modes, after which it is enough.
+"""
+
+
+def components(
+    paths: "Paths", v: np.ndarray, ends: np.ndarray, cost: np.ndarray, n: int
+) -> np.ndarray:
+    """Which failures are joined by paths, be it by way of others: a graph that grows from the first
+    ``n``, along the pairs that point most nearly in the same direction.
+
+    Args:
+        paths: looks for them. Where its budget is used up, the first ``n`` are told apart by
+            direction alone.
+        v: [N, D] normal numbers.
+        ends: [N] steps.
+        cost: [N] how much rarer each is than the mode, in nats.
+        n: refined failures, whose components are wanted.
+
+    Returns:
+        [N]: a number of the component of each.
+    """
+    cosine, owner = unit(v) @ unit(v).T, np.arange(len(v))
+    untried, left = cosine > OPPOSITE, n
+    # straight from one of the first n to another, or by way of others: what pays is done more often
+    reach, joins, tries, in_vain = (n, len(v)), [1, 1], [1, 1], [0, 0]
+    while left > 1 and (ways := [w for w in (0, 1) if in_vain[w] < IN_VAIN]):
+        way = max(ways, key=lambda w: joins[w] / tries[w])
+        few = np.arange(reach[way])
+        open = untried[np.ix_(few, few)] & _on_the_way(owner, cost, few[:, None], few)
+        pairs = _nearest_pairs(cosine[np.ix_(few, few)], open, owner[few], np.unique(owner[:n]))
+        if not pairs:
+            in_vain[way] = IN_VAIN
+            continue
+        if not paths.room:
+            _join(owner, cost, *np.nonzero(np.triu(untried & (cosine > ALIKE), 1)[:n, :n]))
+            break
+        i, j = np.array(sorted(pairs, key=lambda pair: -cosine[pair])[: paths.room]).T
+        untried[i, j] = untried[j, i] = False
+        joined = paths.between((v[i], ends[i]), (v[j], ends[j]))
+        _join(owner, cost, i[joined], j[joined])
+        fewer = left - (left := len(np.unique(owner[:n])))
+        in_vain[way] = 0 if fewer else in_vain[way] + 1
+        joins[way], tries[way] = joins[way] + fewer, tries[way] + len(i)
+    return owner
+
+
+def _on_the_way(owner, cost, i, j):
+    """Of which of the pairs ``i``, ``j``, of two components, neither is much rarer than both of
+    these.
+    """
+    low = np.full(len(cost), np.inf)
+    np.minimum.at(low, owner, cost)
+    rarest = np.maximum(low[owner[i]], low[owner[j]])
+    near = np.maximum(cost[i], cost[j]) <= rarest + np.maximum(RARER * rarest, NATS)
+    return near & (owner[i] != owner[j])
+
+
+def _nearest_pairs(cosine, open, owner, tops):
+    """Of each of the components ``tops`` those of the pairs ``open`` [N, M] that are nearest in
+    direction: a set of pairs.
+    """
+    found, each = set(), max(LEAST, PAIRS // len(tops))
+    for k in tops:
+        mine = np.flatnonzero(owner == k)
+        worth = np.where(open[mine], cosine[mine], -np.inf)
+        best = np.argsort(-worth, axis=None, kind="stable")[:each]
+        a, b = np.unravel_index(best[np.isfinite(worth.flat[best])], worth.shape)
+        found.update((min(pair), max(pair)) for pair in zip(mine[a].tolist(), b.tolist()))
+    return found
+
+
+def _join(owner, cost, i, j):
+    """Put the components of ``i`` and ``j`` [m] together, in place: those of likely pairs first, as
+    what is on the way between two of them is no longer so between what these have become.
+    """
+    for k in np.argsort(np.maximum(cost[i], cost[j]), kind="stable"):
+        if _on_the_way(owner, cost, i[k], j[k]):
+            owner[owner == owner[i[k]]] = owner[j[k]]
+
+
+def assigned(paths, many, known, owner):
+    """Of each of ``many`` failures (points [m, D], steps [m]) the owner, given those of ``known``
+    (points [n, D], steps [n]).
+    """
+    (w, ends), (v, known_ends) = many, known
+    order = np.argsort(-unit(w) @ unit(v).T, axis=1)
+    out = owner[order[:, 0]]
+    left = np.ones(len(w), bool)
+    for k in range(min(order.shape[1], 8)):
+        rows = np.flatnonzero(left)
+        if not len(rows):
+            break
+        other = order[rows, k]
+        joined = paths.between((w[rows], ends[rows]), (v[other], known_ends[other]))
+        out[rows[joined]] = owner[order[rows[joined], k]]
+        left[rows[joined]] = False
+    return out
+
+
+def nearest(w, v):
+    """Of each of the points ``w`` [m, D] the index of that of ``v`` [n, D] in whose direction it
+    lies most nearly: [m].
+    """
+    return np.argmax(unit(w) @ unit(v).T, axis=1)
+
+
+class Paths:
+    """Looks for paths of failures between points of ``sim``, `jast.search.centred`, for at most
+    ``budget`` evaluations.
+    """
+
+    def __init__(self, sim: Simulator, budget: int):
+        self.sim, self.budget, self.judge = sim, budget, Judge(sim)
+
+    @property
+    def spent(self) -> int:
+        return self.judge.spent
+
+    @property
+    def room(self) -> int:
+        """The straight paths that the rest of the budget does for, nearly: one that is no path
+        takes a lift at each try, another one a place each.
+        """
+        return max(self.budget - self.spent, 0) // (PLACES + len(LIFTS))
+
+    def between(self, first, second):
+        """Whether there is a path between each of the failures ``first`` and that of ``second``
+        (points [n, D], steps [n]), as they are or with the first moved in time: [n].
+        """
+        (v, v_ends), (w, w_ends) = first, second
+        joined = self.straight(v, w)
+        rows = np.flatnonzero(~joined & (v_ends != w_ends))
+        if len(rows):
+            steps = (w_ends - v_ends)[rows]
+            moved = jax.vmap(partial(moved_in_time, self.sim))(v[rows], steps)
+            joined[rows] = self.straight(np.asarray(moved), w[rows], of_both=True)
+        return joined
+
+    def straight(self, v, w, of_both=False):
+        """Whether the arc between each of ``v`` [n, D] and that of ``w`` keeps to the failures:
+        [n]. ``of_both``: ``v`` itself is yet to be seen failing.
+        """
+        cosine = np.sum(unit(v) * unit(w), axis=1)
+        if len(v) > self.room:
+            return cosine > ALIKE
+        joined = cosine > OPPOSITE  # no arc is meant between opposite points
+        places = np.arange(0 if of_both else 1, PLACES + 1) / (PLACES + 1)
+        middle = places == 0.5  # first: most that leave the failures have left them there
+        for t in (places[middle], places[~middle]):
+            rows = np.flatnonzero(joined)
+            points = _arcs(v[rows], w[rows], t)
+            joined[rows] = self.failing(points.reshape(-1, v.shape[1])).reshape(len(t), -1).all(0)
+        return joined
+
+    def failing(self, points):
+        """Which of ``points`` [n, D] fail as they are or a little farther out: [n]."""
+        out = np.zeros(len(points), bool)
+        for lift in LIFTS:
+            rows = np.flatnonzero(~out)
+            if len(rows):
+                out[rows] = self.judge(lift * points[rows]).failure
+        return out
+
+
+def _arcs(v, w, t):
+    """Points [T, n, D] of the arcs between ``v`` [n, D] and ``w``, at the shares ``t`` [T]."""
+    norm, t = partial(np.linalg.norm, axis=-1, keepdims=True), t[:, None, None]
+    line = (1 - t) * unit(v) + t * unit(w)
+    size = (1 - t) * norm(v) + t * norm(w)
+    return np.where(norm(line) > 1e-3, unit(line) * size, 0)
