@@ -100,7 +100,7 @@ def modes(
     paths = Paths(centred(sim), budget)
     v = together(lambda f: np.asarray(normal_of(paths.sim, f.episodes), np.float64))
     ends, counts = together(lambda f: f.episodes.length), together(lambda f: f.counts)
-    owner = components(paths, v, ends, together(lambda f: _cost(sim, f)), n)
+    owner = components(paths, v, ends, together(lambda f: _cost(paths, sim, f)), n)
     known = np.isin(owner, owner[:n])
     if not known.all():
         owner[~known] = assigned(
@@ -113,15 +113,15 @@ def modes(
     return Modes(kinds, paths.spent)
 
 
-def _cost(sim, failures):
+def _cost(paths, sim, failures):
     """By how many nats each of ``failures`` is rarer than the mode: [n]; their reward says it,
     unless another one ranks them.
     """
     log_p, known = likelihood(sim), failures.episodes.reward
     score = lambda e: float(replay(sim, e, reward=log_p).reward)
-    if not np.isclose(score(failures[0]), known[0]):
-        known = np.array([score(e) for e in failures])
-    return -known
+    other = not np.isclose(score(failures[0]), known[0])
+    paths.judge.spent += 1 + other * len(failures)
+    return -np.array([score(e) for e in failures]) if other else -known
 
 
 def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
