@@ -36,8 +36,8 @@ def around(radius, *degrees):
 
 
 def dented(points):
-    """A ring whose inner edge has a dent at 45 degrees: 3 away from the origin, there 3.31, which is
-    just beyond a tenth of the way and within a nat.
+    """A ring whose inner edge has a dent at 45 degrees: 3 away from the origin, there 3.31: just
+    beyond a tenth of the way, and within a nat.
     """
     norm, angle = np.linalg.norm(points, axis=1), np.arctan2(points[:, 1], points[:, 0])
     return norm >= 3 + 0.31 * (np.abs(np.degrees(angle) - 45) < 10)
