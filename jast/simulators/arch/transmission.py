@@ -19,8 +19,8 @@ Where this may differ from a run of the original: fourth-order Runge-Kutta steps
 that takes the fifth-order ones of Dormand and Prince; samples 0.02 s apart, not 0.01; the sample
 after a shift is the first to show it; below idle speed the engine's torque is that of idle speed.
 The 45 different falsifying inputs that FalCAuN published for AT1, AT2 and AT6 (MasWag/
-FalCAuN-ARCH-COMP) falsify this model, those of 2024 as they are, those of 2023 with the outputs
-read as that version reads them, every 2 or 5 s: in between, engine speed is above 3000 rpm.
+FalCAuN-ARCH-COMP) falsify this model, as steps; those of 2023 for AT6 where the outputs are read as
+that version reads them, every 2 or 5 s: in between, engine speed is above 3000 rpm in most.
 
 Published, falsified of 10 runs and mean simulations: FalCAuN 2023 AT1 4, 1030; AT2 6, 502; AT6a 10,
 458; AT6b 10, 600; AT6c 10, 901; FalCAuN 2024 AT1 896, AT2 256, AT6a 1002, AT6b none, AT6c 898.
