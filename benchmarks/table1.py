@@ -81,8 +81,6 @@ COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     ),
     "failing": (7, lambda r: f"{r['mean_best_failing']:.2f}"),
     "best of each": (17, lambda r: " ".join(f"{v:.2f}" for v in r.get("bests", [r["best"]]))),
-    "Fisher": (6, lambda r: f"{r['tests']['fisher']:.2g}"),
-    "M-W": (6, lambda r: f"{r['tests']['mann_whitney']:.2g}"),
     "sims/s": (7, lambda r: f"{r['simulations_per_cpu_s']:.0f}"),
     "cost": (5, lambda r: f"{r['cpu_ratio']:.2f}"),
     "factor": (6, lambda r: f"{r['factor']:.0f}"),
@@ -95,8 +93,7 @@ COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     ),
 }
 LEGEND = """B: trees between two trainings, - where nothing is learned. failing: mean best of
-failing trees. Fisher, M-W: p of Fisher's exact test of the failing trees and of the Mann-Whitney
-U test of the best rewards, both two-sided, against the published trees. sims/s: simulations per
+failing trees. sims/s: simulations per
 CPU second, without compilation; cost: CPU time of one, to that of the block's first row; factor:
 sims/s over the published code's; compile: CPU s of the call before, which compiles what no row
 above it did; failing/s: failing trees per CPU second, with the interval of the rate."""
@@ -170,10 +167,8 @@ def settled(search, seed):
     return timed(lambda: search(jax.random.key(seed))) if first[1] < 2 else first
 
 
-def measure(searches, seeds, published=None):
-    """The row of a search, given for each seed; ``published``: the best rewards of the paper's
-    trees.
-    """
+def measure(searches, seeds):
+    """The row of a search, given for each seed."""
     warm = warm_up(searches[0])
     runs = [settled(search, seed) for search, seed in zip(searches, seeds, strict=True)]
     results, cpu, wall = zip(*runs, strict=True)
@@ -188,7 +183,6 @@ def measure(searches, seeds, published=None):
         "B": heads.round if heads is not None and heads.train else None,
         "rates": [float((b > 0).mean()) for b in bests],
         "bests": [b.max() for b in bests],
-        "tests": compare(np.concatenate(bests), published),
         "episodes": episodes,
         "steps": sum(r.steps for r in results),
         "cpu_s": list(cpu),
@@ -201,28 +195,11 @@ def measure(searches, seeds, published=None):
     }
 
 
-def compare(best, published):
-    """p-values of two-sample tests of the trees' best rewards against the published ones; None
-    without those.
-    """
-    if published is None:
-        return None
-    from scipy import stats
-
-    counts = [[int(np.sum(b > 0)), int(np.sum(b <= 0))] for b in (best, published)]
-    return {
-        "fisher": float(stats.fisher_exact(counts).pvalue),
-        "mann_whitney": float(stats.mannwhitneyu(best, published).pvalue),
-    }
-
-
 def published():
-    """Variant -> the paper's row, and variant -> the best rewards of its trees, which is empty
-    where the data is absent.
-    """
+    """Variant -> the paper's row, of its trees' best rewards where the data is there."""
     if (found := data("table1_per_tree.json")) is not None:
-        bests = {name: np.array(found["best_reward_per_tree"][name]) for name in VARIANTS}
-        return {name: outcome(best) for name, best in bests.items()}, bests
+        bests = found["best_reward_per_tree"]
+        return {name: outcome(np.array(bests[name])) for name in VARIANTS}
     row = lambda rate, mean, best: dict(
         trees=200,
         rate=rate / 100,
@@ -230,22 +207,23 @@ def published():
         mean_best=mean,
         best=best,
     )
-    return {name: row(*TABLE[name]) for name in VARIANTS}, {}
+    return {name: row(*TABLE[name]) for name in VARIANTS}
 
 
 def line(name, row):
     def text(show):
         try:
             return show(row)
-        except (KeyError, TypeError):  # a published row, or one without published trees
+        except (KeyError, TypeError):  # a published row
             return "-"
 
     return f"{name:9}" + "".join(f" {text(show):>{width}}" for width, show in COLUMNS.values())
 
 
-def block(title, searches, seeds, say, bests=None):
+def block(title, searches, seeds, say, table1=False):
     """Name -> row, measured and said one by one; a search, or a list of one for each seed. The
-    first is what the others' cost is compared with.
+    first is what the others' cost is compared with; ``table1``: names are the paper's, whose speed
+    is compared with, too.
     """
     say(f"\n{title}")
     rows = {}
@@ -253,11 +231,10 @@ def block(title, searches, seeds, say, bests=None):
         row = measure(
             search if isinstance(search, list) else [search] * len(seeds),
             seeds,
-            (bests or {}).get(name),
         )
         plain = next(iter(rows.values()), row)
         row["cpu_ratio"] = plain["simulations_per_cpu_s"] / row["simulations_per_cpu_s"]
-        if bests is not None:
+        if table1:
             row["factor"] = row["simulations_per_cpu_s"] / SPEED[name]
         rows[name] = row
         say(line(name, row))
@@ -401,21 +378,11 @@ def report(args):
         )
     seeds = range(args.seed, args.seed + (args.seeds or sizes.seeds))
     say = (lambda text: None) if args.json else functools.partial(print, flush=True)
-    rows, bests = published()
+    rows = published()
     out = {"golden": golden(), "seeds": list(seeds), "sizes": sizes._asdict(), "published": rows}
     say(f"golden episodes: {out['golden'] or 'data not found'}\n{LEGEND}\n")
     say(f"{'':9}" + "".join(f" {name:>{width}}" for name, (width, _) in COLUMNS.items()))
-    say(
-        "published"
-        + (
-            ""
-            if bests
-            else (
-                ", as printed: the data of its trees was not found, so nothing is tested against"
-                " them"
-            )
-        )
-    )
+    say("published")
     for name, row in rows.items():
         say(line(name, row))
     for mode in sizes.modes:
@@ -424,7 +391,7 @@ def report(args):
             {name: variant(name, mode, sizes) for name in sizes.variants},
             seeds,
             say,
-            bests,
+            table1=True,
         )
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
     out["S0b"] = block(

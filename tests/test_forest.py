@@ -513,7 +513,8 @@ def test_a_forest_beats_random_search():
 )
 def test_the_published_failure_rates_on_s0(search, share, within):
     """Share of 1000 trees of 9000 simulations that find a collision: MCFS-AP without networks, and
-    MCTS-SA.
+    MCTS-SA. The shares are those of an independent version of the published code, of 2000 and 1500
+    trees; the paper prints .295 and .355, of 200 trees each (+- .063 and .066).
     """
     size = dict(prunes=18, simulations=500) if search is forest else dict(simulations=9000)
     result = search(jax.random.key(0), FERRY, trees=1000, mode="paper", **size, **S0)

@@ -204,3 +204,27 @@ def test_trials_are_asked_for():
             draw({})
         with pytest.raises(ValueError, match=f"plot.{name}: axes must be at least"):
             draw(recorded(FEW), axes=plt.figure().subplots())
+
+
+def test_figures_of_the_thesis_as_printed():
+    """Of one tree: distances 4, 2, -3, 5 negated, with a standard deviation of those so far."""
+    one = [[row[0]] for row in FEW]
+    mean, greatest, failures = drawn(plot.trials(recorded(one), mode="thesis"))
+    assert mean.get_xscale() == failures.get_xscale() == "log"
+    np.testing.assert_allclose(mean.lines[0].get_ydata(), [-4, -3, -1, -2])
+    np.testing.assert_allclose(greatest.lines[0].get_ydata(), [-4, -2, 3, 3])
+    band = mean.collections[0].get_paths()[0].vertices
+    so_far = [np.std([4, 2, -3, 5][: k + 1]) for k in range(4)]
+    for k, (x, middle) in enumerate(zip([1, 2, 3, 4], [-4, -3, -1, -2], strict=True)):
+        ends = band[np.isclose(band[:, 0], x), 1]
+        np.testing.assert_allclose(
+            [ends.min(), ends.max()], [middle - so_far[k], middle + so_far[k]]
+        )
+    assert [line.get_label() for line in mean.lines[1:]] == ["event horizon"]
+    distances, _ = drawn(plot.trial_distances(recorded(one), mode="thesis"))
+    assert distances.get_xlabel() == "-d" and distances.lines[0].get_xdata() == [0, 0]
+    for draw in (plot.trials, plot.trial_distances):
+        with pytest.raises(
+            ValueError, match='mode must be "default" or "thesis", received "log"|log'
+        ):
+            draw(recorded(one), mode="log")

@@ -14,22 +14,29 @@ __all__ = ["trial_distances", "trials"]
 MOST = 2000  # points of a line
 
 
-def trials(results, axes=None):
+def trials(results, axes=None, mode="default"):
     """Over the simulations of a tree: the mean miss distance so far, the least so far, and how many
     failures so far, a panel each. Returns the list of Axes.
 
     ``results``: a search result, or a dict of name -> result, searched with ``record=True``. Of
     several trees: each tree's running figure averaged over the trees, with a light band from
-    quartile to quartile; drawn from where every tree has a valid episode. ValueError for a result
-    without trials.
+    quartile to quartile; drawn from where every tree has a valid episode.
+
+    ``mode="thesis"`` is figure 3.7 as printed: a logarithmic axis of simulations, distances
+    negated, so that a failure lies above the event horizon at 0, and the band about the mean is one
+    standard deviation of the episodes so far (of several trees: its mean). ValueError for a result
+    without trials and another mode.
     """
-    results = _named("trials", results)
+    results, printed = _named("trials", results), _printed("trials", mode)
     with style.axes(axes, (7.2, 7.4), 3) as axes:
         axes = style.panels("trials", axes, 3, "running figure")[:3]
         for i, (name, result) in enumerate(results.items()):
             distance, _, failure, counts = _columns("trials", result)
             n, trees = distance.shape
             figures = _running(distance, failure, counts)
+            if printed:
+                figures = -figures[0], -figures[1], figures[2]
+                deviation = _deviation(distance, counts).mean(1)
             at = np.unique(np.linspace(0, n - 1, min(n, MOST)).astype(int))
             colour, label = (
                 style.COLOURS[i % len(style.COLOURS)],
@@ -37,19 +44,26 @@ def trials(results, axes=None):
             )
             for ax, rows in zip(axes, figures, strict=True):
                 rows = rows[at]
-                ax.plot(at + 1, rows.mean(1), color=colour, label=label, zorder=3)
-                if trees > 1:
+                mean = rows.mean(1)
+                ax.plot(at + 1, mean, color=colour, label=label, zorder=3)
+                look = dict(color=colour, alpha=0.2, linewidth=0, zorder=2)
+                if printed and ax is axes[0]:
+                    spread = deviation[at]
+                    ax.fill_between(at + 1, mean - spread, mean + spread, **look)
+                elif trees > 1 and not printed:
                     ax.fill_between(
                         at + 1,
                         *np.quantile(rows, (0.25, 0.75), 1),
-                        color=colour,
-                        alpha=0.2,
-                        linewidth=0,
-                        zorder=2,
+                        **look,
                     )
-        for ax, label in zip(
-            axes, ("mean miss distance", "least miss distance", "failures"), strict=True
-        ):
+        names = ("mean miss distance", "least miss distance", "failures")
+        if printed:
+            names = ("mean -d", "greatest -d", "failures")
+            for ax in axes[:2]:
+                ax.axhline(0, color=style.INK, linewidth=1, linestyle="--", label="event horizon")
+            for ax in axes:
+                ax.set_xscale("log")
+        for ax, label in zip(axes, names, strict=True):
             ax.set_ylabel(f"{label} so far")
         axes[2].set(xlabel="simulations of a tree", ylim=(0, None))
         axes[2].yaxis.get_major_locator().set_params(integer=True)
@@ -59,21 +73,22 @@ def trials(results, axes=None):
     return axes
 
 
-def trial_distances(results, bins=60, axes=None):
+def trial_distances(results, bins=60, axes=None, mode="default"):
     """Histograms over all trees: the miss distances of the episodes, and log p of those that
     failed, a panel each. Returns the list of Axes.
 
     ``results`` as for `trials`, and so the errors; ``bins``: the most of a histogram, shared by the
     searches. log p depends on the units of the disturbances: compare differences, not ratios.
+    ``mode="thesis"`` is figure 3.8 as printed: distances negated, and the event horizon at 0.
     """
     import matplotlib.pyplot as plt
 
-    of = {}
+    of, printed = {}, _printed("trial_distances", mode)
     for name, result in _named("trial_distances", results).items():
         distance, log_p, failure, counts = _columns("trial_distances", result)
         failure = failure & counts
         of[name] = (
-            distance[counts],
+            -distance[counts] if printed else distance[counts],
             log_p[failure & np.isfinite(log_p)],
             f"{counts.sum():,} episodes, {failure.sum():,} fail",
         )
@@ -85,8 +100,10 @@ def trial_distances(results, bins=60, axes=None):
         )
         axes = style.panels("trial_distances", axes, 2, "histogram")[:2]
         for column, (ax, what) in enumerate(
-            zip(axes, ("miss distance", "log p of failures"), strict=True)
+            zip(axes, (("miss distance", "-d")[printed], "log p of failures"), strict=True)
         ):
+            if printed and not column:
+                ax.axvline(0, color=style.INK, linewidth=1, linestyle="--", label="event horizon")
             every = np.concatenate([rows[column] for rows in of.values()])
             edges = (
                 np.histogram_bin_edges(
@@ -121,6 +138,13 @@ def trial_distances(results, bins=60, axes=None):
                     "none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=style.GREY
                 )
     return axes
+
+
+def _printed(caller, mode):
+    """Whether the picture is the thesis's; ValueError for another mode."""
+    if mode not in ("default", "thesis"):
+        raise ValueError(f'plot.{caller}: mode must be "default" or "thesis", received {mode!r}')
+    return mode == "thesis"
 
 
 def _named(caller, results):
@@ -166,3 +190,13 @@ def _running(distance, failure, counts):
         number > 0, np.minimum.accumulate(np.where(counts, distance, np.inf), 0), np.nan
     )
     return mean, least, np.cumsum(failure & counts, 0)
+
+
+def _deviation(distance, counts):
+    """Running standard deviation of the distances, [n, trees]; NaN before the first."""
+    number = np.cumsum(counts, 0)
+    safe = np.maximum(number, 1)
+    middle = distance[counts].mean() if counts.any() else 0.0
+    centred = np.where(counts, distance - middle, 0)
+    square = np.cumsum(centred**2, 0) / safe - (np.cumsum(centred, 0) / safe) ** 2
+    return np.where(number > 0, np.sqrt(np.maximum(square, 0)), np.nan)
