@@ -507,6 +507,20 @@ def test_a_forest_beats_random_search():
     assert result.best.reward > random.reward.max()
 
 
+@pytest.mark.parametrize("name", ferry_now(["ferry", "landing"]))
+def test_the_best_paths_that_do_not_fail(name):
+    """One a tree without a failure, by falling reward; they replay to what they say."""
+    result = once(name)
+    misses, safe = result.misses, ~result.failing_per_tree
+    assert len(misses.reward) == safe.sum() and not misses.failure.any()
+    np.testing.assert_array_equal(misses.reward, -np.sort(-result.best_reward_per_tree[safe]))
+    for i in range(min(2, len(misses.reward))):
+        one = jax.tree.map(lambda a, i=i: a[i], misses._replace(states=None))
+        again = jast.replay(SYSTEMS[name], one.disturbances, x0=one.x0)
+        assert not again.failure and again.distance == pytest.approx(one.distance, rel=1e-5)
+    assert len(searched(name, top=1).misses.reward) <= 1
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("search", "share", "within"), [(forest, 0.298, 0.04), (mcts, 0.405, 0.045)]

@@ -112,6 +112,10 @@ class SearchResult(NamedTuple):
     """The trees themselves (`jast.search.tree.edges.Branches`), where the search was asked to
     ``keep_trees``: for `jast.plot.tree`.
     """
+    misses: Any = None
+    """Of trees: the best episodes that do not fail, of trees that found no failure, one a tree, at
+    most ``top`` of them by falling reward: an `Episode` with a leading axis, without states.
+    """
 
     simulator_steps = results.alias("steps")
 

@@ -70,7 +70,16 @@ def result(
         roots=roots,
         heads=None if school is None else school.heads,
         lessons=() if school is None else school.lessons,
+        misses=_misses(harvests, top),
     )
+
+
+def _misses(harvests: list[Harvest], top: int) -> Episode:
+    """The ``top`` best episodes of trees that found no failure, one a tree, by falling reward."""
+    own = [jax.tree.map(lambda a, h=h: a[: h.log.shape[1]], h.found) for h in harvests]
+    best = jax.tree.map(lambda *parts: np.concatenate(parts), *own)
+    rows = np.flatnonzero(~best.failure & np.isfinite(best.reward))
+    return _take(best, rows[np.argsort(-best.reward[rows], kind="stable")][:top])
 
 
 def _trials(harvests: list[Harvest], value, failed, fresh) -> Trials | None:
