@@ -184,6 +184,14 @@ def table_of(xs, counts, n=1000, **more):
     return Sweep({"gain": tuple(xs), **more}, found, none, none, {})
 
 
+def test_a_setting_may_be_called_as_a_column():
+    table = table_of([1.0, 2.0], [100, 0], interval=(5, 6), note=("a", "b"))
+    lines = str(table).splitlines()
+    names = ["gain", "interval", "note", "probability", "interval", "episodes", "note"]
+    assert lines[0].split() == names
+    assert lines[1].split()[:4] == ["1", "5", "a", "0.1"] and lines[2].endswith("UNRELIABLE")
+
+
 def test_the_crossing_of_a_straight_line_and_its_interval():
     """log p falls by log 10 a unit: the crossing of .01 lies at 1, and that of the intervals where
     theirs does.

@@ -91,7 +91,7 @@ class Sweep(NamedTuple):
     @property
     def episodes(self) -> int:
         """Episodes simulated in all."""
-        return sum(r.episodes for r in self.results if hasattr(r, "episodes"))
+        return sum(getattr(r, "episodes", None) or 0 for r in self.results)
 
     def crossing(
         self, level: float = 1e-6, against: str | None = None, unreliable: bool = False
@@ -163,16 +163,13 @@ class Sweep(NamedTuple):
 
     def __str__(self):
         rows = [_row(*each) for each in zip(self.results, self.errors)]
-        columns = {k: [_text(v) for v in values] for k, values in self.values.items()}
+        columns = [[k, *map(_text, values)] for k, values in self.values.items()]
         names = dict.fromkeys(k for row in rows for k in row if k != NOTE)
-        names = [*names, NOTE]
-        columns |= {k: [row.get(k, "") for row in rows] for k in names}
-        widths = {k: max(len(k), *map(len, v)) for k, v in columns.items()}
-        line = lambda cells: "  ".join(
-            c if k == NOTE else c.rjust(widths[k]) for k, c in zip(columns, cells)
-        ).rstrip()
-        head = [k for k in columns if k != NOTE or any(columns[NOTE])]
-        lines = [line(head), *map(line, zip(*columns.values(), strict=True))]
+        columns += [[k, *(row.get(k, "") for row in rows)] for k in names]
+        columns = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+        notes = [row.get(NOTE, "") for row in rows]
+        columns.append([NOTE if any(notes) else "", *notes])
+        lines = ["  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
         if "interrupted" in self.settings:
             lines.append(f"interrupted {self.settings['interrupted']}")
         return "\n".join(lines)
@@ -204,8 +201,8 @@ def _row(result, error):
     if best is not None:
         cells["best log p"] = f"{float(best.log_prob):.6g}"
         cells["fails"] = "yes" if best.failure else "no"
-    if hasattr(result, "episodes"):
-        cells["episodes"] = f"{result.episodes}"
+    if (episodes := getattr(result, "episodes", None)) is not None:
+        cells["episodes"] = f"{episodes}"
     elif not cells:
         cells["result"] = shorten(str(result), WIDE, placeholder=" ...")
     if "probability" in cells and not a.reliable:
