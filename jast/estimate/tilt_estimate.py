@@ -38,14 +38,12 @@ by all batches, where the proposal does not cover it; standard errors that may b
 
 def first(s: Any) -> TiltSeeker | None:
     """The `TiltSeeker` of a system of many steps or with choices, after its search; None for
-    another system, and where Gaussians served a similar one. ``s``: the `Seeker`, which pays.
+    another system. ``s``: the `Seeker`, which pays.
     """
     if isinstance(s.near, Tilts):
         t = _sought(s, from_near(s.next_key(), s.sim, s.near), SHARE * s.budget)
         if t.serves(SERVES):
             return t
-    elif s.near is not None:
-        return None
     t = TiltSeeker(s.next_key(), s.sim, 0)
     if not (t.about.choices or t.about.choices0 or s.sim.horizon >= LONG):
         return None
