@@ -177,12 +177,24 @@ def test_signals_end_a_call_with_what_is_done(key, ended_by):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def child(name, folder, **more):
-    """A process that makes a call of `CALLS` with a checkpoint."""
+def taught(key, **how):
+    """A forest whose heads learn between two rounds, without the heads' functions."""
+    found = forest(
+        key, ferry(), trees=6, prunes=3, simulations=60, lanes=2, refine=0, heads="rollout", **how
+    )
+    heads = found.heads
+    return found._replace(heads=(heads.policy.params, heads.inputs, heads.returns))
+
+
+KILLED = CALLS | {"heads": taught}
+
+
+def child(name, folder):
+    """A process that makes a call of `KILLED` with a checkpoint."""
     code = (
         "import sys; sys.path.insert(0, 'tests'); import conftest, jax, test_units as t;"
         f"t.EPISODES = {EPISODES};"
-        f"t.CALLS[{name!r}](jax.random.key(7), checkpoint={str(folder)!r}, **{more})"
+        f"t.KILLED[{name!r}](jax.random.key(7), checkpoint={str(folder)!r})"
     )
     env = os.environ | dict(PYTHONPATH=str(ROOT))
     return subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, env=env)
@@ -405,16 +417,16 @@ def test_processes_of_an_executor_are_as_good_as_this_one(make, key, same, tmp_p
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["nominal", "forest"])
+@pytest.mark.parametrize("name", ["nominal", "forest", "heads", "failure_probability"])
 def test_twenty_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "EPISODES", 2_000_000)
     key, rng = jax.random.key(7), np.random.default_rng(0)
-    whole, lasting = CALLS[name](key), 0
+    whole, lasting = KILLED[name](key), 0
     for i, delay in enumerate(rng.uniform(0, 0.3, 20)):
         folder = tmp_path / str(i)
         folder.mkdir()
         lasting += killed(name, folder, delay) is not None
-        same(CALLS[name](key, checkpoint=folder), whole)
+        same(KILLED[name](key, checkpoint=folder), whole)
     assert lasting > 0
 
 
