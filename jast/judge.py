@@ -45,8 +45,8 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
         part = z[i : i + lanes]
         padded = np.zeros((lanes, d), z.dtype)
         padded[: len(part)] = part
-        run = partial(_in_blocks, sim)
-        out.append(answered(run, padded, np.int32(len(part)), rows=len(part)))
+        run = lambda part, all=padded: _in_blocks(sim, all, np.int32(len(part)))
+        out.append(answered(run, part, rows=len(part)))
     return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
 
 
