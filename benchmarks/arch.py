@@ -62,34 +62,27 @@ def random(key, sim, budget):
     return S.monte_carlo(key, sim, episodes=budget, refine=0).first_failure
 
 
-def cem(key, sim, budget):
-    samples = min(25, budget)
-    found = S.cem(
-        key,
-        sim,
-        samples=samples,
-        elites=max(1, samples // 5),
-        iterations=budget // samples,
-        reward=jast.rewards.lexicographic(near=1.0, rare=1.0),
-        actions=jast.actions.quantiles(),
-        refine=0,
-    )
-    return found.first_failure
+def _guided(search, settings):
+    """A search of jast for failures over the levels of the inputs, with settings for a budget."""
 
-
-def _tree(search, settings):
     def method(key, sim, budget):
         told = jast.rewards.lexicographic(near=1.0, rare=1.0)
         actions = jast.actions.quantiles()
         found = search(key, sim, reward=told, actions=actions, refine=0, **settings(budget))
-        return found.first_failure
+        first = found.first_failure
+        return first if first is not None and first <= budget else None
 
     return method
 
 
+def _generations(budget):
+    samples = min(25, budget)
+    return dict(samples=samples, elites=max(1, samples // 5), iterations=budget // samples)
+
+
 def _peer(name):
     """A peer of `benchmarks.peers`, over the levels of the inputs from the middle of their ranges,
-    a level at a time; what is outside of [0, 1] is clipped.
+    one simulation at a time; what is outside of [0, 1] is clipped.
     """
 
     def method(key, sim, budget):
@@ -115,9 +108,11 @@ def _peer(name):
 METHODS = {
     "falsify": falsify,
     "random": random,
-    "cem": cem,
-    "mcts": _tree(S.mcts, lambda budget: dict(simulations=budget)),
-    "forest": _tree(S.forest, lambda n: dict(trees=1, prunes=min(18, n), simulations=-(-n // 18))),
+    "cem": _guided(S.cem, _generations),
+    "mcts": _guided(S.mcts, lambda n: dict(simulations=n)),
+    "forest": _guided(
+        S.forest, lambda n: dict(trees=1, prunes=min(18, n), simulations=-(-n // 18))
+    ),
     "cma_es": _peer("cma_es"),
     "bayesian": _peer("expected_improvement"),
 }
