@@ -205,7 +205,7 @@ def start(
     **settings,
 ):
     """A `Search` with the settings of `ce_method`, `ce_surrogate` or `ce_mixture`, for an objective
-    that need not be written in JAX:
+    that need not be written in JAX::
 
         search = start(key, proposal, samples=10, iterations=10)
         while not search.done:

@@ -1,0 +1,46 @@
+"""The documentation: ``python -m sphinx -W -c docs . docs/build``."""
+
+import re
+
+import jast
+
+project, author, copyright = "jast", "the authors of jast", "the authors of jast"
+version = release = jast.__version__
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+root_doc = "docs/index"
+include_patterns = ["docs/**", "notebooks/**", "CHANGELOG.md", "CONTRIBUTING.md"]
+exclude_patterns = ["docs/build"]
+html_theme, html_title = "sphinx_book_theme", "jast"
+
+nb_execution_mode = "off"  # notebooks are committed with what they printed
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+default_role = "py:obj"
+suppress_warnings = ["ref.python"]  # a word in backticks may be the name of several fields
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 90
+napoleon_numpy_docstring = False
+
+
+def _bars(app, what, name, obj, options, lines):
+    """Docstrings write |x| for an absolute value, which is no substitution."""
+    lines[:] = [re.sub(r"(``.*?``)|\|", lambda m: m[1] or r"\|", line) for line in lines]
+
+
+def _others(app, what, name, obj, skip, options):
+    """Names of other packages have their own documentation."""
+    module = getattr(obj, "__module__", None)
+    return skip or (isinstance(module, str) and module.split(".")[0] in ("distrax", "jax"))
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", _bars)
+    app.connect("autodoc-skip-member", _others)

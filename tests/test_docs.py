@@ -1,0 +1,67 @@
+"""The documentation: it builds without a warning, what it shows runs, and nothing that is exported is
+missing from its reference.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import jast
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "docs/start.md", *sorted((ROOT / "docs/guides").glob("*.md"))]
+ROOMS = [name for name in jast.__all__ if isinstance(getattr(jast, name), ModuleType)]
+
+
+def python(*arguments, cwd):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": path, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_code_of_a_page_runs(page, tmp_path):
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
+    assert blocks
+    (tmp_path / "page.py").write_text("\n".join(blocks))
+    assert python("page.py", cwd=tmp_path)
+
+
+@pytest.mark.long
+def test_it_builds_without_a_warning(tmp_path):
+    pytest.importorskip("myst_nb", reason="needs the extra `docs`")
+    python("-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", ".", str(tmp_path), cwd=ROOT)
+    assert (tmp_path / "docs/index.html").exists()
+
+
+def test_every_room_has_a_page():
+    pages = {path.stem for path in (ROOT / "docs/api").glob("*.md")}
+    assert set(ROOMS) <= pages
+    listed = (ROOT / "docs/index.md").read_text()
+    assert all(f"api/{page}" in listed for page in pages)
+
+
+def test_every_name_at_the_top_has_its_documentation():
+    text = (ROOT / "docs/api/jast.md").read_text()
+    for name in set(jast.__all__) - set(ROOMS):
+        assert name in text, name
+
+
+def test_links_lead_somewhere():
+    for page in [*PAGES, *(ROOT / "docs").glob("*.md"), ROOT / "CONTRIBUTING.md"]:
+        for link in re.findall(r"\]\(((?!http|#)[^)#]+)", page.read_text()):
+            assert (page.parent / link).exists(), (page, link)
