@@ -1,5 +1,5 @@
-"""The documentation: it builds without a warning, what it shows runs, and nothing that is exported is
-missing from its reference.
+"""The documentation: it builds without a warning, what it shows runs, and its reference has all that
+is exported.
 """
 
 import os
