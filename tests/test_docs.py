@@ -1,5 +1,5 @@
-"""The documentation: it builds without a warning, what it shows runs, and its reference has all that
-is exported.
+"""The documentation: it builds without a warning, what it shows runs, and all that is exported is in
+its reference.
 """
 
 import os
