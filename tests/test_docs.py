@@ -1,6 +1,4 @@
-"""The documentation: it builds without a warning, what it shows runs, and all that is exported is in
-its reference.
-"""
+"""The documentation: it builds without a warning, what it shows runs, and its reference is whole."""
 
 import os
 import re
