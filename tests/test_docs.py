@@ -1,4 +1,4 @@
-"""The documentation: it builds without a warning, what it shows runs, and its reference is whole."""
+"""The documentation: it builds without a warning, and what it shows runs."""
 
 import os
 import re
