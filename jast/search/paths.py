@@ -24,8 +24,8 @@ be: this share of its log p, which is what a tenth of the way makes in normal nu
 nats.
 """
 PAIRS, LEAST, IN_VAIN = 32, 2, 4
-"""Paths looked for at a time, of all modes together and at least of each; times in a row that join
-no two modes, after which it is enough.
+"""Paths looked for at a time, of all modes together and at least of each; times in a row in which
+others join no two modes, after which it is enough.
 """
 
 
@@ -46,45 +46,68 @@ def components(
     Returns:
         [N]: a number of the component of each.
     """
-    cosine, owner = unit(v) @ unit(v).T, np.arange(len(v))
+    cosine, owner, edges = unit(v) @ unit(v).T, np.arange(len(v)), np.zeros((0, 2), int)
     untried, left = cosine > OPPOSITE, n
-    # straight from one of the first n to another, or by way of others: what pays is done more often
-    reach, joins, tries, in_vain = (n, len(v)), [1, 1], [1, 1], [0, 0]
-    while left > 1 and (ways := [w for w in (0, 1) if in_vain[w] < IN_VAIN]):
+    # straight from one of the first n to another, until all are tried, or by way of others, until
+    # that is in vain: what pays is done more often
+    reach, joins, tries, in_vain, most = (n, len(v)), [1, 1], [1, 1], [0, 0], (np.inf, IN_VAIN)
+    while left > 1 and (ways := [w for w in (0, 1) if in_vain[w] < most[w]]):
         way = max(ways, key=lambda w: joins[w] / tries[w])
-        few = np.arange(reach[way])
-        open = untried[np.ix_(few, few)] & _on_the_way(owner, cost, few[:, None], few)
-        pairs = _nearest_pairs(cosine[np.ix_(few, few)], open, owner[few], np.unique(owner[:n]))
-        if not pairs:
-            in_vain[way] = IN_VAIN
+        few = np.ix_(np.arange(reach[way]), np.arange(reach[way]))
+        open = untried[few] & _useful(owner, cost, n)[few]
+        pairs = _nearest_pairs(cosine[few], open, owner[: reach[way]], np.unique(owner[:n]))
+        if not len(pairs):
+            in_vain[way] = np.inf
             continue
-        if not paths.room:
-            _join(owner, cost, *np.nonzero(np.triu(untried & (cosine > ALIKE), 1)[:n, :n]))
-            break
-        i, j = np.array(sorted(pairs, key=lambda pair: -cosine[pair])[: paths.room]).T
-        untried[i, j] = untried[j, i] = False
-        joined = paths.between((v[i], ends[i]), (v[j], ends[j]))
-        _join(owner, cost, i[joined], j[joined])
+        if paths.room:
+            pairs = pairs[: paths.room]
+            i, j = pairs.T
+            joined = paths.between((v[i], ends[i]), (v[j], ends[j]))
+        else:
+            pairs = np.argwhere(np.triu(untried[:n, :n], 1))
+            joined = cosine[tuple(pairs.T)] > ALIKE
+        untried[tuple(pairs.T)] = untried[tuple(pairs.T[::-1])] = False
+        edges = np.concatenate([edges, pairs[joined]])
+        owner = _grown(edges, cost, n)
         fewer = left - (left := len(np.unique(owner[:n])))
         in_vain[way] = 0 if fewer else in_vain[way] + 1
-        joins[way], tries[way] = joins[way] + fewer, tries[way] + len(i)
+        joins[way], tries[way] = joins[way] + fewer, tries[way] + len(pairs)
     return owner
 
 
-def _on_the_way(owner, cost, i, j):
-    """Of which of the pairs ``i``, ``j``, of two components, neither is much rarer than both of
-    these.
+def _limit(low):
+    """How rare a failure may be that joins modes of which the rarer one has the cost ``low``."""
+    return low + np.maximum(RARER * low, NATS)
+
+
+def _useful(owner, cost, n):
+    """Of which pairs [N, N] a path could join two modes."""
+    low = np.full(len(cost), cost[:n].max())
+    tops = np.unique(owner[:n])
+    low[tops] = [cost[:n][owner[:n] == k].min() for k in tops]
+    rarest = np.maximum(low[owner][:, None], low[owner])
+    return (np.maximum(cost[:, None], cost) <= _limit(rarest)) & (owner[:, None] != owner)
+
+
+def _grown(edges, cost, n):
+    """The component of each, by the paths ``edges`` [m, 2], likely ones first: so where two with
+    some of the first ``n`` meet it is by the likeliest way between them, and they stay two modes if
+    that is too rare.
     """
-    low = np.full(len(cost), np.inf)
-    np.minimum.at(low, owner, cost)
-    rarest = np.maximum(low[owner[i]], low[owner[j]])
-    near = np.maximum(cost[i], cost[j]) <= rarest + np.maximum(RARER * rarest, NATS)
-    return near & (owner[i] != owner[j])
+    owner, low = np.arange(len(cost)), np.where(np.arange(len(cost)) < n, cost, np.inf)
+    rarer = cost[edges].max(axis=1)
+    for k in np.argsort(rarer, kind="stable"):
+        a, b = owner[edges[k]]
+        rarest = max(low[a], low[b])
+        if a != b and (rarest == np.inf or rarer[k] <= _limit(rarest)):
+            owner[owner == a] = b
+            low[b] = min(low[a], low[b])
+    return owner
 
 
 def _nearest_pairs(cosine, open, owner, tops):
-    """Of each of the components ``tops`` those of the pairs ``open`` [N, M] that are nearest in
-    direction: a set of pairs.
+    """Of each of the components ``tops`` those of the pairs ``open`` [N, N] that are nearest in
+    direction: [m, 2], the nearest first.
     """
     found, each = set(), max(LEAST, PAIRS // len(tops))
     for k in tops:
@@ -93,16 +116,7 @@ def _nearest_pairs(cosine, open, owner, tops):
         best = np.argsort(-worth, axis=None, kind="stable")[:each]
         a, b = np.unravel_index(best[np.isfinite(worth.flat[best])], worth.shape)
         found.update((min(pair), max(pair)) for pair in zip(mine[a].tolist(), b.tolist()))
-    return found
-
-
-def _join(owner, cost, i, j):
-    """Put the components of ``i`` and ``j`` [m] together, in place: those of likely pairs first, as
-    what is on the way between two of them is no longer so between what these have become.
-    """
-    for k in np.argsort(np.maximum(cost[i], cost[j]), kind="stable"):
-        if _on_the_way(owner, cost, i[k], j[k]):
-            owner[owner == owner[i[k]]] = owner[j[k]]
+    return np.array(sorted(found, key=lambda pair: -cosine[pair]), int).reshape(-1, 2)
 
 
 def assigned(paths, many, known, owner):
@@ -152,15 +166,18 @@ class Paths:
 
     def between(self, first, second):
         """Whether there is a path between each of the failures ``first`` and that of ``second``
-        (points [n, D], steps [n]), as they are or with the first moved in time: [n].
+        (points [n, D], steps [n]), as they are or with the shorter one moved in time, so that both
+        end together: [n].
         """
         (v, v_ends), (w, w_ends) = first, second
         joined = self.straight(v, w)
         rows = np.flatnonzero(~joined & (v_ends != w_ends))
         if len(rows):
-            steps = (w_ends - v_ends)[rows]
-            moved = jax.vmap(partial(moved_in_time, self.sim))(v[rows], steps)
-            joined[rows] = self.straight(np.asarray(moved), w[rows], of_both=True)
+            sooner = (v_ends <= w_ends)[rows, None]
+            early, late = np.where(sooner, v[rows], w[rows]), np.where(sooner, w[rows], v[rows])
+            steps = np.abs(w_ends - v_ends)[rows]
+            moved = jax.vmap(partial(moved_in_time, self.sim))(early, steps)
+            joined[rows] = self.straight(np.asarray(moved), late, of_both=True)
         return joined
 
     def straight(self, v, w, of_both=False):
