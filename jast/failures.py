@@ -62,8 +62,12 @@ class Failures:
     def __getitem__(self, i: int | slice) -> "Episode | Failures":
         if not isinstance(i, slice):
             return self.episode(index(i))
-        rows = _take((self.episodes, self.counts, self.tree, self.simulation), i)
-        return Failures(*rows, self.seen, self.dropped)
+        return self.take(i)
+
+    def take(self, rows: slice | np.ndarray) -> "Failures":
+        """The archive of these ``rows``, a slice or rising numbers."""
+        taken = _take((self.episodes, self.counts, self.tree, self.simulation), rows)
+        return Failures(*taken, self.seen, self.dropped)
 
     def __iter__(self) -> Iterator[Episode]:
         return (self.episode(i) for i in range(len(self)))

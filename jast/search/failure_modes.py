@@ -14,7 +14,7 @@ from jast.limit_state import normal_of, unit
 from jast.rewards import likelihood
 from jast.search.centred import centred
 from jast.search.moves import moved_in_time
-from jast.search.paths import Paths, assigned, components
+from jast.search.paths import ALIKE, Paths, assigned, components
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
@@ -122,6 +122,19 @@ def _cost(paths, sim, failures):
     other = not np.isclose(score(failures[0]), known[0])
     paths.judge.spent += 1 + other * len(failures)
     return -np.array([score(e) for e in failures]) if other else -known
+
+
+def spread(sim: Simulator, failures: Failures, top: int) -> Failures:
+    """At most ``top`` of ``failures``: the best, which are the first half, and of the others those
+    that have the fewest better ones in their direction, so that no mode crowds out another one.
+    """
+    if len(failures) <= top:
+        return failures
+    ways = unit(np.asarray(normal_of(centred(sim), failures.episodes), np.float64))
+    better = np.tril(ways @ ways.T > ALIKE, -1).sum(axis=1)
+    better[: top // 2] = 0
+    rows = np.sort(np.argsort(better, kind="stable")[:top])
+    return failures.take(rows)
 
 
 def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:

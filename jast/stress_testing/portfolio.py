@@ -17,7 +17,7 @@ from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked
 from jast.rewards import likelihood
-from jast.search.failure_modes import Mode, Modes, modes
+from jast.search.failure_modes import Mode, Modes, modes, spread
 from jast.search.refinement import refine
 from jast.simulator import Simulator
 from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points, onward
@@ -191,21 +191,21 @@ class _Work:
     def gather(self, name: str, haul: Haul) -> Failures:
         """The failures that an explorer brought in, which join the pool."""
         found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        self.pool = merge(self.pool, found, top=8 * self.top)
+        self.pool = merge(self.pool, found, top=32 * self.top)
         self.note(name, haul.evaluations, haul.failing, _best(found), haul.invalid)
         return found
 
     def refine(self):
         """The pool to where log p is greatest: many failures a little, then each mode's best."""
-        self.failures = self.pool
         if not len(self.pool):
             return
         if not self.latent:
-            best = self.pool[0]
+            self.failures, best = self.pool, self.pool[0]
             self.modes = Modes([Mode(best, int(self.pool.counts.sum()), 1.0)])
             return
+        self.pool = spread(self.sim, self.pool, 8 * self.top)
+        self.failures = chosen = self.pool
         budget = self.parts.refine
-        chosen = self.pool
         for part in (1.0,) if budget < FEW else (0.5, 0.5):
             if chosen is not self.pool and not self.settled():
                 chosen = self.onward(chosen)
