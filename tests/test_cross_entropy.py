@@ -731,6 +731,8 @@ def test_mode_thesis_is_the_published_code():
         alpha=1.0,
         surrogate="gaussian process",
         kernel="squared exponential",
+        basis="gaussian",
+        degree=2,
     )
     assert MODES["ce_method"]["thesis"] == dict(elitism=False)
     assert MODES["ce_surrogate"]["thesis"] == published
