@@ -78,8 +78,7 @@ def modes(
     the origin (the episode of modes) than the arc itself. The same failure some steps sooner or
     later is of the same mode: where there is no path, one is looked for once more from the shorter
     one moved in time, so that both end together. A path may lead by way of other failures
-    that are known, where none is much rarer than both ends: by more than a nat and more than .21 of
-    their log p relative to the mode.
+    that are known, where none is more than a nat rarer than both ends.
 
     Args:
         sim: the simulator; its disturbances have quantile functions.

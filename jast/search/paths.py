@@ -18,11 +18,8 @@ LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
 path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
 least of those that are alike.
 """
-RARER, NATS = 0.21, 1.0
-"""How much rarer than the rarer of two modes' likeliest failures one on the way between them may
-be: this share of its log p, which is what a tenth of the way makes in normal numbers, or so many
-nats.
-"""
+RARER = 1.0
+"""By how many nats one on the way between two modes may be rarer than the rarer of the two."""
 PAIRS, LEAST, IN_VAIN = 32, 2, 4
 """Paths looked for at a time, of all modes together and at least of each; times in a row in which
 others join no two modes, after which it is enough.
@@ -75,18 +72,13 @@ def components(
     return owner
 
 
-def _limit(low):
-    """How rare a failure may be that joins modes of which the rarer one has the cost ``low``."""
-    return low + np.maximum(RARER * low, NATS)
-
-
 def _useful(owner, cost, n):
     """Of which pairs [N, N] a path could join two modes."""
     low = np.full(len(cost), cost[:n].max())
     tops = np.unique(owner[:n])
     low[tops] = [cost[:n][owner[:n] == k].min() for k in tops]
     rarest = np.maximum(low[owner][:, None], low[owner])
-    return (np.maximum(cost[:, None], cost) <= _limit(rarest)) & (owner[:, None] != owner)
+    return (np.maximum(cost[:, None], cost) <= rarest + RARER) & (owner[:, None] != owner)
 
 
 def _grown(edges, cost, n):
@@ -99,7 +91,7 @@ def _grown(edges, cost, n):
     for k in np.argsort(rarer, kind="stable"):
         a, b = owner[edges[k]]
         rarest = max(low[a], low[b])
-        if a != b and (rarest == np.inf or rarer[k] <= _limit(rarest)):
+        if a != b and (rarest == np.inf or rarer[k] <= rarest + RARER):
             owner[owner == a] = b
             low[b] = min(low[a], low[b])
     return owner
