@@ -197,14 +197,14 @@ def kills(name, sizes, runs, longest):
 
 def report(args):
     sizes = size(args, (100_000, 200, 100_000), (100_000, 16, 20_000), (2000, 8, 5000))
-    repeats, names = size(args, 15, 5, 1), size(args, None, None, ["nominal"])
+    repeats, names = size(args, 15, 3, 1), size(args, None, None, ["nominal"])
     found = dict(overhead={}, checkpoint={}, workers={}, kills={})
     for name in names or calls(*sizes):
         call = calls(*sizes)[name]
         found["overhead"][name] = ratio(call, looped(call), repeats)
         found["checkpoint"][name] = ratio(kept(call), call, repeats)
     if not args.smoke:
-        n, episodes, repeats = size(args, (4_000_000, 1280, 5), (1_000_000, 640, 3), None)
+        n, episodes, repeats = size(args, (4_000_000, 1280, 5), (1_000_000, 640, 1), None)
         of_ferry = lambda **how: jast.nominal(KEY, ferry(), n, **how)
         found["workers"]["S0"] = speedup(of_ferry, repeats)
         found["workers"]["black box, 5 ms"] = speedup(black_box(episodes), repeats)
