@@ -48,12 +48,12 @@ def linear(steps, beta=4.55, sides=1, decay=0.95):
     )
 
 
-def lane():
-    """The lane of the README: a car keeps its lane in gusts of wind."""
+def lane(gain=0.3):
+    """The lane of the README: a car keeps its lane in gusts of wind, steering back by ``gain``."""
 
     def step(car, gust):
         offset, speed = car
-        speed = 0.8 * speed - 0.3 * offset + 0.1 * gust
+        speed = 0.8 * speed - gain * offset + 0.1 * gust
         return jnp.stack([offset + speed, speed])
 
     return jast.Simulator(

@@ -9,7 +9,6 @@ has a known probability: its rows say how many intervals hold it, and where it c
 import argparse
 import json
 import math
-import time
 from statistics import NormalDist
 
 import jax
@@ -17,30 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
+from benchmarks.ferry import timed
 from benchmarks.sizes import options, size
+from benchmarks.stress_systems import lane
 from jast.distributions import Normal
 from jast.estimate import failure_probability
 
-__all__ = ["lane", "run"]
+__all__ = ["run"]
 
 STEPS, LIMIT, LEVEL = 10, 7.0, 1e-5
-
-
-def lane(gain):
-    """The lane of the README; ``gain``: by which the car steers back."""
-
-    def step(car, gust):
-        offset, speed = car
-        speed = 0.8 * speed - gain * offset + 0.1 * gust
-        return jnp.stack([offset + speed, speed])
-
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(2),
-        step=step,
-        disturbance=lambda car: Normal(0.0, 1.0),
-        evaluate=lambda car: (jnp.abs(car[0]) >= 1.4, jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)),
-        horizon=30,
-    )
 
 
 def filtered(decay):
@@ -71,12 +55,12 @@ def run(name, n, budget):
     make, setting, low, high, truth = CASES[name]
     values, key = np.linspace(low, high, n), jax.random.key(0)
     swept = lambda **how: jast.sweep(key, make, {setting: values}, budget=budget, **how)
-    table, seconds = _timed(swept)
+    table, seconds, _ = timed(swept)
     calls = lambda: [
         failure_probability(jax.random.fold_in(key, i), make(v), budget)
         for i, v in enumerate(values)
     ]
-    apart, of_calls = _timed(calls)
+    apart, of_calls, _ = timed(calls)
     report = dict(
         values=n,
         budget=budget,
@@ -91,11 +75,6 @@ def run(name, n, budget):
         exact = _solved(truth, low, high)
         report |= dict(crossing=found.value, crossing_interval=found.interval, exact=exact)
     return report
-
-
-def _timed(work):
-    begin = time.process_time()
-    return work(), round(time.process_time() - begin, 2)
 
 
 def _worth(who, results, values, truth):

@@ -43,16 +43,17 @@ def components(
     Returns:
         [N]: a number of the component of each.
     """
-    cosine, owner, edges = unit(v) @ unit(v).T, np.arange(len(v)), np.zeros((0, 2), int)
+    ways, owner, edges = unit(v), np.arange(len(v)), np.zeros((0, 2), int)
+    cosine = ways @ ways.T
     untried, left = cosine > OPPOSITE, n
     # straight from one of the first n to another, until all are tried, or by way of others, until
     # that is in vain: what pays is done more often
     reach, joins, tries, in_vain, most = (n, len(v)), [1, 1], [1, 1], [0, 0], (np.inf, IN_VAIN)
     while left > 1 and (ways := [w for w in (0, 1) if in_vain[w] < most[w]]):
         way = max(ways, key=lambda w: joins[w] / tries[w])
-        few = np.ix_(np.arange(reach[way]), np.arange(reach[way]))
-        open = untried[few] & _useful(owner, cost, n)[few]
-        pairs = _nearest_pairs(cosine[few], open, owner[: reach[way]], np.unique(owner[:n]))
+        m = reach[way]
+        open = untried[:m, :m] & _useful(owner[:m], cost[:m], n)
+        pairs = _nearest_pairs(cosine[:m, :m], open, owner[:m], np.unique(owner[:n]))
         if not len(pairs):
             in_vain[way] = np.inf
             continue
@@ -74,7 +75,7 @@ def components(
 
 def _useful(owner, cost, n):
     """Of which pairs [N, N] a path could join two modes."""
-    low = np.full(len(cost), cost[:n].max())
+    low = np.full(owner.max() + 1, cost[:n].max())
     tops = np.unique(owner[:n])
     low[tops] = [cost[:n][owner[:n] == k].min() for k in tops]
     rarest = np.maximum(low[owner][:, None], low[owner])
