@@ -60,6 +60,20 @@ def test_every_name_at_the_top_has_its_documentation():
 
 
 def test_links_lead_somewhere():
-    for page in [*PAGES, *(ROOT / "docs").glob("*.md"), ROOT / "CONTRIBUTING.md"]:
+    for page in [*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md"]:
         for link in re.findall(r"\]\(((?!http|#)[^)#]+)", page.read_text()):
             assert (page.parent / link).exists(), (page, link)
+
+
+def test_the_list_of_figures_has_every_page_and_its_commands():
+    pages = {path.stem: path.read_text() for path in (ROOT / "docs/figures").glob("*.md")}
+    rows = re.findall(
+        r"\| \[.+?\]\(figures/(\w+)\.md\)(.*)", (ROOT / "docs/figures.md").read_text()
+    )
+    assert sorted(pages) == sorted(name for name, _ in rows)
+    for name, row in rows:
+        commands = re.findall(r"`(python -m benchmarks\.\w+)`", row)
+        assert commands
+        for command in commands:
+            assert command in pages[name], (name, command)
+            assert (ROOT / (command.split()[-1].replace(".", "/") + ".py")).exists(), command
