@@ -2,8 +2,10 @@
 disturbances are stored.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,11 @@ import numpy as np
 from jast import distributions as D
 from jast._jax import is_traced
 from jast.distributions.numerics import normal_score
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.distributions import Distribution
 
 __all__ = [
     "Quantiles",
@@ -33,7 +40,7 @@ class Samples:
     places_start = False
     focus = 1.0  # draws of the model are near its mode already
 
-    def draw(self, key, dist):
+    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
@@ -41,19 +48,21 @@ class Samples:
 
     draw_start = draw
 
-    def log_prob(self, x, dist):
+    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
         """Log density of `draw` at ``x``."""
         return dist.log_prob(x)
 
-    def near(self, x, dist, scale, start=False):
+    def near(
+        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+    ) -> chex.ArrayTree:
         """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
         return _towards_mode(x, dist, scale)
 
-    def at(self, u, dist):
+    def at(self, u: Any, dist: Distribution) -> chex.ArrayTree:
         """The disturbance at the point ``u`` of [0, 1)^d; uniform points are draws of ``dist``."""
         return D.quantile(dist, u)
 
-    def locate(self, x, dist):
+    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
         return D.cdf(dist, x)
 
@@ -63,42 +72,44 @@ class Samples:
 class Quantiles:
     """See `quantiles`."""
 
-    numbers: tuple = ()
+    numbers: tuple[Any, ...] = ()
     """The leaves of the proposal."""
     kind: Any = field(default=None, metadata=dict(static=True))
     """Its structure, or None without one."""
     focus = 1.0
 
     @property
-    def places_start(self):
+    def places_start(self) -> bool:
         """Whether `place` serves x0 as well: a proposal is one of steps."""
         return self.kind is None
 
-    def of(self, dist):
+    def of(self, dist: Distribution) -> Distribution:
         """The distribution whose quantiles they are."""
         return dist if self.kind is None else self.kind.unflatten(self.numbers)
 
-    def draw(self, key, dist):
+    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
         return self.place(_uniform_like(key, dist), dist)
 
-    def draw_start(self, key, dist):
+    def draw_start(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
         return D.quantile(dist, _uniform_like(key, dist))
 
-    def place(self, u, dist):
+    def place(self, u: Any, dist: Distribution) -> chex.ArrayTree:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(self.of(dist), u)
 
     at = place
 
-    def locate(self, x, dist):
+    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `place`."""
         return D.cdf(self.of(dist), x)
 
-    def log_prob(self, x, dist):
+    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
         """Log density of `draw` at ``x``."""
         return self.of(dist).log_prob(x)
 
-    def near(self, x, dist, scale, start=False):
+    def near(
+        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+    ) -> chex.ArrayTree:
         """``x`` drawn towards the mode of the distribution, by ``scale``; integers stay."""
         return _towards_mode(x, dist if start else self.of(dist), scale)
 
@@ -113,14 +124,14 @@ class UniformBox:
     places_start = False
     focus = 0.2  # a box knows nothing of the model
 
-    def draw(self, key, dist):
+    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
         return self.place(_uniform_like(key, dist), dist)
 
-    def draw_start(self, key, dist):
+    def draw_start(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
         """The box is one of steps: a random start is drawn from its own distribution."""
         return D.sample(dist, key)
 
-    def log_prob(self, x, dist):
+    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
         """Log density of `draw` at ``x``: uniform, -inf outside the box."""
 
         def of(x, low, high):
@@ -132,7 +143,9 @@ class UniformBox:
 
         return D.sum_parts(jax.tree.map(of, x, *self.ends(x)))
 
-    def near(self, x, dist, scale, start=False):
+    def near(
+        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+    ) -> chex.ArrayTree:
         """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""
         if start:
             return _towards_mode(x, dist, scale)
@@ -145,7 +158,7 @@ class UniformBox:
 
         return jax.tree.map(shrink, x, D.mode(dist), *self.ends(x))
 
-    def place(self, u, dist):
+    def place(self, u: Any, dist: Distribution) -> chex.ArrayTree:
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to
         ``high``, both included.
         """
@@ -160,7 +173,7 @@ class UniformBox:
 
     at = place
 
-    def locate(self, x, dist):
+    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
         """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box
         nearest to it. Integers: the middle of the cell.
         """
@@ -174,7 +187,7 @@ class UniformBox:
 
         return jax.tree.map(locate, x, *self.ends(x))
 
-    def ends(self, x):
+    def ends(self, x: Any) -> tuple[chex.ArrayTree, chex.ArrayTree]:
         """``low`` and ``high`` as pytrees like ``x``: each is one already, or an array that serves
         every one of ``x``. ValueError where it is neither.
         """
@@ -210,13 +223,13 @@ class Wide:
         """The distribution whose quantiles a search fits: the model."""
         return dist
 
-    def draw(self, key: jax.Array, dist: Any) -> Any:
+    def draw(self, key: chex.PRNGKey, dist: Any) -> Any:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
         return self.of_normal(_normal_like(key, dist), dist)
 
-    def draw_start(self, key: jax.Array, dist: Any) -> Any:
+    def draw_start(self, key: chex.PRNGKey, dist: Any) -> Any:
         """Likewise x0; drawn from its own distribution where that has no quantile function."""
         return self.draw(key, dist) if D.has_quantile(dist) else D.sample(dist, key)
 
@@ -251,14 +264,14 @@ class Wide:
         return _towards_mode(x, dist, scale if self.width is None else scale / self.width)
 
 
-def samples():
+def samples() -> Samples:
     """Disturbances drawn from the model p(x | s): always possible, also where the density is
     unknown (`jast.distributions.seeds`).
     """
     return Samples()
 
 
-def quantiles(proposal=None):
+def quantiles(proposal: Distribution | None = None) -> Quantiles:
     """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform
     points are draws of p.
 
@@ -292,7 +305,7 @@ def wide(width: Any = None) -> Wide:
     return Wide(width)
 
 
-def uniform(low, high):
+def uniform(low: chex.ArrayTree, high: chex.ArrayTree) -> UniformBox:
     """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or
     pytrees of them where x is one.
 

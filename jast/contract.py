@@ -6,7 +6,10 @@ handful of steps, for what only numbers show: NaN, densities of zero, randomness
 disturbance.
 """
 
+from __future__ import annotations
+
 import warnings
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,9 @@ from jast.outline import outline
 from jast.rounding import rounded
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    from jast.typing import Actions
+
 __all__ = ["check", "contract"]
 
 OBSERVED = 64
@@ -36,7 +42,7 @@ ACTIONS = {
 }
 
 
-def check(sim, actions=None):
+def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     """``sim`` itself, once every function was traced and a few steps were run; with ``actions`` (of
     `jast.actions`), whether they suit it.
 

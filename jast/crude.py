@@ -2,11 +2,13 @@
 is compared with.
 """
 
+from __future__ import annotations
+
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +28,12 @@ from jast.places import Post, Task
 from jast.policy import undisturbed
 from jast.progress import advance, begin, conclude
 from jast.watch import Watch
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.simulator import Simulator
+    from jast.typing import Callback, Executor, PathLike
 
 __all__ = ["nominal"]
 
@@ -89,16 +97,16 @@ class Nominal(NamedTuple):
 
 
 def nominal(
-    key,
-    sim,
-    episodes=100_000,
+    key: chex.PRNGKey,
+    sim: Simulator,
+    episodes: int = 100_000,
     *,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Nominal:
     """How does the system do when nobody searches? Simulate it under its own disturbance model:
     `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
 

@@ -3,8 +3,10 @@
 What an episode is stands in `jast.progress`; here whole ones are played and replayed.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,9 @@ from jast.progress import advance, begin, conclude
 from jast.pytrees import clear, fitted, padded, select
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Episode", "play_back", "replay", "rollout"]
 
 
@@ -29,33 +34,33 @@ class Episode(NamedTuple):
     nothing.
     """
 
-    x0: Any
+    x0: chex.ArrayTree
     """Initial disturbance, ``()`` for a system with one start."""
-    disturbances: Any
+    disturbances: chex.ArrayTree
     """[horizon, ...]: x_1 .. x_length in the first rows."""
-    log_prob: jax.Array
+    log_prob: chex.Array
     """True log density of x0 and the ``length`` steps: never normalised."""
-    distance: jax.Array
+    distance: chex.Array
     """Miss distance: the least, or the last one of an episodic system; inf where the simulator
     returned a number that is not finite.
     """
-    failure: jax.Array
+    failure: chex.Array
     """bool: ended in a failure event."""
-    length: jax.Array
+    length: chex.Array
     """int32: steps taken, 0 .. horizon."""
-    reward: jax.Array
+    reward: chex.Array
     """Sum of the reward over the episode; -inf where the simulator returned a number that is not
     finite.
     """
-    states: Any = None
+    states: chex.ArrayTree | None = None
     """[horizon + 1, ...]: s_0 .. s_length in the first rows, or None where they were not kept."""
 
 
 def rollout(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     policy: Policy | None = None,
-    reward: Callable = rewards.STANDARD,
+    reward: Callable[..., Any] = rewards.STANDARD,
 ) -> Episode:
     """Simulate one episode: `Episode`. ``jax.vmap`` over keys, simulators or policies gives many;
     differentiable in the simulator's and policy's parameters.
@@ -92,7 +97,7 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
 
 
 def replay(
-    sim: Simulator, episode: Any, x0: Any = None, reward: Callable = rewards.STANDARD
+    sim: Simulator, episode: Any, x0: Any = None, reward: Callable[..., Any] = rewards.STANDARD
 ) -> Episode:
     """Run recorded disturbances again: `Episode` with its states. Exact: the same input gives the
     same bits.

@@ -6,12 +6,14 @@ replay on the same platform agrees with them to the bit. All arrays are NumPy's:
 dtype whatever the precision that JAX is set to.
 """
 
+from __future__ import annotations
+
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import index
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -23,6 +25,11 @@ from jast.episode import Episode, replay
 from jast.outline import outline
 from jast.simulator import Simulator
 from jast.tables import from_json, to_csv, to_numpy
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import PathLike, Reward
 
 __all__ = ["Failures", "collect", "from_json", "load", "merge", "save", "to_csv", "to_numpy"]
 __dir__ = listed(__all__)
@@ -59,12 +66,12 @@ class Failures:
     def __len__(self) -> int:
         return len(self.counts)
 
-    def __getitem__(self, i: int | slice) -> "Episode | Failures":
+    def __getitem__(self, i: int | slice) -> Episode | Failures:
         if not isinstance(i, slice):
             return self.episode(index(i))
         return self.take(i)
 
-    def take(self, rows: slice | np.ndarray) -> "Failures":
+    def take(self, rows: slice | np.ndarray) -> Failures:
         """The archive of these ``rows``, a slice or rising numbers."""
         taken = _take((self.episodes, self.counts, self.tree, self.simulation), rows)
         return Failures(*taken, self.seen, self.dropped)
@@ -72,7 +79,7 @@ class Failures:
     def __iter__(self) -> Iterator[Episode]:
         return (self.episode(i) for i in range(len(self)))
 
-    def replace(self, **changes: Any) -> "Failures":
+    def replace(self, **changes: Any) -> Failures:
         """The archive with other fields."""
         return replace(self, **changes)
 
@@ -98,7 +105,7 @@ class Failures:
             )
         return _take(self.episodes, i)
 
-    def __str__(self):
+    def __str__(self) -> str:
         found = f"{int(self.seen)} failing episode{'s' * (self.seen != 1)} simulated"
         if self.dropped:
             found += f", {int(self.dropped)} did not replay to a failure"
@@ -133,7 +140,15 @@ def empty(sim):
     )
 
 
-def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64):
+def collect(
+    sim: Simulator,
+    reward: Reward,
+    episodes: Episode,
+    tree: chex.Array | Sequence[int] | None = None,
+    simulation: chex.Array | Sequence[int] | None = None,
+    seen: int | None = None,
+    top: int = 64,
+) -> Failures:
     """The ``top`` best distinct failures among candidate ``episodes`` (an `Episode` with a leading
     axis [m], NumPy or JAX): `Failures`.
 
@@ -186,7 +201,7 @@ def collect(sim, reward, episodes, tree=None, simulation=None, seen=None, top=64
     )
 
 
-def merge(a, b, top=64):
+def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
     """The ``top`` best distinct failures of two archives of one simulator and one reward:
     `Failures`; ``seen`` and ``dropped`` are added.
 
@@ -211,7 +226,7 @@ def merge(a, b, top=64):
     )
 
 
-def save(path: str | os.PathLike, failures: Failures, settings: dict | None = None) -> None:
+def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = None) -> None:
     """`jast.save` of an archive, with ``settings`` (a dict that JSON can hold: method, seed, counts
     ...) beside it; goes with the next version: save the result of the search, which has both.
 
@@ -224,7 +239,7 @@ def save(path: str | os.PathLike, failures: Failures, settings: dict | None = No
     files.store(path, "jast failures", failures, settings=settings)
 
 
-def load(path: str | os.PathLike, sim: Simulator | None = None) -> tuple[Failures, dict]:
+def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[str, Any]]:
     """``(Failures, settings)`` of a file of `save`: `jast.load` of an archive and the settings
     beside it; goes with the next version.
     """

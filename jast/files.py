@@ -6,9 +6,10 @@ of validations have formats of their own, which version 0.1.0 reads and wrote; a
 records (`jast.records`), in which those stand as parts.
 """
 
+from __future__ import annotations
+
 import importlib
-import os
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +17,9 @@ import numpy as np
 from jast import archive
 from jast.outline import outline
 from jast.records import decode, encode, place_of
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
 
 __all__ = ["load", "save"]
 
@@ -58,7 +62,7 @@ FUNCTIONS = (
 """Made of functions, which are in no file."""
 
 
-def save(path: str | os.PathLike, result: Any) -> None:
+def save(path: PathLike, result: Any) -> None:
     """Write a result to the one file ``path``; an older file of that name stays whole until the new
     one is.
 
@@ -75,7 +79,7 @@ def save(path: str | os.PathLike, result: Any) -> None:
     store(path, FORMATS.get(place_of(result), "jast result"), result)
 
 
-def load(path: str | os.PathLike, sim: Any = None, *, heads: Any = None) -> Any:
+def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
     """What `save` wrote, equal to the bit; its arrays are NumPy's and keep their dtypes.
 
     Args:

@@ -2,14 +2,19 @@
 raised, so that a search goes on.
 """
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 from jax.tree_util import Partial
 
 from jast._doors import listed
+
+if TYPE_CHECKING:
+    from jast.simulator import Simulator
 
 __all__ = ["KINDS", "Incident", "incidents"]
 __dir__ = listed(__all__)
@@ -59,7 +64,7 @@ class Incident(NamedTuple):
     disturbances: Any
     """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one"""
 
-    def __str__(self):
+    def __str__(self) -> str:
         said = (
             self.message if self.message.startswith(self.kind) else f"{self.kind}: {self.message}"
         )
@@ -118,7 +123,7 @@ def hosted(sim):
     return any(True for _ in sources(sim, "incidents"))
 
 
-def incidents(sim):
+def incidents(sim: Simulator) -> tuple[Incident, ...]:
     """What has gone wrong so far in the host code behind ``sim``, by kind and message: a tuple of
     `Incident`; ``()`` for a simulator in JAX.
     """

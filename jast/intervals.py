@@ -1,5 +1,7 @@
 """Intervals for a probability. On the host, in double precision whatever the arrays' dtype."""
 
+from __future__ import annotations
+
 import math
 
 from jast._checks import real
@@ -11,7 +13,7 @@ SKEWED = 0.4
 """The greatest skewness of a mean that is corrected for; above it the series does not hold."""
 
 
-def clopper_pearson(k, n, level=0.95):
+def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
     """Exact (low, high) of a binomial probability after ``k`` events in ``n`` trials: covers at
     least ``level`` of the time (Clopper and Pearson, 1934).
 
@@ -84,7 +86,7 @@ def _betainc(a, b, x):
     return math.exp(log_front) * value if log_front > -745 else 0.0
 
 
-def chernoff(k, n, level=0.95):
+def chernoff(k: int, n: int, level: float = 0.95) -> float:
     """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u
     above k/n with n KL(k/n || u) = log(1 / (1 - level)).
 
@@ -100,7 +102,7 @@ def chernoff(k, n, level=0.95):
     return _solve(lambda u: 1.0 if u >= 1 else (kl(u) - bound if u > m else -1.0))
 
 
-def delta_bound(k, n, level=0.95):
+def delta_bound(k: int, n: int, level: float = 0.95) -> float:
     """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided, as
     Lipkis and Agogino print it (eq. 17): k/n + delta with exp(-n delta^2) = 1 - level, at most 1.
 
@@ -111,7 +113,7 @@ def delta_bound(k, n, level=0.95):
     return min(1.0, int(k) / int(n) + math.sqrt(-math.log1p(-level) / int(n)))
 
 
-def normal(mean, standard_error, level=0.95):
+def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[float, float]:
     """(low, high) of a normal distribution, mean -+ z standard_error, as Lipkis and Agogino print
     it (eq. 15 and 16). ``low`` may be below 0: `jast.estimate.Estimate` has a log-normal interval.
 
@@ -126,7 +128,7 @@ def normal(mean, standard_error, level=0.95):
     return float(mean) - half, float(mean) + half
 
 
-def jeffreys(k, n, level=0.95):
+def jeffreys(k: int, n: int, level: float = 0.95) -> float:
     """Upper end of the one-sided interval of ``level`` under Jeffreys' prior (Lipkis and Agogino,
     eq. 18): that quantile of Beta(k + 1/2, n - k + 1/2).
 

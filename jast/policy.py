@@ -2,6 +2,8 @@
 and a learned failure policy.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -27,7 +29,7 @@ class Policy:
     start: Callable[[], Any]
     disturbance: Callable[[Any, Any], Any]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
             if callable(value) and not isinstance(value, Partial):

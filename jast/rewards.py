@@ -19,9 +19,11 @@ An episodic system has no distance before its end: there ``distance`` and ``appr
 the end ``approach`` is -d.
 """
 
+from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,11 @@ from jax.tree_util import Partial
 from jast._jax import is_traced
 from jast.outline import outline
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Density, Reward
 
 __all__ = [
     "Episodic",
@@ -59,7 +66,9 @@ class Standard:
     event_bonus: Any = 0.0
     density: str = field(**_density)
 
-    def __call__(self, log_p, event, distance, terminal, approach=0.0):
+    def __call__(
+        self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
+    ) -> Any:
         return log_p + jnp.where(
             terminal, jnp.where(event, _like(self.event_bonus, log_p), -distance), 0
         )
@@ -75,10 +84,12 @@ class Episodic:
     mode: str = field(default="default", metadata=dict(static=True))
 
     @property
-    def once(self):
+    def once(self) -> bool:
         return self.mode == "thesis"
 
-    def __call__(self, log_p, event, distance, terminal, approach=0.0):
+    def __call__(
+        self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
+    ) -> Any:
         bonus = _like(self.bonus, log_p)
         if self.mode == "thesis":
             return jnp.where(event, bonus, 1) * (log_p - distance)  # eq. 3.2
@@ -95,7 +106,9 @@ class Shaped:
     event_bonus: Any = 0.0
     density: str = field(**_density)
 
-    def __call__(self, log_p, event, distance, terminal, approach=0.0):
+    def __call__(
+        self, log_p: Any, event: Any, distance: Any, terminal: Any, approach: Any = 0.0
+    ) -> Any:
         return (
             log_p
             + _like(self.scale, log_p) * approach
@@ -151,7 +164,7 @@ class Lexicographic:
         return jnp.where(log_p == -jnp.inf, -jnp.inf, value)  # the model never does that
 
 
-def standard(event_bonus=0.0, density="raw"):
+def standard(event_bonus: chex.Numeric = 0.0, density: Density = "raw") -> Standard:
     """Sum of every step's log p, plus ``event_bonus`` at a failure or less the miss distance at
     another end.
 
@@ -162,7 +175,11 @@ def standard(event_bonus=0.0, density="raw"):
     return Standard(event_bonus, _checked("standard", density))
 
 
-def episodic(bonus=100.0, density="raw", mode="default"):
+def episodic(
+    bonus: chex.Numeric = 100.0,
+    density: Density = "raw",
+    mode: Literal["default", "thesis"] = "default",
+) -> Episodic:
     """log p - d at a non-failing end; at a failure log p - d + (bonus - 1) max(-d, 0): thesis eq.
     3.2, ``(log p - d) bonus``, made monotone.
 
@@ -183,7 +200,9 @@ def episodic(bonus=100.0, density="raw", mode="default"):
     return Episodic(bonus, density=_checked("episodic", density), mode=mode)
 
 
-def shaped(scale, event_bonus=0.0, density="raw"):
+def shaped(
+    scale: chex.Numeric, event_bonus: chex.Numeric = 0.0, density: Density = "raw"
+) -> Shaped:
     """log p + scale (d(s) - d(s')) at every step, plus ``event_bonus`` on arrival at a failure:
     Lipkis and Agogino eq. 21, paid once.
 
@@ -239,19 +258,19 @@ def likelihood(sim: Simulator) -> LogLikelihood:
     return LogLikelihood(outline(sim).density)
 
 
-def density_of(reward):
+def density_of(reward: Reward) -> Density:
     """The density, "raw" or "mode", that ``reward`` wants its log p in."""
     return getattr(getattr(reward, "func", reward), "density", "raw")
 
 
-def once(reward):
+def once(reward: Reward) -> bool:
     """Whether ``reward`` is of whole episodes: called with the sum of their log p, and what it
     returns at the end is the episode's reward.
     """
     return getattr(getattr(reward, "func", reward), "once", False)
 
 
-def as_pytree(reward):
+def as_pytree(reward: Reward) -> Reward:
     """``reward`` as what `jax.jit` takes: a plain function becomes a `jax.tree_util.Partial`,
     static by identity.
     """

@@ -1,8 +1,9 @@
 """The one contract: a simulated system as a pytree of pure functions."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,9 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.distributions import Fixed
+
+if TYPE_CHECKING:
+    from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 
 __all__ = ["Simulator"]
 
@@ -52,32 +56,32 @@ class Simulator:
     whether the functions fit together.
     """
 
-    init: Callable[[Any], Any]
+    init: Init
     """x0 -> state: the state that the initial disturbance puts the system in (x0 is ``()`` with the
     default ``start``).
     """
-    step: Callable[[Any, Any], Any]
+    step: Step
     """(state, x) -> state: one deterministic transition; same shapes and dtypes as its input."""
-    disturbance: Callable[[Any], Any]
+    disturbance: Disturbance
     """state -> Distribution p(x | state): scalar ``log_prob``; x is an array or a pytree of arrays.
     """
-    evaluate: Callable[[Any], tuple]
+    evaluate: Evaluate
     """state -> (failure event: bool scalar, miss distance: float scalar, smaller is nearer to a
     failure). A third value, float, is log p that only the system knows, on top of what
     ``disturbance`` says: of the last disturbance, or of the whole episode where ``episodic``.
     """
     horizon: int = field(metadata=dict(static=True))
     """Greatest number of steps of an episode, at least 1; static."""
-    start: Callable[[], Any] = fixed
+    start: Start = fixed
     """() -> Distribution p(x0)."""
-    is_terminal: Callable[[Any], Any] = never
+    is_terminal: IsTerminal = never
     """state -> bool: ends the episode before the horizon without being a failure."""
-    observe: Callable[[Any], Any] = ravel
+    observe: Observe = ravel
     """state -> float vector, at most 64 numbers: what policies and networks see."""
     episodic: bool = field(default=False, metadata=dict(static=True))
     """``evaluate`` means something only at the end of an episode; static."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
             if f.metadata.get("static"):

@@ -2,11 +2,12 @@
 back from the page of a report.
 """
 
+from __future__ import annotations
+
 import csv
 import json
-import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -15,6 +16,9 @@ from jast.episode import Episode, replay
 from jast.fields import place
 from jast.outline import outline
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
 
 __all__ = ["from_json", "to_csv", "to_numpy"]
 
@@ -42,7 +46,7 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
     return out
 
 
-def to_csv(path: str | os.PathLike, failures: Any) -> None:
+def to_csv(path: PathLike, failures: Any) -> None:
     """Write failures to a table (comma-separated values), one row for each step.
 
     The columns are ``failure`` (from 1, the best first), ``step`` (from 1; 0 is the start) and the
@@ -83,7 +87,7 @@ def to_csv(path: str | os.PathLike, failures: Any) -> None:
                 table.writerow([i + 1, t + 1, *[""] * len(first), *row])
 
 
-def from_json(path: str | os.PathLike, sim: Simulator) -> Episode:
+def from_json(path: PathLike, sim: Simulator) -> Episode:
     """A failure that the page of a report gave as a file (`jast.stress_testing.Report.html`),
     played again to the bit.
 

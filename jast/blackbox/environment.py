@@ -2,6 +2,9 @@
 for it. Goes to the workers by value.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +22,7 @@ class Moment(NamedTuple):
     """The sum of the rewards so far"""
     terminated: bool
     truncated: bool
-    info: dict
+    info: dict[str, Any]
     env: Any
     """The environment itself, for what it does not show"""
 
@@ -89,7 +92,15 @@ class _Environment:
         return seen if seen.dtype.kind in "fiub" else np.zeros(0)
 
 
-def gymnasium_system(make, distance, *, event=None, agent=None, apply=None, seed=0):
+def gymnasium_system(
+    make: Callable[[], Any],
+    distance: Callable[[Moment], float],
+    *,
+    event: Callable[[Moment], bool] | None = None,
+    agent: Callable[[Any], Any] | None = None,
+    apply: Callable[[Any, Any], Any] | None = None,
+    seed: int = 0,
+) -> Callable[..., Any]:
     """A system for `from_python` from a Gymnasium environment: the agent is under test, the
     disturbances are what happens to its actions.
 

@@ -2,6 +2,8 @@
 memory of past outcomes. NumPy only, never JAX.
 """
 
+from __future__ import annotations
+
 import functools
 import threading
 import time
@@ -32,7 +34,7 @@ class Calls(NamedTuple):
     seconds: float
     """Wall time of the host calls"""
 
-    def __str__(self):
+    def __str__(self) -> str:
         each = self.seconds / max(self.rows, 1) * 1e3
         return (
             f"{self.episodes} episodes and {self.transitions} transitions in {self.calls} calls,"

@@ -2,17 +2,23 @@
 value: the standard library and NumPy only.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import shlex
 import shutil
 import signal
 import subprocess
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jast.blackbox.worker import WrongAnswer
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
 
 __all__ = ["program"]
 
@@ -49,7 +55,7 @@ class Program(NamedTuple):
             ) from None
 
 
-def program(command, *, folder=None):
+def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> Callable[..., Any]:
     """A system for `from_python` that runs an external program, once for each episode.
 
     ``command``: the program and its arguments, a list or one string (split as by a POSIX shell,

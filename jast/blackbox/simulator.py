@@ -2,9 +2,12 @@
 of its disturbances; only an outcome asks the host.
 """
 
+from __future__ import annotations
+
 import inspect
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +24,12 @@ from jast.contract import OBSERVED
 from jast.distributions.kinds import Seeds
 from jast.incidents import sources
 from jast.simulator import Simulator, fixed
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.distributions import Distribution
+    from jast.typing import Disturbance, Start
 
 __all__ = ["Record", "Standing", "calls", "from_python"]
 
@@ -59,18 +68,18 @@ class Standing(NamedTuple):
 
 
 def from_python(
-    system,
+    system: Any,
     *,
-    horizon,
-    disturbance=None,
-    start=fixed,
-    episodic=None,
-    likelihood=None,
-    workers=0,
-    time_limit=None,
-    observe=None,
-    like=None,
-):
+    horizon: int,
+    disturbance: Distribution | Disturbance | None = None,
+    start: Distribution | Start = fixed,
+    episodic: bool | None = None,
+    likelihood: bool | None = None,
+    workers: int = 0,
+    time_limit: float | None = None,
+    observe: Callable[[Any], chex.Array] | None = None,
+    like: chex.ArrayTree = None,
+) -> Simulator:
     """A system in plain Python, NumPy or another language as a `jast.Simulator`: it is called on
     the host, once for all lanes of a batch.
 
@@ -195,7 +204,7 @@ def from_python(
     )
 
 
-def calls(sim):
+def calls(sim: Simulator) -> Calls:
     """`Calls`: how often the system behind a black box has run so far, and for how long. ValueError
     for a simulator without one.
     """

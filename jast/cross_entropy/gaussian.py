@@ -2,8 +2,10 @@
 refitted to weighted samples.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from jax.scipy.linalg import solve_triangular
 
 from jast import results
 from jast._jax import is_traced
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "normal", "sample"]
 
@@ -27,7 +32,7 @@ class Gaussian(NamedTuple):
     """[d, d]"""
 
 
-def normal(mean, covariance):
+def normal(mean: chex.Array, covariance: chex.Numeric) -> Gaussian:
     """The `Gaussian` of a ``mean`` [d] and a ``covariance``: a number (times the identity), the
     variances [d], or a matrix [d, d].
 

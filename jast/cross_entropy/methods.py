@@ -2,9 +2,12 @@
 objectives in JAX, and as ask and tell for any other.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,22 +17,30 @@ from jast._checks import random_key
 from jast.cross_entropy import loop
 from jast.cross_entropy.settle import MODES, checked, settled
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.cross_entropy.gaussian import Gaussian
+    from jast.cross_entropy.mixture import Mixture
+    from jast.cross_entropy.result import CEResult
+    from jast.typing import Objective, Schedule
+
 __all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish", "start", "tell"]
 
 
 def ce_method(
-    key,
-    objective,
-    proposal,
+    key: chex.PRNGKey,
+    objective: Objective,
+    proposal: Gaussian | Mixture,
     *,
-    samples=10,
-    elites=5,
-    iterations=10,
-    schedule=None,
-    mode="default",
-    ratchet=False,
-    elitism=None,
-):
+    samples: int = 10,
+    elites: int = 5,
+    iterations: int = 10,
+    schedule: Schedule | Sequence[int] | None = None,
+    mode: Literal["default", "thesis"] = "default",
+    ratchet: bool = False,
+    elitism: bool | None = None,
+) -> CEResult:
     """Minimise ``objective`` (x [d] -> scalar) by the cross-entropy method: `CEResult`. Algorithm 1
     of the thesis.
 
@@ -59,17 +70,17 @@ def ce_method(
 
 
 def ce_surrogate(
-    key,
-    objective,
-    proposal,
+    key: chex.PRNGKey,
+    objective: Objective,
+    proposal: Gaussian | Mixture,
     *,
-    samples=10,
-    elites=5,
-    iterations=10,
-    schedule=None,
-    mode="default",
+    samples: int = 10,
+    elites: int = 5,
+    iterations: int = 10,
+    schedule: Schedule | Sequence[int] | None = None,
+    mode: Literal["default", "thesis"] = "default",
     **settings,
-):
+) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2
     to 4 of the thesis; see `ce_method` for what is common.
 
@@ -121,17 +132,17 @@ def ce_surrogate(
 
 
 def ce_mixture(
-    key,
-    objective,
-    proposal,
+    key: chex.PRNGKey,
+    objective: Objective,
+    proposal: Gaussian | Mixture,
     *,
-    samples=10,
-    elites=5,
-    iterations=10,
-    schedule=None,
-    mode="default",
+    samples: int = 10,
+    elites: int = 5,
+    iterations: int = 10,
+    schedule: Schedule | Sequence[int] | None = None,
+    mode: Literal["default", "thesis"] = "default",
     **settings,
-):
+) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its
     proposal: `CEResult`. Algorithm 5; see `ce_surrogate`.
 
@@ -187,23 +198,23 @@ class Search:
     plan: Any = field(metadata=dict(static=True))
 
     @property
-    def done(self):
+    def done(self) -> bool:
         """Whether the budget is spent."""
         return int(self.state.k) >= len(self.plan.counts)
 
 
 def start(
-    key,
-    proposal,
-    method="ce_surrogate",
+    key: chex.PRNGKey,
+    proposal: Gaussian | Mixture,
+    method: Literal["ce_method", "ce_surrogate", "ce_mixture"] = "ce_surrogate",
     *,
-    samples=10,
-    elites=5,
-    iterations=10,
-    schedule=None,
-    mode="default",
+    samples: int = 10,
+    elites: int = 5,
+    iterations: int = 10,
+    schedule: Schedule | Sequence[int] | None = None,
+    mode: Literal["default", "thesis"] = "default",
     **settings,
-):
+) -> Search:
     """A `Search` with the settings of `ce_method`, `ce_surrogate` or `ce_mixture`, for an objective
     that need not be written in JAX::
 
@@ -232,14 +243,14 @@ def start(
     return Search(_begin(key, plan, proposal), real, plan)
 
 
-def ask(search):
+def ask(search: Search) -> np.ndarray | chex.Array:
     """The next points to evaluate, [m, d]; the same until they are told. ValueError where the
     search is done.
     """
     return _ask(search.plan, search.state)[: _count("ask", search)]
 
 
-def tell(search, x, values):
+def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) -> Search:
     """The `Search` after the objective's ``values`` [m] at ``x`` [m, d]: those that `ask` gave, or
     what was evaluated in their place (clipped to bounds, say).
 
@@ -266,7 +277,7 @@ def tell(search, x, values):
     )
 
 
-def finish(search):
+def finish(search: Search) -> CEResult:
     """The `CEResult` of what was told so far; what was not has value inf in its history."""
     return _finish(search.plan, search.state)
 

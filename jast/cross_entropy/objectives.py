@@ -5,7 +5,11 @@ Each works in the dtype of x, under jit, vmap and grad, and raises ValueError fo
 shape.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +18,11 @@ from jax.tree_util import Partial
 
 from jast._jax import is_traced
 from jast.cross_entropy.gaussian import float_of
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Objective
 
 __all__ = ["ackley", "branin", "paraboloid", "sierra"]
 
@@ -25,8 +34,14 @@ _PATHS = {  # p of the source; the i-th has covariance i^decay Sigma / eta, so t
 
 
 def sierra(
-    mean=(0.0, 0.0), variance=3.0, spacing=2.0, sharpness=6.0, decay=1.0, order="code", log=False
-):
+    mean: chex.Array | Sequence[float] = (0.0, 0.0),
+    variance: chex.Numeric = 3.0,
+    spacing: chex.Numeric = 2.0,
+    sharpness: chex.Numeric = 6.0,
+    decay: chex.Numeric = 1.0,
+    order: Literal["code", "text"] = "code",
+    log: bool = False,
+) -> Objective:
     """Less the density at x [2] of 49 Gaussians of equal weight: a mountain range upside down, for
     optimisers (R. J. Moss's thesis, chapter 2).
 
@@ -94,7 +109,7 @@ def _log_sierra(means, variances, x):
     )
 
 
-def branin(x):
+def branin(x: chex.Array) -> chex.Array:
     """Branin's function of x [2]: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8
     pi)) cos x1 + 10.
 
@@ -109,7 +124,7 @@ def branin(x):
     )
 
 
-def ackley(x):
+def ackley(x: chex.Array) -> chex.Array:
     """Ackley's function of x [d]: 20 - 20 exp(-0.2 sqrt(mean x_i^2)) + e - exp(mean cos(2 pi x_i)).
 
     Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0); a local
@@ -123,7 +138,7 @@ def ackley(x):
     return -20 * jnp.expm1(-0.2 * r) - math.e * jnp.expm1(-2 * jnp.mean(jnp.sin(math.pi * x) ** 2))
 
 
-def paraboloid(x):
+def paraboloid(x: chex.Array) -> chex.Array:
     """The sum of squares of x [d]: 0 at 0."""
     return jnp.sum(_vector("paraboloid", x) ** 2)
 

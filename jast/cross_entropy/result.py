@@ -1,10 +1,15 @@
 """What the cross-entropy methods return, and how runs are judged that know the optimum."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jast import results
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["CEResult", "History", "Scores", "scores"]
 
@@ -51,7 +56,7 @@ class CEResult(NamedTuple):
         """Evaluations of the objective, of one run."""
         return np.shape(self.history.value)[-1]
 
-    def __str__(self):
+    def __str__(self) -> str:
         value = np.asarray(self.best_value)
         n = np.asarray(self.history.value).shape[-1]
         bad = int(np.sum(self.invalid))
@@ -109,7 +114,7 @@ class Scores(NamedTuple):
     """
 
 
-def scores(result, optimum):
+def scores(result: CEResult, optimum: chex.Array | None) -> Scores:
     """The `Scores` of a batch of runs, a `CEResult` with a leading axis [runs], after each
     iteration: arrays [K], the last of which is the outcome.
 

@@ -5,15 +5,22 @@ that sum to ``budget``; a user's own may be given as well. Sizes are static: the
 the host.
 """
 
+from __future__ import annotations
+
 import math
 import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 from jast._checks import whole
+
+if TYPE_CHECKING:
+    from jast.typing import Schedule
 
 __all__ = ["counts", "geometric", "manual", "uniform"]
 
 
-def uniform():
+def uniform() -> Schedule:
     """The same in every iteration; what is left over goes to the first ones, one each."""
 
     def schedule(budget, iterations):
@@ -23,7 +30,7 @@ def uniform():
     return schedule
 
 
-def geometric(p=0.1, normaliser="before"):
+def geometric(p: float = 0.1, normaliser: Literal["before", "after"] = "before") -> Schedule:
     """Most in the first iteration, and ever fewer: floor(budget pmf(k)) in iteration k = 1 .. K -
     1, the rest in the last (R. J. Moss's thesis, Algorithm 6).
 
@@ -51,7 +58,7 @@ def geometric(p=0.1, normaliser="before"):
     return schedule
 
 
-def manual(counts):
+def manual(counts: Sequence[int]) -> Schedule:
     """These very ``counts``; ValueError when they are not as many as the iterations, or do not sum
     to the budget. That of the source: 20, 15, 9, 8 x 7.
     """
@@ -68,7 +75,7 @@ def manual(counts):
     return schedule
 
 
-def counts(schedule, samples, iterations):
+def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]:
     """How many samples each iteration gets, a tuple of ints, by what a user gives as ``schedule``.
 
     None or "uniform": ``samples`` in each of ``iterations``. A function, such as `geometric`

@@ -2,9 +2,11 @@
 cross-entropy methods.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,13 @@ from jast.outline import outline
 from jast.rewards import LogLikelihood, as_pytree
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    from jast.cross_entropy.gaussian import Gaussian
+    from jast.cross_entropy.result import CEResult
+    from jast.episode import Episode
+    from jast.failures import Failures
+    from jast.typing import Actions, Objective, Reward
+
 __all__ = ["Stress", "over"]
 
 
@@ -37,27 +46,27 @@ class Stress:
     actions: Any
 
     @property
-    def objective(self):
+    def objective(self) -> Objective:
         """z [D] -> scalar, to be minimised: a `jax.tree_util.Partial`. NaN where the episode's
         numbers are not finite.
         """
         return Partial(_value, self.sim, self.reward, self.actions)
 
     @property
-    def proposal(self):
+    def proposal(self) -> Gaussian:
         """N(0, I) over z [D], the `Gaussian` to begin with: under it disturbances are draws of the
         model, or uniform in the box.
         """
         z, _ = _flat(self.sim)
         return normal(jnp.zeros_like(z), 1)
 
-    def episode(self, z):
+    def episode(self, z: Any) -> Episode:
         """The `jast.Episode` at the point ``z`` [D], replayed, with its states. ValueError for
         another shape.
         """
         return rollout(jax.random.key(0), self.sim, _policy(self.sim, self.actions, z), self.reward)
 
-    def failures(self, result, top=64):
+    def failures(self, result: CEResult, top: int = 64) -> Failures:
         """The ``top`` best distinct failures among all points that ``result``, a `CEResult`,
         evaluated: `jast.failures.Failures`, each replayed.
 
@@ -79,7 +88,7 @@ class Stress:
         )
 
 
-def over(sim, *, reward=None, actions=None):
+def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | None = None) -> Stress:
     """The search for failures of ``sim`` as a minimisation: `Stress`, with ``objective`` and
     ``proposal`` for the methods of `jast.cross_entropy`.
 

@@ -1,13 +1,18 @@
 """What every distribution of jast is: a pytree with samples and log densities."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable, Sequence
 from math import prod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Distribution", "is_distribution"]
 
@@ -38,15 +43,15 @@ class Distribution(metaclass=_Kind):
 
     event_shape: Any
 
-    def __new__(cls, *args: Any, **settings: Any) -> "Distribution":
+    def __new__(cls, *args: Any, **settings: Any) -> Distribution:
         _introduce()
         return super().__new__(cls)
 
-    def __init_subclass__(cls, **settings: Any):
+    def __init_subclass__(cls, **settings: Any) -> None:
         super().__init_subclass__(**settings)
         jax.tree_util.register_pytree_node(cls, _flatten, lambda static, a: _build(cls, static, a))
 
-    def _sample_n(self, key: jax.Array, n: int) -> Any:
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         raise NotImplementedError(f"{self.name} does not define _sample_n(key, n)")
 
     def log_prob(self, value: Any) -> jax.Array:

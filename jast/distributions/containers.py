@@ -1,12 +1,17 @@
 """Distributions of vectors and structures whose parts are independent."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, is_distribution, tree_map
 from jast.distributions.verbs import mode
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Independent", "Joint"]
 
@@ -22,7 +27,7 @@ class Independent(Distribution):
         ValueError: where values are structures, or there are fewer axes than that.
     """
 
-    def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None):
+    def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None) -> None:
         self._distribution = distribution = _accepted(distribution)
         event, n = distribution.event_shape, reinterpreted_batch_ndims
         if not (isinstance(event, tuple) and all(isinstance(i, int) for i in event)):
@@ -48,37 +53,37 @@ class Independent(Distribution):
         return self._reinterpreted_batch_ndims
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         batch = self._distribution.batch_shape
         return (
             batch[len(batch) - self._reinterpreted_batch_ndims :] + self._distribution.event_shape
         )
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         batch = self._distribution.batch_shape
         return batch[: len(batch) - self._reinterpreted_batch_ndims]
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self._distribution.sample(seed=key, sample_shape=n)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         log_p = self._distribution.log_prob(value)
         return jnp.sum(log_p, axis=tuple(-i - 1 for i in range(self._reinterpreted_batch_ndims)))
 
-    def mean(self):
+    def mean(self) -> Any:
         return self._distribution.mean()
 
-    def variance(self):
+    def variance(self) -> Any:
         return self._distribution.variance()
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return self._distribution.stddev()
 
-    def median(self):
+    def median(self) -> Any:
         return self._distribution.median()
 
-    def mode(self):
+    def mode(self) -> Any:
         return mode(self._distribution)
 
 
@@ -90,7 +95,7 @@ class Joint(Distribution):
         ValueError: where a leaf is no distribution, or the batch shapes differ.
     """
 
-    def __init__(self, distributions: Any):
+    def __init__(self, distributions: Any) -> None:
         self._distributions = tree_map(_accepted, distributions)
         batches = {d.batch_shape for d in leaves(self._distributions)}
         if len(batches) > 1:
@@ -102,33 +107,33 @@ class Joint(Distribution):
         return self._distributions
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return tree_map(lambda d: d.event_shape, self._distributions)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return leaves(self._distributions)[0].batch_shape
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return tree_map(lambda d: d.dtype, self._distributions)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         treedef = jax.tree.structure(self._distributions, is_leaf=is_distribution)
         keys = treedef.unflatten(list(jax.random.split(key, treedef.num_leaves)))
         return tree_map(lambda d, k: d.sample(seed=k, sample_shape=n), self._distributions, keys)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         parts = tree_map(lambda d, v: d.log_prob(v), self._distributions, value)
         return jnp.sum(jnp.stack(jax.tree.leaves(parts)), axis=0)
 
-    def mean(self):
+    def mean(self) -> Any:
         return tree_map(lambda d: d.mean(), self._distributions)
 
-    def median(self):
+    def median(self) -> Any:
         return tree_map(lambda d: d.median(), self._distributions)
 
-    def mode(self):
+    def mode(self) -> Any:
         return tree_map(mode, self._distributions)
 
 

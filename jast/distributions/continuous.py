@@ -2,7 +2,10 @@
 too, agree with its to the bit.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +13,9 @@ from jax.lax import lgamma
 
 from jast.distributions.base import Distribution, float_array
 from jast.distributions.normal import Symmetric
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
 
@@ -19,35 +25,35 @@ LOG_2 = math.log(2.0)
 class Laplace(Symmetric):
     """Density exp(-|x - loc| / scale) / (2 scale)."""
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return -jnp.abs(self._standardize(value)) - LOG_2 - jnp.log(self._scale)
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return math.sqrt(2.0) * self.scale
 
-    def variance(self):
+    def variance(self) -> Any:
         return 2.0 * jnp.square(self.scale)
 
 
 class Logistic(Symmetric):
     """Distribution function 1 / (1 + exp(-(x - loc) / scale))."""
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         tiny = jnp.finfo(self.dtype).tiny
         u = jax.random.uniform(key, **self._like_n(n), minval=tiny, maxval=1.0)
         return self._placed(jnp.log(u) - jnp.log1p(-u))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         v = self._standardize(value)
         return -v - 2.0 * jax.nn.softplus(-v) - jnp.log(self._scale)
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return self.scale * math.pi / math.sqrt(3.0)
 
-    def variance(self):
+    def variance(self) -> Any:
         return jnp.square(self.stddev())
 
 
@@ -56,11 +62,11 @@ class Uniform(Distribution):
 
     event_shape = ()
 
-    def __init__(self, low=0.0, high=1.0):
+    def __init__(self, low: chex.ArrayTree = 0.0, high: chex.ArrayTree = 1.0) -> None:
         self._low, self._high = float_array(low), float_array(high)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._low.shape, self._high.shape)
 
     @property
@@ -76,29 +82,29 @@ class Uniform(Distribution):
         return self.high - self.low
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.result_type(self._low, self._high)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.range.dtype)
         return self.low[None] + self.range[None] * u
 
-    def prob(self, value):
+    def prob(self, value: Any) -> chex.Array:
         outside = (value < self.low) | (value > self.high)
         return jnp.where(outside, jnp.zeros_like(value), jnp.ones_like(value) / self.range)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return jnp.log(self.prob(value))
 
-    def mean(self):
+    def mean(self) -> Any:
         return (self.low + self.high) / 2.0
 
     median = mean
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return self.range / math.sqrt(12.0)
 
-    def variance(self):
+    def variance(self) -> Any:
         return jnp.square(self.range) / 12.0
 
 
@@ -107,15 +113,15 @@ class _Pair(Distribution):
 
     event_shape = ()
 
-    def __init__(self, a, b):
+    def __init__(self, a: chex.Numeric, b: chex.Numeric) -> None:
         self._a, self._b = float_array(a), float_array(b)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._a.shape, self._b.shape)
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.result_type(self._a, self._b)
 
     @property
@@ -126,30 +132,30 @@ class _Pair(Distribution):
 class Gamma(_Pair):
     """Density proportional to x^(concentration - 1) exp(-rate x), x > 0."""
 
-    def __init__(self, concentration, rate):
+    def __init__(self, concentration: chex.Numeric, rate: chex.Numeric) -> None:
         super().__init__(concentration, rate)
 
     concentration = property(lambda self: self._both[0])
     rate = property(lambda self: self._both[1])
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         a, rate = self._both
         return jax.random.gamma(key, a, (n, *a.shape), self.dtype) / rate[None]
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         a, rate = self._a, self._b
         return a * jnp.log(rate) + (a - 1) * jnp.log(value) - rate * value - lgamma(a)
 
-    def mean(self):
+    def mean(self) -> Any:
         return self._a / self._b
 
-    def variance(self):
+    def variance(self) -> Any:
         return self._a / jnp.square(self._b)
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return jnp.sqrt(self._a) / self._b
 
-    def mode(self):
+    def mode(self) -> Any:
         """(concentration - 1) / rate; NaN where the density has no maximum."""
         return jnp.where(self._a >= 1.0, (self._a - 1.0) / self._b, jnp.nan)
 
@@ -157,34 +163,34 @@ class Gamma(_Pair):
 class Beta(_Pair):
     """Density proportional to x^(alpha - 1) (1 - x)^(beta - 1) on [0, 1]."""
 
-    def __init__(self, alpha, beta):
+    def __init__(self, alpha: chex.Numeric, beta: chex.Numeric) -> None:
         super().__init__(alpha, beta)
         self._norm = lgamma(self._a) + lgamma(self._b) - lgamma(self._a + self._b)
 
     alpha = property(lambda self: self._both[0])
     beta = property(lambda self: self._both[1])
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         a, b = self._both
         return jax.random.beta(key, a, b, (n, *a.shape), self.dtype)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         a, b = self._a, self._b
         inner = (a - 1.0) * jnp.log(value) + (b - 1.0) * jnp.log(1.0 - value) - self._norm
         flat = ((a == 1.0) & (value == 0.0)) | ((b == 1.0) & (value == 1.0))
         return jnp.where(flat, -self._norm, inner)
 
-    def mean(self):
+    def mean(self) -> Any:
         return self._a / (self._a + self._b)
 
-    def variance(self):
+    def variance(self) -> Any:
         total = self._a + self._b
         return self._a * self._b / (jnp.square(total) * (total + 1.0))
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return jnp.sqrt(self.variance())
 
-    def mode(self):
+    def mode(self) -> Any:
         """NaN where the density has no single maximum."""
         a, b = self._a, self._b
         inner = (a - 1.0) / (a + b - 2.0)

@@ -2,7 +2,9 @@
 probabilities below and above, so that rare ones come at the right z in both tails.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,9 @@ from jax.scipy.special import betainc, gammainc, gammaincc
 from jast.distributions.base import Distribution, float_array
 from jast.distributions.numerics import inside, log_one_less, log_tails, normal_of_log_tails
 from jast.distributions.table import register
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 
@@ -23,14 +28,14 @@ class _Counts(Distribution):
     _parameter: Any
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self._parameter.shape
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.zeros((), int).dtype
 
-    def log_tails(self, k):
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
         """(log P(X <= k), log P(X > k)) for whole k >= -1, as floats."""
         raise NotImplementedError
 
@@ -48,7 +53,7 @@ class _Counts(Distribution):
         low, high = jax.lax.fori_loop(0, 32, halve, (jnp.full_like(top, -1), top))
         return high.astype(self.dtype)
 
-    def log_cell(self, x):
+    def log_cell(self, x: Any) -> chex.Array:
         """(log of P(X < x) + p(x) / 2, log of P(X > x) + p(x) / 2): the middle of x's cell."""
         k = jnp.floor(jnp.asarray(x).astype(self._parameter.dtype))
         half = self._log_p(jnp.maximum(k, 0)) - jnp.log(2.0).astype(k.dtype)
@@ -57,7 +62,7 @@ class _Counts(Distribution):
         above = self.log_tails(jnp.maximum(k, -1))[1]
         return jnp.logaddexp(below, half), jnp.logaddexp(above, half)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         k = jnp.asarray(value).astype(self._parameter.dtype)
         whole = (k >= 0) & (k == jnp.floor(k))
         return jnp.where(whole, self._log_p(jnp.where(whole, k, 0)), -jnp.inf)
@@ -66,10 +71,10 @@ class _Counts(Distribution):
 class Geometric(_Counts):
     """How many failures come before the first success, of probability ``probs``: 0, 1, 2, ..."""
 
-    def __init__(self, probs):
+    def __init__(self, probs: chex.Numeric) -> None:
         self._parameter = self.probs = float_array(probs)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.probs.dtype)
         return self._place(None, jnp.log1p(-u))
 
@@ -80,60 +85,60 @@ class Geometric(_Counts):
     def _log_p(self, k):
         return jnp.log(self.probs) + k * jnp.log1p(-self.probs)
 
-    def log_tails(self, k):
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
         above = (k + 1) * jnp.log1p(-self.probs)
         return log_one_less(above), above
 
-    def mean(self):
+    def mean(self) -> Any:
         return (1 - self.probs) / self.probs
 
-    def mode(self):
+    def mode(self) -> Any:
         return jnp.zeros(self.batch_shape, self.dtype)
 
 
 class Poisson(_Counts):
     """Of mean ``rate``."""
 
-    def __init__(self, rate):
+    def __init__(self, rate: chex.Numeric) -> None:
         self._parameter = self.rate = float_array(rate)
 
     @property
-    def top(self):
+    def top(self) -> Any:
         return jnp.ceil(self.rate + 40 * jnp.sqrt(self.rate) + 800)  # beyond every float's z
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jax.random.poisson(key, self.rate, (n, *self.batch_shape), self.dtype)
 
     def _log_p(self, k):
         return k * jnp.log(self.rate) - self.rate - lgamma(k + 1)
 
-    def log_tails(self, k):
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
         return jnp.log(gammaincc(k + 1, self.rate)), jnp.log(gammainc(k + 1, self.rate))
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.rate
 
-    def mode(self):
+    def mode(self) -> Any:
         return jnp.floor(self.rate).astype(self.dtype)
 
 
 class Binomial(_Counts):
     """How many of ``total_count`` trials succeed, each with probability ``probs``."""
 
-    def __init__(self, total_count, probs):
+    def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
         self.probs = float_array(probs)
         self.total_count = jnp.asarray(total_count, self.probs.dtype)
         self._parameter = self.probs
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self.total_count.shape, self.probs.shape)
 
     @property
-    def top(self):
+    def top(self) -> Any:
         return self.total_count
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         x = jax.random.binomial(key, self.total_count, self.probs, shape, self.probs.dtype)
         return x.astype(self.dtype)
@@ -145,7 +150,7 @@ class Binomial(_Counts):
         log_p = ways + inner * jnp.log(p) + (n - inner) * jnp.log1p(-p)
         return jnp.where(k > n, -jnp.inf, log_p)
 
-    def log_tails(self, k):
+    def log_tails(self, k: int) -> tuple[chex.Array, chex.Array]:
         n, p = self.total_count, self.probs
         inner = jnp.clip(k, 0, n - 1)
         below = jnp.log(betainc(n - inner, inner + 1, 1 - p))
@@ -156,10 +161,10 @@ class Binomial(_Counts):
             jnp.where(none, 0.0, jnp.where(all_of, -jnp.inf, above)),
         )
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.total_count * self.probs
 
-    def mode(self):
+    def mode(self) -> Any:
         k = jnp.floor((self.total_count + 1) * self.probs)
         return jnp.minimum(k, self.total_count).astype(self.dtype)
 
@@ -169,20 +174,20 @@ class TiltedCounts(Distribution):
     change. Exact.
     """
 
-    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array):
+    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
         self._distribution, self._mean, self._deviation = distribution, mean, deviation
 
     event_shape = ()
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self._distribution.batch_shape
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return self._distribution.dtype
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         e = jax.random.normal(key, (n, *self._mean.shape), self._mean.dtype)
         z = self._mean[None] + self._deviation[None] * e
         return jax.vmap(lambda z: self._distribution._place(*log_tails(z)))(z)
@@ -193,7 +198,7 @@ class TiltedCounts(Distribution):
         z = normal_of_log_tails(below, above)
         return jnp.where(jnp.isinf(below), -jnp.inf, jnp.where(jnp.isinf(above), jnp.inf, z))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         k = jnp.asarray(value).astype(self._mean.dtype)
         edges = (self._edge(v) for v in (jnp.maximum(k - 1, -1), k))
         a, b = ((v - self._mean) / self._deviation for v in edges)

@@ -2,12 +2,17 @@
 to the bit.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, float_array
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Bernoulli", "Categorical"]
 
@@ -31,20 +36,25 @@ class _Choice(Distribution):
         self._dtype = dtype
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jax.dtypes.canonicalize_dtype(self._dtype)
 
 
 class Bernoulli(_Choice):
     """1 with probability ``probs`` = sigmoid(``logits``), else 0, as ``dtype``."""
 
-    def __init__(self, logits=None, probs=None, dtype: Any = int):
+    def __init__(
+        self,
+        logits: chex.Numeric | None = None,
+        probs: chex.Numeric | None = None,
+        dtype: Any = int,
+    ) -> None:
         self._check(logits, probs, dtype, jnp.bool_, jnp.integer, jnp.floating)
         self._probs = None if probs is None else float_array(probs)
         self._logits = None if logits is None else float_array(logits)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return (self._probs if self._logits is None else self._logits).shape
 
     @property
@@ -57,11 +67,11 @@ class Bernoulli(_Choice):
             return self._logits
         return jnp.log(self._probs) - jnp.log(1 - self._probs)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         p = self.probs
         return (jax.random.uniform(key, (n, *p.shape), p.dtype) < p[None]).astype(self._dtype)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         if self._logits is None:
             log_0, log_1 = jnp.log1p(-1.0 * self._probs), jnp.log(self._probs)
         else:
@@ -69,13 +79,13 @@ class Bernoulli(_Choice):
         one = jnp.asarray(value).astype(log_1.dtype)
         return _times(log_0, 1 - one) + _times(log_1, one)
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.probs
 
-    def variance(self):
+    def variance(self) -> Any:
         return (1 - self.probs) * self.probs
 
-    def mode(self):
+    def mode(self) -> Any:
         return (self.probs > 0.5).astype(self._dtype)
 
 
@@ -84,7 +94,9 @@ class Categorical(_Choice):
     ``dtype``.
     """
 
-    def __init__(self, logits=None, probs=None, dtype: Any = int):
+    def __init__(
+        self, logits: chex.Array | None = None, probs: chex.Array | None = None, dtype: Any = int
+    ) -> None:
         self._check(logits, probs, dtype, jnp.integer, jnp.floating)
         self._logits = self._probs = None
         if logits is None:
@@ -94,7 +106,7 @@ class Categorical(_Choice):
             self._logits = jax.nn.log_softmax(jnp.asarray(logits), axis=-1)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return (self._probs if self._logits is None else self._logits).shape[:-1]
 
     @property
@@ -109,20 +121,20 @@ class Categorical(_Choice):
     def num_categories(self) -> int:
         return (self._probs if self._logits is None else self._logits).shape[-1]
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         logits, p = self.logits, self.probs
         valid = jnp.all(jnp.isfinite(p), axis=-1) & jnp.all(p >= 0, axis=-1)
         draws = jax.random.categorical(key, logits, axis=-1, shape=(n, *logits.shape[:-1]))
         draws = draws.astype(self._dtype)
         return jnp.where(valid[None], draws, jnp.ones_like(draws) * -1)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         logits, k = self.logits, self.num_categories
         chosen = jax.nn.one_hot(value, k, dtype=logits.dtype)
         outside = (value < 0) | (value > k - 1)
         return jnp.where(outside, -jnp.inf, jnp.sum(_times(logits, chosen), axis=-1))
 
-    def mode(self):
+    def mode(self) -> Any:
         numbers = self._probs if self._logits is None else self._logits
         return jnp.argmax(numbers, axis=-1).astype(self._dtype)
 

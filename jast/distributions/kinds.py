@@ -2,7 +2,10 @@
 density, the tent of the MCFS-AP paper, one of two classes.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +13,9 @@ import jax.numpy as jnp
 from jast.distributions.base import Distribution
 from jast.distributions.numerics import fraction
 from jast.distributions.verbs import log_density, mode
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
 
@@ -19,18 +25,20 @@ class Fixed(Distribution):
 
     event_shape = ()
 
-    def sample(self, *, seed=None, sample_shape=()):
+    def sample(
+        self, *, seed: chex.PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
+    ) -> Any:
         return ()
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return ()
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
 
-    def mode(self):
+    def mode(self) -> Any:
         return ()
 
 
@@ -39,25 +47,27 @@ class Deterministic(Distribution):
     point, not a density.
     """
 
-    def __init__(self, value: Any):
+    def __init__(self, value: Any) -> None:
         self._value = value
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return jax.tree.map(jnp.shape, self._value)
 
-    def sample(self, *, seed=None, sample_shape=()):
+    def sample(
+        self, *, seed: chex.PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
+    ) -> Any:
         return self._value
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *a.shape)), self._value)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
 
-    def mode(self):
+    def mode(self) -> Any:
         return self._value
 
 
@@ -66,17 +76,17 @@ class Seeds(Distribution):
     ``log_prob`` is 0 and there is no mode.
     """
 
-    def __init__(self, shape=()):
+    def __init__(self, shape: Sequence[int] = ()) -> None:
         self._shape = tuple(shape)
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return self._shape
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jax.random.bits(key, (n, *self._shape), jnp.uint32)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return jnp.zeros(())
 
     log_prob_from_mode = log_prob
@@ -92,14 +102,20 @@ class Tent(Distribution):
 
     event_shape = ()
 
-    def __init__(self, center, width=1.0, low=0.0, high=1.0):
+    def __init__(
+        self,
+        center: chex.Numeric,
+        width: chex.Numeric = 1.0,
+        low: chex.Numeric = 0.0,
+        high: chex.Numeric = 1.0,
+    ) -> None:
         center = jnp.asarray(center)
         self._center, self._width, self._low, self._high = (
             jnp.asarray(v, center.dtype) for v in (center, width, low, high)
         )
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self._center.shape
 
     def _masses(self):
@@ -113,7 +129,7 @@ class Tent(Distribution):
         z = jnp.clip((x - self._center) / self._width, -1.0, 1.0)
         return self._width * jnp.where(z < 0, 0.5 * (1 + z) ** 2, 1 - 0.5 * (1 - z) ** 2)
 
-    def log_prob_from_mode(self, x):
+    def log_prob_from_mode(self, x: Any) -> chex.Array:
         """Log density less the log density of the mode, without the normaliser: exactly ``log(1 -
         |x - center| / width)``.
         """
@@ -121,10 +137,10 @@ class Tent(Distribution):
         height = jnp.where(inside, 1 - jnp.abs(x - self._center) / self._width, 0.0)
         return jnp.where(height > 0, jnp.log(jnp.where(height > 0, height, 1.0)), -jnp.inf)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return self.log_prob_from_mode(value) - jnp.log(self._masses()[1])
 
-    def quantile(self, u):
+    def quantile(self, u: Any) -> Any:
         lower, span = self._masses()
         mass = (lower + u * span) / self._width  # of the full tent of unit mass
         z = jnp.where(
@@ -132,13 +148,13 @@ class Tent(Distribution):
         )
         return jnp.clip(self._center + self._width * z, self._low, self._high)
 
-    def cdf(self, value):
+    def cdf(self, value: Any) -> Any:
         return fraction(*(self._cdf_full(v) for v in (value, self._low, self._high)))
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self.quantile(jax.random.uniform(key, (n, *self.batch_shape), self._center.dtype))
 
-    def mode(self):
+    def mode(self) -> Any:
         return self._center
 
 
@@ -147,7 +163,7 @@ class Where(Distribution):
     kind of value.
     """
 
-    def __init__(self, pred, a, b):
+    def __init__(self, pred: chex.Array | bool, a: Distribution, b: Distribution) -> None:
         self._pred, self._a, self._b = jnp.asarray(pred), a, b
 
     @property
@@ -160,7 +176,7 @@ class Where(Distribution):
         return self._a, self._b
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return self._a.event_shape
 
     def select(self, a: Any, b: Any) -> Any:
@@ -169,40 +185,45 @@ class Where(Distribution):
             lambda x, y: jnp.where(self._pred, x, jnp.asarray(y, jnp.result_type(x))), a, b
         )
 
-    def sample(self, *, seed, sample_shape=()):
+    def sample(self, *, seed: chex.PRNGKey | int, sample_shape: int | Sequence[int] = ()) -> Any:
         # one key serves both, as only one of the two draws is seen; the clone tells JAX's check of
         # reused keys that it is meant
         other = self._b.sample(seed=jax.random.clone(seed), sample_shape=sample_shape)
         return self.select(self._a.sample(seed=seed, sample_shape=sample_shape), other)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self.sample(seed=key, sample_shape=(n,))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return self.select(self._a.log_prob(value), self._b.log_prob(value))
 
-    def log_prob_from_mode(self, value):
+    def log_prob_from_mode(self, value: Any) -> chex.Array:
         return self.select(log_density(self._a, value, "mode"), log_density(self._b, value, "mode"))
 
-    def mode(self):
+    def mode(self) -> Any:
         return self.select(mode(self._a), mode(self._b))
 
 
-def tent(center, width=1.0, low=0.0, high=1.0) -> Tent:
+def tent(
+    center: chex.Numeric,
+    width: chex.Numeric = 1.0,
+    low: chex.Numeric = 0.0,
+    high: chex.Numeric = 1.0,
+) -> Tent:
     """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero
     ``width`` away, cut to ``[low, high]``.
     """
     return Tent(center, width, low, high)
 
 
-def seeds(shape=()) -> Seeds:
+def seeds(shape: Sequence[int] = ()) -> Seeds:
     """`Seeds` of ``shape``, uint32: the density of the disturbance is unknown (log p = 0), only its
     seed is chosen.
     """
     return Seeds(shape)
 
 
-def where(pred, a: Any, b: Any) -> Where:
+def where(pred: chex.Array | bool, a: Distribution, b: Distribution) -> Where:
     """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of
     one shape and dtype.
     """

@@ -2,6 +2,10 @@
 of the probabilities below and above a value.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr, ndtri
@@ -12,26 +16,29 @@ from jast.distributions.numerics import inside, log_one_less, log_tails, normal_
 from jast.distributions.table import register
 from jast.distributions.tails import of_log_tails
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Exponential", "Gumbel", "LogNormal", "TruncatedNormal", "Weibull"]
 
 
 class LogNormal(LocationScale):
     """exp(e), e normal with mean ``loc`` and standard deviation ``scale``."""
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jnp.exp(self._placed(jax.random.normal(key, **self._like_n(n))))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         log = jnp.log(value)
         return -0.5 * jnp.square(self._standardize(log)) - HALF_LOG_2PI - jnp.log(self._scale) - log
 
-    def mean(self):
+    def mean(self) -> Any:
         return jnp.exp(self.loc + jnp.square(self.scale) / 2)
 
-    def median(self):
+    def median(self) -> Any:
         return jnp.exp(self.loc)
 
-    def mode(self):
+    def mode(self) -> Any:
         return jnp.exp(self.loc - jnp.square(self.scale))
 
 
@@ -50,23 +57,23 @@ class Exponential(Distribution):
 
     event_shape = ()
 
-    def __init__(self, rate):
+    def __init__(self, rate: chex.Numeric) -> None:
         self.rate = float_array(rate)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self.rate.shape
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return jnp.where(value < 0, -jnp.inf, jnp.log(self.rate) - self.rate * value)
 
-    def mean(self):
+    def mean(self) -> Any:
         return 1 / self.rate
 
-    def mode(self):
+    def mode(self) -> Any:
         return jnp.zeros_like(self.rate)
 
 
@@ -81,17 +88,17 @@ register(Exponential, **of_log_tails(lambda d, below, above: -above / d.rate, _t
 class Gumbel(LocationScale):
     """Of the largest of many numbers: distribution function exp(-exp(-(x - loc) / scale))."""
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self._placed(jax.random.gumbel(key, **self._like_n(n)))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         v = self._standardize(value)
         return -(v + jnp.exp(-v)) - jnp.log(self._scale)
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.loc + self.scale * jnp.euler_gamma
 
-    def mode(self):
+    def mode(self) -> Any:
         return self.loc
 
 
@@ -110,11 +117,11 @@ class Weibull(Distribution):
 
     event_shape = ()
 
-    def __init__(self, concentration, scale):
+    def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
         self._shape, self._scale = float_array(concentration), float_array(scale)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._shape.shape, self._scale.shape)
 
     @property
@@ -125,17 +132,17 @@ class Weibull(Distribution):
     def scale(self) -> jax.Array:
         return jnp.broadcast_to(self._scale, self.batch_shape)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
         e = jax.random.exponential(key, (n, *k.shape), jnp.result_type(k, scale))
         return scale[None] * e ** (1 / k[None])
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         k, v = self._shape, value / self._scale
         inner = jnp.log(k / self._scale) + (k - 1) * jnp.log(jnp.abs(v)) - jnp.abs(v) ** k
         return jnp.where(v < 0, -jnp.inf, inner)
 
-    def mode(self):
+    def mode(self) -> Any:
         k = self.concentration
         return self.scale * jnp.where(k > 1, jnp.maximum(1 - 1 / k, 0) ** (1 / k), 0.0)
 
@@ -158,12 +165,14 @@ class TruncatedNormal(LocationScale):
     either may be infinite.
     """
 
-    def __init__(self, loc, scale, low, high):
+    def __init__(
+        self, loc: chex.Numeric, scale: chex.Numeric, low: chex.ArrayTree, high: chex.ArrayTree
+    ) -> None:
         super().__init__(loc, scale)
         self._low, self._high = float_array(low), float_array(high)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         each = (self._loc, self._scale, self._low, self._high)
         return jax.lax.broadcast_shapes(*(a.shape for a in each))
 
@@ -183,16 +192,16 @@ class TruncatedNormal(LocationScale):
         below, above = log_tails(near)[0], log_tails(far)[0]
         return a, b, below + log_one_less(jnp.minimum(above - below, 0))
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         z = jax.random.normal(key, **self._like_n(n))
         return jax.vmap(lambda z: _cut(self, z))(z)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         exponent = -0.5 * jnp.square(self._standardize(value))
         log_p = exponent - HALF_LOG_2PI - jnp.log(self._scale) - self.ends()[2]
         return jnp.where((value < self._low) | (value > self._high), -jnp.inf, log_p)
 
-    def mode(self):
+    def mode(self) -> Any:
         return jnp.clip(self.loc, self.low, self.high)
 
 

@@ -2,13 +2,18 @@
 scale. Draws and log densities agree with distrax's to the bit.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, float_array
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["MultivariateNormalDiag", "MultivariateNormalTri", "Normal"]
 
@@ -20,11 +25,11 @@ class LocationScale(Distribution):
 
     event_shape = ()
 
-    def __init__(self, loc, scale):
+    def __init__(self, loc: chex.Numeric, scale: chex.Numeric) -> None:
         self._loc, self._scale = float_array(loc), float_array(scale)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._loc.shape, self._scale.shape)
 
     @property
@@ -36,7 +41,7 @@ class LocationScale(Distribution):
         return jnp.broadcast_to(self._scale, self.batch_shape)
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.result_type(self._loc, self._scale)
 
     def _standardize(self, value):
@@ -54,33 +59,33 @@ class LocationScale(Distribution):
 class Symmetric(LocationScale):
     """Mean, median and mode are ``loc``."""
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.loc
 
-    def median(self):
+    def median(self) -> Any:
         return self.loc
 
-    def mode(self):
+    def mode(self) -> Any:
         return self.loc
 
 
 class Normal(Symmetric):
     """Of mean ``loc`` and standard deviation ``scale``."""
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self._placed(jax.random.normal(key, **self._like_n(n)))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         exponent = -0.5 * jnp.square(self._standardize(value))
         return exponent - (HALF_LOG_2PI + jnp.log(self._scale))
 
-    def cdf(self, value):
+    def cdf(self, value: Any) -> Any:
         return jax.scipy.special.ndtr(self._standardize(value))
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return self.scale
 
-    def variance(self):
+    def variance(self) -> Any:
         return jnp.square(self.scale)
 
 
@@ -90,7 +95,7 @@ class _Vector(Distribution):
     _loc: jax.Array
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return self._loc.shape[-1:]
 
     @property
@@ -98,7 +103,7 @@ class _Vector(Distribution):
         return jnp.broadcast_to(self._loc, self.batch_shape + self.event_shape)
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.result_type(self._loc, *(v for k, v in vars(self).items() if "scale" in k))
 
     # As programs are fused, where a product is rounded depends on each operation around it: those
@@ -112,16 +117,16 @@ class _Vector(Distribution):
         """Of the value with the noise ``e``; ``log_det``: log |det de/dx|."""
         return jnp.sum(self._noise.log_prob(e), axis=-1) + log_det
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.loc
 
-    def median(self):
+    def median(self) -> Any:
         return self.loc
 
-    def mode(self):
+    def mode(self) -> Any:
         return self.loc
 
-    def stddev(self):
+    def stddev(self) -> Any:
         return jnp.sqrt(self.variance())
 
 
@@ -133,7 +138,7 @@ class MultivariateNormalDiag(_Vector):
         ValueError: where neither is given, one is a scalar, or their last axes differ.
     """
 
-    def __init__(self, loc: Any = None, scale_diag: Any = None):
+    def __init__(self, loc: Any = None, scale_diag: Any = None) -> None:
         loc, scale = _given("MultivariateNormalDiag", loc=loc, scale_diag=scale_diag)
         _vectors("MultivariateNormalDiag", "scale_diag", loc, scale, 1)
         if scale is None:
@@ -146,26 +151,26 @@ class MultivariateNormalDiag(_Vector):
         )
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._loc.shape[:-1], self._scale_diag.shape[:-1])
 
     @property
     def scale_diag(self) -> jax.Array:
         return jnp.broadcast_to(self._scale_diag, self.batch_shape + self.event_shape)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         e = self._noise.sample(seed=key, sample_shape=n)
         return self._scale_diag[None] * e + 0.0 + self._loc[None]
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         scale = self._scale_diag
         e = (1.0 / scale) * (value - self._loc - 0.0)
         return self._log_prob(e, 0.0 + jnp.sum(-jnp.log(jnp.abs(scale)), axis=-1))
 
-    def variance(self):
+    def variance(self) -> Any:
         return jnp.square(self.scale_diag)
 
-    def covariance(self):
+    def covariance(self) -> chex.Array:
         return jnp.vectorize(jnp.diag, signature="(k)->(k,k)")(self.variance())
 
 
@@ -177,7 +182,7 @@ class MultivariateNormalTri(_Vector):
         ValueError: where neither is given, or their shapes do not fit.
     """
 
-    def __init__(self, loc: Any = None, scale_tri: Any = None, is_lower: bool = True):
+    def __init__(self, loc: Any = None, scale_tri: Any = None, is_lower: bool = True) -> None:
         loc, scale = _given("MultivariateNormalTri", loc=loc, scale_tri=scale_tri)
         _vectors("MultivariateNormalTri", "scale_tri", loc, scale, 2)
         dtype = jnp.result_type(*(a for a in (loc, scale) if a is not None))
@@ -188,7 +193,7 @@ class MultivariateNormalTri(_Vector):
         self._is_lower = is_lower
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._loc.shape[:-1], self._scale_tri.shape[:-2])
 
     @property
@@ -200,12 +205,12 @@ class MultivariateNormalTri(_Vector):
     def is_lower(self) -> bool:
         return self._is_lower
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         product = jnp.vectorize(lambda e, a: a @ e, signature="(k),(k,k)->(k)")
         e = self._noise.sample(seed=key, sample_shape=n)
         return jax.vmap(lambda e: product(e, self._scale_tri) + self._loc)(e)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         solve = jnp.vectorize(
             lambda x, a: jax.scipy.linalg.solve_triangular(a, x, lower=self._is_lower),
             signature="(k),(k,k)->(k)",
@@ -216,11 +221,11 @@ class MultivariateNormalTri(_Vector):
             0.0 + -jnp.sum(jnp.log(jnp.abs(diagonal)), axis=-1),
         )
 
-    def variance(self):
+    def variance(self) -> Any:
         square = jnp.sum(jnp.square(self._scale_tri), axis=-1)
         return jnp.broadcast_to(square, self.batch_shape + self.event_shape)
 
-    def covariance(self):
+    def covariance(self) -> chex.Array:
         return self.scale_tri @ jnp.swapaxes(self.scale_tri, -1, -2)
 
 

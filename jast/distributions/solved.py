@@ -2,9 +2,11 @@
 value is exact in both tails; `from_normal` inverts it by Newton's method, to rounding.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,9 @@ from jast.distributions.numerics import inside, log_tails, normal_of_log_tails
 from jast.distributions.table import register
 from jast.distributions.tails import tails
 from jast.distributions.verbs import from_normal
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["MixtureSameFamily", "StudentT"]
 
@@ -69,36 +74,38 @@ def solved(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, An
 class StudentT(LocationScale):
     """Student's t of ``df`` degrees of freedom, moved by ``loc`` and stretched by ``scale``."""
 
-    def __init__(self, df, loc=0.0, scale=1.0):
+    def __init__(
+        self, df: chex.Numeric, loc: chex.Numeric = 0.0, scale: chex.Numeric = 1.0
+    ) -> None:
         super().__init__(loc, scale)
         self._df = float_array(df)
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return jax.lax.broadcast_shapes(self._df.shape, self._loc.shape, self._scale.shape)
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         return jnp.result_type(self._df, self._loc, self._scale)
 
     @property
     def df(self) -> jax.Array:
         return jnp.broadcast_to(self._df, self.batch_shape)
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
         return self._placed(jax.random.t(key, self.df[None], shape, self.dtype))
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         return _log_t(self._df, self._standardize(value)) - jnp.log(self._scale)
 
-    def mean(self):
+    def mean(self) -> Any:
         return self.loc
 
-    def median(self):
+    def median(self) -> Any:
         return self.loc
 
-    def mode(self):
+    def mode(self) -> Any:
         return self.loc
 
 
@@ -153,7 +160,7 @@ class MixtureSameFamily(Distribution):
 
     event_shape = ()
 
-    def __init__(self, mixture_distribution: Any, components_distribution: Any):
+    def __init__(self, mixture_distribution: Any, components_distribution: Any) -> None:
         if components_distribution.event_shape != ():
             raise ValueError(
                 "MixtureSameFamily: components_distribution: expected one of numbers, received"
@@ -170,10 +177,10 @@ class MixtureSameFamily(Distribution):
         return self._components
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self._components.batch_shape[:-1]
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         which, what = jax.random.split(key)
         k = self._mixture.sample(seed=which, sample_shape=n)
         k = k.reshape(n, *(1,) * (len(self.batch_shape) + 1 - k.ndim), *k.shape[1:])
@@ -181,7 +188,7 @@ class MixtureSameFamily(Distribution):
         x = self._components.sample(seed=what, sample_shape=n)
         return jnp.take_along_axis(x, k[..., None].astype(jnp.int32), axis=-1)[..., 0]
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         each = self._components.log_prob(jnp.asarray(value)[..., None])
         return jax.nn.logsumexp(each + _log_weights(self), axis=-1)
 

@@ -2,7 +2,9 @@
 N(mean, deviation^2) in place of N(0, 1).
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,9 @@ from jast.distributions.numerics import float_dtype
 from jast.distributions.table import row
 from jast.distributions.verbs import event_like, from_normal, has_cdf, to_normal
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Tilted", "tilted", "untiltable"]
 
 
@@ -20,24 +25,24 @@ class Tilted(Distribution):
     taken number by number.
     """
 
-    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array):
+    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
         self._distribution, self._mean, self._deviation = distribution, mean, deviation
 
     @property
-    def event_shape(self):
+    def event_shape(self) -> Any:
         return self._distribution.event_shape
 
     @property
-    def batch_shape(self):
+    def batch_shape(self) -> tuple[int, ...]:
         return self._distribution.batch_shape
 
-    def _sample_n(self, key, n):
+    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         z = self._mean[None] + self._deviation[None] * jax.random.normal(
             key, (n, *self._mean.shape), self._mean.dtype
         )
         return jax.vmap(lambda z: from_normal(self._distribution, z))(z)
 
-    def log_prob(self, value):
+    def log_prob(self, value: Any) -> chex.Array:
         """log p(x) + log N(z; mean, deviation) - log N(z; 0, 1) at z = Phi^-1(cdf(x)), as dz/dx is
         the same in both.
         """

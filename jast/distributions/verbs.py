@@ -2,8 +2,10 @@
 values, the unit interval and normal numbers. Each is a look-up in the table of families.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,9 @@ from jax import lax
 
 from jast.distributions.numerics import float_dtype, normal_score, phi
 from jast.distributions.table import row
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = [
     "cdf",
@@ -30,7 +35,7 @@ __all__ = [
 ]
 
 
-def sample(d: Any, key: jax.Array) -> Any:
+def sample(d: Any, key: chex.PRNGKey) -> Any:
     """One draw from ``d``."""
     return d.sample(seed=key)
 

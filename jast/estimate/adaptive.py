@@ -2,7 +2,11 @@
 methods beside it.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -32,6 +36,14 @@ from jast.results import asked
 from jast.rounding import rounded
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.episode import Episode
+    from jast.failures import Failures
+    from jast.simulator import Simulator
+    from jast.typing import Callback, Executor, PathLike
+
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo"]
 
 NAME, LEAST = "failure_probability", 5000
@@ -52,20 +64,20 @@ greatest share of the last part.
 
 
 def failure_probability(
-    key,
-    sim,
-    budget=100_000,
+    key: chex.PRNGKey,
+    sim: Simulator,
+    budget: int = 100_000,
     *,
-    failures=None,
-    near=None,
-    gradients=True,
-    level=0.95,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    failures: Failures | Episode | None = None,
+    near: Any = None,
+    gradients: bool = True,
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
     """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its
     own finding: `Estimate`.
 
@@ -286,17 +298,17 @@ def _of_the_search(s, level):
 
 
 def monte_carlo(
-    key,
-    sim,
-    samples=100_000,
+    key: chex.PRNGKey,
+    sim: Simulator,
+    samples: int = 100_000,
     *,
-    level=0.95,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
     """How probable is a failure, by counting alone? Crude Monte Carlo, the baseline of estimators:
     `Estimate` with an exact interval, and Chernoff's and Jeffreys' upper bounds also where no
     failure was seen. `jast.nominal` is for a first look at a system, and
@@ -322,7 +334,9 @@ def monte_carlo(
     return found._replace(settings=settings, draws=draws)
 
 
-def adaptive_cross_entropy(key, sim, budget=100_000, *, level=0.95):
+def adaptive_cross_entropy(
+    key: chex.PRNGKey, sim: Simulator, budget: int = 100_000, *, level: float = 0.95
+) -> Estimate:
     """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one
     Gaussian, then importance sampling with the rest: `Estimate`.
 

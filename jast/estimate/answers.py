@@ -2,8 +2,11 @@
 of a given probability, and when failures happen. No episode is simulated.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +16,9 @@ from jast.estimate import diagnostics
 from jast.estimate.draws import Draws, Moments, interval, moments, of_weights, share, shares
 from jast.estimate.estimate import Estimate
 from jast.intervals import checked_level
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Exceedance", "FailureTimes", "distance_quantile", "exceedance", "failure_times"]
 
@@ -55,7 +61,7 @@ class FailureTimes(NamedTuple):
     high: Any
     given_failure: Any
     """[T + 1] the same, given that it fails; sum 1"""
-    quantiles: dict
+    quantiles: dict[str, Any]
     """Of the time, given a failure: 0.05, 0.5, 0.95 -> (step, low, high)"""
     mean: float
     """Mean time of a failure"""
@@ -67,7 +73,12 @@ class FailureTimes(NamedTuple):
     method: str
 
 
-def exceedance(estimate, thresholds=None, *, level=None):
+def exceedance(
+    estimate: Estimate,
+    thresholds: Sequence[float] | chex.Array | None = None,
+    *,
+    level: float | None = None,
+) -> Exceedance:
     """The distribution of the miss distance in its tail: `Exceedance`, the probability that an
     episode fails or comes as near as each of ``thresholds``; below 0, where the miss distance goes
     on, that it fails by so much. No further episode.
@@ -100,7 +111,9 @@ def exceedance(estimate, thresholds=None, *, level=None):
     return Exceedance(u, p, low, high, ess, good, level, estimate.method, estimate.unseen)
 
 
-def distance_quantile(estimate, probability, *, level=None):
+def distance_quantile(
+    estimate: Estimate, probability: float, *, level: float | None = None
+) -> tuple[float, tuple[float, float]]:
     """The miss distance within which an episode comes with this ``probability``: (distance, (low,
     high)), the inverse of `exceedance`. No further episode.
 
@@ -126,7 +139,7 @@ def distance_quantile(estimate, probability, *, level=None):
     return middle, ends
 
 
-def failure_times(estimate, *, level=None):
+def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureTimes:
     """When the system fails: `FailureTimes`, the probability of a failure at each step with its
     interval, and quantiles of the time given a failure. No further episode.
 

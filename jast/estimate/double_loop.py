@@ -2,7 +2,10 @@
 traces.
 """
 
+from __future__ import annotations
+
 from functools import partial
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +20,31 @@ from jast.intervals import checked_level
 from jast.results import asked
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.estimate.estimate import Estimate
+    from jast.estimate.proposals import Proposal
+    from jast.policy import Policy
+    from jast.simulator import Simulator
+    from jast.typing import Callback
+
 __all__ = ["double_loop"]
 
 LANES = 16384
 
 
 def double_loop(
-    key, sim, proposal, starts=1000, samples=100, *, level=0.95, progress=False, callback=None
-):
+    key: chex.PRNGKey,
+    sim: Simulator,
+    proposal: Proposal | Policy,
+    starts: int = 1000,
+    samples: int = 100,
+    *,
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+) -> Estimate:
     """Estimate the failure probability of ``sim`` as a mean over starts of the probability given
     each: `Estimate`.
 

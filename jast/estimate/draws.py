@@ -2,6 +2,8 @@
 `jast.estimate.answers` and `jast.estimate.events`.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 
@@ -50,7 +52,7 @@ class Draws(NamedTuple):
     """
 
     @property
-    def severity(self):
+    def severity(self) -> np.ndarray:
         """[m] What ranks episodes: the miss distance, above 0 unless they failed, and at most 0
         where they did.
         """
@@ -58,7 +60,7 @@ class Draws(NamedTuple):
         return np.where(self.failure, np.minimum(self.distance, 0), safe).astype(np.float64)
 
     @property
-    def counted(self):
+    def counted(self) -> int:
         """Whether all weights are 1, as those of plain draws are."""
         return self.every == 1 and not self.log_weight.any()
 

@@ -1,5 +1,7 @@
 """The answer of every estimator: a probability, how sure it is, and whether to believe it."""
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 
@@ -35,7 +37,7 @@ class Estimate(NamedTuple):
     """Of the mean"""
     relative_error: float
     """standard_error / mean, also where both are below the least double"""
-    interval: tuple
+    interval: tuple[Any, ...]
     """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is), with ``high``
     corrected for the skewness of the weights; of plain counts Clopper and Pearson's
     """
@@ -64,7 +66,7 @@ class Estimate(NamedTuple):
     """[K] the part of the estimate that each component or failure mode carries, of sum 1"""
     reliable: bool
     """No known reason against it"""
-    warnings: tuple
+    warnings: tuple[Any, ...]
     """Texts: the reasons why not, then remarks"""
     chernoff: float | None = None
     """Of plain counts: upper bound at one-sided ``level`` (the paper's eq. 17)"""
@@ -78,7 +80,7 @@ class Estimate(NamedTuple):
     """What it was drawn from, where the method found it: for `jast.estimate.failure_samples`"""
     history: Any = None
     """How that was found, a text a line"""
-    settings: dict | None = None
+    settings: dict[str, Any] | None = None
     """What was asked for: ``method`` and numbers"""
     mode_intervals: Any = None
     """[K, 2] intervals of the probability of each of ``modes``"""
@@ -91,11 +93,11 @@ class Estimate(NamedTuple):
     evaluations = results.alias("episodes")
 
     @property
-    def log10_mean(self):
+    def log10_mean(self) -> float:
         """Decimal logarithm of the estimate."""
         return self.log_mean / math.log(10)
 
-    def __str__(self):
+    def __str__(self) -> str:
         rows, low, high = [], *self.interval
         if not math.isnan(self.log_mean):
             value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"

@@ -4,9 +4,11 @@ The failing draws are made again from their key, and the system is run to where 
 is judged again, so that the weights stay what they were.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,14 @@ from jast.limit_state import Latent, dimension, policy_of
 from jast.policy import nominal_policy
 from jast.pytrees import clear, select, strong
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.estimate.estimate import Estimate
+    from jast.estimate.proposals import Proposal
+    from jast.policy import Policy
+    from jast.simulator import Simulator
+
 __all__ = ["Event", "GivenStart", "events", "given_start"]
 
 BLOCK = 1024
@@ -40,11 +50,11 @@ class Event(NamedTuple):
 
     probability: float
     """That an episode fails and the event happens in it"""
-    interval: tuple
+    interval: tuple[Any, ...]
     """(low, high) at ``level``"""
     given_failure: float
     """Probability of the event given a failure"""
-    given_interval: tuple
+    given_interval: tuple[Any, ...]
     """(low, high) at ``level``"""
     ess: float
     """Effective sample size of the failures in which it happened"""
@@ -52,7 +62,7 @@ class Event(NamedTuple):
     """How many these are"""
     reliable: bool
     """The estimate is, and the weights of these failures speak for a number"""
-    warnings: tuple
+    warnings: tuple[Any, ...]
     """Why not"""
     level: float
 
@@ -63,20 +73,28 @@ class GivenStart(NamedTuple):
 
     probability: float
     """Of a failure, given a start in the set"""
-    interval: tuple
+    interval: tuple[Any, ...]
     """(low, high) at ``level``"""
     start: float
     """Probability of a start in the set"""
-    start_interval: tuple
+    start_interval: tuple[Any, ...]
     """(low, high) at ``level``"""
     together: Event
     """The failures that start there"""
     reliable: bool
-    warnings: tuple
+    warnings: tuple[Any, ...]
     level: float
 
 
-def events(sim, estimate, named, *, of="state", proposal=None, level=None):
+def events(
+    sim: Simulator,
+    estimate: Estimate,
+    named: Mapping[str, Callable[[Any], Any]],
+    *,
+    of: Literal["state", "episode"] = "state",
+    proposal: Proposal | Policy | None = None,
+    level: float | None = None,
+) -> dict[str, Event]:
     """How probable are several events among the failures of one ``estimate``: dict of name ->
     `Event`, all from the same draws, so that events and their complements add up.
 
@@ -108,7 +126,16 @@ def events(sim, estimate, named, *, of="state", proposal=None, level=None):
     return {k: _event(estimate, draws, log_w, v, level) for k, v in happened.items()}
 
 
-def given_start(key, sim, estimate, named, *, draws=1_000_000, proposal=None, level=None):
+def given_start(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    estimate: Estimate,
+    named: Mapping[str, Callable[[Any], Any]],
+    *,
+    draws: int = 1_000_000,
+    proposal: Proposal | Policy | None = None,
+    level: float | None = None,
+) -> dict[str, GivenStart]:
     """How probable is a failure given that the episode starts in a set: dict of name ->
     `GivenStart`, P(failure and start in the set) / P(start in the set).
 

@@ -2,8 +2,10 @@
 a user looks at.
 """
 
+from __future__ import annotations
+
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +23,13 @@ from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
 from jast.memory import require_episodes
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.estimate.proposals import Proposal
+    from jast.policy import Policy
+    from jast.simulator import Simulator
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -44,7 +53,7 @@ class FailureSamples(NamedTuple):
 
     episodes = results.former("episodes", "failures")
 
-    def __str__(self):
+    def __str__(self) -> str:
         n, e = len(self.failures.length), self.failures
         steps = (
             f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to"
@@ -56,7 +65,14 @@ class FailureSamples(NamedTuple):
         )
 
 
-def failure_samples(key, sim, source, samples=1000, *, moves=20):
+def failure_samples(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    source: Estimate | Proposal | Policy,
+    samples: int = 1000,
+    *,
+    moves: int = 20,
+) -> FailureSamples:
     """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are
     resampled, each then makes Markov moves: `FailureSamples`.
 

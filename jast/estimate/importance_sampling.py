@@ -6,8 +6,11 @@ overflows. Episodes are simulated in chunks of constant size; a chunk's log weig
 where they are summed in double precision.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +38,15 @@ from jast.results import asked
 from jast.rewards import log_likelihood
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.estimate.estimate import Estimate
+    from jast.estimate.proposals import Proposal
+    from jast.policy import Policy
+    from jast.simulator import Simulator
+    from jast.typing import Callback, Executor, PathLike
+
 __all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played"]
 
 LANES = 16384
@@ -59,7 +71,14 @@ class Traces(NamedTuple):
     """Miss distance; inf where invalid"""
 
 
-def log_weights(key, sim, proposal, samples, *, mode="default"):
+def log_weights(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    proposal: Proposal | Policy,
+    samples: int,
+    *,
+    mode: Literal["default", "paper"] = "default",
+) -> Traces:
     """``samples`` episodes drawn from ``proposal`` (a `Proposal` or a `Policy` with densities):
     `Traces`, for estimates of your own.
 
@@ -79,19 +98,19 @@ def log_weights(key, sim, proposal, samples, *, mode="default"):
 
 
 def importance(
-    key,
-    sim,
-    proposal,
-    samples=100_000,
+    key: chex.PRNGKey,
+    sim: Simulator,
+    proposal: Proposal | Policy,
+    samples: int = 100_000,
     *,
-    mode="default",
-    level=0.95,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    mode: Literal["default", "paper"] = "default",
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
     """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal:
     `Estimate`.
 

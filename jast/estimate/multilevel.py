@@ -4,8 +4,10 @@ De Boer, Kroese, Mannor and Rubinstein 2005, A tutorial on the cross-entropy met
 (the multi-level algorithm), on sequences of disturbances.
 """
 
+from __future__ import annotations
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,9 @@ from jast.memory import require_episodes
 from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["FailureProposal", "failure_proposal"]
 
@@ -60,7 +65,7 @@ class FailureProposal(NamedTuple):
     failures = results.former("failures", "failing")
     evaluations = results.alias("episodes")
 
-    def __str__(self):
+    def __str__(self) -> str:
         reached, levels = np.asarray(self.reached), np.asarray(self.levels)
         if reached.ndim:
             return (
@@ -84,8 +89,15 @@ class Settings(NamedTuple):
 
 
 def failure_proposal(
-    key, sim, *, samples=1000, iterations=10, quantile=0.1, smoothing=0.3, floor=0.7
-):
+    key: chex.PRNGKey,
+    sim: Simulator,
+    *,
+    samples: int = 1000,
+    iterations: int = 10,
+    quantile: float = 0.1,
+    smoothing: float = 0.3,
+    floor: float = 0.7,
+) -> FailureProposal:
     """Find a proposal under which the failures of ``sim`` are frequent: `FailureProposal`, whose
     ``policy`` is for `jast.rollout` and importance sampling.
 

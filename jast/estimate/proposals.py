@@ -5,8 +5,11 @@ Lipkis and Agogino, Discovery and Analysis of Rare High-Impact Failure Modes Usi
 RL-Informed Sampling ("the paper").
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +27,9 @@ from jast.limit_state import latents
 from jast.outline import ask, outline
 from jast.policy import Policy
 from jast.pytrees import fitted
+
+if TYPE_CHECKING:
+    from jast.simulator import Simulator
 
 __all__ = ["Proposal", "policy_proposal", "trace_proposal"]
 
@@ -48,7 +54,14 @@ class Proposal:
     """
 
 
-def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=True):
+def trace_proposal(
+    sim: Simulator,
+    episodes: Episode | Sequence[Episode],
+    epsilon: float = 0.05,
+    *,
+    mixing: Literal["step", "trace"] = "step",
+    tilt_start: bool = True,
+) -> Proposal:
     """The proposal of recorded failures, the paper's Algorithm 1 (one trace) and eq. 19-20
     (several): `Proposal` of one component a trace.
 
@@ -100,7 +113,14 @@ def trace_proposal(sim, episodes, epsilon=0.05, *, mixing="step", tilt_start=Tru
     return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
 
 
-def policy_proposal(sim, policy, epsilon=0.05, *, tilt_start=True, mixing="step"):
+def policy_proposal(
+    sim: Simulator,
+    policy: Policy,
+    epsilon: float = 0.05,
+    *,
+    tilt_start: bool = True,
+    mixing: Literal["step", "trace"] = "step",
+) -> Proposal:
     """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's
     value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
 

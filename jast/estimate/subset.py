@@ -1,7 +1,10 @@
 """Subset simulation, as an estimator of its own and as what is left where no proposal was found."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -19,6 +22,11 @@ from jast.results import asked
 from jast.simulator import Simulator
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, Executor, PathLike
+
 __all__ = ["subset_simulation"]
 
 LOST = "a mode that few members of a population reach is lost at times, and nothing shows it"
@@ -26,18 +34,18 @@ REPLICATES, FEWEST, LEAST = 5, 3, 100
 
 
 def subset_simulation(
-    key,
-    sim,
-    samples=1000,
+    key: chex.PRNGKey,
+    sim: Simulator,
+    samples: int = 1000,
     *,
-    replicates=10,
-    level=0.95,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    replicates: int = 10,
+    level: float = 0.95,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Estimate:
     """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
     ``samples``: `Estimate`, the mean of theirs.
 

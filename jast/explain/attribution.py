@@ -1,7 +1,9 @@
 """attribution: the share of each disturbance in how near the system came to failing."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from jast.counter import generator
 from jast.episode import Episode
 from jast.explain.point import Given, given, like_disturbances, names, steps_of
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Attribution", "attribution"]
 
@@ -33,7 +38,7 @@ class Attribution(NamedTuple):
     total: float
     """Miss distance of the undisturbed system less that of the episode."""
     method: str
-    parts: tuple
+    parts: tuple[Any, ...]
     """(step, name, value, error), the greatest first; step 0 is x0."""
     residual: float
     """``total`` less the sum of all values: what a sum of differences has left out. NaN of the
@@ -41,7 +46,7 @@ class Attribution(NamedTuple):
     evaluations: int
     """Episodes simulated; one with its gradient counts as 4."""
 
-    def __str__(self):
+    def __str__(self) -> str:
         lines = [f"{self.method}: the disturbances lowered the miss distance by {self.total:.4g}"]
         for step, name, value, error in self.parts[:LINES]:
             line = f"  step {step:4d}  {name:<12} {value:+10.4g}"
@@ -59,7 +64,7 @@ def attribution(
     episode: Episode,
     method: str = "shapley",
     *,
-    key: jax.Array | None = None,
+    key: chex.PRNGKey | None = None,
     permutations: int = 200,
 ) -> Attribution:
     """Which disturbances brought the failure about, and by how much?

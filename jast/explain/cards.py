@@ -1,7 +1,9 @@
 """What is worth saying of every failure mode, for the page of a report."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
@@ -11,6 +13,9 @@ from jast.explain.minimal import Minimal, minimal
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["cards"]
 
 MODES, LEAST = 4, 20
@@ -18,7 +23,7 @@ MODES, LEAST = 4, 20
 
 
 def cards(
-    key: jax.Array, sim: Simulator, modes: Sequence[Mode], budget: int = 20_000
+    key: chex.PRNGKey, sim: Simulator, modes: Sequence[Mode], budget: int = 20_000
 ) -> list[list[Minimal | Criticality]]:
     """`minimal` and `criticality` of the likeliest failure of each of the first four ``modes``.
 

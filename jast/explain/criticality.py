@@ -1,6 +1,8 @@
 """criticality: how probable a failure was at each moment of the episode that ended in it."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from jast.intervals import checked_level, clopper_pearson
 from jast.pytrees import in_lanes, select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Criticality", "criticality"]
 
@@ -40,7 +45,7 @@ class Criticality(NamedTuple):
     evaluations: int
     """Episodes simulated."""
 
-    def __str__(self):
+    def __str__(self) -> str:
         p, n = self.probability, len(self.probability) - 1
         lines = []
         if self.steepest:
@@ -62,7 +67,7 @@ class Criticality(NamedTuple):
 
 
 def criticality(
-    key: jax.Array, sim: Simulator, episode: Episode, *, draws: int = 1000, level: float = 0.95
+    key: chex.PRNGKey, sim: Simulator, episode: Episode, *, draws: int = 1000, level: float = 0.95
 ) -> Criticality:
     """When was the failure still avoidable?
 

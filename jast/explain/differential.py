@@ -1,6 +1,8 @@
 """differential: where one version of a system fails and another does not."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,9 @@ from jast.outline import outline
 from jast.pytrees import select, strong
 from jast.simulator import Simulator
 from jast.stress_testing.report import Report
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["differential", "regression"]
 
@@ -31,7 +36,7 @@ class Both(NamedTuple):
 
 
 def differential(
-    key: jax.Array, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
+    key: chex.PRNGKey, sim_a: Simulator, sim_b: Simulator, budget: int = 200_000, **settings: Any
 ) -> Report:
     """Which disturbances make version b fail, and not version a; and how probable is that?
 

@@ -1,8 +1,10 @@
 """indices: how much each disturbance decides whether the system fails."""
 
+from __future__ import annotations
+
 import math
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +28,9 @@ from jast.outline import outline
 from jast.pytrees import count
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Index", "Indices", "indices"]
 
 KEPT, LANES = 16_384, 1024
@@ -48,11 +53,11 @@ class Index(NamedTuple):
     """Its normal number, on average over the failures: 0 where a failure does not move it"""
     first: float
     """First-order index: the share of the variance of failing that this number decides alone"""
-    first_interval: tuple
+    first_interval: tuple[Any, ...]
     """(low, high) at ``level``, of the delta method"""
     total: float
     """Total index: the share that it decides alone or together with others; NaN where not asked"""
-    total_interval: tuple
+    total_interval: tuple[Any, ...]
     """(low, high) at ``level``, of counts"""
 
 
@@ -60,7 +65,7 @@ class Index(NamedTuple):
 class Indices(NamedTuple):
     """Sensitivity of a failure to each number of the disturbances."""
 
-    rows: tuple
+    rows: tuple[Any, ...]
     """An `Index` for each number, x0 first, then step by step"""
     probability: float
     """Of failure: what a first-order index is about where a number decides nothing alone is a small
@@ -72,7 +77,7 @@ class Indices(NamedTuple):
     """The estimate is, and there are 100 effective failures or more"""
     evaluations: int
 
-    def __str__(self):
+    def __str__(self) -> str:
         lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
         lines.append(
             f"{'number':<20} {'step':>4} {'mean':>7} {'first order':>12} {'total':>7}"
@@ -90,7 +95,7 @@ class Indices(NamedTuple):
 
 
 def indices(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     estimate: Estimate,
     *,

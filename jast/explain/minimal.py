@@ -1,5 +1,7 @@
 """minimal: the fewest and smallest disturbances of a failure that still make it fail."""
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +32,7 @@ class Minimal(NamedTuple):
     """bool, like x0."""
     episode: Episode
     """Fails with these alone, and with its states; the others are at the mode."""
-    parts: tuple
+    parts: tuple[Any, ...]
     """(step, name, value, normal number) of each that is needed, by step; step 0 is x0. The normal
     number tells how unlikely a value is: 0 at the mode, about 1 a standard deviation from there.
     """
@@ -38,7 +40,7 @@ class Minimal(NamedTuple):
     """How many numbers the disturbances of the given episode have."""
     evaluations: int
 
-    def __str__(self):
+    def __str__(self) -> str:
         steps = sorted({step for step, *_ in self.parts})
         what = "disturbance is" if len(self.parts) == 1 else "disturbances are"
         lines = [f"{len(self.parts)} of {self.numbers} {what} needed: {_in_words(steps)}"]

@@ -1,7 +1,9 @@
 """monitor: while the system runs, will it fail within the next steps?"""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +16,9 @@ from jast.explain.observed import observed, ordinary
 from jast.intervals import clopper_pearson
 from jast.simulator import Simulator
 from jast.weakness.measures import Roc, roc
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Monitor", "monitor"]
 
@@ -34,28 +39,28 @@ class Monitor(NamedTuple):
     """Steps that it looks ahead."""
     threshold: float
     """It warns where `probability` is above this."""
-    false_alarms: tuple
+    false_alarms: tuple[Any, ...]
     """(share, (low, high)): of the held-out others, those with a warning at any step. Near misses
     are not among them."""
-    warned: tuple
+    warned: tuple[Any, ...]
     """(share, (low, high)): of the held-out failures, those with a warning before the failure."""
-    ahead: tuple
+    ahead: tuple[Any, ...]
     """Steps from the first warning to the failure: the least of 90 %, the median, and the least of
     10 %, of those with a warning; NaN where there is none."""
     auc: float
     """Area under the ROC curve: the chance that of two held-out moments, one within reach of a
     failure and one not, the first has the higher probability."""
-    auc_interval: tuple
+    auc_interval: tuple[Any, ...]
     roc: Roc
-    held_out: tuple
+    held_out: tuple[Any, ...]
     """(failures, near misses, others): episodes."""
     level: float
     maxima: np.ndarray
     """The greatest probability of each of the others that set the threshold, sorted."""
     evaluations: int
-    settings: dict
+    settings: dict[str, Any]
 
-    def __str__(self):
+    def __str__(self) -> str:
         n, near, calm = self.held_out
         (rate, (a, b)), (hit, (c, d)) = self.false_alarms, self.warned
         low, high = self.auc_interval
@@ -110,7 +115,7 @@ def monitor(
     observe: Callable[[Any], Any] | None = None,
     model: str = "boosted",
     false_alarms: float = 0.01,
-    key: jax.Array | None = None,
+    key: chex.PRNGKey | None = None,
     episodes: int = 1000,
     level: float = 0.95,
 ) -> Monitor:

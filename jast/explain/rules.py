@@ -1,7 +1,9 @@
 """rules: a few words that tell the episodes which fail from those that nearly do."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +18,9 @@ from jast.explain.learning import DISTINCT, learner, parted
 from jast.explain.trees import grown, read
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Rules", "rules"]
 
 HELD_OUT = 0.3
@@ -27,21 +32,21 @@ OF = "disturbances", "states", "both"
 class Rules(NamedTuple):
     """Rules for failures, and how they do on episodes that they were not made from."""
 
-    rules: tuple
+    rules: tuple[Any, ...]
     """`Rule` of each way to a failure, by label and then those first that tell the most."""
-    classes: tuple
+    classes: tuple[Any, ...]
     """What `predict` may say; the first is "does not fail"."""
-    precision: dict
+    precision: dict[str, Any]
     """Class -> of the held-out episodes that are said to be of it, the share that is."""
-    recall: dict
+    recall: dict[str, Any]
     """Class -> of the held-out episodes of it, the share that is said to be."""
-    held_out: dict
+    held_out: dict[str, Any]
     """Class -> how many episodes were held out."""
     level: float
     """Of the intervals."""
     tree: Any
     """The `sklearn.tree.DecisionTreeClassifier`."""
-    features: tuple
+    features: tuple[Any, ...]
     """Names of its columns."""
     describer: Describer
     ends: np.ndarray
@@ -50,9 +55,9 @@ class Rules(NamedTuple):
     sim: Simulator
     evaluations: int
     """Episodes simulated."""
-    settings: dict
+    settings: dict[str, Any]
 
-    def __str__(self):
+    def __str__(self) -> str:
         lines = []
         for rule in self.rules:
             lines.append(str(rule))
@@ -88,8 +93,8 @@ def rules(
     failures: Any,
     others: Any = None,
     *,
-    labels: Sequence | None = None,
-    key: jax.Array | None = None,
+    labels: Sequence[Any] | None = None,
+    key: chex.PRNGKey | None = None,
     episodes: int = 1000,
     of: str = "disturbances",
     lead: int = 5,

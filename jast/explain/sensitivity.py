@@ -1,7 +1,9 @@
 """sensitivity: how the probability of failure moves with the parameters of the disturbances."""
 
+from __future__ import annotations
+
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,9 @@ from jast.estimate.redrawn import fits, redrawn
 from jast.intervals import checked_level
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["Sensitivity", "sensitivity"]
 
 LANES = 1024
@@ -27,7 +32,7 @@ FEW = 100
 class Sensitivity(NamedTuple):
     """Derivatives of the log probability of failure."""
 
-    rows: tuple
+    rows: tuple[Any, ...]
     """(name, value, derivative of log P, standard error, (low, high)) of each parameter. Times the
     value it is the elasticity: per cent of P for one per cent of the parameter."""
     level: float
@@ -37,7 +42,7 @@ class Sensitivity(NamedTuple):
     """The estimate is, and there are 100 effective failures or more."""
     evaluations: int
 
-    def __str__(self):
+    def __str__(self) -> str:
         lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
         lines.append(
             f"{'parameter':<28} {'value':>10} {'d log P':>11} {'elasticity':>11}"
@@ -55,7 +60,7 @@ def sensitivity(
     sim: Simulator,
     estimate: Estimate,
     *,
-    key: jax.Array | None = None,
+    key: chex.PRNGKey | None = None,
     samples: int = 16_384,
     level: float = 0.95,
 ) -> Sensitivity:

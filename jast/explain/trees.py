@@ -1,6 +1,8 @@
 """Decision trees: how large they grow, and the rules that they hold."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,16 +22,16 @@ class Rule(NamedTuple):
 
     label: str
     """What it says of an episode: "fails", or the kind of failure."""
-    conditions: tuple
+    conditions: tuple[Any, ...]
     """(what, kind, low, high) of each: ``low < what <= high``. What holds or not is 1 or 0."""
     precision: float
     """Of the held-out episodes that it fits, the share that is of this label."""
-    precision_interval: tuple
+    precision_interval: tuple[Any, ...]
     recall: float
     """Of the held-out episodes of this label, the share that it fits."""
-    recall_interval: tuple
+    recall_interval: tuple[Any, ...]
 
-    def __str__(self):
+    def __str__(self) -> str:
         text = " and ".join(map(_condition, self.conditions)) or "always"
         return f"{text} -> {self.label}"
 

@@ -2,8 +2,11 @@
 to come after one.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,9 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.heads.networks import Head
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = [
     "Heads",
@@ -37,21 +43,21 @@ class Moments(NamedTuple):
     """[n] float32: 0 where nothing varies, which then is as good as 1."""
 
     @classmethod
-    def empty(cls, *shape):
+    def empty(cls, *shape: Sequence[int]) -> Moments:
         return cls(
             np.zeros((), np.float32), np.zeros(shape, np.float32), np.ones(shape, np.float32)
         )
 
-    def normalise(self, x):
+    def normalise(self, x: Any) -> chex.Array:
         return (x - self.mean) / self._scale()
 
-    def restore(self, x):
+    def restore(self, x: Any) -> chex.Array:
         return self.mean + self._scale() * x
 
     def _scale(self):
         return jnp.where(self.deviation > 0, self.deviation, 1)
 
-    def first(self, n):
+    def first(self, n: int) -> Moments:
         """Those of the first ``n`` numbers."""
         return Moments(self.count, self.mean[:n], self.deviation[:n])
 
@@ -95,7 +101,7 @@ class Heads:
     by them deeper down. Give those that you trained yourself the horizon.
     """
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("policy", "value"):
             head = getattr(self, name)
             if isinstance(head, tuple) and len(head) == 2 and callable(head[1]):

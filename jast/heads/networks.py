@@ -2,13 +2,19 @@
 brings none.
 """
 
+from __future__ import annotations
+
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Head", "make_head"]
 
@@ -34,8 +40,14 @@ class Head(NamedTuple):
 
 
 def make_head(
-    key, inputs, outputs=(), *, hidden=(32, 32), activation="relu", first_activation=True
-):
+    key: chex.PRNGKey,
+    inputs: int,
+    outputs: Sequence[int] = (),
+    *,
+    hidden: Sequence[int] = (32, 32),
+    activation: Literal["relu", "tanh"] = "relu",
+    first_activation: bool = True,
+) -> Head:
     """A dense Flax network from [inputs] to ``outputs``, a shape: ``(params, apply)``, a `Head`.
 
     ``outputs=()`` is a value head, ``(d, bins)`` a rollout-policy head for a disturbance of d

@@ -2,6 +2,8 @@
 that work, each by its name.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 __all__ = ["MODES", "HeadSettings", "checked", "settings"]
@@ -144,7 +146,7 @@ CHOICES = dict(
 )
 
 
-def settings(mode="default", **changes):
+def settings(mode="default", **changes) -> HeadSettings:
     """`HeadSettings` of a mode, with changes: ``settings("code", round=8)``.
 
     "default" is what works. "code" is the published code of MCFS-AP, of which "paper" is the

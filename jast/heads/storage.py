@@ -2,8 +2,11 @@
 its function is made of.
 """
 
+from __future__ import annotations
+
 import operator
 import os
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +18,15 @@ from jast.archive import arrays_of, check_array, check_structure, describe, name
 from jast.heads.heads import Heads, Moments
 from jast.heads.networks import ACTIVATIONS, Head, dense
 
+if TYPE_CHECKING:
+    from jast.typing import PathLike
+
 __all__ = ["load", "save"]
 
 HEADS, MOMENTS = ("policy", "value"), ("inputs", "returns")
 
 
-def save(path: str | os.PathLike, heads: Heads) -> None:
+def save(path: PathLike, heads: Heads) -> None:
     """`jast.save` of heads; goes with the next version.
 
     The function of a network of `jast.heads.make_head` is in the file by its sizes and its
@@ -31,7 +37,7 @@ def save(path: str | os.PathLike, heads: Heads) -> None:
     files.store(path, "jast heads", heads)
 
 
-def load(path: str | os.PathLike, heads: Heads | None = None) -> Heads:
+def load(path: PathLike, heads: Heads | None = None) -> Heads:
     """`jast.load` of heads, with ``heads=heads``; goes with the next version.
 
     A network of `jast.heads.make_head` gets the very function that such networks of one shape

@@ -4,6 +4,11 @@ inputs that it finds most suspect, and what it has learned of each pixel.
 R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter 4.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jast._checks import number, whole
@@ -12,13 +17,21 @@ from jast.plot.weakness import checked_result, truth_of
 from jast.weakness.encoded import Encoded
 from jast.weakness.measures import precision_recall
 
+if TYPE_CHECKING:
+    import chex
+    from matplotlib.axes import Axes
+
+    from jast.weakness.result import Result
+
 __all__ = ["confusion", "likely_failures", "pixel_likelihood", "threshold_sweep"]
 
 BRIGHT = 10.0  # of the one number of a code that is decoded alone, as in the published notebook
 KINDS = ("true positives", "false negatives", "likely failures")
 
 
-def confusion(result, failed, threshold=0.5, ax=None):
+def confusion(
+    result: Result, failed: chex.Array, threshold: float = 0.5, ax: Axes | None = None
+) -> Axes:
     """How many inputs a score of at least ``threshold`` calls failures, against the truth: the
     confusion matrix of the adversary (figure 4.3b of the thesis). Returns the Axes.
 
@@ -55,7 +68,12 @@ def confusion(result, failed, threshold=0.5, ax=None):
     return ax
 
 
-def threshold_sweep(result, failed, thresholds=21, ax=None):
+def threshold_sweep(
+    result: Result,
+    failed: chex.Array,
+    thresholds: int | Sequence[float] = 21,
+    ax: Axes | None = None,
+) -> Axes:
     """Precision and recall of the scores against the threshold from which an input is called a
     failure (figure 4.4b of the thesis). Returns the Axes.
 
@@ -83,7 +101,14 @@ def threshold_sweep(result, failed, thresholds=21, ax=None):
     return ax
 
 
-def likely_failures(networks, inputs, failed, kind="true positives", count=10, axes=None):
+def likely_failures(
+    networks: Encoded,
+    inputs: chex.Array,
+    failed: chex.Array,
+    kind: str = "true positives",
+    count: int = 10,
+    axes: Sequence[Axes] | None = None,
+) -> list[Axes]:
     """Images ranked by the adversary's score, a column each: the image, what the decoder makes of
     the strongest number of its code alone, and its reconstruction (figure 4.5 of the thesis).
     Returns the list of Axes, row by row.
@@ -145,7 +170,7 @@ def likely_failures(networks, inputs, failed, kind="true positives", count=10, a
     return panels[: 3 * len(chosen)]
 
 
-def pixel_likelihood(networks, ax=None):
+def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
     """A(E(x)) of images that are dark but for one pixel, which is 1: how suspect each pixel alone
     makes an image (figure 4.6 of the thesis). Returns the Axes.
 

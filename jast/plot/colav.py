@@ -5,10 +5,13 @@ Positions are in metres, times in seconds from the start; a step is 3 s. Ships a
 to be seen: a collision is 1 m between the centres.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from numbers import Real
 from operator import index
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +22,14 @@ from jast.simulators.colav.planner import SPEEDS, STILL, ZONES
 from jast.simulators.colav.system import COLLISION, ColavState
 from jast.simulators.colav.tracker import PERIOD
 
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.axes import Axes
+
+    from jast.episode import Episode
+    from jast.simulator import Simulator
+    from jast.typing import PathLike
+
 __all__ = ["colav", "colav_animation", "colav_story"]
 
 # m ahead and to the right of the centre
@@ -27,7 +38,12 @@ BELIEF, ZONE, DASHED = style.GREEN, style.ORANGE, (0, (3, 1.2))
 SHADES = ((0.30, "-"), (0.16, "--"), (0.07, ":"))  # of `ZONES`: opacity, edge
 
 
-def colav(episode, sim=None, moments=3, axes=None):
+def colav(
+    episode: Episode,
+    sim: Simulator | None = None,
+    moments: int | Sequence[int] = 3,
+    axes: Sequence[Axes] | None = None,
+) -> list[Axes]:
     """One colav `Episode` as the planner saw it, at some moments: a panel each, x east (m), y north
     (m). Returns the list of Axes.
 
@@ -65,7 +81,9 @@ def colav(episode, sim=None, moments=3, axes=None):
     return axes
 
 
-def colav_story(episode, sim=None, axes=None):
+def colav_story(
+    episode: Episode, sim: Simulator | None = None, axes: Sequence[Axes] | None = None
+) -> list[Axes]:
     """One colav `Episode` over time (s): a panel for each kind of disturbance, then the distances
     (m), then the ferry's speed (m/s). Returns the list of Axes.
 
@@ -139,7 +157,13 @@ def colav_story(episode, sim=None, axes=None):
     return axes
 
 
-def colav_animation(episode, sim=None, fps=8, path=None, smooth=3):
+def colav_animation(
+    episode: Episode,
+    sim: Simulator | None = None,
+    fps: int = 8,
+    path: PathLike | None = None,
+    smooth: int = 3,
+) -> FuncAnimation:
     """A panel of `colav` that moves: ``smooth`` frames a step, between states by straight lines.
     Returns the matplotlib FuncAnimation.
 

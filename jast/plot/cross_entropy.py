@@ -2,12 +2,22 @@
 looked, and how fast several runs converge.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast.cross_entropy import CEResult, Mixture, scores
 from jast.plot import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jast.typing import Objective
 
 __all__ = ["convergence", "proposal_contours", "surrogate_samples"]
 
@@ -16,7 +26,14 @@ EDGE, DEVIATIONS = dict(markeredgecolor=style.INK, markeredgewidth=0.7), {1: "-"
 SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
 
 
-def proposal_contours(result, objective, axes=None, iterations=None, bounds=None, elites=5):
+def proposal_contours(
+    result: CEResult,
+    objective: Objective,
+    axes: Sequence[Axes] | None = None,
+    iterations: Sequence[int] | None = None,
+    bounds: Any = None,
+    elites: int = 5,
+) -> list[Axes]:
     """How the proposal of one run moved over an objective of two numbers, a panel an iteration
     (figure 2.2 of the thesis). Returns the list of Axes.
 
@@ -97,7 +114,13 @@ def proposal_contours(result, objective, axes=None, iterations=None, bounds=None
     return panels
 
 
-def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
+def surrogate_samples(
+    result: CEResult,
+    objective: Objective,
+    iteration: int,
+    axes: Sequence[Axes] | None = None,
+    bounds: Any = None,
+) -> list[Axes]:
     """One iteration of a run with a surrogate, for an objective of two numbers (figure 2.4 of the
     thesis). Returns the list of two Axes.
 
@@ -155,7 +178,11 @@ def surrogate_samples(result, objective, iteration, axes=None, bounds=None):
     return panels
 
 
-def convergence(results, optimum=None, axes=None):
+def convergence(
+    results: CEResult | Mapping[str, CEResult],
+    optimum: float | None = None,
+    axes: Sequence[Axes] | None = None,
+) -> list[Axes]:
     """Best value so far by true evaluations: the mean over runs and its 95 % band, 1.96 standard
     errors (figure 2.3 of the thesis). Returns the list of Axes.
 

@@ -1,6 +1,8 @@
 """The exceedance curve of an estimate: how probable it is that an episode comes so near."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -8,10 +10,13 @@ from jast.estimate import Estimate, Exceedance
 from jast.estimate import exceedance as curve_of
 from jast.plot import style
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["exceedance"]
 
 
-def exceedance(curves: Any, truth: Any = None, ax: Any = None) -> Any:
+def exceedance(curves: Any, truth: Any = None, ax: Any = None) -> Axes:
     """The probability that an episode comes as near to a failure as a threshold of the miss
     distance, with its band, on a logarithmic axis; dashed where it must not be believed, a gap
     where it is not known, a vertical line at the failure.

@@ -1,11 +1,22 @@
 """Pictures of `jast.weakness`: which inputs fail, and which of their features mark the weakness."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jast._checks import whole
 from jast.plot import style
 from jast.plot.weakness import checked_result
 from jast.weakness.data import arrays
+
+if TYPE_CHECKING:
+    import chex
+    from matplotlib.axes import Axes
+
+    from jast.weakness.result import Result
 
 __all__ = ["contributions", "first_failures"]
 
@@ -14,7 +25,14 @@ BARS = 15  # features of a table
 EFFECTS = {1: ("raises", style.VERMILION), -1: ("lowers", style.BLUE), 0: ("neither", style.GREY)}
 
 
-def first_failures(result, inputs, labels, count=20, names=None, axes=None):
+def first_failures(
+    result: Result,
+    inputs: chex.Array,
+    labels: chex.Array,
+    count: int = 20,
+    names: Sequence[str] | None = None,
+    axes: Sequence[Axes] | None = None,
+) -> list[Axes]:
     """The first failures found, a tile each: what the system said, what it is, and the input's
     number. The thesis's figure 4.5 is `likely_failures`.
 
@@ -88,7 +106,12 @@ def first_failures(result, inputs, labels, count=20, names=None, axes=None):
     return axes
 
 
-def contributions(values, names=None, background=None, ax=None):
+def contributions(
+    values: chex.Array,
+    names: Sequence[str] | None = None,
+    background: chex.Array | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Which features mark the weakness: the mean magnitude of their contributions to the log odds
     of failure. Returns the Axes. The thesis's figure 4.6 is `pixel_likelihood`.
 

@@ -1,7 +1,9 @@
 """How a number of the state runs to failure, over many failures."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -10,6 +12,9 @@ from jast.episode import Episode, replay
 from jast.plot import style
 from jast.plot.played import DISTANCE, Given, chosen, given, kind_words, kinds, lines
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["failure_fan"]
 
@@ -25,8 +30,8 @@ def failure_fan(
     label: str | None = None,
     *,
     modes: Any = None,
-    units: dict | None = None,
-) -> Any:
+    units: dict[str, Any] | None = None,
+) -> Axes:
     """How a number of the state runs to failure, a line an episode with a mark where it fails: a
     colour and a mark for each failure mode, or, without modes, two colours where some end above 0
     and others below.

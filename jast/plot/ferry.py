@@ -1,5 +1,9 @@
 """The ferry of `jast.simulators.ferry` and its adversary."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jast.episode import replay
@@ -7,10 +11,16 @@ from jast.plot import style
 from jast.simulators.ferry import COLLISION, FerryState
 from jast.simulators.ferry import ferry as ferry_simulator
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jast.episode import Episode
+    from jast.simulator import Simulator
+
 __all__ = ["ferry"]
 
 
-def ferry(episode, sim=None, ax=None):
+def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None) -> Axes:
     """Both vessels of one ferry `Episode`: their paths with a dot a step and a number every fifth,
     and the closest approach.
 

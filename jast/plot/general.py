@@ -2,7 +2,10 @@
 came.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -14,10 +17,17 @@ from jast.fields import fields
 from jast.plot import style
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jast.search.result import SearchResult
+
 __all__ = ["disturbances", "distances", "history", "spreads"]
 
 
-def history(results, ax=None, total=False):
+def history(
+    results: SearchResult | Mapping[str, SearchResult], ax: Axes | None = None, total: bool = False
+) -> Axes:
     """How the best reward grew with the episodes of a tree: the mean over trees with its 95 % band,
     and (dashed) the best over trees.
 
@@ -84,8 +94,8 @@ def disturbances(
     axes: Any = None,
     *,
     sim: Simulator | None = None,
-    units: dict | None = None,
-) -> list:
+    units: dict[str, Any] | None = None,
+) -> list[Axes]:
     """The disturbances of one `Episode` over its steps, a panel for each array of x, a line for
     each of its numbers.
 
@@ -167,7 +177,12 @@ def _spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
     return spread(sim.start(), episode.x0) if jax.tree.leaves(episode.x0) else (), steps
 
 
-def distances(*episodes, labels=None, bins=40, ax=None):
+def distances(
+    *episodes: Episode | Sequence[Episode],
+    labels: Sequence[str] | None = None,
+    bins: int = 40,
+    ax: Axes | None = None,
+) -> Axes:
     """Histogram of the miss distances of one or several batches of episodes (each an `Episode` with
     leading axes); failures are ticks on the axis.
 

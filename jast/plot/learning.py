@@ -1,6 +1,8 @@
 """How what draws failures was learned: the training of a policy, and the levels of a proposal."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -8,10 +10,13 @@ from jast.estimate import FailureProposal
 from jast.plot import style
 from jast.policies import FailurePolicy
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["levels", "training"]
 
 
-def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = None) -> list:
+def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = None) -> list[Axes]:
     """The training of a failure policy over its episodes: the share of them that fail, and the mean
     log p of those in the latent numbers, relative to the mode, a panel each.
 
@@ -40,7 +45,7 @@ def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = Non
     return axes
 
 
-def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Any = None) -> Any:
+def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Any = None) -> Axes:
     """The miss distance that the elites of each iteration of `jast.estimate.failure_proposal`
     reached; 0 is a failure.
 

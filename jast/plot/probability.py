@@ -2,15 +2,25 @@
 trusted.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from jast.estimate import Estimate, Traces, pareto_k
 from jast.plot import style
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["probability", "weights"]
 
 
-def probability(estimates, truth=None, ax=None):
+def probability(
+    estimates: Estimate | Mapping[str, Any], truth: float | None = None, ax: Axes | None = None
+) -> Axes:
     """Failure probabilities with their intervals on a logarithmic axis, a row each; an UNRELIABLE
     one is a dashed line and a cross, and named so.
 
@@ -82,7 +92,7 @@ def probability(estimates, truth=None, ax=None):
     return ax
 
 
-def weights(traces, ax=None):
+def weights(traces: Traces, ax: Axes | None = None) -> Axes:
     """The greatest weights of an estimate: which share of the episodes has a weight above so many
     times the mean, both axes logarithmic. Returns the Axes.
 

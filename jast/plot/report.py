@@ -1,7 +1,9 @@
 """A report of `jast.stress` as a picture: one page to print or to attach."""
 
+from __future__ import annotations
+
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -26,6 +28,9 @@ from jast.simulator import Simulator
 from jast.stress_testing import Report
 from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict, work
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 __all__ = ["report"]
 
 WIDTH, MARGIN = 8.27, 0.55
@@ -42,8 +47,8 @@ def report(
     sim: Simulator | None = None,
     *,
     nominal: Any = None,
-    units: dict | None = None,
-) -> Any:
+    units: dict[str, Any] | None = None,
+) -> Figure:
     """A report on one page: what was found, the probability and whether to believe it, the first
     four modes, what was tried. ``figure.savefig("report.pdf")`` makes a file of it.
 

@@ -1,5 +1,10 @@
 """Sierra for several of its settings: figure 2.1 of Moss's thesis."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,13 +12,18 @@ import numpy as np
 from jast.cross_entropy.objectives import sierra as objective
 from jast.plot import style
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["sierra"]
 
 SIDE, POINTS, LEVELS = 15.0, 161, 24
 PUBLISHED = tuple((sharpness, decay) for decay in (1.0, 0.0) for sharpness in (0.5, 2.0, 6.0))
 
 
-def sierra(settings=PUBLISHED, axes=None, **others):
+def sierra(
+    settings: Any = PUBLISHED, axes: Sequence[Axes] | None = None, **others: Any
+) -> list[Axes]:
     """Sierra (`jast.cross_entropy.sierra`) on [-15, 15] x [-15, 15], a panel for each pair of
     settings: figure 2.1 of the thesis. The brighter, the lower; each panel has its own scale, from
     0 to the least value, which its title says.

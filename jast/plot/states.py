@@ -2,7 +2,9 @@
 another.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +22,9 @@ from jast.plot.played import (
     quiet_line,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 __all__ = ["draw_traces", "phase", "traces"]
 
 PANELS = 8
@@ -36,10 +41,10 @@ def traces(
     *,
     modes: Any = None,
     nominal: Any = None,
-    units: dict | None = None,
+    units: dict[str, Any] | None = None,
     most: int = 60,
     axes: Any = None,
-) -> list:
+) -> list[Axes]:
     """How the numbers of the state went in failures, a panel each, against the ordinary: grey bands
     from the 5 to the 95 % and from the 25 to the 75 % quantile of nominal episodes (of those that
     still run), dashed the undisturbed system. A mark ends each failure; its colour is its mode.
@@ -146,10 +151,10 @@ def phase(
     *,
     modes: Any = None,
     nominal: Any = None,
-    units: dict | None = None,
+    units: dict[str, Any] | None = None,
     most: int = 60,
     ax: Any = None,
-) -> Any:
+) -> Axes:
     """Phase portrait: one number of the state over another. Failures in the colours of their modes,
     a square where each starts and a mark where it ends; grey nominal episodes, dashed the
     undisturbed one.

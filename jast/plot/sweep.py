@@ -1,12 +1,17 @@
 """The picture of a sweep: the probability of failure against a setting."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jast.plot import style
 from jast.sweeping import Sweep
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["sweep"]
 
@@ -16,9 +21,9 @@ def sweep(
     against: str | None = None,
     *,
     level: float | None = None,
-    truth: Callable | None = None,
+    truth: Callable[..., Any] | None = None,
     ax: Any = None,
-) -> Any:
+) -> Axes:
     """The probability of failure against a setting, on a logarithmic axis: a line with the band of
     its intervals through the rows that are reliable, the others as crosses; a triangle at the
     upper end of the interval where no failure was seen.

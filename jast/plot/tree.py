@@ -2,18 +2,24 @@
 page whose nodes open.
 """
 
-import os
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jast.page.nodes import nodes_of
 from jast.plot import style
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jast.typing import PathLike
+
 __all__ = ["tree", "tree_page"]
 
 
-def tree(result: Any, axes: Any = None, *, tree: int | None = None, levels: int = 40) -> list:
+def tree(result: Any, axes: Any = None, *, tree: int | None = None, levels: int = 40) -> list[Axes]:
     """Q and visits of the nodes on the path to a tree's best episode, a panel each, and of the
     other children of each node on it: the tree, opened along that path. A dot is a child.
 
@@ -64,7 +70,7 @@ def tree(result: Any, axes: Any = None, *, tree: int | None = None, levels: int 
     return axes
 
 
-def tree_page(result: Any, path: str | os.PathLike, *, tree: int | None = None) -> None:
+def tree_page(result: Any, path: PathLike, *, tree: int | None = None) -> None:
     """Write a tree as one HTML file that needs no network and no Python: nodes that open, with
     visits, Q, the best reward below and the action; the most visited child first; opened along the
     path to the best episode. Of a large tree the most visited nodes, so that the file stays below

@@ -5,16 +5,30 @@ They read ``result.trials``, which a search keeps with ``record=True``. Left out
 were invalid, and those that a tree did not simulate as it had come to their end before.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
 import numpy as np
 
 from jast.plot import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jast.search.result import SearchResult
 
 __all__ = ["trial_distances", "trials"]
 
 MOST = 2000  # points of a line
 
 
-def trials(results, axes=None, mode="default"):
+def trials(
+    results: SearchResult | Mapping[str, SearchResult],
+    axes: Sequence[Axes] | None = None,
+    mode: Literal["default", "thesis"] = "default",
+) -> list[Axes]:
     """Over the simulations of a tree: the mean miss distance so far, the least so far, and how many
     failures so far, a panel each. Returns the list of Axes.
 
@@ -73,7 +87,12 @@ def trials(results, axes=None, mode="default"):
     return axes
 
 
-def trial_distances(results, bins=60, axes=None, mode="default"):
+def trial_distances(
+    results: SearchResult | Mapping[str, SearchResult],
+    bins: int = 60,
+    axes: Sequence[Axes] | None = None,
+    mode: Literal["default", "thesis"] = "default",
+) -> list[Axes]:
     """Histograms over all trees: the miss distances of the episodes, and log p of those that
     failed, a panel each. Returns the list of Axes.
 

@@ -1,17 +1,30 @@
 """Pictures of `jast.weakness`: failures found against calls, and how well the scores tell them."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from jast.plot import style
 from jast.weakness import measures
 from jast.weakness.result import Result
 
+if TYPE_CHECKING:
+    import chex
+    from matplotlib.axes import Axes
+
 __all__ = ["failures_found", "roc"]
 
 LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
 
-def failures_found(results, failed=None, ax=None):
+def failures_found(
+    results: Result | Sequence[Result] | Mapping[str, Any],
+    failed: chex.Array | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Failures found against calls of the system, call by call, and beside them the most that can
     be found: each call a failure. Returns the Axes.
 
@@ -83,7 +96,12 @@ def failures_found(results, failed=None, ax=None):
     return ax
 
 
-def roc(result, failed, iterations=None, ax=None):
+def roc(
+    result: Result,
+    failed: chex.Array,
+    iterations: Sequence[int] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """ROC curves of the scores after several iterations, the darker and thicker the later, each
     with the area under it (figure 4.4 of the thesis).
 

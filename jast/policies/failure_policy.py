@@ -2,6 +2,8 @@
 its training.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -121,7 +123,7 @@ class FailurePolicy(Policy):
         """int: transitions in which a number was not finite."""
         return self.history.invalid[..., -1]
 
-    def __str__(self):
+    def __str__(self) -> str:
         h, last = self.history, len(self.history.episodes) - 1
         formats = dict(
             episodes="9d",

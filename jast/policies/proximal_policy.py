@@ -1,9 +1,10 @@
 """ppo: a failure policy by proximal policy optimisation (Schulman et al., arXiv:1707.06347)."""
 
+from __future__ import annotations
+
 import math
-import os
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,11 @@ from jast.policies.latent import sizes
 from jast.policies.proximal import Rates, networks
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, PathLike
+
 __all__ = ["ppo"]
 
 LONGEST = 128
@@ -31,7 +37,7 @@ LOOKED_AT = 100_000
 
 
 def ppo(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 12_000,
@@ -50,8 +56,8 @@ def ppo(
     clip: float = 0.2,
     trace: float = 0.95,
     progress: bool = False,
-    callback: Callable[..., Any] | None = None,
-    checkpoint: str | os.PathLike | None = None,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> FailurePolicy:
     """Teach a policy to make ``sim`` fail in the likeliest ways: the `FailurePolicy` that
     `jast.policies.sac` hands out, by clipped proximal policy optimisation with generalised

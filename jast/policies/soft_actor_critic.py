@@ -2,10 +2,11 @@
 arXiv:1812.05905).
 """
 
+from __future__ import annotations
+
 import math
-import os
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,11 @@ from jast.policies.latent import sizes
 from jast.policies.learner import Rates, networks
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, PathLike
+
 __all__ = ["sac"]
 
 UPDATES = 5000
@@ -31,7 +37,7 @@ ALONE = 0.1
 
 
 def sac(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 12_000,
@@ -50,8 +56,8 @@ def sac(
     polyak: float = 0.01,
     updates: int | str = "auto",
     progress: bool = False,
-    callback: Callable[..., Any] | None = None,
-    checkpoint: str | os.PathLike | None = None,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
 ) -> FailurePolicy:
     """Teach a policy to make ``sim`` fail in the likeliest ways: `FailurePolicy`, a `jast.Policy`
     with its start, for `jast.rollout` and importance sampling.

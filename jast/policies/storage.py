@@ -2,7 +2,10 @@
 simulator's functions are not in it.
 """
 
+from __future__ import annotations
+
 import os
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +24,20 @@ from jast.policies.learner import learner
 from jast.policies.start import Tilt
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    from jast.typing import PathLike
+
 __all__ = ["load", "save"]
 
 
-def save(path: str | os.PathLike, policy: FailurePolicy) -> None:
+def save(path: PathLike, policy: FailurePolicy) -> None:
     """`jast.save` of a `FailurePolicy`; goes with the next version. ValueError for a policy of
     another kind.
     """
     files.store(path, "jast policy", policy)
 
 
-def load(path: str | os.PathLike, sim: Simulator) -> FailurePolicy:
+def load(path: PathLike, sim: Simulator) -> FailurePolicy:
     """`jast.load` of a `FailurePolicy`, with the simulator that it was taught on, or one like it;
     goes with the next version.
     """

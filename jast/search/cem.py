@@ -7,8 +7,10 @@ time, each step with its own (`jast.cross_entropy.sequences`). Unlike there, eli
 all iterations.
 """
 
+from __future__ import annotations
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,14 @@ from jast.search import proposals as P
 from jast.search.ending import ended, planned, usual
 from jast.search.pilot import joined
 from jast.search.prepare import default_actions, prepare
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.failures import Failures
+    from jast.search.result import SearchResult
+    from jast.simulator import Simulator
+    from jast.typing import Actions, Callback, PathLike, Reward
 
 __all__ = ["cem"]
 
@@ -63,26 +73,26 @@ class Pool(NamedTuple):
 
 
 def cem(
-    key,
-    sim,
+    key: chex.PRNGKey,
+    sim: Simulator,
     *,
-    samples=300,
-    elites=30,
-    iterations=30,
-    reward=None,
-    actions=None,
-    smoothing=0.3,
-    floor=0.05,
-    fresh=0.1,
-    trees=1,
-    failures=None,
-    refine=None,
-    top=64,
-    record=False,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-):
+    samples: int = 300,
+    elites: int = 30,
+    iterations: int = 30,
+    reward: Reward | None = None,
+    actions: Actions | None = None,
+    smoothing: float = 0.3,
+    floor: float = 0.05,
+    fresh: float = 0.1,
+    trees: int = 1,
+    failures: Failures | None = None,
+    refine: float | None = None,
+    top: int = 64,
+    record: bool = False,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+) -> SearchResult:
     """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the
     ``elites`` best distinct ones so far; maximises ``reward``.
 

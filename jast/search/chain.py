@@ -7,8 +7,10 @@ points (parallel tempering, Geyer 1991; Earl and Deem 2005). There is no drift b
 density of z is Gaussian, and the proposal has that drift already, exactly.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,11 @@ from jast.search.ending import SHARE, ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback
+
 __all__ = ["chain"]
 
 LANES, MOMENTS = 64, 100
@@ -38,7 +45,7 @@ LEVELS = 4, 16
 
 
 def chain(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 100_000,
@@ -46,7 +53,7 @@ def chain(
     refine: float | None = None,
     top: int = 64,
     progress: bool = False,
-    callback: Callable | None = None,
+    callback: Callback | None = None,
 ) -> SearchResult:
     """Find likely failures of many kinds by Markov chains that never leave the failures.
 

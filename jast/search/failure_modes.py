@@ -1,8 +1,10 @@
 """Failure modes: which failures are variants of one another, and the likeliest of each kind."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -41,16 +43,16 @@ class Modes(tuple):
 
     evaluations = 0
 
-    def __new__(cls, items: Iterable[Mode] = (), evaluations: int = 0):
+    def __new__(cls, items: Iterable[Mode] = (), evaluations: int = 0) -> Modes:
         self = super().__new__(cls, items)
         self.evaluations = evaluations
         return self
 
-    def _asdict(self):
+    def _asdict(self) -> dict[str, Any]:
         """For files."""
         return dict(items=tuple(self), evaluations=self.evaluations)
 
-    def __str__(self):
+    def __str__(self) -> str:
         if not self:
             return "no failure mode"
         lines = [

@@ -7,9 +7,11 @@ in [0, 1]: what a requirement over time asks for is rarely noise that is new at 
 level that is held, at an end of its range for some seconds.
 """
 
-from collections.abc import Callable, Iterator
+from __future__ import annotations
+
+from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,11 @@ from jast.search import lockstep as E
 from jast.search.result import History, SearchResult
 from jast.simulator import Simulator
 from jast.watch import Watch, in_pieces
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback
 
 __all__ = ["falsify"]
 
@@ -66,7 +73,7 @@ class _Found(NamedTuple):
 
 
 def falsify(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     simulations: int = 300,
@@ -74,7 +81,7 @@ def falsify(
     stop: bool = True,
     top: int = 64,
     progress: bool = False,
-    callback: Callable | None = None,
+    callback: Callback | None = None,
 ) -> SearchResult:
     """Find a failure with few simulations, however unlikely it is.
 

@@ -2,8 +2,23 @@
 1.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
 from jast.search.tree.grow import grow_trees
 from jast.search.tree.settings import PLAIN, settled
+
+if TYPE_CHECKING:
+    import chex
+    import jax
+
+    from jast.heads.heads import Heads
+    from jast.heads.settings import HeadSettings
+    from jast.search.result import SearchResult
+    from jast.simulator import Simulator
+    from jast.typing import Actions, Callback, Executor, PathLike, Reward
 
 __all__ = ["MODES", "forest"]
 
@@ -21,38 +36,38 @@ MODES = {
 
 
 def forest(
-    key,
-    sim,
+    key: chex.PRNGKey,
+    sim: Simulator,
     *,
-    trees=200,
-    prunes=18,
-    simulations=500,
-    heads=None,
-    reward=None,
-    actions=None,
-    exploration=None,
-    mode="default",
-    widening=None,
-    spread=None,
-    focus=None,
-    follow=None,
-    feed=None,
-    urgent=None,
-    head_settings=None,
-    memoize="auto",
-    refine=None,
-    top=64,
-    record=False,
-    keep_trees=False,
-    threads=None,
-    lanes=None,
-    available=None,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    trees: int = 200,
+    prunes: int = 18,
+    simulations: int = 500,
+    heads: Heads | Callable[..., Any] | None = None,
+    reward: Reward | None = None,
+    actions: Actions | None = None,
+    exploration: float | None = None,
+    mode: Literal["default", "code", "text", "paper", "thesis", "episodic"] = "default",
+    widening: tuple[float, float] | None = None,
+    spread: float | None = None,
+    focus: float | None = None,
+    follow: float | None = None,
+    feed: int | None = None,
+    urgent: float | None = None,
+    head_settings: HeadSettings | None = None,
+    memoize: bool | Literal["auto"] = "auto",
+    refine: float | None = None,
+    top: int = 64,
+    record: bool = False,
+    keep_trees: bool = False,
+    threads: int | None = None,
+    lanes: int | None = None,
+    available: int | None = None,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> SearchResult:
     """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each:
     `SearchResult`. The reward is maximised.
 

@@ -7,8 +7,11 @@ phase has a search: from each state of the known failing episode, the later ones
 ways to a failure.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +33,11 @@ from jast.search.ending import SHARE, ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback
+
 __all__ = ["go_explore"]
 
 LANES, HOSTED, SLOTS, TRACES = 256, 64, 4096, 4
@@ -42,17 +50,17 @@ MOMENTS = 100
 
 
 def go_explore(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     episodes: int = 100_000,
     length: int | None = None,
-    cell: Callable | None = None,
+    cell: Callable[..., Any] | None = None,
     backward: float = 0.5,
     refine: float | None = None,
     top: int = 64,
     progress: bool = False,
-    callback: Callable | None = None,
+    callback: Callback | None = None,
 ) -> SearchResult:
     """Find failures that need many things to go wrong one after another: for long horizons, and for
     systems that do not say how near a failure is.

@@ -2,7 +2,9 @@
 the likeliest failures (`jast.boundary`, `jast.search.refine`).
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,11 @@ from jast.search.ending import ended, planned
 from jast.search.result import SearchResult
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback
+
 __all__ = ["gradient"]
 
 GRADIENT = 4
@@ -32,14 +39,14 @@ LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3
 
 
 def gradient(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     *,
     starts: int = 48,
     refine: float | None = None,
     top: int = 64,
     progress: bool = False,
-    callback: Callable | None = None,
+    callback: Callback | None = None,
 ) -> SearchResult:
     """Follow the gradient of the miss distance to failures, and make them as likely as they get.
 

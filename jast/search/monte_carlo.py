@@ -2,8 +2,11 @@
 search.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,13 @@ from jast.search import lockstep as E
 from jast.search.ending import ended, planned, usual
 from jast.search.prepare import prepare
 from jast.watch import Watch
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.search.result import SearchResult
+    from jast.simulator import Simulator
+    from jast.typing import Actions, Callback, Executor, PathLike, Reward
 
 __all__ = ["monte_carlo"]
 
@@ -50,21 +60,21 @@ SAMPLES = choices.samples()
 
 
 def monte_carlo(
-    key,
-    sim,
+    key: chex.PRNGKey,
+    sim: Simulator,
     *,
-    episodes=100_000,
-    reward=None,
-    actions=SAMPLES,
-    refine=None,
-    top=64,
-    record=False,
-    progress=False,
-    callback=None,
-    checkpoint=None,
-    executor=None,
-    devices=None,
-):
+    episodes: int = 100_000,
+    reward: Reward | None = None,
+    actions: Actions = SAMPLES,
+    refine: float | None = None,
+    top: int = 64,
+    record: bool = False,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> SearchResult:
     """What are the likeliest failures that chance alone finds? Simulate ``episodes`` independent
     episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree.
     Maximises ``reward``. The baseline of searches, with ``refine=0``; `jast.nominal` only counts,

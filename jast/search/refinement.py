@@ -1,7 +1,9 @@
 """refine: from failures to the likeliest failures near them."""
 
+from __future__ import annotations
+
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,9 @@ from jast.search import moves as M
 from jast.search.centred import centred
 from jast.search.rounds import begun, residuals, round_of
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Refined", "refine"]
 
@@ -55,9 +60,9 @@ class Refined(NamedTuple):
     episodes: int
     """Evaluations: episodes simulated; one with its gradient counts as 4."""
     invalid: int
-    settings: dict
+    settings: dict[str, Any]
 
-    def __str__(self):
+    def __str__(self) -> str:
         n = len(self.failures)
         if not n:
             return f"refine: no failure to pull, {self.episodes} evaluations"
@@ -73,7 +78,7 @@ class Refined(NamedTuple):
 
 
 def refine(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     failures: Failures | Episode,
     *,

@@ -2,6 +2,9 @@
 failures.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,7 +90,7 @@ class SearchResult(NamedTuple):
     """int: episodes in which the simulator, a density or the reward gave NaN or infinity; they
     count as no failure, with reward -inf.
     """
-    settings: dict | None
+    settings: dict[str, Any] | None
     """What was asked for: method, counts, seed."""
     roots: Any = None
     """Of trees: statistics of every root (`jast.search.tree.prune.Roots`, one for each prune)."""
@@ -95,11 +98,11 @@ class SearchResult(NamedTuple):
     """`jast.heads.Heads` as the search left them, to be used again; None without."""
     trials: Trials | None = None
     """Every episode, where the search was asked to ``record``."""
-    incidents: tuple = ()
+    incidents: tuple[Any, ...] = ()
     """What went wrong on the host of a black box: `jast.incidents.Incident`, with counts and an
     example of each.
     """
-    lessons: tuple = ()
+    lessons: tuple[Any, ...] = ()
     """Of each round of training: name of the head -> `jast.heads.Lesson`."""
     failing: Any = None
     """int: how many of the episodes failed."""
@@ -129,11 +132,11 @@ class SearchResult(NamedTuple):
         """int: the episodes, and the evaluations of the refinement."""
         return self.episodes + (0 if self.refined is None else self.refined.episodes)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return table({(self.settings or {}).get("method", "search"): self}) + "\n" + _words(self)
 
 
-def table(results):
+def table(results: Mapping[str, SearchResult]) -> str:
     """A readable table of several searches, a dict name -> `SearchResult`."""
     lines = [
         f"{'method':14} {'episodes':>10} {'steps':>12} {'failing':>9} {'trees':>7} {'first':>9}"

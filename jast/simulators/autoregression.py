@@ -6,6 +6,10 @@ truth (a = exp(-.1), threshold 5, 100 steps; Nystrom quadrature of the first-pas
 agree to 1e-9): P = 1.7438880336e-5.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
@@ -13,10 +17,15 @@ from jast.distributions import Normal
 from jast.simulator import Simulator
 from jast.simulators._parameter import positive
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["autoregression"]
 
 
-def autoregression(rate=0.1, threshold=5.0, horizon=100):
+def autoregression(
+    rate: chex.Numeric = 0.1, threshold: chex.Numeric = 5.0, horizon: int = 100
+) -> Simulator:
     """The process from 0, a `Simulator` with a scalar state of variance below 1 and a standard
     normal x (scalar).
 

@@ -24,12 +24,14 @@ late (R without the wind) and ends LNAV beside the last waypoint (issue #354): a
 onto a last leg of 3.5 nmi in 30 kt passes by .8 nmi, within the tolerance.
 """
 
+from __future__ import annotations
+
 import contextlib
 import importlib.metadata
 import io
 import threading
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +39,11 @@ import numpy as np
 from jast._checks import real, whole
 from jast.blackbox import from_python
 from jast.distributions import Independent, Normal
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.simulator import Simulator
 
 __all__ = ["MEANS", "SIGMAS", "Flight", "bluesky", "bluesky_flight"]
 
@@ -72,7 +79,9 @@ class Flight(NamedTuple):
     """BlueSky ended LNAV within the time"""
 
 
-def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
+def bluesky(
+    waypoints: int = 4, tolerance: float = 1.0, *, workers: int = 1, time_limit: float | None = None
+) -> Simulator:
     """Routes of ``waypoints`` random waypoints flown by BlueSky, an episodic `Simulator` of as many
     steps through `jast.blackbox.from_python`.
 
@@ -108,7 +117,7 @@ def bluesky(waypoints=4, tolerance=1.0, *, workers=1, time_limit=None):
     )
 
 
-def bluesky_flight(disturbances):
+def bluesky_flight(disturbances: chex.Array) -> Flight:
     """The `Flight` of the disturbances [T, 4] of an episode of `bluesky`, flown by the BlueSky of
     this process. ImportError, ValueError for another shape.
     """

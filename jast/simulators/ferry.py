@@ -9,7 +9,9 @@ failure, closest approach 24.2074. Best known failure: reward 29.649, seeds 0.97
 Rewards are those of ``standard(event_bonus=30., density="mode")`` with actions ``uniform(0., 1.)``.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +40,9 @@ class FerryState(NamedTuple):
     moving: jax.Array
 
 
-def ferry(adversary=(16.0, 0.0), observation="code"):
+def ferry(
+    adversary: tuple[float, float] = (16.0, 0.0), observation: Literal["code", "default"] = "code"
+) -> Simulator:
     """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts
     ((17, 0) is the easier S0b). ``observation``: what networks see. "code": the five numbers of the
     published code, the ferry's x and the adversary's x and y over 100, and half of the sine and

@@ -8,7 +8,9 @@ x1(0) = 0, x2(0) = s0 ~ N(0, sigma_i^2); ten steps of x1 += 1, x2 += x_t, x_t ~ 
 var = .04737 and their mirror image, var = .019.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,9 @@ from jax.tree_util import Partial
 from jast.distributions import Normal
 from jast.simulator import Simulator
 from jast.simulators._parameter import positive
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["LandingState", "landing", "landing_probability"]
 
@@ -31,7 +36,9 @@ class LandingState(NamedTuple):
     x2: jax.Array
 
 
-def landing(b=1.0, sigma_i=0.1, sigma_t=0.03):
+def landing(
+    b: chex.Numeric = 1.0, sigma_i: chex.Numeric = 0.1, sigma_t: chex.Numeric = 0.03
+) -> Simulator:
     """The landing, a `Simulator` of ten steps, episodic, with the initial offset as x0 (scalar) and
     the drift of a step as x (scalar).
 
@@ -51,7 +58,9 @@ def landing(b=1.0, sigma_i=0.1, sigma_t=0.03):
     )
 
 
-def landing_probability(b=1.0, sigma_i=0.1, sigma_t=0.03):
+def landing_probability(
+    b: chex.Numeric = 1.0, sigma_i: chex.Numeric = 0.1, sigma_t: chex.Numeric = 0.03
+) -> chex.Array:
     """The failure probability of `landing` in closed form: 2 Phi(-b / sqrt(sigma_i^2 + 10
     sigma_t^2)).
     """

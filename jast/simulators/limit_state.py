@@ -6,6 +6,11 @@ Known truths: hyperplane g = 5 - x.e, abs(e) = 1, any d: Phi(-5) = 2.8665157188e
 2: 2.2227950662e-3; g = max(3.5 - x1, 3.5 - x2): Phi(-3.5)^2 = 5.4116288413e-8.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -13,10 +18,13 @@ from jax.tree_util import Partial
 from jast.distributions import MultivariateNormalDiag
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["limit_state"]
 
 
-def limit_state(g, dimension):
+def limit_state(g: Callable[[Any], chex.Array], dimension: int) -> Simulator:
     """One step, x ~ N(0, I_dimension) [dimension]; failure where g(x) <= 0, miss distance max(g(x),
     0): a `Simulator`, episodic.
 

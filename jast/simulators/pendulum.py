@@ -8,7 +8,9 @@ truth: P = 8.169e-3 +- .009e-3 (Monte Carlo, 1e8 episodes, one standard error). 
 failure.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,9 @@ from jax.tree_util import Partial
 from jast.distributions import MultivariateNormalDiag
 from jast.simulator import Simulator
 from jast.simulators._parameter import positive
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["PendulumState", "pendulum"]
 
@@ -33,7 +38,12 @@ class PendulumState(NamedTuple):
     omega: jax.Array
 
 
-def pendulum(noise=0.1, sigma_theta=jnp.pi / 32, sigma_omega=0.5, limit=jnp.pi / 4):
+def pendulum(
+    noise: chex.Numeric = 0.1,
+    sigma_theta: chex.Numeric = jnp.pi / 32,
+    sigma_omega: chex.Numeric = 0.5,
+    limit: chex.Numeric = jnp.pi / 4,
+) -> Simulator:
     """The pendulum, a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the error of the
     observation as x [2].
 

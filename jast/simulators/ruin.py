@@ -7,6 +7,10 @@ Known truth (up = .4, start 1, goal 30), without a horizon: P = (r^start - 1) / 
 9.9e-4 of it (powers of the transition matrix).
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
@@ -16,10 +20,13 @@ from jast._jax import is_traced
 from jast.distributions import Categorical
 from jast.simulator import Simulator
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["ruin", "ruin_probability"]
 
 
-def ruin(up=0.4, start=1, goal=30, horizon=371):
+def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 371) -> Simulator:
     """The gambler, a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0
     (lost), int32.
 
@@ -45,7 +52,9 @@ def ruin(up=0.4, start=1, goal=30, horizon=371):
     )
 
 
-def ruin_probability(up=0.4, start=1, goal=30, horizon=None):
+def ruin_probability(
+    up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int | None = None
+) -> chex.Array:
     """The failure probability of `ruin`, scalar: in closed form without a horizon, else exactly,
     step by step. ``start``, ``goal``, ``horizon``: ints.
     """

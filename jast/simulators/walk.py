@@ -6,6 +6,10 @@ Known truth (sigma = 1, threshold = 10, failure at any step; quadrature, two gri
 -13.5754; by density over that of the mode: 30 steps of 1/3, -1.6667.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
@@ -13,12 +17,20 @@ from jast.distributions import Normal
 from jast.simulator import Simulator
 from jast.simulators._parameter import positive
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["walk1d"]
 
 HORIZON = {"two-sided": 30, "one-sided": 10}
 
 
-def walk1d(form="two-sided", sigma=1.0, threshold=10.0, horizon=None):
+def walk1d(
+    form: Literal["two-sided", "one-sided"] = "two-sided",
+    sigma: chex.Numeric = 1.0,
+    threshold: chex.Numeric = 10.0,
+    horizon: int | None = None,
+) -> Simulator:
     """s += x, x ~ N(0, sigma^2), from s = 0: a `Simulator` with a scalar state.
 
     ``form="two-sided"`` fails where abs(s) >= threshold within 30 steps, miss distance

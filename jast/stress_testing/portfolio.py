@@ -1,8 +1,9 @@
 """jast.stress: check, nominal, explorers, refinement, modes, probability; one budget."""
 
+from __future__ import annotations
+
 import warnings
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -26,6 +27,11 @@ from jast.stress_testing.shares import cost as shares_cost
 from jast.stress_testing.shares import shares
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback
+
 __all__ = ["stress"]
 
 LEAST, ESTIMABLE, SMALL = 300, 5000, 20
@@ -47,13 +53,13 @@ nothing else to find: the evaluations of `onward` are the estimate's then.
 
 
 def stress(
-    key: jax.Array,
+    key: chex.PRNGKey,
     sim: Simulator,
     budget: int = 200_000,
     *,
     top: int = 64,
     progress: bool = False,
-    callback: Callable | None = None,
+    callback: Callback | None = None,
 ) -> Report:
     """How does the system fail, how likely, and what is its likeliest failure?
 

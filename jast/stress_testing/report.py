@@ -1,8 +1,9 @@
 """What `jast.stress` says: one screen, or a page to hand on."""
 
-import os
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from jast.failures import Failures
 from jast.search.failure_modes import Modes
 from jast.simulator import Simulator
 from jast.stress_testing.words import advice, verdict, work
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
 
 __all__ = ["Report", "Tried"]
 
@@ -46,25 +50,25 @@ class Report(NamedTuple):
     boundary of failure as a share of its whole slope; NaN where the distance has no gradient."""
     late: float
     """log p that the likeliest failure gained in the last tenth of its refinement."""
-    tried: tuple
+    tried: tuple[Any, ...]
     """`Tried`: what was done, in order."""
     episodes: int
     """Evaluations in all; one with its gradient counts for more."""
     invalid: int
-    settings: dict
+    settings: dict[str, Any]
     sim: Simulator | None = None
     """The simulator, which plays failures again; None in a report from a file, as a file holds no
     functions."""
 
     @property
-    def spent(self) -> dict:
+    def spent(self) -> dict[str, Any]:
         """Evaluations by the name of what they were spent on."""
         spent = {}
         for part in self.tried:
             spent[part.name] = spent.get(part.name, 0) + part.evaluations
         return spent
 
-    def __str__(self):
+    def __str__(self) -> str:
         lines = [*(f"{name:<13}{text}" for name, text in verdict(self)), ""]
         if self.modes:
             lines += [str(self.modes), ""]
@@ -73,7 +77,7 @@ class Report(NamedTuple):
 
     def html(
         self,
-        path: str | os.PathLike,
+        path: PathLike,
         sim: Simulator | None = None,
         *,
         draw: Callable[[Any], str] | None = None,

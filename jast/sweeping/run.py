@@ -1,8 +1,10 @@
 """sweep: one function on many systems."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -16,19 +18,24 @@ from jast.sweeping.batch import batch, kinds
 from jast.sweeping.table import Sweep
 from jast.watch import Watch
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, Executor
+
 __all__ = ["sweep"]
 
 
 def sweep(
-    key: jax.Array,
+    key: chex.PRNGKey,
     simulators: Callable[..., Simulator] | Sequence[Simulator],
-    values: Mapping[str, Iterable],
+    values: Mapping[str, Iterable[Any]],
     function: Callable[..., Any] = failure_probability,
     *,
     follow: bool | None = None,
-    executor: Any = None,
+    executor: Executor | None = None,
     progress: bool = False,
-    callback: Callable[[int, int, Any], Any] | None = None,
+    callback: Callback | None = None,
     **options: Any,
 ) -> Sweep:
     """How does a result depend on a setting? ``function`` on a system for each of N values::

@@ -2,6 +2,8 @@
 probability crosses a level.
 """
 
+from __future__ import annotations
+
 import math
 from textwrap import shorten
 from typing import Any, NamedTuple
@@ -43,7 +45,7 @@ class Crossing(NamedTuple):
     """
     level: float
 
-    def __str__(self):
+    def __str__(self) -> str:
         low, high = self.interval
         return f"{self.name} {self.value:.6g} [{low:.6g}, {high:.6g}] at probability {self.level:g}"
 
@@ -55,21 +57,21 @@ class Sweep(NamedTuple):
     holds, with ``near``, the result of the last row before it that has one.
     """
 
-    values: dict[str, tuple]
+    values: dict[str, tuple[Any, ...]]
     """The settings: name -> N values"""
-    results: tuple
+    results: tuple[Any, ...]
     """[N] what the function returned; None where it raised"""
-    errors: tuple
+    errors: tuple[Any, ...]
     """[N] texts of what was raised; None where nothing was"""
-    simulators: tuple
+    simulators: tuple[Any, ...]
     """[N] `jast.Simulator`; None where it could not be made"""
-    settings: dict
+    settings: dict[str, Any]
     """What was asked for; ``programs``: how many kinds of systems there were, which compile apart;
     ``interrupted`` where the last rows are missing
     """
 
     @property
-    def answers(self) -> tuple:
+    def answers(self) -> tuple[Any, ...]:
         """[N] `Answer` of each row."""
         return tuple(map(answer, self.results))
 
@@ -161,7 +163,7 @@ class Sweep(NamedTuple):
             )
         return name, numeric[name]
 
-    def __str__(self):
+    def __str__(self) -> str:
         rows = [_row(*each) for each in zip(self.results, self.errors)]
         columns = [[k, *map(_text, values)] for k, values in self.values.items()]
         names = dict.fromkeys(k for row in rows for k in row if k != NOTE)

@@ -2,8 +2,13 @@
 it answers.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
 
 __all__ = ["Seen", "Selector", "Step"]
 
@@ -19,12 +24,12 @@ class Seen(NamedTuple):
     """[n] int32: the true classes"""
 
     @property
-    def tried(self):
+    def tried(self) -> np.ndarray:
         """[n] bool"""
         return self.predicted >= 0
 
     @property
-    def failed(self):
+    def failed(self) -> np.ndarray:
         """[n] bool: run, and wrong"""
         return self.tried & (self.predicted != self.labels)
 
@@ -32,7 +37,7 @@ class Seen(NamedTuple):
 class Step(NamedTuple):
     """What one iteration of a selector comes to."""
 
-    memory: dict
+    memory: dict[str, Any]
     """Arrays by name: what the next iteration needs of this one"""
     scores: Any
     """[n] in [0, 1]: how suspect each input is"""
@@ -48,11 +53,11 @@ class Selector(NamedTuple):
     """A way of choosing inputs: `default`, `thesis`, `random`, or your own."""
 
     name: str
-    settings: dict
+    settings: dict[str, Any]
     """Plain numbers and texts: a state of other settings is refused"""
-    start: Callable
+    start: Callable[..., Any]
     """``start(key, data) -> memory``, before any call"""
-    step: Callable
+    step: Callable[..., Any]
     """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do.
     ``ask(indices)`` runs the system on those of ``indices`` that were not run yet, as far as the
     budget goes, and returns the new `Seen`.

@@ -2,17 +2,22 @@
 from.
 """
 
+from __future__ import annotations
+
 import gzip
 import hashlib
 import math
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jast._checks import whole
 from jast.weakness.result import Result
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
 
 __all__ = ["Data", "arrays", "digits", "from_idx", "idx"]
 
@@ -33,11 +38,11 @@ class Data(NamedTuple):
     classes: int
 
     @property
-    def size(self):
+    def size(self) -> int:
         return len(self.labels)
 
     @property
-    def image(self):
+    def image(self) -> bool:
         """Whether the inputs are images or other grids, whose numbers have one unit; else they are
         rows of a table, whose columns each have their own.
         """
@@ -121,7 +126,7 @@ def fingerprint(data):
     return digest.hexdigest()[:16]
 
 
-def idx(path):
+def idx(path: PathLike) -> np.ndarray:
     """The array of one IDX file, the format of MNIST, EMNIST and Fashion-MNIST, compressed with
     gzip or not; in the machine's byte order.
 
@@ -158,7 +163,7 @@ def idx(path):
     return np.frombuffer(raw, kind, offset=start).reshape(shape).astype(kind.newbyteorder("="))
 
 
-def from_idx(folder, name="t10k"):
+def from_idx(folder: PathLike, name: str = "t10k") -> tuple[np.ndarray, np.ndarray]:
     """``(inputs [n, height, width] float32 in [0, 1], labels [n] int32)`` of a folder of IDX files:
     MNIST's, by default its test images.
 
@@ -178,7 +183,7 @@ def from_idx(folder, name="t10k"):
     return images.astype(np.float32) / np.float32(255), labels.astype(np.int32)
 
 
-def digits():
+def digits() -> tuple[np.ndarray, np.ndarray]:
     """``(inputs [1797, 8, 8] float32 in [0, 1], labels [1797] int32)``: the handwritten digits that
     come with scikit-learn, of E. Alpaydin and C. Kaynak.
     """

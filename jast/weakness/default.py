@@ -2,6 +2,8 @@
 the system differs, learned from its answers.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jast._checks import number, whole
@@ -26,7 +28,9 @@ SURE, ENOUGH = 2, 20
 PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
 
 
-def default(*, first=None, growth=0.35, exploration=0.01, repeats=4):
+def default(
+    *, first: int | None = None, growth: float = 0.35, exploration: float = 0.01, repeats: int = 4
+) -> Selector:
     """The `Selector` that `validate` uses unless told otherwise. It needs no knowledge of the
     system, and works on images and tables.
 

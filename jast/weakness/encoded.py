@@ -1,7 +1,9 @@
 """The networks that the thesis's selector ended with, for pictures of what they have learned."""
 
+from __future__ import annotations
+
 import json
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,6 +14,11 @@ from jast.weakness.data import of_result
 from jast.weakness.thesis import encoder, nested
 from jast.weakness.validation import iteration_key
 from jast.weakness.views import scaled
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.weakness.result import Result
 
 __all__ = ["Encoded", "encoded"]
 
@@ -24,21 +31,21 @@ class Encoded(NamedTuple):
     """[n, h]: E(x) of each input"""
     scores: Any
     """[n]: A(E(x)), how suspect the adversary finds each input, in [0, 1]"""
-    shape: tuple
+    shape: tuple[Any, ...]
     """Of an input"""
     autoencoder: Any
     """Parameters"""
     adversary: Any
     """Parameters"""
-    hidden: tuple
+    hidden: tuple[Any, ...]
     """The autoencoder's widths"""
 
-    def score(self, rows):
+    def score(self, rows: chex.Array) -> chex.Array:
         """A(E(x)) [m] of ``rows`` [m, d] in the scale of the autoencoder, 0 to 1."""
         codes = self._network.encode(self.autoencoder, np.asarray(rows, np.float32))
         return np.asarray(jax.nn.sigmoid(networks.logits(self.adversary, codes)))
 
-    def decode(self, codes):
+    def decode(self, codes: chex.Array) -> chex.Array:
         """What the decoder makes of ``codes`` [m, h]: [m, ...] in the shape of the inputs."""
         rows = self._network.decode(self.autoencoder, np.asarray(codes, np.float32))
         return np.asarray(rows).reshape(-1, *self.shape)
@@ -48,7 +55,9 @@ class Encoded(NamedTuple):
         return networks.autoencoder(int(np.prod(self.shape)), self.hidden)
 
 
-def encoded(result, inputs, labels, *, classes=None):
+def encoded(
+    result: Result, inputs: chex.Array, labels: chex.Array, *, classes: int | None = None
+) -> Encoded:
     """The `Encoded` networks of a result of the thesis's selector.
 
     A result keeps the codes and the adversary, not the autoencoder, which is trained here once more

@@ -2,6 +2,11 @@
 that imitate the system.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jast._checks import random_key
@@ -11,12 +16,25 @@ from jast.weakness.data import of_result, within
 from jast.weakness.default import PASSES, STRENGTH
 from jast.weakness.views import centred, scaled
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.weakness.result import Result
+
 __all__ = ["influence"]
 
 MEMBERS, EFFORT = 5, 4
 
 
-def influence(key, result, inputs, labels, *, at=None, classes=None):
+def influence(
+    key: chex.PRNGKey,
+    result: Result,
+    inputs: chex.Array,
+    labels: chex.Array,
+    *,
+    at: chex.Array | Sequence[int] | None = None,
+    classes: int | None = None,
+) -> np.ndarray:
     """[k, ...]: what each number of k inputs contributes to the log odds that the system gets them
     wrong, in the shape of the inputs; above 0: to failure.
 

@@ -2,13 +2,18 @@
 recall.
 """
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jast import results
 from jast._checks import number, whole
 from jast.weakness.result import Result
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
 
@@ -25,7 +30,7 @@ class Roc(NamedTuple):
     """[m]: falling, from infinity"""
 
     @property
-    def area(self):
+    def area(self) -> float:
         """Under the curve; NaN where all inputs fail or none."""
         return float(np.trapezoid(self.true_positive, self.false_positive))
 
@@ -44,7 +49,7 @@ class Judgement(NamedTuple):
     """[R] int: inputs with a score of at least the threshold, or the ``top``"""
 
 
-def roc(scores, failed):
+def roc(scores: chex.Array, failed: chex.Array) -> Roc:
     """The `Roc` of ``scores`` [n] (high: suspect) against ``failed`` [n] bool; equal scores are one
     point. NaN shares where all fail or none.
 
@@ -68,14 +73,16 @@ def roc(scores, failed):
     )
 
 
-def auc(scores, failed):
+def auc(scores: chex.Array, failed: chex.Array) -> float:
     """Area under the ROC curve: the chance that a failure has the higher score of a random pair,
     equal ones count half. NaN where all inputs fail or none.
     """
     return roc(scores, failed).area
 
 
-def judge(result, failed, *, threshold=0.5, top=None):
+def judge(
+    result: Result, failed: chex.Array, *, threshold: float = 0.5, top: int | None = None
+) -> Judgement:
     """The `Judgement` of a result's iterations by the truth on all inputs: ``failed`` [n] bool,
     which only a study knows that has run the system on all.
 

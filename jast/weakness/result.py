@@ -1,5 +1,7 @@
 """What a validation returns."""
 
+from __future__ import annotations
+
 import json
 from typing import Any, NamedTuple
 
@@ -49,7 +51,7 @@ class State(NamedTuple):
     """Fingerprint of the inputs and labels"""
     key: Any
     """The key's numbers"""
-    memory: dict
+    memory: dict[str, Any]
     """What the selector has learned: arrays by name"""
     order: Any
     """[calls] int: the inputs that were run"""
@@ -83,7 +85,7 @@ class Result(NamedTuple):
     expected: float
     """How many failures the selector expects among these; NaN before and within an iteration"""
     history: History
-    incidents: tuple
+    incidents: tuple[Any, ...]
     """Texts: why it ended before its budget was spent, empty if it did not"""
     state: State
     """Give it to `validate` again to go on"""
@@ -100,7 +102,7 @@ class Result(NamedTuple):
         """The ``selector`` with its settings, as text."""
         return {"selector": self.state.selector}
 
-    def __str__(self):
+    def __str__(self) -> str:
         h, n = self.history, len(self.scores)
         rows = zip(h.calls, h.found, h.precision, h.recall, h.auc, h.expected, strict=True)
         table = "\n".join(

@@ -1,5 +1,7 @@
 """The selectors by name."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jast._checks import whole
@@ -11,7 +13,7 @@ from jast.weakness.thesis import thesis
 __all__ = ["default", "random", "thesis"]
 
 
-def random(*, batch=None):
+def random(*, batch: int | None = None) -> Selector:
     """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least
     10): the baseline, whose failure rate is unbiased.
     """

@@ -1,24 +1,29 @@
 """States of a validation in files."""
 
+from __future__ import annotations
+
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jast import files
 from jast.weakness.result import History, State
 
+if TYPE_CHECKING:
+    from jast.typing import PathLike
+
 __all__ = ["load", "save"]
 
 PLAIN = ("selector", "data", "complete", "finished")
 
 
-def save(path: str | os.PathLike, state: State) -> None:
+def save(path: PathLike, state: State) -> None:
     """`jast.save` of a `State`; goes with the next version."""
     files.store(path, "jast validation", state)
 
 
-def load(path: str | os.PathLike) -> State:
+def load(path: PathLike) -> State:
     """`jast.load` of a `State`; goes with the next version."""
     return files.restore(path, "jast validation", None)[0]
 

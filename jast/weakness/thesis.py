@@ -2,7 +2,10 @@
 Systems", Stanford 2021, chapter 4.
 """
 
+from __future__ import annotations
+
 import functools
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -20,18 +23,18 @@ ADVERSARY = "adversary/"
 
 def thesis(
     *,
-    iterations=10,
-    sample=500,
-    threshold=0.5,
-    copies=10,
-    epochs=20,
-    rate=3e-5,
-    hidden=None,
-    encoder_epochs=20,
-    encoder_rate=1e-3,
-    batch=None,
-    replacement=False,
-):
+    iterations: int = 10,
+    sample: int = 500,
+    threshold: float = 0.5,
+    copies: int = 10,
+    epochs: int = 20,
+    rate: float = 3e-5,
+    hidden: Sequence[int] | None = None,
+    encoder_epochs: int = 20,
+    encoder_rate: float = 1e-3,
+    batch: int | None = None,
+    replacement: bool = False,
+) -> Selector:
     """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes
     of the inputs, without their labels.
 

@@ -1,9 +1,12 @@
 """The validation loop: which inputs a classifier gets wrong, found with few calls."""
 
+from __future__ import annotations
+
 import json
 import os
 import traceback
 import warnings
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import numpy as np
@@ -17,6 +20,11 @@ from jast.weakness.measures import auc
 from jast.weakness.result import History, Result, State
 from jast.weakness.storage import load, save
 
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, PathLike, Predict
+
 __all__ = ["validate"]
 
 CHUNK = 1024  # inputs of one call of predict
@@ -28,19 +36,19 @@ class _Stop(Exception):
 
 
 def validate(
-    key,
-    predict,
-    inputs,
-    labels,
+    key: chex.PRNGKey,
+    predict: Predict,
+    inputs: chex.Array,
+    labels: chex.Array,
     *,
-    budget=None,
-    selector="default",
-    classes=None,
-    state=None,
-    checkpoint=None,
-    progress=False,
-    callback=None,
-):
+    budget: int | None = None,
+    selector: Selector | Literal["default", "random", "thesis"] = "default",
+    classes: int | None = None,
+    state: State | None = None,
+    checkpoint: PathLike | None = None,
+    progress: bool = False,
+    callback: Callback | None = None,
+) -> Result:
     """Find the inputs of a labelled data set that a classifier gets wrong, with at most ``budget``
     calls of it: a `Result`.
 

@@ -1,8 +1,11 @@
 """The ferry, the adversary, the tracker between them and the disturbances, as one `Simulator`."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +29,9 @@ from jast.simulators.colav.vessels import (
     ferry_substep,
     world_velocity,
 )
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["ColavState", "colav"]
 
@@ -75,16 +81,16 @@ class Model:
 
 
 def colav(
-    scenario="sharp turn",
-    disturbances="delay",
+    scenario: Scenario | Literal["head-on", "crossing", "overtaking", "sharp turn"] = "sharp turn",
+    disturbances: str | Sequence[str] = "delay",
     *,
-    substeps=30,
-    longest_delay=BUFFER,
-    delay_change=0.2,
-    delay_easing=0.8,
-    steering_change=0.5,
-    noise=(0.3, 0.1),
-):
+    substeps: int = 30,
+    longest_delay: chex.Numeric = BUFFER,
+    delay_change: chex.Numeric = 0.2,
+    delay_easing: chex.Numeric = 0.8,
+    steering_change: chex.Numeric = 0.5,
+    noise: Sequence[float] = (0.3, 0.1),
+) -> Simulator:
     """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s,
     with states of 90 numbers.
 

@@ -2,8 +2,10 @@
 distances for users and pictures.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,12 @@ from jast.simulators.fms import events
 from jast.simulators.fms.database import APART, KLAX, KSFO, POSITIONS
 from jast.simulators.fms.geodesic import EARTHS, Earth, direct
 from jast.simulators.fms.lateral import KNOT, NMI, Build, lateral
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.simulators.fms.events import Misses
+    from jast.simulators.fms.path import Path
 
 __all__ = ["MEANS", "SIGMAS", "FmsState", "fms", "fms_misses", "fms_path"]
 
@@ -51,18 +59,18 @@ class Model:
 
 
 def fms(
-    eps=0.03,
-    bank=23.3,
-    tas=450.0,
-    waypoints=12,
-    guard="s-turns",
-    event="arc length",
-    fixed=False,
+    eps: chex.Numeric = 0.03,
+    bank: chex.Numeric = 23.3,
+    tas: chex.Numeric = 450.0,
+    waypoints: int = 12,
+    guard: Literal["s-turns", "all"] = "s-turns",
+    event: Literal["arc length", "kink", "disconnection", "course"] = "arc length",
+    fixed: bool = False,
     *,
-    earth="wgs84",
-    snap=True,
-    database=False,
-):
+    earth: Literal["wgs84", "sphere"] = "wgs84",
+    snap: bool = True,
+    database: bool = False,
+) -> Simulator:
     """The predictor on routes from KSFO to KLAX, an episodic `Simulator` of ``waypoints`` steps: x
     places the next waypoint, the path is judged at the end.
 
@@ -127,14 +135,14 @@ def fms(
     )
 
 
-def fms_path(sim, episode):
+def fms_path(sim: Simulator, episode: Episode | FmsState) -> Path:
     """The lateral path of an `Episode` (or of an `FmsState`) of ``sim``:
     `jast.simulators.fms.Path`. ValueError for those of another system.
     """
     return _path(*_route("fms_path", sim, episode))
 
 
-def fms_misses(sim, episode):
+def fms_misses(sim: Simulator, episode: Episode | FmsState) -> Misses:
     """The miss distances of all four events, of an `Episode` (or of an `FmsState`) of ``sim``:
     `jast.simulators.fms.Misses`. ValueError as for `fms_path`.
     """
