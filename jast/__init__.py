@@ -39,6 +39,7 @@ __all__ = [
     "specs",
     "stress",
     "sweep",
+    "typing",
     "weakness",
 ]
 

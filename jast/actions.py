@@ -18,7 +18,8 @@ from jast.distributions.numerics import normal_score
 if TYPE_CHECKING:
     import chex
 
-    from jast.distributions import Distribution
+    from jast.typing import DistributionLike
+
 
 __all__ = [
     "Quantiles",
@@ -40,7 +41,7 @@ class Samples:
     places_start = False
     focus = 1.0  # draws of the model are near its mode already
 
-    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
@@ -48,21 +49,21 @@ class Samples:
 
     draw_start = draw
 
-    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
         """Log density of `draw` at ``x``."""
         return dist.log_prob(x)
 
     def near(
-        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
     ) -> chex.ArrayTree:
         """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
         return _towards_mode(x, dist, scale)
 
-    def at(self, u: Any, dist: Distribution) -> chex.ArrayTree:
+    def at(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The disturbance at the point ``u`` of [0, 1)^d; uniform points are draws of ``dist``."""
         return D.quantile(dist, u)
 
-    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
+    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
         return D.cdf(dist, x)
 
@@ -83,32 +84,32 @@ class Quantiles:
         """Whether `place` serves x0 as well: a proposal is one of steps."""
         return self.kind is None
 
-    def of(self, dist: Distribution) -> Distribution:
+    def of(self, dist: DistributionLike) -> DistributionLike:
         """The distribution whose quantiles they are."""
         return dist if self.kind is None else self.kind.unflatten(self.numbers)
 
-    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         return self.place(_uniform_like(key, dist), dist)
 
-    def draw_start(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         return D.quantile(dist, _uniform_like(key, dist))
 
-    def place(self, u: Any, dist: Distribution) -> chex.ArrayTree:
+    def place(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(self.of(dist), u)
 
     at = place
 
-    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
+    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `place`."""
         return D.cdf(self.of(dist), x)
 
-    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
         """Log density of `draw` at ``x``."""
         return self.of(dist).log_prob(x)
 
     def near(
-        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
     ) -> chex.ArrayTree:
         """``x`` drawn towards the mode of the distribution, by ``scale``; integers stay."""
         return _towards_mode(x, dist if start else self.of(dist), scale)
@@ -124,14 +125,14 @@ class UniformBox:
     places_start = False
     focus = 0.2  # a box knows nothing of the model
 
-    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         return self.place(_uniform_like(key, dist), dist)
 
-    def draw_start(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """The box is one of steps: a random start is drawn from its own distribution."""
         return D.sample(dist, key)
 
-    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
         """Log density of `draw` at ``x``: uniform, -inf outside the box."""
 
         def of(x, low, high):
@@ -144,7 +145,7 @@ class UniformBox:
         return D.sum_parts(jax.tree.map(of, x, *self.ends(x)))
 
     def near(
-        self, x: Any, dist: Distribution, scale: chex.Numeric, start: bool = False
+        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
     ) -> chex.ArrayTree:
         """A box ``scale`` times as wide around the mode of ``dist``, cut to the box."""
         if start:
@@ -158,7 +159,7 @@ class UniformBox:
 
         return jax.tree.map(shrink, x, D.mode(dist), *self.ends(x))
 
-    def place(self, u: Any, dist: Distribution) -> chex.ArrayTree:
+    def place(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The point of the box at ``u`` in [0, 1)^d; integers are the whole numbers from ``low`` to
         ``high``, both included.
         """
@@ -173,7 +174,7 @@ class UniformBox:
 
     at = place
 
-    def locate(self, x: Any, dist: Distribution) -> chex.ArrayTree:
+    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The point of [0, 1]^d at which `place` gives ``x``, a pytree like ``x``: that of the box
         nearest to it. Integers: the middle of the cell.
         """
@@ -271,7 +272,7 @@ def samples() -> Samples:
     return Samples()
 
 
-def quantiles(proposal: Distribution | None = None) -> Quantiles:
+def quantiles(proposal: DistributionLike | None = None) -> Quantiles:
     """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform
     points are draws of p.
 
@@ -289,7 +290,7 @@ def quantiles(proposal: Distribution | None = None) -> Quantiles:
     return Quantiles(tuple(numbers), None if proposal is None else kind)
 
 
-def wide(width: Any = None) -> Wide:
+def wide(width: chex.Numeric | None = None) -> Wide:
     """Draws of the model with wider noise: x is at the normal numbers width z, z ~ N(0, I), where z
     itself gives draws of p(x | s) (`jast.distributions.from_normal`). So it reaches the tails of
     any distribution with a quantile function, in any unit, and never leaves its support; a random

@@ -69,14 +69,17 @@ class Nominal(NamedTuple):
     """Number of the first episode that failed, which ``rollout(jax.random.fold_in(key, first),
     sim)`` plays again; None where none did.
     """
-    settings: Mapping = {}
+    settings: Mapping[str, Any] = {}
     """``method``, ``seed``, the ``episodes`` asked for, and ``interrupted`` where not all were
     played.
     """
 
-    failures = results.former("failures", "failing")
+    @results.Former
+    def failures(self) -> int:
+        """Deprecated: ``failing``."""
+        return results.renamed(self, "failures", "failing")
 
-    def __str__(self):
+    def __str__(self) -> str:
         quiet = "not defined: a disturbance has neither a mode nor a median"
         if self.undisturbed is not None:
             quiet = (

@@ -25,6 +25,9 @@ from jast.simulator import Simulator
 if TYPE_CHECKING:
     import chex
 
+    from jast.typing import Reward
+
+
 __all__ = ["Episode", "play_back", "replay", "rollout"]
 
 
@@ -60,7 +63,7 @@ def rollout(
     key: chex.PRNGKey,
     sim: Simulator,
     policy: Policy | None = None,
-    reward: Callable[..., Any] = rewards.STANDARD,
+    reward: Reward = rewards.STANDARD,
 ) -> Episode:
     """Simulate one episode: `Episode`. ``jax.vmap`` over keys, simulators or policies gives many;
     differentiable in the simulator's and policy's parameters.
@@ -97,7 +100,10 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
 
 
 def replay(
-    sim: Simulator, episode: Any, x0: Any = None, reward: Callable[..., Any] = rewards.STANDARD
+    sim: Simulator,
+    episode: Any,
+    x0: chex.ArrayTree | None = None,
+    reward: Reward = rewards.STANDARD,
 ) -> Episode:
     """Run recorded disturbances again: `Episode` with its states. Exact: the same input gives the
     same bits.

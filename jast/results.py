@@ -111,32 +111,17 @@ def asked(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
     return dict(method=method, **jax.tree.map(plain, given), seed=np.asarray(words).tolist())
 
 
-def alias(name: str) -> property:
-    """A second name of the field ``name``, for good."""
-    return property(lambda self: getattr(self, name), doc=f"The same as ``{name}``.")
+class Former(property):
+    """A decorator as `property`, for a name of an earlier version, which tables leave out."""
 
 
-def former(
-    old: str, new: str, value: Callable[[Any], Any] | None = None, later: str = ""
-) -> property:
-    """The field ``old`` of an earlier version, which is ``new`` now: each use warns
-    (DeprecationWarning). It goes with the next version.
-
-    Args:
-        value: what it was, from the object; default: what ``new`` is.
-        later: what else the warning says.
+def renamed(result: Any, old: str, new: str) -> Any:
+    """The field ``new`` of ``result``, which was ``old`` in an earlier version: each use warns
+    (DeprecationWarning). The old name goes with the next version.
     """
-
-    def get(self: Any) -> Any:
-        text = f"{type(self).__name__}.{old} is {new} now; the old name goes with the next version"
-        warnings.warn(text + later, DeprecationWarning, stacklevel=2)
-        return getattr(self, new) if value is None else value(self)
-
-    return _Former(get, doc=f"Deprecated: {new}.")
-
-
-class _Former(property):
-    """A former name, which tables leave out."""
+    text = f"{type(result).__name__}.{old} is {new} now; the old name goes with the next version"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return getattr(result, new)
 
 
 def batch_shape(value: Any) -> tuple[int, ...] | None:
@@ -230,7 +215,7 @@ def _html(self: Any) -> str:
     """A table of the fields; the names of `VOCABULARY` that are no fields of it come after them."""
     rows = dict(_fields(self))
     for name in VOCABULARY:
-        if name in rows or isinstance(getattr(type(self), name, None), _Former):
+        if name in rows or isinstance(getattr(type(self), name, None), Former):
             continue
         if (value := getattr(self, name, None)) is not None:
             rows[name] = value

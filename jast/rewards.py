@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from jast.typing import Density, Reward
 
+
 __all__ = [
     "Episodic",
     "Lexicographic",
@@ -214,7 +215,10 @@ def shaped(
 
 
 def lexicographic(
-    near: Any = None, rare: Any = None, likely: Any = 0.0, density: str | None = None
+    near: chex.Numeric | None = None,
+    rare: chex.Numeric | None = None,
+    likely: chex.Numeric = 0.0,
+    density: Density | None = None,
 ) -> Lexicographic:
     """Any failure above all episodes that do not fail; failures by log p, the others by nearness.
 
@@ -288,4 +292,4 @@ def _like(value, log_p):
 
 
 STANDARD = standard()
-log_likelihood = LogLikelihood()
+log_likelihood: LogLikelihood = LogLikelihood()

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 if TYPE_CHECKING:
     import chex
 
-    from jast.distributions import Distribution
-
 __all__ = [
     "Actions",
     "Callback",
     "Density",
+    "DistributionLike",
     "Disturbance",
     "Evaluate",
     "Executor",
@@ -53,6 +52,18 @@ Schedule: TypeAlias = Callable[[int, int], Sequence[int]]
 """
 
 
+class DistributionLike(Protocol):
+    """A distribution of jast, of distrax, or of one's own."""
+
+    def sample(self, *, seed: Any, sample_shape: Any = ()) -> Any:
+        """Values of shape ``sample_shape`` + that of one value."""
+        ...
+
+    def log_prob(self, value: Any) -> Any:
+        """Log density of ``value``."""
+        ...
+
+
 class Init(Protocol):
     """``init`` of a `jast.Simulator`: the state that the initial disturbance leads to."""
 
@@ -70,7 +81,7 @@ class Disturbance(Protocol):
     disturbance.
     """
 
-    def __call__(self, state: Any, /) -> Distribution: ...
+    def __call__(self, state: Any, /) -> DistributionLike: ...
 
 
 class Evaluate(Protocol):
@@ -84,7 +95,7 @@ class Evaluate(Protocol):
 class Start(Protocol):
     """``start`` of a `jast.Simulator`: the distribution p(x0) of the initial disturbance."""
 
-    def __call__(self) -> Distribution: ...
+    def __call__(self) -> DistributionLike: ...
 
 
 class IsTerminal(Protocol):
@@ -110,15 +121,15 @@ class Reward(Protocol):
 class Actions(Protocol):
     """How a search chooses disturbances; see `jast.actions`."""
 
-    def draw(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """One disturbance, where ``dist`` is the model of disturbances at the state."""
         ...
 
-    def draw_start(self, key: chex.PRNGKey, dist: Distribution) -> chex.ArrayTree:
+    def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """One initial disturbance, where ``dist`` is its model."""
         ...
 
-    def log_prob(self, x: Any, dist: Distribution) -> chex.Array:
+    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
         """Log density of `draw` at ``x``."""
         ...
 

@@ -489,7 +489,6 @@ BAD = {
     ),
     "alpha must be a number above 0, received 0": dict(alpha=0),
     "optimism must be a number of at least 0, received -1.0": dict(optimism=-1.0),
-    "no setting components, keep; there are [": dict(keep=3, components=2),
     "schedule: counts must be whole numbers": dict(schedule=(3, -1)),
 }
 
@@ -566,6 +565,13 @@ def test_bad_proposals_and_objectives_are_named(key):
         START,
         warp="rank",
         method=lambda *a, **s: ce.start(a[0], a[2], "ce_method", **s),
+    )
+    raises(
+        r"ce_surrogate: no setting components, keep; there are \[",
+        START,
+        method=ce.start,
+        keep=3,
+        components=2,
     )
     raises("start: method must be one of", START, "annealing", method=ce.start)
 

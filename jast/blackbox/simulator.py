@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,7 @@ from jast.simulator import Simulator, fixed
 if TYPE_CHECKING:
     import chex
 
-    from jast.distributions import Distribution
-    from jast.typing import Disturbance, Start
+    from jast.typing import DistributionLike, Disturbance, Start
 
 __all__ = ["Record", "Standing", "calls", "from_python"]
 
@@ -71,10 +70,10 @@ def from_python(
     system: Any,
     *,
     horizon: int,
-    disturbance: Distribution | Disturbance | None = None,
-    start: Distribution | Start = fixed,
+    disturbance: DistributionLike | Disturbance | None = None,
+    start: DistributionLike | Start = fixed,
     episodic: bool | None = None,
-    likelihood: bool | None = None,
+    likelihood: Literal["log_prob", "prob"] | None = None,
     workers: int = 0,
     time_limit: float | None = None,
     observe: Callable[[Any], chex.Array] | None = None,

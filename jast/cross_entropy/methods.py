@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from jast.cross_entropy.gaussian import Gaussian
     from jast.cross_entropy.mixture import Mixture
     from jast.cross_entropy.result import CEResult
-    from jast.typing import Objective, Schedule
+    from jast.typing import DistributionLike, Objective, Schedule
+
+Surrogate: TypeAlias = Literal["gaussian process", "linear", "polynomial", "radial basis"]
+Proposal: TypeAlias = "Gaussian | Mixture | tuple[chex.Array, chex.Numeric] | DistributionLike"
 
 __all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish", "start", "tell"]
 
@@ -31,7 +34,7 @@ __all__ = ["Search", "ask", "ce_method", "ce_mixture", "ce_surrogate", "finish",
 def ce_method(
     key: chex.PRNGKey,
     objective: Objective,
-    proposal: Gaussian | Mixture,
+    proposal: Proposal,
     *,
     samples: int = 10,
     elites: int = 5,
@@ -41,145 +44,197 @@ def ce_method(
     ratchet: bool = False,
     elitism: bool | None = None,
 ) -> CEResult:
-    """Minimise ``objective`` (x [d] -> scalar) by the cross-entropy method: `CEResult`. Algorithm 1
-    of the thesis.
+    """Minimise ``objective`` by the cross-entropy method: `CEResult`. Algorithm 1 of R. J. Moss's
+    thesis.
 
-    Each of ``iterations`` draws ``samples`` points from the proposal, evaluates them, and refits
-    the proposal by maximum likelihood to the best of them, the ``elites``. ``proposal``: a
-    `Gaussian` (`jast.cross_entropy.normal`), a pair (mean [d], covariance), or a distribution with
-    ``mean()`` and ``covariance()``. Where the elites have no covariance that is positive definite
-    (as when they are at most d), the proposal stays.
+    Each iteration draws a batch of points from the proposal, evaluates them, and refits the
+    proposal by maximum likelihood to the best of them, the elites. Where the elites have no
+    positive definite covariance (as when there are at most d of them), the proposal stays as it is.
+    With an uneven schedule the objective is also called on rows that pad a batch; they are neither
+    kept nor counted. An evaluation that is NaN or infinite is kept in the history, counted in
+    ``invalid``, and never an elite.
 
-    ``schedule``: None, the same number in each iteration; of `jast.cross_entropy.schedules`; or the
-    numbers, of which zeros are left out. ``mode="thesis"`` takes the elites from the last batch
-    only, ``"default"`` from all that were evaluated (``elitism``). ``ratchet``: once a batch is
-    smaller than the elites, they stay as few, as in the published code. Counts and names are
-    static, the key, the proposal and what a `jax.tree_util.Partial` binds to the objective are
-    traced: `jax.vmap` runs hundreds of seeds and proposals in one program. With an uneven schedule
-    the objective is also called on rows that pad a batch; they are neither kept nor counted. An
-    evaluation that is NaN or infinite is kept in the history, counted in ``invalid``, never an
-    elite.
+    Counts and names are static. The key, the proposal and what a `jax.tree_util.Partial` binds to
+    the objective are traced, so `jax.vmap` runs hundreds of seeds and proposals in one program.
 
-    Raises ValueError for a proposal that is no proper distribution, elites above the samples,
-    counts below 1, and an objective that is not written in JAX (see `start`) or not a number.
+    Args:
+        key: consumed.
+        objective: a function in JAX of x [d] that returns one number.
+        proposal: what the first batch is drawn from: a `Gaussian` (see `normal`), a pair (mean [d],
+            covariance), or a distribution with ``mean()`` and ``covariance()``.
+        samples: points in a batch.
+        elites: how many of the best points refit the proposal.
+        iterations: how many batches there are.
+        schedule: None for batches of equal size, a function from `jast.cross_entropy.schedules`, or
+            the sizes themselves, of which zeros are left out.
+        mode: "thesis" takes the elites from the last batch only, "default" from every point
+            evaluated so far.
+        ratchet: once a batch is smaller than ``elites``, later batches have no more elites than it
+            had, as in the published code.
+        elitism: overrides the mode: True takes the elites from every point evaluated so far.
+
+    Raises:
+        ValueError: for a proposal that is no proper distribution, more elites than samples, a count
+            below 1, and an objective that is not written in JAX (use `start` for those) or does not
+            return one number.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> wide = ce.normal(jnp.zeros(2), 9.0)
+        >>> bowl = lambda x: jnp.sum((x - 1.0) ** 2)
+        >>> found = ce.ce_method(jax.random.key(0), bowl, wide, iterations=5)
+        >>> found.best_x.shape, bool(found.best_value < 1.0)
+        ((2,), True)
     """
-    more = dict(ratchet=ratchet, elitism=elitism)
-    return _run(
-        "ce_method", key, objective, proposal, samples, elites, iterations, schedule, mode, more
-    )
+    return _run("ce_method", **locals())
 
 
 def ce_surrogate(
     key: chex.PRNGKey,
     objective: Objective,
-    proposal: Gaussian | Mixture,
+    proposal: Proposal,
     *,
     samples: int = 10,
     elites: int = 5,
     iterations: int = 10,
     schedule: Schedule | Sequence[int] | None = None,
     mode: Literal["default", "thesis"] = "default",
-    **settings,
+    surrogate: Surrogate | None = None,
+    kernel: Literal["squared exponential", "matern12", "matern32", "matern52"] | None = None,
+    degree: int | None = None,
+    basis: Literal["gaussian", "linear", "squared", "multiquadratic"] | None = None,
+    memory: int | None = None,
+    best: int | None = None,
+    warp: Literal["raw", "standard", "rank"] | None = None,
+    frame: Literal["window", "initial"] | None = None,
+    selection: float | Literal["elites", "dimension"] | None = None,
+    optimism: chex.Numeric | None = None,
+    current: bool | None = None,
+    alpha: chex.Numeric | None = None,
+    evaluated: float | None = None,
+    ratchet: bool = False,
+    elitism: bool | None = None,
 ) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate: `CEResult`. Algorithms 2
-    to 4 of the thesis; see `ce_method` for what is common.
+    to 4 of R. J. Moss's thesis.
 
-    A cheap model of the objective is fitted in every iteration. The proposal is refitted to the
-    elites that were evaluated, to the best part of ten times as many samples that only the model
-    judged, and to the best points of short cross-entropy searches on the model, one around each
+    Every iteration fits a cheap model of the objective. The proposal is refitted to three kinds of
+    points: the elites that were evaluated, the best of ten times as many samples that only the
+    model judged, and the best points of short cross-entropy searches on the model, one around each
     true elite.
 
-    ``settings``, beside ``ratchet`` and ``elitism`` (each with the value of `MODES` [method][mode]
-    where it is not given):
+    A setting that is None has the value of the mode. ``mode="thesis"`` is the published code: raw
+    values, a memory of three iterations, elites of the last batch, no search result evaluated, the
+    initial covariance. Its likelihood is maximised on a grid here. ``mode="default"`` is tuned on
+    `sierra` and checked on other functions (docs/figures.md).
 
-    - ``surrogate``: "gaussian process" (with a ``kernel``: "squared exponential", "matern12",
-      "matern32", "matern52"), "linear", "polynomial" (of ``degree``, by default 2) or "radial
-      basis" around the points it is fitted to.
-    - ``basis``: of the distance r in the ``frame``: "gaussian", exp(-r^2 / 2 d); "linear", r;
-      "squared", r^2; "multiquadratic", sqrt(r^2 + 1). Given alone, as in the thesis's printed call
-      ``ce_surrogate(f, M; basis=:squared)``, it chooses "radial basis".
-    - ``memory``, ``best``: it is fitted to the evaluations of so many of the last iterations, and
-      so many of the best before them.
-    - ``warp``: to values "raw", "standard" (mean 0, variance 1), or "rank" (normal scores, which no
-      increasing function of the objective alters).
-    - ``frame``: in coordinates whitened by those points ("window"), or in the scale of the initial
-      proposal ("initial").
-    - ``selection``: the share of the judged samples that are elites; "elites": as among the
-      evaluated ones, "dimension": but at most one in d.
-    - ``optimism``: the searches minimise the mean less so many standard deviations of the model;
-      traced. Only a Gaussian process has any.
-    - ``current``, ``alpha``: they start with the covariance of the current proposal, or else of the
-      initial one, over alpha, which is traced.
-    - ``evaluated``: the share of each batch, rounded up, that is spent on their best points in the
-      iteration after; at most a half.
+    Args:
+        key, objective, proposal, samples, elites, iterations, schedule: as for `ce_method`.
+        mode: "default" or "thesis".
+        surrogate: the model: "gaussian process", "linear", "polynomial", or "radial basis" around
+            the points that it is fitted to.
+        kernel: of the Gaussian process.
+        degree: of the polynomial; 2 by default.
+        basis: radial function of the distance r in the ``frame``: "gaussian", exp(-r^2 / 2 d);
+            "linear", r; "squared", r^2; "multiquadratic", sqrt(r^2 + 1). Given alone, as in the
+            thesis's printed call ``ce_surrogate(f, M; basis=:squared)``, it chooses the surrogate
+            "radial basis".
+        memory: the model is fitted to the evaluations of this many of the last iterations.
+        best: and to this many of the best evaluations before them.
+        warp: the values that it is fitted to: "raw", "standard" (mean 0, variance 1), or "rank"
+            (normal scores, which no increasing function of the objective alters).
+        frame: its coordinates: "window", whitened by the points that it is fitted to, or "initial",
+            on the scale of the initial proposal.
+        selection: the share of the judged samples that become elites; "elites" for the same share
+            as among the evaluated points, "dimension" for that share but at most one in d.
+        optimism: the searches minimise the model's mean less this many of its standard deviations;
+            traced. Only a Gaussian process has any.
+        current: whether the searches start with the covariance of the current proposal; else with
+            the initial one over ``alpha``.
+        alpha: see ``current``; traced.
+        evaluated: the share of each batch, rounded up, that is spent in the next iteration on the
+            best points of the searches; at most a half.
+        ratchet, elitism: as for `ce_method`.
 
-    ``mode="thesis"`` is the published code: raw values, three iterations, elites of the last batch,
-    no search result evaluated, initial covariance; its likelihood is maximised on a grid here.
-    ``mode="default"`` is tuned on sierra and checked on others (docs/figures.md).
+    Raises:
+        ValueError: as `ce_method`, and for a setting that is out of range.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> wide = ce.normal(jnp.zeros(2), 9.0)
+        >>> bowl = lambda x: jnp.sum((x - 1.0) ** 2)
+        >>> found = ce.ce_surrogate(jax.random.key(0), bowl, wide, iterations=3)
+        >>> bool(found.best_value < 1.0)
+        True
     """
-    return _run(
-        "ce_surrogate",
-        key,
-        objective,
-        proposal,
-        samples,
-        elites,
-        iterations,
-        schedule,
-        mode,
-        settings,
-    )
+    return _run("ce_surrogate", **locals())
 
 
 def ce_mixture(
     key: chex.PRNGKey,
     objective: Objective,
-    proposal: Gaussian | Mixture,
+    proposal: Proposal,
     *,
     samples: int = 10,
     elites: int = 5,
     iterations: int = 10,
     schedule: Schedule | Sequence[int] | None = None,
     mode: Literal["default", "thesis"] = "default",
-    **settings,
+    surrogate: Surrogate | None = None,
+    kernel: Literal["squared exponential", "matern12", "matern32", "matern52"] | None = None,
+    degree: int | None = None,
+    basis: Literal["gaussian", "linear", "squared", "multiquadratic"] | None = None,
+    memory: int | None = None,
+    best: int | None = None,
+    warp: Literal["raw", "standard", "rank"] | None = None,
+    frame: Literal["window", "initial"] | None = None,
+    selection: float | Literal["elites", "dimension"] | None = None,
+    optimism: chex.Numeric | None = None,
+    current: bool | None = None,
+    alpha: chex.Numeric | None = None,
+    evaluated: float | None = None,
+    ratchet: bool = False,
+    elitism: bool | None = None,
+    components: int | None = None,
+    start: Literal["elites", "searches"] | None = None,
+    regularisation: chex.Numeric | None = None,
 ) -> CEResult:
     """Minimise ``objective`` by the cross-entropy method with a surrogate and a mixture for its
-    proposal: `CEResult`. Algorithm 5; see `ce_surrogate`.
+    proposal: `CEResult`. Algorithm 5 of R. J. Moss's thesis.
 
-    The `Mixture` is fitted by ten iterations of expectation maximisation. ``proposal`` may also be
-    one. ``settings``, beside those of `ce_surrogate`:
+    The `Mixture` is fitted by ten iterations of expectation maximisation.
 
-    - ``components``: how many; 2, and in mode "thesis" as many as elites.
-    - ``start``: each begins as a Gaussian around a true elite ("elites"), or as the proposal with
-      which the search around it ended ("searches", the thesis).
-    - ``regularisation``: added to the diagonals of their covariances; traced.
+    Args:
+        key, objective, samples, elites, iterations, schedule, mode: as for `ce_method`.
+        proposal: as for `ce_method`, or a `Mixture`.
+        surrogate, kernel, degree, basis, memory, best, warp, frame, selection: as for
+            `ce_surrogate`.
+        optimism, current, alpha, evaluated, ratchet, elitism: as for `ce_surrogate`.
+        components: how many the mixture has: 2, and in mode "thesis" as many as elites.
+        start: each component begins as a Gaussian around a true elite ("elites"), or as the
+            proposal with which the search around that elite ended ("searches", the thesis).
+        regularisation: added to the diagonals of the components' covariances; traced.
+
+    Raises:
+        ValueError: as `ce_surrogate`, and for more components than elites.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> wide = ce.normal(jnp.zeros(2), 9.0)
+        >>> bowl = lambda x: jnp.sum((x - 1.0) ** 2)
+        >>> found = ce.ce_mixture(jax.random.key(0), bowl, wide, iterations=3)
+        >>> found.proposal.weights.shape
+        (2,)
     """
-    return _run(
-        "ce_mixture",
-        key,
-        objective,
-        proposal,
-        samples,
-        elites,
-        iterations,
-        schedule,
-        mode,
-        settings,
-    )
+    return _run("ce_mixture", **locals())
 
 
-def _run(method, key, objective, proposal, samples, elites, iterations, schedule, mode, more):
+def _run(method: str, *, key: chex.PRNGKey, objective: Objective, **given: Any) -> CEResult:
     random_key(method, key)
-    plan, settings, proposal = settled(
-        method,
-        proposal,
-        samples=samples,
-        elites=elites,
-        iterations=iterations,
-        schedule=schedule,
-        mode=mode,
-        **more,
-    )
+    plan, settings, proposal = settled(method, **given)
     leaf = jax.tree.leaves(proposal)[1]
     return loop.run(
         key, plan, settings, checked(method, objective, leaf.shape[-1], leaf.dtype), proposal
@@ -194,8 +249,8 @@ class Search:
     """
 
     state: loop.State
-    settings: Any
-    plan: Any = field(metadata=dict(static=True))
+    settings: loop.Settings
+    plan: loop.Plan = field(metadata=dict(static=True))
 
     @property
     def done(self) -> bool:
@@ -205,7 +260,7 @@ class Search:
 
 def start(
     key: chex.PRNGKey,
-    proposal: Gaussian | Mixture,
+    proposal: Proposal,
     method: Literal["ce_method", "ce_surrogate", "ce_mixture"] = "ce_surrogate",
     *,
     samples: int = 10,
@@ -213,19 +268,32 @@ def start(
     iterations: int = 10,
     schedule: Schedule | Sequence[int] | None = None,
     mode: Literal["default", "thesis"] = "default",
-    **settings,
+    **settings: Any,
 ) -> Search:
-    """A `Search` with the settings of `ce_method`, `ce_surrogate` or `ce_mixture`, for an objective
-    that need not be written in JAX::
+    """A `Search` for an objective that need not be written in JAX.
 
-        search = start(key, proposal, samples=10, iterations=10)
-        while not search.done:
-            x = ask(search)  # [m, d], exactly as many as are to be evaluated
-            search = tell(search, x, [program(row) for row in x])
-        result = finish(search)
+    It spends exactly the budget of evaluations, and takes the same steps as `ce_method`,
+    `ce_surrogate` or `ce_mixture` with the same key. A search is a pytree that can be pickled: keep
+    it to go on later.
 
-    It takes exactly the budget of evaluations, and the same steps as those functions with the same
-    key. A search is a pytree that can be pickled: keep it to go on later.
+    Args:
+        key: consumed.
+        proposal, samples, elites, iterations, schedule, mode: as for `ce_method`.
+        method: the function whose steps it takes: "ce_method", "ce_surrogate" or "ce_mixture".
+        settings: the other keywords of that function, such as ``surrogate`` or ``components``.
+
+    Raises:
+        ValueError: for an unknown method or setting, and as the function does.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> search = ce.start(jax.random.key(0), ce.normal(jnp.zeros(2), 9.0), iterations=3)
+        >>> while not search.done:
+        ...     x = ce.ask(search)  # [m, d], exactly as many as are to be evaluated
+        ...     search = ce.tell(search, x, [float(row @ row) for row in x])
+        >>> ce.finish(search).history.value.shape
+        (30,)
     """
     if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
@@ -244,18 +312,43 @@ def start(
 
 
 def ask(search: Search) -> np.ndarray | chex.Array:
-    """The next points to evaluate, [m, d]; the same until they are told. ValueError where the
-    search is done.
+    """The next points to evaluate, [m, d]; the same until their values are told.
+
+    Args:
+        search: of `start` or `tell`.
+
+    Raises:
+        ValueError: where the search is done.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> search = ce.start(jax.random.key(0), ce.normal(jnp.zeros(2), 9.0), samples=4, elites=2)
+        >>> ce.ask(search).shape
+        (4, 2)
     """
     return _ask(search.plan, search.state)[: _count("ask", search)]
 
 
 def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) -> Search:
-    """The `Search` after the objective's ``values`` [m] at ``x`` [m, d]: those that `ask` gave, or
-    what was evaluated in their place (clipped to bounds, say).
+    """The `Search` after the objective's values at some points.
 
-    A value may be NaN or infinite where an evaluation failed. ValueError for other shapes, and
-    where the search is done.
+    Args:
+        search: what `ask` was given.
+        x: [m, d]: the points that `ask` gave, or those evaluated in their place (clipped to bounds,
+            say).
+        values: [m]; NaN or infinite where an evaluation failed.
+
+    Raises:
+        ValueError: for other shapes, and where the search is done.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> search = ce.start(jax.random.key(0), ce.normal(jnp.zeros(2), 9.0), iterations=1)
+        >>> x = ce.ask(search)
+        >>> ce.tell(search, x, (x**2).sum(1)).done
+        True
     """
     shape, dtype = (_count("tell", search), search.state.x.shape[1]), search.state.x.dtype
     try:
@@ -278,7 +371,20 @@ def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) ->
 
 
 def finish(search: Search) -> CEResult:
-    """The `CEResult` of what was told so far; what was not has value inf in its history."""
+    """The `CEResult` of what was told so far; what was not told has value inf in its history.
+
+    Args:
+        search: of `start` or `tell`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> search = ce.start(jax.random.key(0), ce.normal(jnp.zeros(2), 9.0), iterations=1)
+        >>> x = ce.ask(search)
+        >>> result = ce.finish(ce.tell(search, x, (x**2).sum(1)))
+        >>> bool(result.best_value == (x**2).sum(1).min())
+        True
+    """
     return _finish(search.plan, search.state)
 
 

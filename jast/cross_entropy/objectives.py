@@ -39,7 +39,7 @@ def sierra(
     spacing: chex.Numeric = 2.0,
     sharpness: chex.Numeric = 6.0,
     decay: chex.Numeric = 1.0,
-    order: Literal["code", "text"] = "code",
+    order: Literal["code", "thesis"] = "code",
     log: bool = False,
 ) -> Objective:
     """Less the density at x [2] of 49 Gaussians of equal weight: a mountain range upside down, for

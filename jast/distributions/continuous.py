@@ -60,7 +60,7 @@ class Logistic(Symmetric):
 class Uniform(Distribution):
     """On [``low``, ``high``], which broadcast."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, low: chex.ArrayTree = 0.0, high: chex.ArrayTree = 1.0) -> None:
         self._low, self._high = float_array(low), float_array(high)
@@ -111,10 +111,11 @@ class Uniform(Distribution):
 class _Pair(Distribution):
     """Of two positive parameters that broadcast."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, a: chex.Numeric, b: chex.Numeric) -> None:
-        self._a, self._b = float_array(a), float_array(b)
+        self._a: jax.Array = float_array(a)
+        self._b: jax.Array = float_array(b)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -125,7 +126,7 @@ class _Pair(Distribution):
         return jnp.result_type(self._a, self._b)
 
     @property
-    def _both(self):
+    def _both(self) -> tuple[jax.Array, ...]:
         return tuple(jnp.broadcast_to(v, self.batch_shape) for v in (self._a, self._b))
 
 
@@ -135,8 +136,13 @@ class Gamma(_Pair):
     def __init__(self, concentration: chex.Numeric, rate: chex.Numeric) -> None:
         super().__init__(concentration, rate)
 
-    concentration = property(lambda self: self._both[0])
-    rate = property(lambda self: self._both[1])
+    @property
+    def concentration(self) -> jax.Array:
+        return self._both[0]
+
+    @property
+    def rate(self) -> jax.Array:
+        return self._both[1]
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         a, rate = self._both
@@ -167,8 +173,13 @@ class Beta(_Pair):
         super().__init__(alpha, beta)
         self._norm = lgamma(self._a) + lgamma(self._b) - lgamma(self._a + self._b)
 
-    alpha = property(lambda self: self._both[0])
-    beta = property(lambda self: self._both[1])
+    @property
+    def alpha(self) -> jax.Array:
+        return self._both[0]
+
+    @property
+    def beta(self) -> jax.Array:
+        return self._both[1]
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         a, b = self._both

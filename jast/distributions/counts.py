@@ -24,7 +24,7 @@ __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 class _Counts(Distribution):
     """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)`` and ``top``."""
 
-    event_shape = ()
+    event_shape: Any = ()
     _parameter: Any
 
     @property
@@ -72,7 +72,8 @@ class Geometric(_Counts):
     """How many failures come before the first success, of probability ``probs``: 0, 1, 2, ..."""
 
     def __init__(self, probs: chex.Numeric) -> None:
-        self._parameter = self.probs = float_array(probs)
+        self.probs: jax.Array = float_array(probs)
+        self._parameter = self.probs
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         u = jax.random.uniform(key, (n, *self.batch_shape), self.probs.dtype)
@@ -100,7 +101,8 @@ class Poisson(_Counts):
     """Of mean ``rate``."""
 
     def __init__(self, rate: chex.Numeric) -> None:
-        self._parameter = self.rate = float_array(rate)
+        self.rate: jax.Array = float_array(rate)
+        self._parameter = self.rate
 
     @property
     def top(self) -> Any:
@@ -126,8 +128,8 @@ class Binomial(_Counts):
     """How many of ``total_count`` trials succeed, each with probability ``probs``."""
 
     def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
-        self.probs = float_array(probs)
-        self.total_count = jnp.asarray(total_count, self.probs.dtype)
+        self.probs: jax.Array = float_array(probs)
+        self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
         self._parameter = self.probs
 
     @property
@@ -177,7 +179,7 @@ class TiltedCounts(Distribution):
     def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
         self._distribution, self._mean, self._deviation = distribution, mean, deviation
 
-    event_shape = ()
+    event_shape: Any = ()
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -20,7 +20,7 @@ __all__ = ["Bernoulli", "Categorical"]
 class _Choice(Distribution):
     """Given by ``probs`` or by ``logits``, in whatever form: one of the two."""
 
-    event_shape = ()
+    event_shape: Any = ()
     _logits: Any
     _probs: Any
     _dtype: Any

@@ -17,13 +17,15 @@ from jast.distributions.verbs import log_density, mode
 if TYPE_CHECKING:
     import chex
 
+    from jast.typing import DistributionLike
+
 __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", "where"]
 
 
 class Fixed(Distribution):
     """The certain, empty disturbance ``()``: a system with one start."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def sample(
         self, *, seed: chex.PRNGKey | int | None = None, sample_shape: int | Sequence[int] = ()
@@ -100,7 +102,7 @@ class Tent(Distribution):
     reward of the MCFS-AP paper (eq. 1 as a sum of logs).
     """
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(
         self,
@@ -163,7 +165,7 @@ class Where(Distribution):
     kind of value.
     """
 
-    def __init__(self, pred: chex.Array | bool, a: Distribution, b: Distribution) -> None:
+    def __init__(self, pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> None:
         self._pred, self._a, self._b = jnp.asarray(pred), a, b
 
     @property
@@ -223,7 +225,7 @@ def seeds(shape: Sequence[int] = ()) -> Seeds:
     return Seeds(shape)
 
 
-def where(pred: chex.Array | bool, a: Distribution, b: Distribution) -> Where:
+def where(pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> Where:
     """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of
     one shape and dtype.
     """

@@ -55,10 +55,10 @@ register(
 class Exponential(Distribution):
     """Density rate exp(-rate x), x >= 0."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, rate: chex.Numeric) -> None:
-        self.rate = float_array(rate)
+        self.rate: jax.Array = float_array(rate)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -115,7 +115,7 @@ register("distrax:Gumbel", **_gumbel)
 class Weibull(Distribution):
     """Survival function exp(-(x / scale)^concentration), x >= 0."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
         self._shape, self._scale = float_array(concentration), float_array(scale)

@@ -23,10 +23,11 @@ HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 class LocationScale(Distribution):
     """x = loc + scale e, e of a standard distribution; ``loc`` and ``scale`` broadcast."""
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, loc: chex.Numeric, scale: chex.Numeric) -> None:
-        self._loc, self._scale = float_array(loc), float_array(scale)
+        self._loc: jax.Array = float_array(loc)
+        self._scale: jax.Array = float_array(scale)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -1,11 +1,16 @@
 """What several families need: the normal distribution in both tails, fractions, cells."""
 
+from __future__ import annotations
+
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, ndtr, ndtri
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["float_dtype", "fraction", "log_tails", "normal_of_log_tails", "normal_score", "phi"]
 
@@ -32,7 +37,7 @@ def inside(u: jax.Array) -> jax.Array:
     return jnp.clip(u, eps / 2, 1 - eps)
 
 
-def fraction(x: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+def fraction(x: chex.Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is
     no way.
     """

@@ -158,7 +158,7 @@ class MixtureSameFamily(Distribution):
         components_distribution: a batch of distributions of numbers [..., k].
     """
 
-    event_shape = ()
+    event_shape: Any = ()
 
     def __init__(self, mixture_distribution: Any, components_distribution: Any) -> None:
         if components_distribution.event_shape != ():

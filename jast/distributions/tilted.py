@@ -17,6 +17,9 @@ from jast.distributions.verbs import event_like, from_normal, has_cdf, to_normal
 if TYPE_CHECKING:
     import chex
 
+    from jast.typing import DistributionLike
+
+
 __all__ = ["Tilted", "tilted", "untiltable"]
 
 
@@ -53,7 +56,9 @@ class Tilted(Distribution):
         return log_p + jnp.sum(gain, axis=tuple(range(log_p.ndim, gain.ndim)))
 
 
-def tilted(dist: Any, mean: Any, deviation: Any) -> Any:
+def tilted(
+    dist: DistributionLike, mean: chex.ArrayTree, deviation: chex.ArrayTree
+) -> DistributionLike:
     """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of
     ``dist``; ``mean`` and ``deviation`` are like a value, floats.
 
@@ -77,7 +82,7 @@ def tilted(dist: Any, mean: Any, deviation: Any) -> Any:
     return Tilted(dist, mean, deviation)
 
 
-def untiltable(dist: Any) -> str | None:
+def untiltable(dist: DistributionLike) -> str | None:
     """Why `tilted` cannot serve ``dist``; None where it can."""
     full = lambda v: jax.tree.map(
         lambda s: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist)

@@ -17,6 +17,9 @@ from jast.distributions.table import row
 if TYPE_CHECKING:
     import chex
 
+    from jast.typing import Density, DistributionLike
+
+
 __all__ = [
     "cdf",
     "event_like",
@@ -35,12 +38,12 @@ __all__ = [
 ]
 
 
-def sample(d: Any, key: chex.PRNGKey) -> Any:
+def sample(d: DistributionLike, key: chex.PRNGKey) -> chex.ArrayTree:
     """One draw from ``d``."""
     return d.sample(seed=key)
 
 
-def mode(d: Any) -> Any:
+def mode(d: DistributionLike) -> chex.ArrayTree:
     """The likeliest value of ``d``; its median where no mode is known.
 
     Raises:
@@ -62,13 +65,13 @@ def mode(d: Any) -> Any:
         ) from None
 
 
-def log_mode(d: Any) -> jax.Array:
+def log_mode(d: DistributionLike) -> jax.Array:
     """The log density of ``d`` at its mode: scalar."""
     known = row(d, "log_mode").log_mode
     return known(d) if known is not None else d.log_prob(mode(d))
 
 
-def log_density(d: Any, x: Any, density: str = "raw") -> jax.Array:
+def log_density(d: DistributionLike, x: chex.ArrayTree, density: Density = "raw") -> jax.Array:
     """Log density of ``x``: ``"raw"``, or ``"mode"``: less that of the mode, so that the likeliest
     value has 0.
     """
@@ -78,7 +81,7 @@ def log_density(d: Any, x: Any, density: str = "raw") -> jax.Array:
     return known(d, x) if known is not None else d.log_prob(x) - log_mode(d)
 
 
-def quantile(d: Any, u: Any) -> Any:
+def quantile(d: DistributionLike, u: chex.ArrayTree) -> chex.ArrayTree:
     """The value of ``d`` at the quantile ``u`` in [0, 1] (a pytree like a value of ``d``, floats),
     so that ``u ~ U(0, 1)`` gives a draw of ``d``.
 
@@ -94,7 +97,7 @@ def quantile(d: Any, u: Any) -> Any:
     return known(d, u)
 
 
-def cdf(d: Any, x: Any) -> Any:
+def cdf(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
     """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with
     ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
 
@@ -115,7 +118,7 @@ def cdf(d: Any, x: Any) -> Any:
     return known(d, x)
 
 
-def from_normal(d: Any, z: Any) -> Any:
+def from_normal(d: DistributionLike, z: chex.ArrayTree) -> chex.ArrayTree:
     """The value of ``d`` at the normal number ``z`` (a pytree like a value, floats): ``quantile(d,
     Phi(z))``, so that ``z ~ N(0, I)`` gives a draw of ``d``.
 
@@ -128,7 +131,7 @@ def from_normal(d: Any, z: Any) -> Any:
     return known(d, z) if known is not None else quantile(d, jax.tree.map(phi, z))
 
 
-def to_normal(d: Any, x: Any) -> Any:
+def to_normal(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
     """The inverse of `from_normal`: z with ``from_normal(d, z) == x``, for a whole number the
     middle (in probability) of those.
 
@@ -139,22 +142,22 @@ def to_normal(d: Any, x: Any) -> Any:
     return known(d, x) if known is not None else jax.tree.map(normal_score, cdf(d, x))
 
 
-def has_mode(d: Any) -> bool:
+def has_mode(d: DistributionLike) -> bool:
     """Whether `mode` is defined for ``d`` (host-side)."""
     return _defined(lambda: mode(d))
 
 
-def has_quantile(d: Any) -> bool:
+def has_quantile(d: DistributionLike) -> bool:
     """Whether `quantile` is defined for ``d`` (host-side)."""
     return _defined(lambda: quantile(d, _half(d)))
 
 
-def has_cdf(d: Any) -> bool:
+def has_cdf(d: DistributionLike) -> bool:
     """Whether `cdf` is defined for ``d`` (host-side)."""
     return _defined(lambda: cdf(d, sample(d, jax.random.key(0))))
 
 
-def has_exact_tails(d: Any) -> bool:
+def has_exact_tails(d: DistributionLike) -> bool:
     """Whether `from_normal` of ``d`` is exact however far out (host-side); where it is not, in
     float32 all z > 5.4 are one value.
     """
@@ -162,12 +165,12 @@ def has_exact_tails(d: Any) -> bool:
     return known.from_normal is not None and (known.exact is None or known.exact(d))
 
 
-def event_like(d: Any) -> Any:
+def event_like(d: DistributionLike) -> chex.ArrayTree:
     """Shapes and dtypes of one value of ``d``."""
     return jax.eval_shape(lambda: sample(d, jax.random.key(0)))
 
 
-def sum_parts(parts: Any) -> jax.Array:
+def sum_parts(parts: chex.ArrayTree) -> jax.Array:
     """The sum of a pytree of scalars, in the widest of their dtypes."""
     leaves = jax.tree.leaves(parts)
     dtype = jnp.result_type(*leaves)

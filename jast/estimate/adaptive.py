@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -39,7 +39,6 @@ from jast.watch import Watch
 if TYPE_CHECKING:
     import chex
 
-    from jast.episode import Episode
     from jast.failures import Failures
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
@@ -68,8 +67,8 @@ def failure_probability(
     sim: Simulator,
     budget: int = 100_000,
     *,
-    failures: Failures | Episode | None = None,
-    near: Any = None,
+    failures: Failures | None = None,
+    near: Estimate | None = None,
     gradients: bool = True,
     level: float = 0.95,
     progress: bool = False,

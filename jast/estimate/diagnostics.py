@@ -4,19 +4,20 @@ greatest weights, and the rules made of them.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     import chex
 
+
 __all__ = ["pareto_k", "reasons"]
 
 K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
-def pareto_k(log_weights: chex.Array, samples: int, failures: Any = None) -> float:
+def pareto_k(log_weights: chex.Array, samples: int, failures: chex.Array | None = None) -> float:
     """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those
     above 0, of ``samples`` in all): a float.
 

@@ -89,8 +89,15 @@ class Estimate(NamedTuple):
     and `events`; None where there are none
     """
 
-    failures_seen = results.alias("failing")
-    evaluations = results.alias("episodes")
+    @property
+    def failures_seen(self) -> int:
+        """The same as ``failing``."""
+        return self.failing
+
+    @property
+    def evaluations(self) -> int:
+        """The same as ``episodes``."""
+        return self.episodes
 
     @property
     def log10_mean(self) -> float:

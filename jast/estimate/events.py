@@ -91,7 +91,7 @@ def events(
     estimate: Estimate,
     named: Mapping[str, Callable[[Any], Any]],
     *,
-    of: Literal["state", "episode"] = "state",
+    of: Literal["state", "start", "episode"] = "state",
     proposal: Proposal | Policy | None = None,
     level: float | None = None,
 ) -> dict[str, Event]:

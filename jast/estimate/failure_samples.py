@@ -51,7 +51,10 @@ class FailureSamples(NamedTuple):
     evaluations: int
     """Episodes simulated in all"""
 
-    episodes = results.former("episodes", "failures")
+    @results.Former
+    def episodes(self) -> Episode:
+        """Deprecated: ``failures``."""
+        return results.renamed(self, "episodes", "failures")
 
     def __str__(self) -> str:
         n, e = len(self.failures.length), self.failures

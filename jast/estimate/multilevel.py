@@ -62,8 +62,15 @@ class FailureProposal(NamedTuple):
     is fitted to near misses as well
     """
 
-    failures = results.former("failures", "failing")
-    evaluations = results.alias("episodes")
+    @results.Former
+    def failures(self) -> Any:
+        """Deprecated: ``failing``."""
+        return results.renamed(self, "failures", "failing")
+
+    @property
+    def evaluations(self) -> Any:
+        """The same as ``episodes``."""
+        return self.episodes
 
     def __str__(self) -> str:
         reached, levels = np.asarray(self.reached), np.asarray(self.levels)

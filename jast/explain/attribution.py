@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
+
 
 __all__ = ["Attribution", "attribution"]
 
@@ -62,7 +63,7 @@ class Attribution(NamedTuple):
 def attribution(
     sim: Simulator,
     episode: Episode,
-    method: str = "shapley",
+    method: Literal["shapley", "integrated", "gradient"] = "shapley",
     *,
     key: chex.PRNGKey | None = None,
     permutations: int = 200,

@@ -33,7 +33,7 @@ class Feature(NamedTuple):
 class Describer(NamedTuple):
     """What is fixed once, so that every later episode gets the same table."""
 
-    kinds: dict
+    kinds: dict[str, Any]
     """Component -> the values that it takes, of those that have few."""
     finest: int
     """Steps of the shortest window at a place of its own."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from jast.weakness.measures import Roc, roc
 
 if TYPE_CHECKING:
     import chex
+
 
 __all__ = ["Monitor", "monitor"]
 
@@ -113,7 +114,7 @@ def monitor(
     *,
     within: int = 5,
     observe: Callable[[Any], Any] | None = None,
-    model: str = "boosted",
+    model: Literal["boosted", "logistic"] = "boosted",
     false_alarms: float = 0.01,
     key: chex.PRNGKey | None = None,
     episodes: int = 1000,

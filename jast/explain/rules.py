@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
+
 
 __all__ = ["Rules", "rules"]
 
@@ -96,7 +97,7 @@ def rules(
     labels: Sequence[Any] | None = None,
     key: chex.PRNGKey | None = None,
     episodes: int = 1000,
-    of: str = "disturbances",
+    of: Literal["disturbances", "states", "both"] = "disturbances",
     lead: int = 5,
     most: int = 8,
     level: float = 0.95,

@@ -2,7 +2,9 @@
 density.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,11 @@ from jast.heads.heads import Heads, histogram, in_bins, observed
 from jast.outline import outline
 from jast.policy import Policy
 from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Actions
 
 __all__ = ["as_policy"]
 
@@ -62,7 +69,7 @@ class Histogram(D.Distribution):
         return base + jnp.sum(logs).astype(base.dtype)
 
 
-def as_policy(sim: Simulator, heads: Heads, actions: Any, power: Any = 1.0) -> Policy:
+def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeric = 1.0) -> Policy:
     """The policy head of ``heads`` as a `jast.Policy` of ``sim``, with the ``actions`` that it was
     trained on; x0 is drawn from the system's own start.
 

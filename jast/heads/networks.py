@@ -45,7 +45,7 @@ def make_head(
     outputs: Sequence[int] = (),
     *,
     hidden: Sequence[int] = (32, 32),
-    activation: Literal["relu", "tanh"] = "relu",
+    activation: Literal["gelu", "relu", "silu", "tanh"] = "relu",
     first_activation: bool = True,
 ) -> Head:
     """A dense Flax network from [inputs] to ``outputs``, a shape: ``(params, apply)``, a `Head`.

@@ -4,7 +4,7 @@ that work, each by its name.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 __all__ = ["MODES", "HeadSettings", "checked", "settings"]
 
@@ -146,7 +146,9 @@ CHOICES = dict(
 )
 
 
-def settings(mode="default", **changes) -> HeadSettings:
+def settings(
+    mode: Literal["default", "code", "text", "paper"] = "default", **changes: Any
+) -> HeadSettings:
     """`HeadSettings` of a mode, with changes: ``settings("code", round=8)``.
 
     "default" is what works. "code" is the published code of MCFS-AP, of which "paper" is the

@@ -7,7 +7,7 @@ R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from jast.weakness.result import Result
+
 
 __all__ = ["confusion", "likely_failures", "pixel_likelihood", "threshold_sweep"]
 
@@ -105,7 +106,7 @@ def likely_failures(
     networks: Encoded,
     inputs: chex.Array,
     failed: chex.Array,
-    kind: str = "true positives",
+    kind: Literal["true positives", "false negatives", "likely failures"] = "true positives",
     count: int = 10,
     axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +14,13 @@ from jast.plot import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 __all__ = ["exceedance"]
 
 
-def exceedance(curves: Any, truth: Any = None, ax: Any = None) -> Axes:
+def exceedance(
+    curves: Any, truth: Callable[[Any], Any] | None = None, ax: Axes | None = None
+) -> Axes:
     """The probability that an episode comes as near to a failure as a threshold of the miss
     distance, with its band, on a logarithmic axis; dashed where it must not be believed, a gap
     where it is not known, a vertical line at the failure.

@@ -16,6 +16,7 @@ from jast.simulator import Simulator
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 __all__ = ["failure_fan"]
 
 
@@ -25,7 +26,7 @@ def failure_fan(
     sim: Simulator | None = None,
     value: Callable[[Any], Any] | str | None = None,
     nominal: Episode | None = None,
-    ax: Any = None,
+    ax: Axes | None = None,
     most: int = 200,
     label: str | None = None,
     *,

@@ -4,8 +4,9 @@ predictor says of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from jast.simulators.fms.system import fms_path
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 __all__ = ["fms"]
 
 POINTS = 181  # on an arc
@@ -30,7 +32,7 @@ UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " r
 
 
 @style.result_first
-def fms(episode: Episode, sim: Simulator, axes: Any = None) -> list[Axes]:
+def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) -> list[Axes]:
     """One `Episode` of an fms simulator: the route on a map (left; degrees), and the turn with the
     largest error of its arc, enlarged (right; nmi from its waypoint). Where the defect acted, it is
     the second of the turns that overlap. Returns the list of Axes.

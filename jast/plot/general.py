@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from jast.search.result import SearchResult
 
+
 __all__ = ["disturbances", "distances", "history", "spreads"]
 
 
@@ -91,7 +92,7 @@ def history(
 
 def disturbances(
     episode: Episode,
-    axes: Any = None,
+    axes: Sequence[Axes] | None = None,
     *,
     sim: Simulator | None = None,
     units: dict[str, Any] | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +14,13 @@ from jast.policies import FailurePolicy
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 __all__ = ["levels", "training"]
 
 
-def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = None) -> list[Axes]:
+def training(
+    policies: FailurePolicy | dict[str, FailurePolicy], axes: Sequence[Axes] | None = None
+) -> list[Axes]:
     """The training of a failure policy over its episodes: the share of them that fail, and the mean
     log p of those in the latent numbers, relative to the mode, a panel each.
 
@@ -45,7 +49,7 @@ def training(policies: FailurePolicy | dict[str, FailurePolicy], axes: Any = Non
     return axes
 
 
-def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Any = None) -> Axes:
+def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | None = None) -> Axes:
     """The miss distance that the elites of each iteration of `jast.estimate.failure_proposal`
     reached; 0 is a failure.
 

@@ -31,6 +31,9 @@ from jast.stress_testing.words import advice, belief, headline, mode_facts, verd
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jast.episode import Episode
+
+
 __all__ = ["report"]
 
 WIDTH, MARGIN = 8.27, 0.55
@@ -46,7 +49,7 @@ def report(
     report: Report,
     sim: Simulator | None = None,
     *,
-    nominal: Any = None,
+    nominal: Episode | int | None = None,
     units: dict[str, Any] | None = None,
 ) -> Figure:
     """A report on one page: what was found, the probability and whether to believe it, the first

@@ -4,6 +4,7 @@ another.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,10 @@ from jast.plot.played import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from jast.episode import Episode
+    from jast.simulator import Simulator
+
+
 __all__ = ["draw_traces", "phase", "traces"]
 
 PANELS = 8
@@ -36,14 +41,14 @@ DASHED = (0, (4, 2))
 @style.result_first
 def traces(
     samples: Any,
-    sim: Any = None,
-    fields: Any = None,
+    sim: Simulator | None = None,
+    fields: Sequence[str] | None = None,
     *,
     modes: Any = None,
-    nominal: Any = None,
+    nominal: Episode | int | None = None,
     units: dict[str, Any] | None = None,
     most: int = 60,
-    axes: Any = None,
+    axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:
     """How the numbers of the state went in failures, a panel each, against the ordinary: grey bands
     from the 5 to the 95 % and from the 25 to the 75 % quantile of nominal episodes (of those that
@@ -146,14 +151,14 @@ def _bands(ax: Any, rows: np.ndarray, n: int) -> None:
 @style.result_first
 def phase(
     samples: Any,
-    sim: Any = None,
+    sim: Simulator | None = None,
     fields: tuple[str, str] | None = None,
     *,
     modes: Any = None,
-    nominal: Any = None,
+    nominal: Episode | int | None = None,
     units: dict[str, Any] | None = None,
     most: int = 60,
-    ax: Any = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Phase portrait: one number of the state over another. Failures in the colours of their modes,
     a square where each starts and a mark where it ends; grey nominal episodes, dashed the

@@ -13,6 +13,7 @@ from jast.sweeping import Sweep
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 __all__ = ["sweep"]
 
 
@@ -22,7 +23,7 @@ def sweep(
     *,
     level: float | None = None,
     truth: Callable[..., Any] | None = None,
-    ax: Any = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """The probability of failure against a setting, on a logarithmic axis: a line with the band of
     its intervals through the rows that are reliable, the others as crosses; a triangle at the

@@ -4,6 +4,7 @@ page whose nodes open.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,10 +17,13 @@ if TYPE_CHECKING:
 
     from jast.typing import PathLike
 
+
 __all__ = ["tree", "tree_page"]
 
 
-def tree(result: Any, axes: Any = None, *, tree: int | None = None, levels: int = 40) -> list[Axes]:
+def tree(
+    result: Any, axes: Sequence[Axes] | None = None, *, tree: int | None = None, levels: int = 40
+) -> list[Axes]:
     """Q and visits of the nodes on the path to a tree's best episode, a panel each, and of the
     other children of each node on it: the tree, opened along that path. A dot is a child.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback, PathLike
 
+
 __all__ = ["ppo"]
 
 LONGEST = 128
@@ -41,16 +42,16 @@ def ppo(
     sim: Simulator,
     *,
     episodes: int = 12_000,
-    scale: float | str = "auto",
+    scale: float | Literal["auto"] = "auto",
     bonus: float = 0.0,
     alpha: float = 1.0,
-    shaping: str = "auto",
-    widen: float | str = "auto",
+    shaping: Literal["auto", "steps", "end"] = "auto",
+    widen: float | Literal["auto"] = "auto",
     components: int = 2,
-    lanes: int | str = "auto",
+    lanes: int | Literal["auto"] = "auto",
     hidden: Sequence[int] = (100, 100),
     learning_rate: float = 1e-3,
-    steps: int | str = "auto",
+    steps: int | Literal["auto"] = "auto",
     epochs: int = 10,
     batch: int = 256,
     clip: float = 0.2,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback, PathLike
 
+
 __all__ = ["sac"]
 
 UPDATES = 5000
@@ -41,12 +42,12 @@ def sac(
     sim: Simulator,
     *,
     episodes: int = 12_000,
-    scale: float | str = "auto",
+    scale: float | Literal["auto"] = "auto",
     bonus: float = 0.0,
-    alpha: float | str = 1.0,
+    alpha: float | Literal["auto"] = 1.0,
     entropy: float = -0.1,
-    shaping: str = "auto",
-    widen: float | str = "auto",
+    shaping: Literal["auto", "steps", "end"] = "auto",
+    widen: float | Literal["auto"] = "auto",
     components: int = 2,
     lanes: int = 16,
     hidden: Sequence[int] = (100, 100),
@@ -54,7 +55,7 @@ def sac(
     batch: int = 256,
     buffer: int = 100_000,
     polyak: float = 0.01,
-    updates: int | str = "auto",
+    updates: int | Literal["auto"] = "auto",
     progress: bool = False,
     callback: Callback | None = None,
     checkpoint: PathLike | None = None,

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 from jast.search.tree.grow import grow_trees
 from jast.search.tree.settings import PLAIN, settled
@@ -42,7 +42,7 @@ def forest(
     trees: int = 200,
     prunes: int = 18,
     simulations: int = 500,
-    heads: Heads | Callable[..., Any] | None = None,
+    heads: Heads | Literal["rollout", "value", "both"] | None = None,
     reward: Reward | None = None,
     actions: Actions | None = None,
     exploration: float | None = None,

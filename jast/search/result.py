@@ -28,7 +28,10 @@ class History(NamedTuple):
     failing: Any
     """[C] int: failing episodes so far, over all trees."""
 
-    failures = results.alias("failing")
+    @property
+    def failures(self) -> Any:
+        """The same as ``failing``."""
+        return self.failing
 
 
 @results.shown()
@@ -120,7 +123,10 @@ class SearchResult(NamedTuple):
     most ``top`` of them by falling reward: an `Episode` with a leading axis, without states.
     """
 
-    simulator_steps = results.alias("steps")
+    @property
+    def simulator_steps(self) -> Any:
+        """The same as ``steps``."""
+        return self.steps
 
     @property
     def failing_trees(self) -> Any:

@@ -2,8 +2,10 @@
 shows beside its slider (``report.html(path, draw=jast.simulators.draw)``).
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 from jast.simulators import svg
 from jast.simulators.colav.planner import SPEEDS
@@ -13,13 +15,16 @@ from jast.simulators.ferry import COLLISION, FerryState
 from jast.simulators.pendulum import PendulumState
 from jast.simulators.svg import BLUE, GREEN, GREY, INK, VERMILION
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = ["DRAWN", "draw"]
 
 HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
 """Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
 
 
-def draw(state: Any) -> str:
+def draw(state: chex.ArrayTree) -> str:
     """One state of `ferry`, `colav` or `pendulum` as an SVG picture.
 
     Args:

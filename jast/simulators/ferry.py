@@ -41,7 +41,7 @@ class FerryState(NamedTuple):
 
 
 def ferry(
-    adversary: tuple[float, float] = (16.0, 0.0), observation: Literal["code", "default"] = "code"
+    adversary: tuple[float, float] = (16.0, 0.0), observation: Literal["code", "text"] = "code"
 ) -> Simulator:
     """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts
     ((17, 0) is the easier S0b). ``observation``: what networks see. "code": the five numbers of the

@@ -90,7 +90,10 @@ class Result(NamedTuple):
     state: State
     """Give it to `validate` again to go on"""
 
-    episodes = results.alias("calls")
+    @property
+    def episodes(self) -> int:
+        """The same as ``calls``."""
+        return self.calls
 
     @property
     def failing(self) -> int:

@@ -1,9 +1,11 @@
 """The models of the category: run on published inputs, or a `Simulator` under a requirement."""
 
+from __future__ import annotations
+
 import math
 from functools import cache
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,9 @@ from jast.simulators.arch import cars, transmission
 from jast.simulators.arch.specifications import SPECIFICATIONS
 from jast.specs import Formula, under
 from jast.specs.robustness import reach
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = ["automatic_transmission", "chasing_cars", "simulate"]
 
@@ -91,7 +96,12 @@ def automatic_transmission(
     return _driven("automatic_transmission", transmission, "AT", requirement, segments, disturbance)
 
 
-def simulate(model: str, times: Any, inputs: Any, interpolation: str = "step") -> tuple[Any, float]:
+def simulate(
+    model: str,
+    times: chex.Array,
+    inputs: chex.Array,
+    interpolation: Literal["step", "linear"] = "step",
+) -> tuple[Any, float]:
     """A model's trace under given inputs, such as published ones.
 
     Args:
