@@ -55,6 +55,19 @@ def mcts(key, sim, budget):
     return _searched(sim, jast.search.mcts(key, sim, trees=trees, simulations=budget // trees))
 
 
+def gradient(key, sim, budget):
+    """Descents from as many starts as it makes by itself; the budget plays no part."""
+    return _searched(sim, jast.search.gradient(key, sim))
+
+
+def go_explore(key, sim, budget):
+    return _searched(sim, jast.search.go_explore(key, sim, episodes=budget))
+
+
+def chain(key, sim, budget):
+    return _searched(sim, jast.search.chain(key, sim, episodes=budget))
+
+
 def cma_es(key, sim, budget):
     """CMA-ES (the package cma) over the normal numbers of an episode, 128 at a time; like `stress`
     it ranks failures first, by log p. Started anew where it has converged, and refined as the
@@ -96,7 +109,12 @@ def _scored(sim, z):
     return jax.vmap(lambda z: play(z)._replace(states=None))(z)
 
 
-METHODS = {f.__name__: f for f in (stress, monte_carlo, cem, forest, mcts, cma_es)}
+METHODS = {
+    f.__name__: f
+    for f in (stress, monte_carlo, cem, forest, mcts, cma_es, gradient, go_explore, chain)
+}
+SINGLE = "gradient", "go_explore", "chain"
+"""Searches for some kinds of system alone: measured where they are asked for."""
 
 
 def _best(failures):
@@ -160,13 +178,14 @@ def table(report):
 def main(argv=None):
     parser = options(argparse.ArgumentParser(description=__doc__), "two systems, few evaluations")
     parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
-    help = "default: all; cma_es needs the package cma (extra `benchmark`)"
+    help = f"default: all but {', '.join(SINGLE)}; cma_es needs the package cma (extra `benchmark`)"
     parser.add_argument("--methods", nargs="+", choices=METHODS, help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
     there = [m for m in METHODS if m != "cma_es" or importlib.util.find_spec("cma")]
+    there = [m for m in there if m not in SINGLE]
     methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)

@@ -10,7 +10,7 @@ from jast.files import load, save
 from jast.policy import Policy
 from jast.simulator import Simulator
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Episode",
