@@ -14,7 +14,8 @@ extensions = [
     "sphinx.ext.viewcode",
 ]
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/**", "CHANGELOG.md", "CONTRIBUTING.md"]
+abouts = ["CHANGELOG.md", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md", "SECURITY.md"]
+include_patterns = ["docs/**", "notebooks/**", *abouts]
 exclude_patterns = ["docs/build"]
 html_theme, html_title = "sphinx_book_theme", "jast"
 
