@@ -31,7 +31,9 @@ import jast  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast import places, units  # noqa: E402
 from jast.blackbox import from_python  # noqa: E402
+from jast.checkpoints import PARTS  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
+from jast.ledger import records  # noqa: E402
 from jast.simulators import ferry, landing  # noqa: E402
 
 KEY, WAIT = jax.random.key(0), 0.005
@@ -165,13 +167,11 @@ def killed(name, sizes, moment, folder):
     """Units that had ended, and parts on disk, of a call whose process was killed ``moment``
     seconds after its first part; None where it was done before.
     """
-    log, parts = Path(folder, "log"), Path(folder, "run.jast")
-    log.touch()
-    command = [sys.executable, "-W", "ignore", "-c", CHILD, log, name, parts, *sizes]
+    ended, checkpoint = Path(folder, "ended"), Path(folder, "run.jast")
+    ended.touch()
+    command = [sys.executable, "-W", "ignore", "-c", CHILD, ended, name, checkpoint, *sizes]
     process = subprocess.Popen([str(word) for word in command])
-    stored = lambda: len([p for p in parts.glob("*-0*.jast") if not p.name.startswith("answer")])
-    begun = lambda: any(parts.glob("*-0*.jast"))
-    while not begun() and process.poll() is None:
+    while not parts(checkpoint) and process.poll() is None:
         time.sleep(0.002)
     try:
         process.wait(moment)
@@ -179,7 +179,14 @@ def killed(name, sizes, moment, folder):
         process.kill()
     if process.wait() == 0:
         return None
-    return log.stat().st_size, stored()
+    found = parts(checkpoint)
+    return ended.stat().st_size, sum(not name.startswith("answer") for name in found)
+
+
+def parts(checkpoint):
+    """Names of the parts in the folder, where it is there yet."""
+    path = checkpoint / PARTS
+    return [r.header["name"] for r in records(path)] if path.exists() else []
 
 
 def kills(name, sizes, runs, longest):

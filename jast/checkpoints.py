@@ -1,7 +1,8 @@
 """A checkpoint: a folder that holds the finished parts of a long call, so that the same call goes
 on where it was ended, whatever ended it.
 
-Each part is a file of `jast.archive`: whole or not there, with a checksum, without pickle.
+Parts are records of a `jast.ledger`; the state of a chain of steps, each of which replaces the
+last, is a file of `jast.archive`. Both are whole or not there, with checksums, without pickle.
 """
 
 import contextlib
@@ -17,31 +18,32 @@ import numpy as np
 
 from jast import archive
 from jast.fingerprint import differences, fingerprint
+from jast.ledger import Ledger
 
-__all__ = ["Store", "stored"]
+__all__ = ["PARTS", "Store", "stored"]
 
-ABOUT, PART, VERSION = "jast checkpoint", "jast checkpoint part", 1
+ABOUT, STATE, VERSION = "jast checkpoint", "jast checkpoint state", 1
+PARTS = "parts.log"
 REFUSED = "give another folder, or remove this one to begin anew"
 
 
 class Store:
-    """The parts of one call in its folder; made by `stored`."""
+    """What is kept of one call in its folder; made by `stored`."""
 
-    def __init__(self, function: str, folder: Path):
-        self._function, self._folder = function, folder
+    def __init__(self, function: str, folder: Path, ledger: Ledger):
+        self._function, self._folder, self._ledger = function, folder, ledger
 
     def get(self, number: int, name: str) -> list[np.ndarray] | None:
         """The arrays of a part; None where there is no whole one."""
-        try:
-            path = self._path(number, name)
-            header, arrays = archive.read(path, PART, VERSION, "a part of a checkpoint")
-        except (FileNotFoundError, ValueError):  # not there, or damaged with the machine
+        found = self._ledger.get(f"{name}-{number}")
+        if found is None:
             return None
-        out, at = [], 0
-        for name, shape in header["arrays"]:
-            dtype = jnp.dtype(name)
-            end = at + math.prod(shape) * dtype.itemsize
-            out.append(arrays["data"][at:end].view(dtype).reshape(shape))
+        header, data = found
+        out, at, buffer = [], 0, np.frombuffer(data, np.uint8)
+        for dtype, shape in header["arrays"]:
+            end = at + math.prod(shape) * jnp.dtype(dtype).itemsize
+            # a copy: the bytes of an array within others' may lie across what its dtype wants
+            out.append(buffer[at:end].copy().view(jnp.dtype(dtype)).reshape(shape))
             at = end
         return out
 
@@ -49,9 +51,25 @@ class Store:
         """Keep the arrays of a part. OSError where they cannot be written."""
         arrays = [np.asarray(a) for a in arrays]
         header = dict(arrays=[[a.dtype.name, a.shape] for a in arrays])
-        # as one, since each array of a file takes time of its own
-        data = np.frombuffer(b"".join(a.tobytes() for a in arrays), np.uint8)
-        self._write(self._path(number, name), PART, header, dict(data=data))
+        data = b"".join(a.tobytes() for a in arrays)
+        with self._told():
+            self._ledger.put(f"{name}-{number}", header, data)
+
+    def state(self) -> tuple[dict, dict[str, np.ndarray]] | None:
+        """``(header, arrays)`` of where a chain of steps stands; None where there is no whole
+        one.
+        """
+        try:
+            return archive.read(self._state, STATE, VERSION, "the state of a checkpoint")
+        except (FileNotFoundError, ValueError):  # not there, or damaged with the machine
+            return None
+
+    def replace(self, header: dict, arrays: dict[str, np.ndarray]) -> None:
+        """Keep the next `state`; the last one stays whole until it is. OSError where it cannot be
+        written.
+        """
+        with self._told():
+            archive.write(self._state, STATE, VERSION, header, arrays, quick=True)
 
     def settled(self, choose: Any) -> dict[str, Any]:
         """``choose()``, a dict that JSON can hold, as the first call chose: what depends on the
@@ -61,35 +79,16 @@ class Store:
         if path.exists():
             return archive.read(path, ABOUT, VERSION, "of a checkpoint")[0]["settled"]
         chosen = choose()
-        self._write(path, ABOUT, dict(settled=chosen), {})
+        with self._told():
+            archive.write(path, ABOUT, VERSION, dict(settled=chosen), {})
         return chosen
 
-    def agree(self, about: dict[str, str]) -> None:
-        """ValueError unless the folder is new or its call was ``about`` the same."""
-        path = self._folder / "about.jast"
-        if not path.exists():
-            others = [p.name for p in self._folder.iterdir() if p.name != "lock"]
-            if others:
-                raise ValueError(
-                    f"{self._function}: checkpoint {self._folder} is a folder with other files in"
-                    f" it, such as {sorted(others)[0]}: {REFUSED.partition(',')[0]}"
-                )
-            return self._write(path, ABOUT, dict(about=about), {})
-        header, _ = archive.read(path, ABOUT, VERSION, "a checkpoint")
-        if unlike := differences(header["about"], about):
-            raise ValueError(
-                f"{self._function}: checkpoint {self._folder} is of another call: {unlike};"
-                f" {REFUSED}"
-            )
+    @property
+    def _state(self) -> Path:
+        return self._folder / "state.jast"
 
-    def _path(self, number: int, name: str) -> Path:
-        return self._folder / f"{name}-{number:06d}.jast"
-
-    def _write(self, path: Path, kind: str, header: dict, arrays: dict) -> None:
-        try:
-            archive.write(path, kind, VERSION, header, arrays, quick=kind == PART)
-        except OSError as error:
-            raise _unwritten(self._function, self._folder, error) from error
+    def _told(self) -> contextlib.AbstractContextManager:
+        return _writing(self._function, self._folder)
 
 
 @contextlib.contextmanager
@@ -121,23 +120,44 @@ def stored(
         ) from None
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{function}: checkpoint must be a folder, received the file {folder}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = open(folder / "lock", "a+")
-    except OSError as error:
-        raise _unwritten(function, folder, error) from error
-    with lock:
+    with contextlib.ExitStack() as stack:
+        with _writing(function, folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context(open(folder / "lock", "a+"))
         _locked(function, folder, lock)
         for part in folder.glob("*.part"):  # of a process that was killed while it wrote
             part.unlink()
-        store = Store(function, folder)
-        store.agree(fingerprint(function=function, key=key, **about))
-        yield store
+        _agree(function, folder, fingerprint(function=function, key=key, **about))
+        with _writing(function, folder):
+            ledger = stack.enter_context(Ledger(folder / PARTS))
+        yield Store(function, folder, ledger)
 
 
-def _unwritten(function: str, folder: Path, error: OSError) -> OSError:
-    text = f"{function}: checkpoint {folder} cannot be written: {error.strerror}"
-    return type(error)(error.errno, f"{text}; what it holds already stays")
+def _agree(function: str, folder: Path, about: dict[str, str]) -> None:
+    """ValueError unless the folder is new or its call was ``about`` the same."""
+    path = folder / "about.jast"
+    if not path.exists():
+        others = [p.name for p in folder.iterdir() if p.name != "lock"]
+        if others:
+            raise ValueError(
+                f"{function}: checkpoint {folder} is a folder with other files in it, such as"
+                f" {sorted(others)[0]}: {REFUSED.partition(',')[0]}"
+            )
+        with _writing(function, folder):
+            return archive.write(path, ABOUT, VERSION, dict(about=about), {})
+    header, _ = archive.read(path, ABOUT, VERSION, "a checkpoint")
+    if unlike := differences(header["about"], about):
+        raise ValueError(f"{function}: checkpoint {folder} is of another call: {unlike}; {REFUSED}")
+
+
+@contextlib.contextmanager
+def _writing(function: str, folder: Path) -> Iterator[None]:
+    """A context in which an OSError names the call and the folder."""
+    try:
+        yield
+    except OSError as error:
+        text = f"{function}: checkpoint {folder} cannot be written: {error.strerror}"
+        raise type(error)(error.errno, f"{text}; what it holds already stays") from error
 
 
 def _locked(function: str, folder: Path, lock: Any) -> None:
