@@ -43,19 +43,32 @@ ACTIONS = {
 
 
 def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
-    """``sim`` itself, once every function was traced and a few steps were run; with ``actions`` (of
-    `jast.actions`), whether they suit it.
+    """Whether a simulator keeps its contract: every function is traced and a few steps are run.
 
-    Raises ValueError naming the function at fault (its own exception is the ``__cause__``): what
-    `contract` finds; a log density that is not finite on its own samples; NaN in the state or a
-    distance that is not finite in the undisturbed first steps, or in more than half of the nominal
-    ones; ``init``, ``step`` or ``evaluate`` with another answer the second time; actions that are
-    impossible under p(x | s) in more than half of 64 draws at the start. Only the traced half runs
-    where ``sim`` holds tracers or inside a transformation. Runs 33 episodes of an episodic system,
-    and the first steps of another. Warns (UserWarning) where objects of `jast.blackbox` that are
-    judged at the end only (``episodic=True``) failed on the way in some of 16 more, and where the
-    floats of the state are too coarse for what a disturbance does to it (`jast.rounding`, up to 48
-    episodes).
+    Runs 33 episodes of an episodic system, and the first steps of any other. Where ``sim`` holds
+    tracers, or inside a transformation of JAX, only the traced half runs. Warns (UserWarning) where
+    objects of `jast.blackbox` that are judged at the end only (``episodic=True``) failed on the way
+    in some of 16 more episodes, and where the floats of the state are too coarse for what a
+    disturbance does to it (`jast.rounding`, up to 48 episodes).
+
+    Args:
+        sim: the simulator.
+        actions: of `jast.actions`; checks whether they suit it as well.
+
+    Returns:
+        ``sim`` itself.
+
+    Raises:
+        ValueError: that names the function at fault (its own exception is the ``__cause__``): one
+            that does not fit the others; a log density that is not finite on its own samples; NaN
+            in the state, or a distance that is not finite in the undisturbed first steps or in more
+            than half of the nominal ones; ``init``, ``step`` or ``evaluate`` with another answer
+            the second time; actions that are impossible under p(x | s) in more than half of 64
+            draws at the start.
+
+    Example:
+        >>> import jast
+        >>> sim = jast.check(jast.simulators.walk1d(), jast.actions.wide(2.0))
     """
     contract(sim, actions)
     if is_traced(sim, actions) or is_tracing():

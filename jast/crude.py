@@ -110,26 +110,42 @@ def nominal(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Nominal:
-    """How does the system do when nobody searches? Simulate it under its own disturbance model:
-    `Nominal`, the undisturbed outcome and the failure rate with its exact interval.
+    """How does the system do when nobody searches? Simulate it under its own disturbance model: the
+    undisturbed outcome, and the failure rate with its exact interval.
 
-    Of the three that draw from the model alone, this one keeps no episode and asks nothing of a
-    reward; `jast.search.monte_carlo` keeps the best failures, and `jast.estimate.monte_carlo` gives
-    an `Estimate`, to be compared with those of other estimators.
+    Three functions draw from the model alone. This one keeps no episode and needs no reward;
+    `jast.search.monte_carlo` keeps the best failures; `jast.estimate.monte_carlo` gives an
+    `Estimate` to be compared with those of other estimators.
 
-    The key is consumed; episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not
-    grow with ``episodes``. ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
-    now and then. Warns (UserWarning) where the system fails undisturbed and where
-    episodes are invalid. A KeyboardInterrupt ends it with the result of the episodes played by
-    then, and is raised where there are none.
+    Episode i is ``rollout(jax.random.fold_in(key, i), sim)``. Memory does not grow with
+    ``episodes``. Warns (UserWarning) where the system fails undisturbed and where episodes are
+    invalid. A KeyboardInterrupt ends the work with the result of the episodes played by then, and
+    is raised where there are none.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
+    Args:
+        key: consumed.
+        sim: the simulator.
+        episodes: how many to simulate, at least 1.
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` now and then.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    Raises ValueError for ``episodes`` below 1 and where
-    the simulator's functions do not fit together.
+    Returns:
+        `Nominal`: print it.
+
+    Raises:
+        ValueError: for ``episodes`` below 1, and where the simulator's functions do not fit
+            together.
+
+    Example:
+        >>> import jax, jast
+        >>> found = jast.nominal(jax.random.key(0), jast.simulators.walk1d(), 1000)
+        >>> found.episodes, 0.0 < found.rate < 0.2
+        (1000, True)
     """
     random_key("nominal", key)
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:

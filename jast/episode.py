@@ -33,8 +33,14 @@ __all__ = ["Episode", "play_back", "replay", "rollout"]
 
 @results.shown()
 class Episode(NamedTuple):
-    """One episode, or many along leading axes. Rows from ``length`` on are zero and mean
-    nothing.
+    """One episode, or many along leading axes. Rows from ``length`` on are zero and mean nothing.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> many = jax.vmap(jast.rollout, (0, None))(jax.random.split(jax.random.key(0), 5), sim)
+        >>> many.distance.shape, many.disturbances.shape
+        ((5,), (5, 30))
     """
 
     x0: chex.ArrayTree
@@ -65,13 +71,27 @@ def rollout(
     policy: Policy | None = None,
     reward: Reward = rewards.STANDARD,
 ) -> Episode:
-    """Simulate one episode: `Episode`. ``jax.vmap`` over keys, simulators or policies gives many;
-    differentiable in the simulator's and policy's parameters.
+    """Simulate one episode.
 
-    ``policy`` chooses the disturbances (default: the simulator's own model, the nominal system),
-    ``reward`` scores them. The key is consumed. An episode in which the simulator returns NaN has
-    no failure, distance inf and reward -inf. Its `replay` is the same to the bit; inside a
-    transformation, where drawing and stepping are one program, up to rounding.
+    ``jax.vmap`` over keys, simulators or policies gives many. Differentiable in the simulator's and
+    the policy's parameters. An episode in which the simulator returns NaN has no failure, distance
+    inf and reward -inf. The `replay` of an episode is the same to the bit; inside a transformation,
+    where drawing and stepping are one program, up to rounding.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        policy: chooses the disturbances. Default: the simulator's own model, the nominal system.
+        reward: of `jast.rewards`; scores the episode.
+
+    Returns:
+        `Episode`.
+
+    Example:
+        >>> import jax, jast
+        >>> episode = jast.rollout(jax.random.key(0), jast.simulators.walk1d())
+        >>> episode.disturbances.shape, bool(episode.failure)
+        ((30,), False)
     """
     random_key("rollout", key)
     reward = rewards.as_pytree(reward)
@@ -105,12 +125,28 @@ def replay(
     x0: chex.ArrayTree | None = None,
     reward: Reward = rewards.STANDARD,
 ) -> Episode:
-    """Run recorded disturbances again: `Episode` with its states. Exact: the same input gives the
-    same bits.
+    """Run recorded disturbances again. Exact: the same input gives the same bits.
 
-    ``episode`` is an `Episode`, or its disturbances [T, ...] with T <= horizon (a pytree where x is
-    one) and, for a system with a random start, ``x0``. An episode that neither failed nor ended by
-    then ends there. Raises ValueError where the disturbances do not fit the simulator.
+    An episode that has neither failed nor ended when the disturbances run out ends there.
+
+    Args:
+        sim: the simulator.
+        episode: an `Episode`, or its disturbances [T, ...] with T <= horizon (a pytree where x is
+            one).
+        x0: with disturbances alone, the initial one of a system with a random start.
+        reward: of `jast.rewards`; scores the episode.
+
+    Returns:
+        `Episode` with its states.
+
+    Raises:
+        ValueError: where the disturbances do not fit the simulator.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> episode = jast.replay(jast.simulators.walk1d(), jnp.full(6, 2.0))
+        >>> bool(episode.failure), int(episode.length)
+        (True, 5)
     """
     length = None
     if isinstance(episode, Episode):

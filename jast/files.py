@@ -63,18 +63,27 @@ FUNCTIONS = (
 
 
 def save(path: PathLike, result: Any) -> None:
-    """Write a result to the one file ``path``; an older file of that name stays whole until the new
-    one is.
+    """Write a result to a file. The write is atomic: an existing file is replaced only once the new
+    one is complete.
 
     Args:
         path: of the file, by any name.
         result: of a search, an estimate, a cross-entropy method, `jast.nominal` or a validation; an
             archive of failures, an `jast.Episode`, `jast.heads.Heads`, a failure policy, or the
-            state of a validation; also a batch of them, of `jax.vmap`. A proposal that is made of
-            functions and the simulator of a report are left out, and None after `load`.
+            state of a validation; also a batch of them, from `jax.vmap`. A proposal that is made of
+            functions and the simulator of a report are left out, and are None after `load`.
 
     Raises:
         ValueError: that names what a file cannot hold.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> episode = jast.rollout(jax.random.key(0), jast.simulators.walk1d())
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "episode.npz")
+        ...     jast.save(path, episode)
+        ...     bool(jast.load(path).distance == episode.distance)
+        True
     """
     store(path, FORMATS.get(place_of(result), "jast result"), result)
 
@@ -83,15 +92,24 @@ def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
     """What `save` wrote, equal to the bit; its arrays are NumPy's and keep their dtypes.
 
     Args:
-        path: of the file, also one of version 0.1.0.
-        sim: the simulator that it is of, which must fit (horizon, structure, shapes, kinds of
+        path: of the file. Files of version 0.1.0 can be read too.
+        sim: the simulator of the result, which must fit it (horizon, structure, shapes, kinds of
             number; the float precision may differ). A failure policy needs it, and so do x0, x and
-            states that hold classes of its own.
+            states that hold classes of their own.
         heads: `jast.heads.Heads` with functions of your own, for a file that holds such heads.
 
     Raises:
-        ValueError: that says why the file is refused: none of jast, of an unknown version, damaged,
-            or no fit to ``sim`` or ``heads``.
+        ValueError: that says why the file is refused: it is not one of jast, its version is
+            unknown, it is damaged, or it does not fit ``sim`` or ``heads``.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> found = jast.nominal(jax.random.key(0), jast.simulators.walk1d(), 100)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "nominal.npz")
+        ...     jast.save(path, found)
+        ...     jast.load(path).episodes
+        100
     """
     format = archive.format_of(path)
     if format not in KINDS:

@@ -22,8 +22,16 @@ __all__ = ["Policy", "nominal_policy", "recorded", "undisturbed"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:
-    """Chooses disturbances: ``start() -> Distribution`` over x0 and ``disturbance(state, t) ->
-    Distribution`` over x_t, t = 0, 1, ...; a pytree.
+    """Chooses disturbances. A pytree of two functions: ``start() -> Distribution`` over x0 and
+    ``disturbance(state, t) -> Distribution`` over x_t, t = 0, 1, ...
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> sim = jast.simulators.walk1d()
+        >>> push = jast.Policy(sim.start, lambda state, t: D.Normal(1.0, 0.1))
+        >>> bool(jast.rollout(jax.random.key(0), sim, push).failure)
+        True
     """
 
     start: Callable[[], Any]

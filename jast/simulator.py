@@ -44,16 +44,32 @@ class Simulator:
 
     All randomness is the disturbances (x0, x1, ..., xT), each with its density, so an episode is
     its disturbances. The functions are wrapped in `jax.tree_util.Partial`: arguments bound by a
-    ``Partial`` are traced, so simulators that differ only in them share one compiled program and
+    ``Partial`` are traced, so simulators that differ only in them share one compiled program, and
     `jax.vmap` over a batch of them is a parameter sweep. Plain functions and lambdas are static, by
     identity: define them once.
 
-    At a state, in this order: a failure ends the episode, then ``is_terminal``, then the horizon.
-    The miss distance of an episode is the least over s0..sT; of an ``episodic`` one, the last
-    state's, and only there the failure event counts.
+    Three things end an episode, in this order: a failure, then ``is_terminal``, then the horizon.
+    The miss distance of an episode is the least over s0..sT. In an ``episodic`` system it is that
+    of the last state, and only there does the failure event count.
 
-    Raises ValueError for a horizon below 1 or a field that is no function. `jast.check` says
-    whether the functions fit together.
+    `jast.check` says whether the functions fit together.
+
+    Raises:
+        ValueError: for a horizon below 1 or a field that is no function.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jast
+        >>> from jast import distributions as D
+        >>> sim = jast.Simulator(
+        ...     init=lambda x0: jnp.zeros(()),
+        ...     step=lambda s, x: 0.9 * s + x,
+        ...     disturbance=lambda s: D.Normal(jnp.zeros(()), 1.0),
+        ...     evaluate=lambda s: (jnp.abs(s) > 5.0, jnp.maximum(5.0 - jnp.abs(s), 0.0)),
+        ...     horizon=20,
+        ... )
+        >>> jast.check(sim).horizon
+        20
     """
 
     init: Init

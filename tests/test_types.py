@@ -1,44 +1,20 @@
 """The types of what is exported: annotated, complete for a type checker, and shipped."""
 
-import importlib
 import inspect
 import json
-import pkgutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-
-import jast
+from doors import DOORS, exported, functions
 
 ROOT = Path(__file__).parents[1]
-DOORS = [
-    m.name
-    for m in pkgutil.walk_packages(jast.__path__, "jast.")
-    if not m.name.endswith("__main__")
-    and (m.name.removeprefix("jast.") in jast.__all__ or m.name in ("jast.sweeping",))
-]
-DOORS += ["jast", "jast.cross_entropy.schedules", "jast.simulators.arch", "jast.stress_testing"]
-
-
-def exported():
-    """(room.name, object) of every function and class of jast at a door."""
-    for door in DOORS:
-        room = importlib.import_module(door)
-        for name in room.__all__:
-            value = getattr(room, name)
-            ours = getattr(value, "__module__", "").startswith("jast")
-            if ours and (inspect.isfunction(value) or inspect.isclass(value)):
-                yield f"{door}.{name}", value
-
-
-FUNCTIONS = [(name, f) for name, f in exported() if inspect.isfunction(f)]
 
 
 @pytest.mark.parametrize("door", DOORS)
 def test_every_parameter_and_what_comes_back_is_annotated(door):
-    for name, function in FUNCTIONS:
+    for name, function in functions():
         if name.rpartition(".")[0] == door:
             signature = inspect.signature(function)
             bare = [p for p in signature.parameters.values() if p.annotation is p.empty]
@@ -47,7 +23,7 @@ def test_every_parameter_and_what_comes_back_is_annotated(door):
 
 
 def test_keywords_that_are_passed_on_are_explained():
-    for name, function in FUNCTIONS:
+    for name, function in functions():
         for p in inspect.signature(function).parameters.values():
             if p.kind is p.VAR_KEYWORD:
                 assert f"``{p.name}``" in function.__doc__ or f"{p.name}:" in function.__doc__, name

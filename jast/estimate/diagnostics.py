@@ -17,7 +17,7 @@ __all__ = ["pareto_k", "reasons"]
 K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
-def pareto_k(log_weights: chex.Array, samples: int, failures: chex.Array | None = None) -> float:
+def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
     """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those
     above 0, of ``samples`` in all): a float.
 

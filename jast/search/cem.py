@@ -93,42 +93,67 @@ def cem(
     callback: Callback | None = None,
     checkpoint: PathLike | None = None,
 ) -> SearchResult:
-    """Search by cross-entropy: `SearchResult`. ``iterations`` of ``samples`` episodes, like the
-    ``elites`` best distinct ones so far; maximises ``reward``.
+    """Search by the cross-entropy method: every iteration simulates a batch of episodes like the
+    best distinct ones so far, its elites.
 
-    Failures rank before other episodes, each by reward; one whose reward is not finite is never an
-    elite. Default ``reward``: `jast.rewards.lexicographic`, with its scales from 128 plain episodes
-    of the system (10 of a black box), which count among the episodes, as tree -1.
+    Failures rank before other episodes, each by reward; an episode whose reward is not finite is
+    never an elite. With ``actions.quantiles()`` and ``uniform(low, high)``, x_t is the quantile, or
+    the point of the box, at u = Phi(z). The z_t ~ N(m_t, s_t^2) are fitted to the elites and begin
+    at N(0, 1). ``wide()`` begins at N(0, width^2); where no width is given it widens only where all
+    plain episodes have the same miss distance, so that nothing else points to failures. With
+    ``samples()``, for any disturbance (integers, seeds of unknown density), x_t is that of a random
+    elite, each step from another. A random start is treated likewise, but never by the box.
 
-    With ``actions.quantiles()`` and ``uniform(low, high)`` x_t is the quantile, or the point of the
-    box, at u = Phi(z), with z_t ~ N(m_t, s_t^2) fitted to the elites, from N(0, 1) on: the share
-    ``smoothing`` of the last fit is kept, and s_t >= ``floor``. ``wide()`` begins at N(0, width^2);
-    where no width is given, it widens only where all plain episodes have the same miss distance, so
-    that nothing else points to failures. With ``samples()``, for any disturbance (integers, seeds
-    of unknown density), x_t is that of a random elite, each step with another, or with probability
-    ``fresh`` a draw from p(x | s). A random start is treated likewise, but never by the box.
-    Default ``actions``: wide where disturbances have a quantile function, else samples.
+    A reward whose log p outweighs the distance, such as `jast.rewards.standard` over many steps,
+    has its best non-failing episode far from any failure, and the elites gather there.
 
-    ``failures``: an archive, the likeliest of which the first draws lie around, as wide as without
-    it: a search then leads on from what others found. With ``quantiles()`` and ``wide()`` only.
+    KeyboardInterrupt ends the search with the result of the whole iterations, and
+    ``settings["interrupted"]`` says so. Works under `jax.jit` and `jax.vmap`, without archive,
+    history and callbacks.
 
-    ``trees``: independent searches, side by side; tree k is the same whatever their number.
-    Defaults are tuned on the ferry; 1000 samples, 100 elites and 10 iterations are the customary
-    ones. Counts are static, real-valued settings (from 0 to 1) traced. The key is consumed.
-    ``refine``: as in `jast.search.forest`, the share that pulls the failures to where they are
-    likeliest.
-    ``top``: distinct failures kept; ``record=True`` keeps the numbers of every episode
-    (``result.trials``). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called
-    after every iteration with the episodes of all trees; KeyboardInterrupt ends the search with the
-    result of the whole iterations, and ``settings["interrupted"]``. ``checkpoint``: a folder that
-    keeps the iterations; the same call goes on where it was ended, by whatever, to the same result
-    (docs/scale.md). Works under `jax.jit` and
-    `jax.vmap`, without archive, history and callbacks.
+    Args:
+        key: consumed.
+        sim: the simulator.
+        samples: episodes in a batch; static, like all counts. The defaults are tuned on the ferry;
+            1000 samples, 100 elites and 10 iterations are the customary ones.
+        elites: how many of the best episodes the next batch is like.
+        iterations: how many batches.
+        reward: what is maximised. Default: `jast.rewards.lexicographic`, with its scales from 128
+            plain episodes of the system (10 of a black box), which count among the episodes, as
+            tree -1.
+        actions: of `jast.actions`. Default: wide where disturbances have a quantile function, else
+            samples.
+        smoothing: share of the last fit that is kept, from 0 to 1; traced, like ``floor`` and
+            ``fresh``.
+        floor: the least s_t, from 0 to 1.
+        fresh: with ``samples()``, the probability that a step draws from p(x | s) instead.
+        trees: independent searches, side by side; tree k is the same whatever their number.
+        failures: an archive. The first draws lie around the likeliest of them, as wide as without
+            it, so that a search continues from what others found. With ``quantiles()`` and
+            ``wide()`` only.
+        refine: as for `forest`, the share that pulls the failures to where they are likeliest.
+        top: distinct failures kept.
+        record: keep the numbers of every episode (``result.trials``).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after every iteration, with the episodes
+            of all trees.
+        checkpoint: a folder that keeps the iterations. The same call then goes on where it was
+            stopped, to the same result (docs/scale.md).
 
-    A reward whose log p outweighs the distance, as `jast.rewards.standard` of many steps, has its
-    best non-failing episode far from any failure, and the elites gather there. Raises ValueError
-    for a count below 1, more elites than samples, a setting outside its range, a ``refine`` that
-    cannot be, and where the simulator's functions or the actions do not fit together.
+    Returns:
+        `SearchResult`.
+
+    Raises:
+        ValueError: for a count below 1, more elites than samples, a setting outside its range, a
+            ``refine`` that is not possible, and where the simulator's functions or the actions do
+            not fit together.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.cem(jax.random.key(0), sim, samples=50, elites=5, iterations=4)
+        >>> bool(result.best.failure)
+        True
     """
     samples, elites, iterations, trees, top = E.whole(
         "cem", samples=samples, elites=elites, iterations=iterations, trees=trees, top=top

@@ -86,6 +86,13 @@ def chain(
         ValueError: for a count below 1, ``narrowest`` or ``refine`` outside its range, disturbances
             without a quantile function, a simulator whose functions do not fit together, and inside
             of a transformation of JAX.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.chain(jax.random.key(0), sim, episodes=2000, refine=0)
+        >>> bool(result.best.failure)
+        True
     """
     name = "chain"
     episodes, top = E.whole(name, episodes=episodes, top=top)

@@ -92,6 +92,14 @@ def modes(
     Returns:
         `Modes`. A further failure that has no path to any of ``likeliest`` counts for the mode
         whose likeliest failure it points most nearly to. Each share is of the members.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(key, sim, episodes=500, refine=0).failures
+        >>> ways = jast.search.modes(sim, jast.search.refine(key, sim, found, budget=2000).failures)
+        >>> len(ways)  # upwards and downwards
+        2
     """
     n = len(likeliest)
     if not n:

@@ -85,20 +85,22 @@ def falsify(
 ) -> SearchResult:
     """Find a failure with few simulations, however unlikely it is.
 
-    30 signals of few pieces, half of them at the ends of the disturbances' ranges, then children of
-    the ten nearest episodes: of two of them, one up to a step and the other from there on, or of
-    one, with a stretch of the steps that it took moved, held at another level or at an end of its
-    range. The ends are the levels 3e-5 and 1 - 3e-5. The likeliest failure is the business of the
-    other searches.
+    The first 30 signals consist of few pieces, half of them at the ends of the disturbances' ranges
+    (the levels 3e-5 and 1 - 3e-5). Then come children of the ten nearest episodes. A child is made
+    of two of them, one up to a step and the other from there on, or of one, with a stretch of its
+    steps moved, held at another level, or held at an end of its range. Finding the likeliest
+    failure is left to the other searches.
+
+    ``history.best_reward`` is minus the least miss distance so far.
 
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        simulations: at most.
+        simulations: the most that are run.
         batch: simulations side by side; with 1, each learns from all before it.
         stop: end with the batch that has the first failure.
         top: distinct failures kept.
-        progress: show a bar.
+        progress: whether to show a progress bar.
         callback: called as ``callback(done, total, None)``, in simulations, after each batch.
 
     Returns:
@@ -107,9 +109,13 @@ def falsify(
 
     Raises:
         ValueError: for a count below 1, disturbances without a quantile function, a simulator whose
-            functions do not fit together, and inside of a transformation of JAX.
+            functions do not fit together, and inside a transformation of JAX.
 
-    ``history.best_reward`` is minus the least miss distance so far.
+    Example:
+        >>> import jax, jast
+        >>> result = jast.search.falsify(jax.random.key(0), jast.simulators.walk1d())
+        >>> int(result.first_failure) <= 30
+        True
     """
     name = "falsify"
     simulations, batch, top = E.whole(name, simulations=simulations, batch=batch, top=top)

@@ -48,13 +48,13 @@ def forest(
     exploration: float | None = None,
     mode: Literal["default", "code", "text", "paper", "thesis", "episodic"] = "default",
     widening: tuple[float, float] | None = None,
-    spread: float | None = None,
+    spread: bool | None = None,
     focus: float | None = None,
-    follow: float | None = None,
-    feed: int | None = None,
-    urgent: float | None = None,
+    follow: bool | None = None,
+    feed: bool | None = None,
+    urgent: bool | None = None,
     head_settings: HeadSettings | None = None,
-    memoize: bool | Literal["auto"] = "auto",
+    memoize: Literal["auto", "node", "root", "none"] = "auto",
     refine: float | None = None,
     top: int = 64,
     record: bool = False,
@@ -68,79 +68,111 @@ def forest(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> SearchResult:
-    """Grow ``trees`` independent trees of ``prunes`` roots with ``simulations`` each:
-    `SearchResult`. The reward is maximised.
+    """Grow independent trees, each from many roots in turn. The reward is maximised.
 
-    A simulation walks down from the root by eq. 3, Q(s, a) + ``exploration`` sqrt(ln N(s) / (1 +
-    N(s, a))), where a node has at most k N^alpha + 1 children, ``widening`` = (k, alpha), alpha in
-    [0, 1]; takes a child never visited, rolls out at random to the episode's end, and backs its
-    reward up as a mean. After ``simulations`` of them the most visited child becomes the root and
-    keeps its subtree; a tree ends early when its root is an episode's end.
+    A simulation walks down from the root by eq. 3, Q(s, a) + c sqrt(ln N(s) / (1 + N(s, a))), where
+    a node has at most k N^alpha + 1 children. It takes a child that was never visited, rolls out at
+    random to the episode's end, and backs its reward up as a mean. Then the most visited child
+    becomes the root and keeps its subtree. A tree ends early when its root is an episode's end. The
+    equations are those of MCFS-AP.
 
-    ``mode="code"`` (earlier: "paper") is the published search: ``widening`` (0.5, 0.6), every
-    action drawn independently. ``mode="default"`` is what works: (2, 0.5); ``spread``: the children
-    of a node cover the action space evenly; ``focus``: every second child, and in half of the trees
-    every second rollout step, is drawn closer to the mode of the disturbance by this factor: 0.2
-    for a uniform box, 1 (off) for draws of the model, which are near it already. Above 1 it reaches
-    into the tails, for failures too rare for the model's own draws; where failures lie at the edge
-    of a tight box, 1 finds more. Each may be given on its own.
+    The modes are:
 
-    Default ``reward``: `jast.rewards.lexicographic`, any failure above all misses, then the
-    likeliest failure, the nearest miss. Default ``actions``: `jast.actions.wide` where disturbances
-    have a quantile function, else draws of the model. Their scales come from up to 768 episodes of
-    the system (60 of a black box) before the first tree, the same for every key; these count among
-    the episodes, and their failures are tree -1's. ``exploration``: default 1 with the
-    lexicographic reward, else the published 10. Modes "code", "text" and "thesis" have the
-    published `jast.rewards.standard` and draws of the model.
+    - "default" is what works: ``widening`` (2, 0.5), ``spread`` and ``focus``.
+    - "code" (earlier: "paper") is the published search: ``widening`` (0.5, 0.6), every action drawn
+      independently, `jast.rewards.standard` and draws of the model. "text" differs from it in the
+      heads.
+    - "episodic" is for failures that a chance rollout hits and that nothing points to, as in
+      systems that are judged at their end only: ``urgent`` and ``follow``.
+    - "thesis" is Moss's: ``widening`` (10, 0.3), ``urgent`` and ``feed``, with the published reward
+      and draws of the model.
 
-    ``memoize`` keeps the simulator's states at every "node", at the current "root" only, or "none":
-    the same trees, for memory against simulator steps; "auto" takes "node" where it fits. ``top``:
-    failures kept in the archive; ``record=True`` keeps the numbers of every episode as well
-    (``result.trials``), ``keep_trees=True`` the trees themselves (``result.trees``), which
-    `jast.plot.tree` shows; states are kept at every node then.
+    With heads, the trees grow in rounds. Between two rounds the heads learn from the statistics of
+    the roots, and the policy also from the best episodes. No untrained head guides the first round.
+    ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
 
-    ``refine``: evaluations of `jast.search.refine` at the end, on top of the trees, as a share of
-    their episodes. It pulls the archived failures to where they are likeliest; ``result.refined``
-    says what came of that, ``result.evaluations`` counts both. Default: 0.1 with the lexicographic
-    reward, else 0; also 0 in modes "code", "text" and "thesis", under `jax.jit` and `jax.vmap`, and
-    where a disturbance has no quantile function. A share of fewer than 100 evaluations is not
-    spent.
+    A KeyboardInterrupt ends the search with an honest result of what was done. Under `jax.jit` and
+    `jax.vmap` one traced program runs, with no archive.
 
-    ``mode="episodic"`` is for failures that a chance rollout hits and that nothing points to, as of
-    systems that are judged at their end only: ``urgent`` and ``follow``. ``urgent``: a child that
-    was never visited comes first (else its Q is 0). ``follow``: as soon as a failure is the best of
-    its tree, the next simulations grow its path into the tree, an action each, so that every step
-    of it can be varied; not with a value head. ``exploration`` is in the units of the reward: of
-    one of your own give here a hundredth of what a failure earns. ``mode="thesis"`` is Moss's:
-    ``widening`` (10, 0.3), ``urgent``, and ``feed``: with half of its steps to go, a rollout takes
-    the action that the tree's best episode took there (Algorithm 9).
+    Args:
+        key: consumed.
+        sim: the simulator.
+        trees: how many; each is a search of its own.
+        prunes: roots of a tree.
+        simulations: from each root.
+        heads: networks that guide the trees, on what ``observe`` shows. "rollout" is a policy from
+            which rollouts draw, "value" a v(s, a) that joins eq. 3, "both" is both; or
+            `jast.heads.Heads` of your own or of an earlier result (``result.heads``), also of
+            another start of the same system. The modes "code" and "text" have the heads of the
+            published code and text.
+        reward: default: `jast.rewards.lexicographic`, which ranks any failure above all misses,
+            then the likeliest failure, then the nearest miss.
+        actions: of `jast.actions`. Default: `jast.actions.wide` where disturbances have a quantile
+            function, else draws of the model. The scales of reward and actions come from up to 768
+            episodes of the system (60 of a black box) before the first tree, the same for every
+            key; these count among the episodes, and their failures are tree -1's.
+        exploration: c of eq. 3, in the units of the reward. Default: 1 with the lexicographic
+            reward, else the published 10. With a reward of your own in mode "episodic", give a
+            hundredth of what a failure earns.
+        mode: see above. The settings below override it, each on its own.
+        widening: (k, alpha), alpha in [0, 1].
+        spread: the children of a node cover the action space evenly.
+        focus: every second child, and in half of the trees every second rollout step, is drawn
+            closer to the mode of the disturbance by this factor: 0.2 for a uniform box, 1 (off) for
+            draws of the model, which are near it already. Above 1 it reaches into the tails, for
+            failures too rare for the model's own draws; where failures lie at the edge of a tight
+            box, 1 finds more.
+        follow: as soon as a failure is the best of its tree, the next simulations grow its path
+            into the tree, an action each, so that every step of it can be varied; not with a value
+            head.
+        feed: with half of its steps to go, a rollout takes the action that the tree's best episode
+            took there (Algorithm 9 of the thesis).
+        urgent: a child that was never visited comes first (else its Q is 0).
+        head_settings: of `jast.heads.settings`. Default: the mode's. ``settings(train=False)`` uses
+            heads as they are, which is what `jax.jit` and `jax.vmap` do.
+        memoize: keeps the simulator's states at every "node", at the current "root" only, or
+            nowhere ("none"). The trees are the same; it trades memory for simulator steps. "auto"
+            takes "node" where it fits.
+        refine: evaluations of `jast.search.refine` at the end, on top of the trees, as a share of
+            their episodes. It pulls the archived failures to where they are likeliest;
+            ``result.refined`` says what came of that, ``result.evaluations`` counts both. Default:
+            0.1 with the lexicographic reward, else 0; also 0 in modes "code", "text" and "thesis",
+            under `jax.jit` and `jax.vmap`, and where a disturbance has no quantile function. A
+            share of fewer than 100 evaluations is not spent.
+        top: distinct failures kept.
+        record: keep the numbers of every episode (``result.trials``).
+        keep_trees: keep the trees themselves (``result.trees``), which `jast.plot.tree` shows;
+            states are then kept at every node.
+        threads: how many run trees. Default: one for each processor. Like ``lanes``, it changes no
+            result.
+        lanes: trees that a thread runs side by side. They are the unit of a checkpoint or an
+            executor, with which the default is 64 to 128: smaller units lose less and make one wait
+            less, but cost more each.
+        available: bytes that the trees in flight may take. Default: what is free.
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` now and then, with the simulations of
+            all trees.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    Trees run ``lanes`` at a time in each of ``threads`` threads (default: all processors); neither
-    changes a result. ``available``: bytes that the trees in flight may take (default: what is
-    free). ``progress=True`` shows a bar; ``callback(done, total, None)`` is called now and then
-    with the simulations of all trees. A KeyboardInterrupt ends the search with an honest result of
-    what was done. Under `jax.jit` and `jax.vmap` one traced program runs, with no archive.
+    Returns:
+        `SearchResult`.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
-    A unit is a group of ``lanes`` trees, with a checkpoint or an executor 64 to 128 by default:
-    fewer are less to lose and to wait for, but cost more each.
+    Raises:
+        ValueError: for counts below 1, a negative ``refine`` and one above 0 where it is not
+            possible, a simulator that breaks its contract, heads that do not fit it, an ``observe``
+            that is not finite at the start, and trees that do not fit into memory, with the
+            numbers.
 
-    ``heads``: networks on what ``observe`` shows. "rollout": a policy from which rollouts draw,
-    "value": a v(s, a) that joins eq. 3, "both"; or `jast.heads.Heads` of your own or of an earlier
-    result (``result.heads``), also of another start of the same system. The trees then grow in
-    rounds, and between two rounds the heads learn from the statistics of the roots and, the policy,
-    from the best episodes; no untrained head guides the first round. With ``mode="code"`` they are
-    those of the published code, with ``mode="text"`` those of the published text, a tree a round
-    (`jast.heads.settings` has what differs). ``head_settings``: `jast.heads.settings`, if not the
-    mode's; ``settings(train=False)`` uses heads as they are, which is what `jax.jit` and `jax.vmap`
-    do. ``result.lessons`` tells of each round; a training whose loss is not finite is rejected.
-
-    Raises ValueError for counts below 1, a negative ``refine`` and one above 0 where it cannot be,
-    a simulator that breaks its contract, heads that do not fit it, an ``observe`` that is not
-    finite at the start, and trees that do not fit into memory, with the numbers.
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.forest(jax.random.key(0), sim, trees=4, prunes=2, simulations=100)
+        >>> bool(result.best.failure)
+        True
     """
     given = dict(
         widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent

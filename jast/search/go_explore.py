@@ -101,6 +101,13 @@ def go_explore(
 
     A system whose miss distance means something only at its end (``episodic``) has no nearest
     states; there cells are told by the step and what is observed.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.go_explore(jax.random.key(0), sim, episodes=2000, refine=0)
+        >>> bool(result.best.failure)
+        True
     """
     name = "go_explore"
     episodes, top = E.whole(name, episodes=episodes, top=top)

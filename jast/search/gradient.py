@@ -76,6 +76,13 @@ def gradient(
         ValueError: for a count below 1, a negative ``refine``, a system that runs on the host,
             disturbances without a quantile function, a simulator whose functions do not fit
             together, and inside of a transformation of JAX.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.gradient(jax.random.key(0), sim, starts=4, refine=0)
+        >>> bool(result.best.failure)
+        True
     """
     name = "gradient"
     starts, top = E.whole(name, starts=starts, top=top)

@@ -42,12 +42,12 @@ def mcts(
     exploration: float | None = None,
     mode: Literal["default", "code", "paper", "thesis", "episodic"] = "default",
     widening: tuple[float, float] | None = None,
-    spread: float | None = None,
+    spread: bool | None = None,
     focus: float | None = None,
-    follow: float | None = None,
-    feed: int | None = None,
-    urgent: float | None = None,
-    memoize: bool | Literal["auto"] = "auto",
+    follow: bool | None = None,
+    feed: bool | None = None,
+    urgent: bool | None = None,
+    memoize: Literal["auto", "node", "root", "none"] = "auto",
     refine: float | None = None,
     top: int = 64,
     record: bool = False,
@@ -61,13 +61,33 @@ def mcts(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> SearchResult:
-    """Grow ``trees`` independent trees of ``simulations`` from their first root: `SearchResult`.
-    The reward is maximised.
+    """Grow independent trees from their first root: `jast.search.forest` without its action
+    pruning. The reward is maximised.
 
-    `jast.search.forest` without its action pruning, with its settings and errors.
-    ``mode="default"`` has ``widening`` (1, 0.5), ``"paper"`` is the published MCTS-SA, ``"thesis"``
-    the modified search of Moss's thesis for systems that are evaluated at the end of an episode
-    (Algorithms 7 to 11), and ``"episodic"`` what works better there.
+    Args:
+        key, sim: as for `forest`.
+        trees: how many; each is a search of its own.
+        simulations: of each tree.
+        reward, actions, exploration, widening, spread, focus, follow, feed, urgent: as for
+            `forest`.
+        mode: "default" has ``widening`` (1, 0.5); "code" (earlier: "paper") is the published
+            MCTS-SA; "thesis" the modified search of Moss's thesis for systems that are evaluated at
+            the end of an episode (Algorithms 7 to 11); "episodic" is what works better there.
+        memoize, refine, top, record, keep_trees, threads, lanes, available: as for `forest`.
+        progress, callback, checkpoint, executor, devices: as for `forest`.
+
+    Returns:
+        `SearchResult`.
+
+    Raises:
+        ValueError: as `forest`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.mcts(jax.random.key(0), sim, simulations=500)
+        >>> bool(result.best.failure)
+        True
     """
     given = dict(
         widening=widening, spread=spread, focus=focus, follow=follow, feed=feed, urgent=urgent

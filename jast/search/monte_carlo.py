@@ -75,32 +75,52 @@ def monte_carlo(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> SearchResult:
-    """What are the likeliest failures that chance alone finds? Simulate ``episodes`` independent
-    episodes with disturbances of ``actions``, and keep the best: `SearchResult` of one tree.
-    Maximises ``reward``. The baseline of searches, with ``refine=0``; `jast.nominal` only counts,
+    """What are the likeliest failures that chance alone finds? Simulate independent episodes and
+    keep the best. With ``refine=0`` this is the baseline of searches; `jast.nominal` only counts,
     and `jast.estimate.monte_carlo` is the baseline of estimators.
 
     With ``actions.samples()`` or ``quantiles()`` the failing share is the failure probability, up
     to chance. A random start is drawn likewise (from its own distribution where actions are a box).
-    Default ``reward``: `jast.rewards.lexicographic`; its scales come from 128 plain episodes (10 of
-    a black box), the same for every key, which are not among those of the result. ``refine``: as in
-    `jast.search.forest`, the share that pulls the failures to where they are likeliest.
+    Episode i depends on the key and on i alone, not on ``episodes``.
 
-    The key is consumed; episode i depends on it and on i alone, not on ``episodes``. ``top``:
-    distinct failures kept, static like ``episodes``. ``record=True`` keeps the numbers of every
-    episode (``result.trials``); without it memory does not grow with ``episodes``.
-    ``progress=True`` shows a bar; ``callback(done, total, None)`` is called after every chunk, of
-    which there are about 200 (a black box has one each 64 episodes); KeyboardInterrupt ends the
-    search with the result of the whole chunks, and ``settings["interrupted"]``.
+    KeyboardInterrupt ends the search with the result of the whole chunks, and
+    ``settings["interrupted"]`` says so. Works under `jax.jit` and `jax.vmap`, without archive,
+    history and callbacks.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
+    Args:
+        key: consumed.
+        sim: the simulator.
+        episodes: how many; static, like ``top``.
+        reward: what is maximised. Default: `jast.rewards.lexicographic`. Its scales come from 128
+            plain episodes (10 of a black box), the same for every key, which are not among those of
+            the result.
+        actions: of `jast.actions`, which draw the disturbances.
+        refine: as for `forest`, the share that pulls the failures to where they are likeliest.
+        top: distinct failures kept.
+        record: keep the numbers of every episode (``result.trials``); without it memory does not
+            grow with ``episodes``.
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after every chunk. There are about 200
+            of them; a black box has one every 64 episodes.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    Works under `jax.jit` and `jax.vmap`, without archive, history and callbacks. Raises ValueError
-    for a count below 1, a ``refine`` that cannot be, and where the simulator's functions or the
-    actions do not fit together.
+    Returns:
+        `SearchResult` of one tree.
+
+    Raises:
+        ValueError: for a count below 1, a ``refine`` that is not possible, and where the
+            simulator's functions or the actions do not fit together.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> result = jast.search.monte_carlo(jax.random.key(0), sim, episodes=1000, refine=0)
+        >>> len(result.failures) > 0, bool(result.best.failure)
+        (True, True)
     """
     episodes, top = E.whole("monte_carlo", episodes=episodes, top=top)
     asked = dict(sim=sim, reward=reward, actions=actions, episodes=episodes, record=bool(record))

@@ -143,7 +143,18 @@ class SearchResult(NamedTuple):
 
 
 def table(results: Mapping[str, SearchResult]) -> str:
-    """A readable table of several searches, a dict name -> `SearchResult`."""
+    """A readable table of several searches.
+
+    Args:
+        results: name -> `SearchResult`.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> chance = jast.search.monte_carlo(key, sim, episodes=500, refine=0)
+        >>> len(jast.search.table({"chance": chance}).splitlines())
+        2
+    """
     lines = [
         f"{'method':14} {'episodes':>10} {'steps':>12} {'failing':>9} {'trees':>7} {'first':>9}"
         f" {'best reward':>12} {'mean best':>10}"

@@ -85,6 +85,12 @@ def stress(
 
     Raises:
         ValueError: for a budget below 300, and where the simulator's functions do not fit together.
+
+    Example:
+        >>> import jax, jast
+        >>> report = jast.stress(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> bool(report.failures.best.failure), report.probability.mean > 0
+        (True, True)
     """
     name = "stress"
     _checks.random_key(name, key)

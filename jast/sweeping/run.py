@@ -84,6 +84,15 @@ def sweep(
         ValueError: for no values, values of unequal numbers, a number of simulators that is not
             theirs, ``follow`` with an executor, and what is no function; and what the first row
             raised where all raise.
+
+    Example:
+        >>> import jax, jast
+        >>> make = lambda threshold: jast.simulators.walk1d(threshold=threshold)
+        >>> table = jast.sweep(
+        ...     jax.random.key(0), make, {"threshold": [8.0, 12.0]}, jast.nominal, episodes=500
+        ... )
+        >>> table.results[0].failing > table.results[1].failing
+        True
     """
     random_key("sweep", key)
     columns, rows = _rows(values)
