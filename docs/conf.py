@@ -20,7 +20,7 @@ exclude_patterns = ["docs/build"]
 html_theme, html_title = "sphinx_book_theme", "jast"
 
 nb_execution_mode = "off"  # notebooks are committed with what they printed
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["attrs_inline", "dollarmath"]
 myst_heading_anchors = 3
 
 default_role = "py:obj"

@@ -65,6 +65,18 @@ def test_links_lead_somewhere():
             assert (page.parent / link).exists(), (page, link)
 
 
+def test_the_front_page_moves_and_every_lesson_has_a_picture():
+    image = pytest.importorskip("PIL.Image", reason="comes with matplotlib")
+    film = ROOT / "docs/failure.gif"
+    assert film.stat().st_size < 500_000
+    with image.open(film) as frames:
+        assert frames.n_frames > 20
+    gallery = (ROOT / "docs/lessons.md").read_text()
+    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
+        assert gallery.count(f"../notebooks/{notebook.name}") == 2, notebook.stem
+        assert f"thumbnails/{notebook.stem}.png" in gallery
+
+
 def test_the_list_of_figures_has_every_page_and_its_commands():
     pages = {path.stem: path.read_text() for path in (ROOT / "docs/figures").glob("*.md")}
     rows = re.findall(
