@@ -7,12 +7,9 @@ An executor is whatever has ``submit(function, *args)`` and whose futures have `
 that raises there, or whose process dies, is tried again twice, and then left out and reported.
 """
 
-import contextlib
 import functools
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -21,7 +18,7 @@ from jast._jax import was_interrupted
 from jast.checkpoints import Store
 from jast.incidents import Incident, merged
 from jast.places import Answer, Differs, Gone, Place, Task, devices_of, executor_of, opened
-from jast.watch import Watch
+from jast.watch import Watch, terminable
 
 __all__ = ["Ran", "Ways", "joined", "not_traced", "note", "run", "ways"]
 
@@ -119,7 +116,7 @@ def run(
         desk = _Desk(task, place, ways, watch)
         kept, sent, ended = _Kept(state), 0, None
         try:
-            with _terminable():
+            with terminable():
                 while kept.done < n:
                     while sent < min(n, kept.done + place.ahead):
                         desk.begin(sent)
@@ -258,21 +255,3 @@ class _Desk:
 
 def _words(error: BaseException | None) -> str:
     return f"{type(error).__name__}: {error}"[:200]
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """A context in which SIGTERM does what Ctrl-C does, unless the user has it do something."""
-    main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-
-    def interrupt(number, frame):
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -2,12 +2,15 @@
 signature of it.
 """
 
+import contextlib
 import inspect
+import signal
+import threading
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-__all__ = ["Watch", "in_pieces"]
+__all__ = ["Watch", "in_pieces", "terminable"]
 
 Callback = Callable[[int, int, Any], Any]
 State = TypeVar("State")
@@ -104,23 +107,42 @@ def in_pieces(
         words: of a state, for the bar.
 
     Returns:
-        The last state and its end. A KeyboardInterrupt ends the work after the last whole piece,
-        and is raised again where there is none.
+        The last state and its end. A KeyboardInterrupt, or SIGTERM, ends the work after the last
+        whole piece, and is raised again where there is none.
     """
     kept = state, 0
     try:
-        for end in ends:
-            state, done = kept
-            # at once: an interruption finds all of a piece or nothing
-            kept = work(state, done, end), end
-            watch.reach(units(end), **words(kept[0]))
-            watch.tell()
+        with terminable():
+            for end in ends:
+                state, done = kept
+                # at once: an interruption finds all of a piece or nothing
+                kept = work(state, done, end), end
+                watch.reach(units(end), **words(kept[0]))
+                watch.tell()
     except KeyboardInterrupt:
         if not kept[1]:
             raise
     finally:
         watch.close()
     return kept
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """A context in which SIGTERM does what Ctrl-C does, unless the user has it do something."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _of_three(name: str, callback: Any, former: Callable[..., tuple] | None) -> Callback:

@@ -5,6 +5,7 @@ import weakref
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jast
@@ -78,6 +79,11 @@ def test_thirty_calls_with_fresh_simulators_do_not_grow(monkeypatch):
 CALLS = {
     "monte_carlo": lambda key: jast.search.monte_carlo(key, fresh(), episodes=5000, record=True),
     "cem": lambda key: jast.search.cem(key, fresh(), samples=5000, elites=10, iterations=1),
+    "go_explore": lambda key: jast.search.go_explore(key, fresh(), episodes=5000),
+    "validate": lambda key: jast.weakness.validate(
+        key, lambda x: np.zeros(len(x), int), np.zeros((2000, 10)), np.arange(2000) % 3
+    ),
+    "ppo": lambda key: jast.policies.ppo(key, fresh(), episodes=2000, lanes=64),
     "sac": lambda key: jast.policies.sac(key, fresh(), episodes=100, lanes=4, buffer=100_000),
     "subset_simulation": lambda key: jast.estimate.subset_simulation(key, fresh(), samples=5000),
     "failure_proposal": lambda key: jast.estimate.failure_proposal(key, fresh(), samples=5000),

@@ -202,7 +202,7 @@ def test_a_reward_at_the_end_alone_is_learned_from(key):
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
     """An uninterrupted training with its checkpoint, and the rows that the callback got."""
-    rows, path = [], tmp_path_factory.mktemp("ppo") / "whole.npz"
+    rows, path = [], tmp_path_factory.mktemp("ppo") / "whole.jast"
     tell = lambda done, total, so_far: rows.append((done, total, so_far))
     return ppo(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=tell), rows, path
 
@@ -232,7 +232,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
         if len(seen) == 4:
             raise KeyboardInterrupt
 
-    path = tmp_path / "run.npz"
+    path = tmp_path / "run.jast"
     part = ppo(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=stop)
     assert len(part.history.episodes) == 4  # what is there is handed out
     rest = ppo(jax.random.key(3), WALK, **TINY, checkpoint=path)
@@ -242,9 +242,11 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
 
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
-    with pytest.raises(ValueError, match="ppo: checkpoint .* another training: rates was"):
+    with pytest.raises(ValueError, match="ppo: checkpoint .* another call: rates.clip is"):
         ppo(jax.random.key(3), WALK, **TINY, clip=0.1, checkpoint=path)
-    with pytest.raises(ValueError, match="is not a checkpoint of jast.policies.sac"):
+    with pytest.raises(
+        ValueError, match="sac: .* another call: function is 'ppo' there, 'sac' here"
+    ):
         sac(jax.random.key(3), WALK, episodes=256, lanes=8, checkpoint=path)
 
 

@@ -162,7 +162,7 @@ def test_a_policy_goes_through_jit_and_vmap(learned, key):
 def whole_run(tmp_path_factory):
     """An uninterrupted training with its checkpoint, and the rows that the callback got."""
     rows = []
-    path = tmp_path_factory.mktemp("sac") / "whole.npz"
+    path = tmp_path_factory.mktemp("sac") / "whole.jast"
     policy = sac(
         jax.random.key(3),
         WALK,
@@ -200,7 +200,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
         if len(seen) == 4:
             raise KeyboardInterrupt
 
-    path = tmp_path / "run.npz"
+    path = tmp_path / "run.jast"
     part = sac(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=stop)
     assert len(part.history.episodes) == 4  # what is there is handed out
     rest = sac(jax.random.key(3), WALK, **TINY, checkpoint=path)
@@ -210,9 +210,9 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
 
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
-    with pytest.raises(ValueError, match="sac: checkpoint .* is of another training: rates was"):
+    with pytest.raises(ValueError, match="sac: checkpoint .* is of another call: rates.polyak is"):
         sac(jax.random.key(3), WALK, **TINY, polyak=0.5, checkpoint=path)
-    with pytest.raises(ValueError, match="sac: checkpoint .* is of another training: seed was"):
+    with pytest.raises(ValueError, match="sac: checkpoint .* is of another call: key is"):
         sac(jax.random.key(4), WALK, **TINY, checkpoint=path)
 
 

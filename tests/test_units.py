@@ -3,6 +3,7 @@ on the way is told.
 """
 
 import concurrent.futures
+import functools
 import gc
 import importlib.util
 import os
@@ -15,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from systems import line
@@ -25,6 +27,7 @@ from jast.checkpoints import PARTS, Store
 from jast.estimate import (
     Estimate,
     failure_probability,
+    failure_samples,
     importance,
     importance_sampling,
     policy_proposal,
@@ -33,13 +36,16 @@ from jast.estimate import (
 from jast.fingerprint import differences, fingerprint
 from jast.ledger import Ledger, records
 from jast.places import Task
+from jast.policies import sac
 from jast.policy import nominal_policy
 from jast.search import cem, forest, mcts, monte_carlo
 from jast.simulators import ferry, walk1d
 from jast.watch import Watch
+from jast.weakness import default, validate
 
 ROOT = Path(__file__).parents[1]
 LINE = line(horizon=3)
+EASY = line(horizon=3, evaluate=lambda s: (s >= 1, jnp.maximum(1 - s, 0)))
 EPISODES = 3000
 CALLS = {
     "nominal": lambda key, **how: jast.nominal(key, walk1d(), EPISODES, **how),
@@ -93,11 +99,14 @@ def same(equal):
     """Asserts that two results are the same to the bit."""
 
     def check(a, b):
-        assert a.settings == b.settings and str(a) == str(b)
+        about = lambda result: getattr(result, "settings", None)
+        assert about(a) == about(b) and str(a) == str(b)
         if isinstance(a, Estimate):
             assert repr(tuple(a)) == repr(tuple(b))  # NaN is NaN
-        else:
+        elif "settings" in getattr(a, "_fields", ()):
             equal(a._replace(settings=None), b._replace(settings=None))
+        else:
+            equal(a, b)
 
     return check
 
@@ -208,7 +217,28 @@ def taught(key, **how):
     return found._replace(heads=(heads.policy.params, heads.inputs, heads.returns))
 
 
-KILLED = CALLS | {"heads": taught}
+def learned(key, **how):
+    """A policy that was taught, without its functions."""
+    policy = sac(
+        key, walk1d(horizon=3), episodes=800, lanes=8, hidden=(16,), batch=32, updates=1, **how
+    )
+    return policy.learned, policy.history
+
+
+def guessed(inputs):
+    """A classifier that takes a while."""
+    time.sleep(0.01)
+    return (inputs.sum(axis=1) > 0).astype(int)
+
+
+def validated(key, **how):
+    inputs = np.random.default_rng(0).normal(size=(300, 3))
+    labels = (inputs[:, 0] > 0).astype(int)
+    found = validate(key, guessed, inputs, labels, selector=default(first=30, growth=0.0), **how)
+    return found[: found._fields.index("incidents")]
+
+
+KILLED = CALLS | {"heads": taught, "sac": learned, "validate": validated}
 
 
 def child(name, folder):
@@ -223,11 +253,12 @@ def child(name, folder):
 
 
 def killed(name, folder, delay):
-    """How many units a call had finished when its process was killed, ``delay`` seconds after the
-    first; None where it had come to its end.
+    """How many parts a call had kept when its process was killed, ``delay`` seconds after it had
+    begun to; None where it had come to its end.
     """
     process = child(name, folder)
-    while not parts(folder) and process.poll() is None:
+    begun = lambda: parts(folder) or (folder / "state.jast").exists()
+    while not begun() and process.poll() is None:
         time.sleep(0.002)
     time.sleep(delay)
     process.kill()
@@ -244,17 +275,30 @@ def test_a_killed_call_goes_on_to_the_same_result(tmp_path, same, monkeypatch):
     same(CALLS["nominal"](key, checkpoint=folder), CALLS["nominal"](key))
 
 
+@functools.cache
+def estimated():
+    return failure_probability(jax.random.key(0), LINE, 5000)
+
+
+def sampled(source, key, sim, **how):
+    return failure_samples(key, sim, source, 50, moves=4, **how)
+
+
 SEQUENTIAL = {
     "cem": lambda key, **how: cem(
         key, walk1d(), samples=40, elites=8, iterations=4, refine=0, record=True, **how
     ),
     "failure_probability": CALLS["failure_probability"],
     "few calls": lambda key, **how: failure_probability(key, LINE, 60, **how),
+    "failure_samples": lambda key, **how: sampled(estimated(), key, LINE, **how),
+    "samples of a policy": lambda key, **how: sampled(nominal_policy(EASY), key, EASY, **how),
 }
 """Calls whose steps depend on one another."""
 
 
-@pytest.mark.parametrize("name", ["failure_probability", *map(long, ("cem", "few calls"))])
+@pytest.mark.parametrize(
+    "name", ["failure_probability", *map(long, SEQUENTIAL.keys() - {"failure_probability"})]
+)
 def test_a_system_is_not_asked_again(name, key, same, tmp_path, monkeypatch):
     """A journal with its second half gone is the same as none, and so is one with other answers."""
     call, folder = SEQUENTIAL[name], tmp_path / "run.jast"
@@ -445,7 +489,9 @@ def test_processes_of_an_executor_are_as_good_as_this_one(make, key, same, tmp_p
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["nominal", "forest", "heads", "failure_probability"])
+@pytest.mark.parametrize(
+    "name", ["nominal", "forest", "heads", "failure_probability", "sac", "validate"]
+)
 def test_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch):
     """At random moments; each is a process of its own, which takes seconds to start."""
     monkeypatch.setattr(sys.modules[__name__], "EPISODES", 2_000_000)

@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score, roc_curve
 
-from jast import weakness
+from jast import archive, weakness
+from jast.checkpoints import Store
 from jast.counter import generator
-from jast.weakness import Selector, Step, validate, validation
+from jast.weakness import Selector, Step, validate
 
 KEY = jax.random.key(0)
 
@@ -211,23 +212,38 @@ def test_an_interrupted_validation_goes_on_as_if_it_had_not_been(at, error):
 
 def test_a_checkpoint_holds_every_answer(tmp_path):
     inputs, labels, answers = problem(60)
-    path = tmp_path / "validation.npz"
+    path = tmp_path / "run.jast"
     whole = validate(KEY, System(answers), inputs, labels, selector=in_turn())
     system = Flaky(answers, 38, SystemExit())  # what nothing catches
     with pytest.raises(SystemExit):
         validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path)
-    assert len(weakness.load(path).order) == 35
+    _, state = archive.read(path / "state.jast", "jast checkpoint state", 1, "a state")
+    assert len(state["order"]) == 35
     same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
     assert len(system.asked) == 60
-    again = validate(
-        KEY,
-        lambda x: pytest.fail("nothing is left to ask"),
-        inputs,
-        labels,
-        selector=in_turn(),
-        checkpoint=path,
-    )
-    same(again, whole)
+    same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
+    assert len(system.asked) == 60
+    for change, what in [
+        (dict(key=jax.random.key(1)), "key is"),
+        (dict(predict=lambda x: x), "predict is .*Flaky there, .*lambda"),
+        (dict(labels=labels[::-1]), "data is"),
+        (dict(selector="random"), "selector is"),
+        (dict(state=whole.state), "state"),
+    ]:
+        asked = dict(key=KEY, predict=system, inputs=inputs, labels=labels, selector=in_turn())
+        with pytest.raises(ValueError, match=f"validate: checkpoint .* another call: {what}"):
+            validate(**asked | change, checkpoint=path)
+
+
+def test_a_state_and_its_checkpoint_go_on_together(tmp_path):
+    inputs, labels, answers = problem(60)
+    go_on = lambda system, **how: validate(KEY, system, inputs, labels, selector=in_turn(), **how)
+    state, whole = go_on(System(answers), budget=14).state, go_on(System(answers))
+    system = Flaky(answers, 38, SystemExit())
+    with pytest.raises(SystemExit):
+        go_on(system, state=state, checkpoint=tmp_path)
+    same(go_on(system, state=state, checkpoint=tmp_path), whole)
+    assert len(system.asked) == 60 - 14
 
 
 def test_a_state_survives_its_file(tmp_path):
@@ -354,11 +370,10 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
     if where in ("selector", "scores"):
         selector = selector._replace(step=step)
     if where == "checkpoint":
-        calls = []
-        real = validation.save
+        calls, real = [], Store.replace
         monkeypatch.setattr(
-            validation,
-            "save",
+            Store,
+            "replace",
             lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a),
         )
     at = (
@@ -377,7 +392,7 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
             labels,
             selector=selector,
             callback=at,
-            checkpoint=tmp_path / "c.npz" if where == "checkpoint" else None,
+            checkpoint=tmp_path if where == "checkpoint" else None,
         )
     assert part.calls == len(system.asked) == 42 and len(part.incidents) == 1
     assert np.isnan(part.expected) == (where != "callback")  # the third iteration had ended
@@ -399,10 +414,11 @@ def test_a_smaller_budget_ends_what_was_begun():
 
 def test_the_last_iteration_is_in_the_checkpoint(tmp_path):
     inputs, labels, answers = problem(60)
-    result = validate(
-        KEY, System(answers), inputs, labels, selector=in_turn(), checkpoint=tmp_path / "c.npz"
-    )
-    same(weakness.load(tmp_path / "c.npz"), result.state)
+    asked = dict(inputs=inputs, labels=labels, selector=in_turn(), checkpoint=tmp_path)
+    result = validate(KEY, System(answers), **asked)
+    system = System(answers)
+    same(validate(KEY, system, **asked), result)
+    assert not len(system.asked)
 
 
 def test_more_classes_may_turn_up():
@@ -548,10 +564,8 @@ GOOD = np.zeros((6, 2)), np.array([0, 1, 2, 0, 1, 2])
         ),
         (dict(labels=np.array(list("abcabc"))), r"labels must be whole numbers.*np.unique\(labels"),
         (dict(callback=3), "callback must be callable"),
-        (
-            dict(checkpoint="/no/such/folder/file.npz"),
-            "checkpoint must be a file in a folder that exists",
-        ),
+        (dict(checkpoint=3), "checkpoint must be the path of a folder, received 3"),
+        (dict(checkpoint=__file__), "checkpoint must be a folder, received the file"),
         (dict(predict=None), "predict must be callable"),
         (dict(budget=0), "budget must be a whole number of at least 1"),
         (dict(selector="best"), "selector must be one of .*received 'best'"),

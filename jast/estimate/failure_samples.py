@@ -5,6 +5,7 @@ a user looks at.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast import results
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.episode import Episode
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
@@ -22,6 +24,7 @@ from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.populations import Chain
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
+from jast.journal import answered, kept
 from jast.memory import require_episodes
 
 if TYPE_CHECKING:
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from jast.estimate.proposals import Proposal
     from jast.policy import Policy
     from jast.simulator import Simulator
+    from jast.typing import PathLike
 
 __all__ = ["FailureSamples", "failure_samples"]
 
@@ -75,6 +79,7 @@ def failure_samples(
     samples: int = 1000,
     *,
     moves: int = 20,
+    checkpoint: PathLike | None = None,
 ) -> FailureSamples:
     """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are
     resampled, each then makes Markov moves: `FailureSamples`.
@@ -82,22 +87,30 @@ def failure_samples(
     ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with
     densities; ``10 * samples`` episodes are drawn from it. The ``moves`` change the latent normal
     numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that
-    the proposal lacks, and the shares of modes are those of the weights. Raises ValueError for a
-    source without a proposal or without a failure among its episodes, a count below 1, and
-    disturbances without a quantile function.
+    the proposal lacks, and the shares of modes are those of the weights. ``checkpoint``: a folder
+    that keeps what the system answered; the same call goes on where it was ended, by whatever, to
+    the same result (docs/scale.md). Raises ValueError for a source without a proposal or without a
+    failure among its episodes, a count below 1, disturbances without a quantile function, and a
+    checkpoint of another call.
     """
     name = "failure_samples"
     random_key(name, key)
     samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
     latent.check(name, sim)
-    key, for_draws, for_rows = jax.random.split(key, 3)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
         raise ValueError(
             f"{name}: source must hold a proposal, received one of {source.method} without one"
         )
+    require_episodes(name, sim, PER_SAMPLE * samples)
+    about = dict(sim=sim, source=q, samples=samples, moves=moves)
+    with stored(name, checkpoint, key, **about) as store, kept(store):
+        return _sampled(name, key, sim, q, samples, moves)
+
+
+def _sampled(name, key, sim, q, samples, moves):
+    key, for_draws, for_rows = jax.random.split(key, 3)
     n = PER_SAMPLE * samples
-    require_episodes(name, sim, n)
     if isinstance(q, latent.Latent):
         if (received := q.means.shape[1]) != latent.dimension(sim):
             raise ValueError(
@@ -115,9 +128,9 @@ def failure_samples(
         z, o, log_w = redrawn(for_draws, sim, q, n)
         failure = o.failure
     else:
-        e, log_w = played(for_draws, sim, as_proposal(name, sim, q), n)
-        z = latent.normal_of(sim, e)
-        failure, log_w = jax.device_get((e.failure, log_w))
+        q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
+        e, log_w = answered(lambda _: played(for_draws, sim, q, n), key_data)
+        z, failure = latent.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
         raise ValueError(
@@ -128,7 +141,7 @@ def failure_samples(
     chain = Chain(key, sim, samples)
     people = chain.judge(np.asarray(z[rows], chain.dtype))
     people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
-    episodes = jax.device_get(latent.episodes(sim, people.z))
+    episodes = answered(partial(latent.episodes, sim), people.z)
     # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
     # side in another program
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)

@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast.archive import arrays_of, named
+from jast.checkpoints import Store
 from jast.policies.exploring import Count, Training, settle
 from jast.policies.failure_policy import FAILING_SHARE, History, history, row
 from jast.policies.settings import Plan
-from jast.watch import Watch
+from jast.watch import Watch, terminable
 
 __all__ = ["learn", "look"]
 
@@ -68,19 +70,20 @@ def look(
 
 def learn(
     function: str,
-    training: Training,
-    rows: np.ndarray,
+    first: Callable[[], tuple[Training, np.ndarray]],
     run: Run,
     plan: Plan,
     *,
     auto_scale: bool,
     progress: bool,
     callback: Callable[..., Any] | None,
-    keep: Callable[[Training, np.ndarray], None],
+    store: Store | None,
+    like: Training,
 ) -> tuple[Training, np.ndarray]:
-    """``(Training, rows)`` after all stretches that ``rows`` do not hold yet; ``keep`` is given
-    them after each stretch.
+    """``(Training, rows)`` after all stretches; ``first()``: those before. ``store`` keeps them
+    after each stretch, and they go on from what it holds; ``like``: a training's shapes.
     """
+    training, rows = _kept(store, like) or first()
     kept, lanes = (training, rows), training.lanes.t.shape[0]
     last = lambda h: jax.tree.map(lambda a: a[-1], h)
     watch = Watch(
@@ -93,20 +96,35 @@ def learn(
         former=lambda done, total, h: (int(h.episodes[-1]), last(h)),
     )
     try:
-        while (left := plan.total - int(kept[0].at)) > 0:
-            training, count = run(kept[0], min(left, plan.stretch))
-            rows = row(kept[1], training, jax.device_get(count))
-            gone = 1 - (left - plan.stretch) / plan.learning
-            if auto_scale and RAISED[0] < gone < RAISED[1] and rows[-1, FAILING_SHARE] < FAILING:
-                training = training._replace(scale=training.scale * jnp.float32(RAISE))
-            kept = training, rows  # at once: an interruption finds all of a stretch or nothing
-            keep(*kept)
-            failing, log_p = rows[-1, FAILING_SHARE : FAILING_SHARE + 2]
-            watch.reach(int(training.at) * lanes, failing=f"{failing:.1%}", log_p=f"{log_p:.4g}")
-            watch.tell(lambda rows=rows: history(rows[1:]))
+        with terminable():
+            while (left := plan.total - int(kept[0].at)) > 0:
+                training, count = run(kept[0], min(left, plan.stretch))
+                rows = row(kept[1], training, jax.device_get(count))
+                gone = 1 - (left - plan.stretch) / plan.learning
+                few = rows[-1, FAILING_SHARE] < FAILING
+                if auto_scale and RAISED[0] < gone < RAISED[1] and few:
+                    training = training._replace(scale=training.scale * jnp.float32(RAISE))
+                # at once: an interruption finds all of a stretch or nothing
+                kept = training, rows
+                if store is not None:
+                    store.replace({}, named(dict(training=training, rows=rows)))
+                failing, log_p = rows[-1, FAILING_SHARE : FAILING_SHARE + 2]
+                watch.reach(
+                    int(training.at) * lanes, failing=f"{failing:.1%}", log_p=f"{log_p:.4g}"
+                )
+                watch.tell(lambda rows=rows: history(rows[1:]))
     except KeyboardInterrupt:
         if len(kept[1]) < 2:
             raise
     finally:
         watch.close()
     return kept
+
+
+def _kept(store: Store | None, like: Training) -> tuple[Training, np.ndarray] | None:
+    """``(Training, rows)`` that a checkpoint holds; None where there is none."""
+    state = None if store is None else store.state()
+    if state is None:
+        return None
+    leaves, (rows,) = (arrays_of(state[1], name) for name in ("training", "rows"))
+    return jax.tree.structure(like).unflatten(map(jnp.asarray, leaves)), rows

@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.contract import contract
+from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
 from jast.policies import proximal_training as T
-from jast.policies.checkpoints import Book
 from jast.policies.exploring import Shape
 from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
+from jast.policies.lanes import empty
 from jast.policies.latent import sizes
 from jast.policies.proximal import Rates, networks
 from jast.simulator import Simulator
@@ -92,8 +94,8 @@ def ppo(
         progress: whether there is a bar.
         callback: called some twenty times as ``callback(done, total, history)``, with the steps of
             all lanes and the `History` so far.
-        checkpoint: a file to which the training is saved as often, and from which a call with the
-            same arguments goes on to the same bits.
+        checkpoint: a folder that keeps where the training stands; the same call goes on from there,
+            whatever ended it, to the same bits (docs/scale.md).
 
     Returns:
         `FailurePolicy`; its ``history.alpha`` is ``alpha`` and ``critic_loss`` that of V. A
@@ -102,7 +104,7 @@ def ppo(
 
     Raises:
         ValueError: for settings out of range, a simulator that breaks its contract, a disturbance
-            that is not of floats or cannot be tilted (named), a checkpoint of another training.
+            that is not of floats or cannot be tilted (named), a checkpoint of another call.
     """
     random_key("ppo", key)
     contract(sim)
@@ -140,40 +142,45 @@ def ppo(
         Shape(m, n, n0, hidden, components, dense, lanes, batch, looked_at),
         (steps, epochs),
     )
-    known = dict(
-        shape=list(shape),
-        pace=list(pace),
-        plan=list(plan),
-        rates=list(rates),
+    about = dict(
+        sim=sim,
+        shape=shape,
+        steps=steps,
+        epochs=epochs,
+        plan=plan,
+        rates=rates,
         scale=scale,
         widen=widen,
-        seed=settings.seed(key),
-        x64=jax.config.jax_enable_x64,
     )
 
     for_first, for_steps, for_start = jax.random.split(key, 3)
     applies = tuple(apply for _, apply in networks(n, hidden, components))
     rates = jax.tree.map(jnp.float32, rates)
     begin = lambda: T.first(for_first, sim, shape, rates.alpha)
+    like, between = jax.eval_shape(begin), jax.eval_shape(lambda: empty(steps * lanes, m, n))
+    held = f"{steps} steps of {lanes} lanes between updates, and the networks"
+    require("ppo", 2 * (size(like) + size(between)), held, "use fewer lanes or steps")
     look = lambda training, steps: T.look(for_steps, sim, shape, applies[0], training, steps)
     run = lambda training, n: jax.block_until_ready(
         T.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
     )
-    book = Book("ppo", checkpoint, sim, known)
-    training, rows = book.resume(jax.eval_shape(begin)._replace(buffer=())) or course.look(
-        begin(), look, plan, sim.horizon, scale, widen
-    )
-    training, rows = course.learn(
-        "ppo",
-        training._replace(buffer=()),
-        rows,
-        run,
-        plan,
-        auto_scale=auto_scale,
-        progress=progress,
-        callback=callback,
-        keep=book.keep,
-    )
+
+    def first():
+        training, rows = course.look(begin(), look, plan, sim.horizon, scale, widen)
+        return training._replace(buffer=()), rows
+
+    with stored("ppo", checkpoint, key, **about) as store:
+        training, rows = course.learn(
+            "ppo",
+            first,
+            run,
+            plan,
+            auto_scale=auto_scale,
+            progress=progress,
+            callback=callback,
+            store=store,
+            like=like._replace(buffer=()),
+        )
     tilt = T.tilt(for_start, sim, shape, applies[1], training, rates.bonus) if n0 else ()
     learned = Learned(
         training.learner.actor,

@@ -4,15 +4,12 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import numpy as np
-
 from jast._checks import real, whole
 from jast._jax import is_traced
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
-__all__ = ["Plan", "auto", "number", "plan", "positive", "seed", "shaped", "widening", "widths"]
+__all__ = ["Plan", "auto", "number", "plan", "positive", "shaped", "widening", "widths"]
 
 STRETCHES = 20
 NOMINAL, AROUND = 0.03, 0.05
@@ -95,9 +92,3 @@ def shaped(function: str, shaping: Any, sim: Simulator) -> bool:
     if shaping == "auto":
         return not (sim.episodic and hosted(sim))
     return shaping == "steps"
-
-
-def seed(key: jax.Array) -> list[int]:
-    """The numbers of a key, raw or typed."""
-    data = key if jax.numpy.issubdtype(key.dtype, np.unsignedinteger) else jax.random.key_data(key)
-    return np.ravel(data).tolist()

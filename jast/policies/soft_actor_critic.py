@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.contract import contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
 from jast.policies import training as T
-from jast.policies.checkpoints import Book
 from jast.policies.exploring import Shape
 from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
 from jast.policies.latent import sizes
@@ -101,12 +101,11 @@ def sac(
     ==================  ============================================================================
 
     ``progress`` shows a bar; ``callback(done, total, history)`` is called twenty times, with the
-    steps of all lanes and the `History` so far. A KeyboardInterrupt ends the training after its
-    last whole stretch and gives what was learned by then (it is raised again where there is none).
-    ``checkpoint``: a file to which each stretch is saved, and from which a call with the same
-    arguments goes on: to the bit as if nothing had been between (the functions of ``sim`` cannot be
-    compared, its parameters are). The loop runs on the host, so not under `jax.jit` or `jax.vmap`;
-    the result does. The key is consumed.
+    steps of all lanes and the `History` so far. A KeyboardInterrupt or SIGTERM ends the training
+    after its last whole stretch and gives what was learned by then (it is raised again where there
+    is none). ``checkpoint``: a folder that keeps where the training stands after each stretch; the
+    same call goes on from there, whatever ended it, to the same bits (docs/scale.md). The loop runs
+    on the host, so not under `jax.jit` or `jax.vmap`; the result does. The key is consumed.
 
     Transitions in which a number is not finite are counted (``history.invalid``), end their episode
     and are never learned from. More ways to fail out of one certain state than ``components`` are
@@ -114,7 +113,7 @@ def sac(
     sampling from the policy itself has both of two.
 
     Raises ValueError for settings out of range, a simulator that breaks its contract, a disturbance
-    that is not of floats or cannot be tilted (named), and a checkpoint of another training.
+    that is not of floats or cannot be tilted (named), and a checkpoint of another call.
     """
     random_key("sac", key)
     contract(sim)
@@ -145,14 +144,14 @@ def sac(
     n, n0 = sizes(sim, "sac")
     (m,) = outline(sim).observation
     shape = Shape(m, n, n0, hidden, components, dense, lanes, batch, max(buffer, lanes))
-    known = dict(
-        shape=list(shape),
-        plan=[*plan, updates],
-        rates=list(rates),
+    about = dict(
+        sim=sim,
+        shape=shape,
+        plan=plan,
+        updates=updates,
+        rates=rates,
         scale=scale,
         widen=widen,
-        seed=settings.seed(key),
-        x64=jax.config.jax_enable_x64,
     )
 
     for_first, for_steps, for_start = jax.random.split(key, 3)
@@ -178,21 +177,19 @@ def sac(
             )
         )
     )
-    book = Book("sac", checkpoint, sim, known)
-    training, rows = book.resume(like) or course.look(
-        begin(), run(0), plan, sim.horizon, scale, widen
-    )
-    training, rows = course.learn(
-        "sac",
-        training,
-        rows,
-        run(updates),
-        plan,
-        auto_scale=auto_scale,
-        progress=progress,
-        callback=callback,
-        keep=book.keep,
-    )
+    look = lambda: course.look(begin(), run(0), plan, sim.horizon, scale, widen)
+    with stored("sac", checkpoint, key, **about) as store:
+        training, rows = course.learn(
+            "sac",
+            look,
+            run(updates),
+            plan,
+            auto_scale=auto_scale,
+            progress=progress,
+            callback=callback,
+            store=store,
+            like=like,
+        )
     tilt = T.tilt(for_start, sim, shape, applies, training, rates.bonus) if n0 else ()
     learned = Learned(
         training.learner.average,

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast import _checks
+from jast import _checks, memory
 from jast._jax import is_traced, is_tracing
 from jast.contract import contract
 from jast.counter import generator, tree_keys
@@ -132,6 +132,8 @@ def go_explore(
     before = incidents(sim)
     mark = jax.eval_shape(partial(C.features, sim), outline(sim).state)
     slots = min(SLOTS, max(64, 4 * episodes))
+    needed = 2 * memory.size(jax.eval_shape(partial(C.empty, sim, slots)))  # and those that enter
+    memory.require(name, needed, f"{slots} states and the ways there", "use a smaller state")
     carry = C.empty(sim, slots), K.none(sim, max(top, 64), mark), None, 0
     stretch = lanes if hosted(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
     ends = [*range(stretch, episodes, stretch), episodes]

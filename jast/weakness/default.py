@@ -12,7 +12,7 @@ from jast.weakness import committee
 from jast.weakness.contract import Selector, Step
 from jast.weakness.logistic import logistic, sigmoid
 from jast.weakness.residual import residual
-from jast.weakness.views import components, difficulty_of_neighbours, reduce, views
+from jast.weakness.views import components, difficulty_of_neighbours, reduce, require_room, views
 
 __all__ = ["default"]
 
@@ -61,6 +61,7 @@ def default(
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):
+        require_room(data)
         rng = generator(key)
         reduced = reduce(rng, data)
         seen_as = views(data, reduced)

@@ -14,7 +14,7 @@ from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import networks
 from jast.weakness.contract import Selector, Step
-from jast.weakness.views import scaled
+from jast.weakness.views import require_room, scaled
 
 __all__ = ["thesis"]
 
@@ -121,6 +121,7 @@ def encoder(key, rows, hidden, epochs, rate, batch):
 
 
 def _start(hidden, epochs, rate, batch, key, data):
+    require_room(data)
     first, then = jax.random.split(key)
     rows = scaled(data)
     hidden, params, losses = encoder(first, rows, hidden, epochs, rate, batch)

@@ -12,13 +12,15 @@ import jax
 import numpy as np
 
 from jast._checks import random_key, whole
+from jast.checkpoints import stored
 from jast.counter import generator
-from jast.watch import Watch
+from jast.watch import Watch, terminable
 from jast.weakness.contract import Seen, Selector
 from jast.weakness.data import arrays, fingerprint, within
 from jast.weakness.measures import auc
 from jast.weakness.result import History, Result, State
-from jast.weakness.storage import load, save
+from jast.weakness.storage import parts
+from jast.weakness.storage import whole as restored
 
 if TYPE_CHECKING:
     import chex
@@ -65,18 +67,19 @@ def validate(
 
     ``state``: of an earlier result of the same data and selector, to go on from there: after an
     interruption as if there had been none, after a budget that was spent with new batches.
-    ``checkpoint``: a file to which the state is written after every call of ``predict``, and from
-    which an existing one goes on. ``progress=True`` shows a bar of calls; ``callback(done, total,
+    ``checkpoint``: a folder that keeps the state after every call of ``predict``; the same call
+    goes on from there, whatever ended it, to the same result (docs/scale.md), and with a larger
+    budget as from a ``state``. ``progress=True`` shows a bar of calls; ``callback(done, total,
     result)`` is called after each iteration, with the calls and the result so far. The key is
     consumed; a ``state`` goes on with its own.
 
     Where ``predict`` raises, or answers with something else than m labels in range, or at a
-    KeyboardInterrupt, the search ends, with a RuntimeWarning, and the result so far says so in
-    ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked
-    again by a run that goes on. So it does where anything else raises after the first answer:
+    KeyboardInterrupt or SIGTERM, the search ends, with a RuntimeWarning, and the result so far says
+    so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is
+    asked again by a run that goes on. So it does where anything else raises after the first answer:
     ``callback``, the checkpoint's disk, a selector. ValueError for an answer that is none at the
-    very first call; for inputs that are not finite, labels out of range, a state or checkpoint of
-    other data or of another selector.
+    very first call; for inputs that are not finite, labels out of range, a state of other data or
+    of another selector, a checkpoint of another call.
     """
     data = arrays("validate", inputs, labels, classes)
     chosen = _selector(selector)
@@ -87,20 +90,19 @@ def validate(
             f" {predict!r}"
         )
     budget = n if budget is None else min(whole("validate", "budget", budget), n)
-    if checkpoint is not None and not os.path.isdir(os.path.dirname(os.path.abspath(checkpoint))):
-        raise ValueError(
-            f"validate: checkpoint must be a file in a folder that exists, received {checkpoint}"
-        )
-    if checkpoint is not None and os.path.exists(checkpoint):
-        if state is not None:
-            raise ValueError(
-                f"validate: give state or an existing checkpoint, not both; {checkpoint} exists"
-            )
-        state = load(checkpoint)
-    state = _begin(key, data, chosen) if state is None else _fits(state, data, chosen)
-    return _run(
-        state, chosen, data, predict, max(budget, len(state.order)), checkpoint, progress, callback
-    )
+    if state is None:
+        random_key("validate", key)
+    else:
+        _fits(state, data, chosen)
+    about = dict(predict=predict, data=fingerprint(data), selector=_described(chosen), state=state)
+    with stored("validate", checkpoint, key, **about) as store, terminable():
+        kept = None if store is None else store.state()
+        if kept is not None:
+            state = restored("", *kept, None)
+        elif state is None:
+            state = _begin(key, data, chosen)
+        budget = max(budget, len(state.order))
+        return _run(state, chosen, data, predict, budget, store, progress, callback)
 
 
 def _selector(selector):
@@ -122,7 +124,6 @@ def _described(selector):
 
 
 def _begin(key, data, selector):
-    random_key("validate", key)
     n = data.size
     history = History(
         *(np.zeros(0, int) for _ in range(2)),
@@ -164,10 +165,9 @@ def _fits(state, data, selector):
             f"validate: state is of the selector {state.selector}, received {_described(selector)}:"
             " give the same again"
         )
-    return state
 
 
-def _run(state, selector, data, predict, budget, checkpoint, progress, callback):
+def _run(state, selector, data, predict, budget, store, progress, callback):
     answers, answered = state.predicted.copy(), list(state.order)  # all that the system has said
     # what whole iterations have seen of it
     seen = _seen(state.order[: state.complete], answers, data.labels)
@@ -196,6 +196,10 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             finished,
         )
 
+    def keep():
+        if store is not None:
+            store.replace(*parts(kept()))
+
     current = seen
 
     def ask(indices):
@@ -215,8 +219,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             answers[batch] = _answers(predict, data, batch)
             answered.extend(batch.tolist())
             watch.reach(len(answered))
-            if checkpoint is not None:
-                save(checkpoint, kept())
+            keep()
         current = _seen(
             current.order.tolist() + [i for i in new if answers[i] >= 0], answers, data.labels
         )
@@ -244,8 +247,7 @@ def _run(state, selector, data, predict, budget, checkpoint, progress, callback)
             if idle == IDLE:
                 incidents.append(f"the selector asked for nothing new in {IDLE} iterations")
                 break
-        if checkpoint is not None:
-            save(checkpoint, kept())
+        keep()
     except _Stop as stop:
         if not answered:
             raise ValueError(f"validate: {stop}") from stop.__cause__

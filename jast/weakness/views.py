@@ -4,10 +4,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast.memory import require
+
 __all__ = [
     "components",
     "difficulty_of_neighbours",
     "reduce",
+    "require_room",
     "scaled",
     "squared_distances",
     "views",
@@ -27,6 +30,12 @@ class Views(NamedTuple):
     """
     centred: Any
     """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
+
+
+def require_room(data):
+    """`jast.memory.require` for the two copies of the inputs that `scaled` and `views` make."""
+    needed = 2 * 4 * data.inputs.size
+    require("validate", needed, f"{data.size} inputs as the selector sees them", "use fewer")
 
 
 def views(data, reduced):
