@@ -23,6 +23,7 @@ CALLS = {
     "start": lambda key: C.start(key, (jnp.zeros(1), jnp.eye(1))),
     "ppo": lambda key: jast.policies.ppo(key, walk1d()),
     "sac": lambda key: jast.policies.sac(key, walk1d()),
+    "q_learning": lambda key: jast.policies.q_learning(key, walk1d()),
     "importance": lambda key: E.importance(key, walk1d(), None),
     "log_weights": lambda key: E.log_weights(key, walk1d(), None, 2),
     "failure_probability": lambda key: E.failure_probability(key, walk1d()),

@@ -3,9 +3,10 @@
 from jast._doors import listed
 from jast.policies.failure_policy import FailurePolicy, History
 from jast.policies.proximal_policy import ppo
+from jast.policies.q_learning_policy import q_learning
 from jast.policies.soft_actor_critic import sac
 from jast.policies.storage import load, save
 
-__all__ = ["FailurePolicy", "History", "load", "ppo", "sac", "save"]
+__all__ = ["FailurePolicy", "History", "load", "ppo", "q_learning", "sac", "save"]
 
 __dir__ = listed(__all__)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jast.distributions.mixtures import x_of
 from jast.heads.heads import Moments
@@ -17,7 +18,7 @@ from jast.policies.actor import Net, act, draw, see
 from jast.pytrees import select
 from jast.simulator import Simulator
 
-__all__ = ["Count", "Shape", "Training", "first", "move", "nothing", "settle", "tilt"]
+__all__ = ["Count", "Shape", "Training", "first", "look", "move", "nothing", "settle", "tilt"]
 
 
 class Shape(NamedTuple):
@@ -119,12 +120,13 @@ def move(
     apply: Callable,
     training: Training,
     acting: jax.Array,
+    draw: Callable = draw,
 ) -> tuple[L.Lane, L.Rows, jax.Array, Count]:
     """One step of all lanes: ``(Lane, Rows, valid, Count)``, each [lanes] but for the last. Those
     that are over begin anew.
 
-    ``acting``: the policy draws the latents; else they are a drift of each episode's own, and
-    noise.
+    ``acting``: ``draw`` takes the latents from the policy's mixture; else they are a drift of each
+    episode's own, and noise.
     """
     k, lanes, net = shape.lanes, training.lanes, training.net
     noise, drift, z0 = _cut(for_noise, ((k, shape.n + 1), (k, shape.n), (k, shape.n0)))
@@ -159,6 +161,28 @@ def move(
         squares=total(whole, moved.nearest**2),
     )
     return jax.vmap(select)(moved.over, again, moved), new, valid, count
+
+
+@functools.partial(jax.jit, static_argnames=("shape", "apply"))
+def look(
+    key: jax.Array,
+    sim: Simulator,
+    shape: Shape,
+    apply: Callable,
+    training: Training,
+    steps: int,
+) -> tuple[Training, Count]:
+    """``steps`` steps of all lanes around the model, kept in the buffer and not learned from."""
+
+    def body(_, carry):
+        training, count = carry
+        keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 0), training.at))
+        lanes, new, valid, more = move(*keys, sim, shape, apply, training, jnp.asarray(False))
+        buffer, stored = L.put(training.buffer, training.stored, new, valid)
+        training = training._replace(lanes=lanes, buffer=buffer, stored=stored, at=training.at + 1)
+        return training, jax.tree.map(jnp.add, count, more)
+
+    return lax.fori_loop(0, steps, body, (training, nothing()))
 
 
 def _cut(key: jax.Array, shapes: tuple) -> list[jax.Array]:

@@ -15,8 +15,8 @@ from jast.contract import contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
+from jast.policies import exploring as E
 from jast.policies import proximal_training as T
-from jast.policies.exploring import Shape
 from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
 from jast.policies.lanes import empty
 from jast.policies.latent import sizes
@@ -139,7 +139,7 @@ def ppo(
     (m,) = outline(sim).observation
     looked_at = max(min(LOOKED_AT, lanes * (plan.nominal + plan.around)), lanes)
     shape, pace = (
-        Shape(m, n, n0, hidden, components, dense, lanes, batch, looked_at),
+        E.Shape(m, n, n0, hidden, components, dense, lanes, batch, looked_at),
         (steps, epochs),
     )
     about = dict(
@@ -160,7 +160,7 @@ def ppo(
     like, between = jax.eval_shape(begin), jax.eval_shape(lambda: empty(steps * lanes, m, n))
     held = f"{steps} steps of {lanes} lanes between updates, and the networks"
     require("ppo", 2 * (size(like) + size(between)), held, "use fewer lanes or steps")
-    look = lambda training, steps: T.look(for_steps, sim, shape, applies[0], training, steps)
+    look = lambda training, steps: E.look(for_steps, sim, shape, applies[0], training, steps)
     run = lambda training, n: jax.block_until_ready(
         T.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
     )

@@ -1,5 +1,5 @@
-"""The training by proximal policy optimisation as compiled programs: the look around, then steps of
-all lanes by the policy as it is, which they are learned from, and so on.
+"""The training by proximal policy optimisation as compiled programs: steps of all lanes by the
+policy as it is, which they are learned from, and so on.
 """
 
 import functools
@@ -10,13 +10,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from jast.policies import exploring as E
-from jast.policies import lanes as L
 from jast.policies.actor import act, entropy_term, see
 from jast.policies.proximal import Batch, Rates, advantages, learner, update
 from jast.policies.start import Tilt
 from jast.simulator import Simulator
 
-__all__ = ["first", "look", "stretch", "tilt"]
+__all__ = ["first", "stretch", "tilt"]
 
 
 def _judge(training, applies, rates, horizon, rows, valid):
@@ -115,28 +114,6 @@ def first(key: jax.Array, sim: Simulator, shape: E.Shape, alpha: jax.Array) -> E
     for_lanes, for_networks = jax.random.split(key)
     new = learner(for_networks, shape.m, shape.n, shape.hidden, shape.components, alpha)
     return E.first(for_lanes, sim, shape, new)
-
-
-@functools.partial(jax.jit, static_argnames=("shape", "apply"))
-def look(
-    key: jax.Array,
-    sim: Simulator,
-    shape: E.Shape,
-    apply: Callable,
-    training: E.Training,
-    steps: int,
-) -> tuple[E.Training, E.Count]:
-    """``steps`` steps of all lanes around the model, kept in the buffer and not learned from."""
-
-    def body(_, carry):
-        training, count = carry
-        keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 0), training.at))
-        lanes, new, valid, more = E.move(*keys, sim, shape, apply, training, jnp.asarray(False))
-        buffer, stored = L.put(training.buffer, training.stored, new, valid)
-        training = training._replace(lanes=lanes, buffer=buffer, stored=stored, at=training.at + 1)
-        return training, jax.tree.map(jnp.add, count, more)
-
-    return lax.fori_loop(0, steps, body, (training, E.nothing()))
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "apply"))

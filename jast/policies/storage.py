@@ -22,6 +22,7 @@ from jast.policies.failure_policy import FailurePolicy, History, Learned, assemb
 from jast.policies.latent import sizes
 from jast.policies.learner import learner
 from jast.policies.start import Tilt
+from jast.policies.tabular import Table
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -51,6 +52,8 @@ def parts(policy: FailurePolicy) -> tuple[dict, dict[str, np.ndarray]]:
             f"save: policy must be a jast.policies.FailurePolicy, received {type(policy).__name__}"
         )
     learned = policy.learned
+    if isinstance(learned.actor, Table):
+        raise ValueError("save: a policy of q_learning has no file: learn it again, with its key")
     layers = learned.actor["params"]
     widths = [int(layers[f"Dense_{i}"]["bias"].shape[0]) for i in range(len(layers))]
     sim, _, dense = policy.disturbance.args[:3]

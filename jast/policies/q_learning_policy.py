@@ -1,0 +1,215 @@
+"""q_learning: a failure policy by Q-learning on a discretised state (Watkins and Dayan 1992), the
+learner that Lipkis and Agogino (NASA) name beside soft actor-critic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jast._checks import random_key, whole
+from jast.checkpoints import stored
+from jast.contract import contract
+from jast.memory import require
+from jast.outline import outline
+from jast.policies import course, settings
+from jast.policies import exploring as E
+from jast.policies import tabular as T
+from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
+from jast.policies.latent import sizes
+from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import Callback, PathLike
+
+__all__ = ["q_learning"]
+
+LOOKED_AT = 100_000
+"""Transitions of the look around that the ranges are taken of."""
+
+
+def q_learning(
+    key: chex.PRNGKey,
+    sim: Simulator,
+    *,
+    episodes: int = 25_000,
+    cells: int | Sequence[int] = 50,
+    cell: Callable[[chex.Array, chex.Array], chex.Array] | None = None,
+    ranges: Sequence[Sequence[float]] | chex.Array | Literal["auto"] = "auto",
+    values: int = 13,
+    reach: float = 3.0,
+    scale: float | Literal["auto"] = "auto",
+    widen: float | Literal["auto"] = "auto",
+    epsilon: float = 0.3,
+    lanes: int = 16,
+    learning_rate: float = 1.0,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+) -> FailurePolicy:
+    """Teach a policy to make ``sim`` fail in the likeliest way, by Q-learning in a table: the
+    `FailurePolicy` that `jast.policies.sac` hands out.
+
+    A row of the table is a cell of what ``observe(state)`` shows at a step, a column a value of the
+    disturbance's latents z. The return of an episode is log p relative to the mode, -|z|^2 / 2 a
+    step, less lambda times the last miss distance, undiscounted: so the table learns the likeliest
+    way to fail from each cell. The policy's ``disturbance`` is N(z*, 1) in the latents, z* the best
+    column, so `jast.rollout` plays it and importance sampling may draw from it.
+
+    A cell must be small beside what a step moves the state by, in the numbers that decide: else its
+    value is that of the luckiest state in it (docs/figures.md). So a state of more than two or
+    three numbers needs a ``cell`` of your own, or `sac`.
+
+    Args:
+        key: of `jax.random`; consumed.
+        sim: with a disturbance of floats that has a quantile function and its inverse.
+        episodes: in all, of full length; where they end early there are more of them. At least 4 a
+            lane.
+        cells: of the grid, for each number that ``observe`` shows, [m], or one count for all; every
+            step of the horizon has a grid of its own. With ``cell``: how many it tells apart.
+        cell: function of what is observed, [m] float32, and of the step, int32, to the number of
+            its cell, from 0 to ``cells`` - 1; beyond that, the nearest. None: the grid.
+        ranges: of the grid, [m, 2], the least and the greatest of each number observed; what is
+            beyond belongs to the last cell. "auto": what the look around before the learning saw.
+        values: of each latent, at least 2, evenly from -``reach`` to ``reach``; the table has
+            ``values`` to the power of the latents columns.
+        reach: in standard deviations, above 0.
+        scale: lambda, as for `sac`.
+        widen: as for `sac`.
+        epsilon: share of the actions that are any of the table, 0 to 1.
+        lanes: episodes side by side, each step of which is learned from.
+        learning_rate: above 0 and at most 1; falls to a twentieth. A system that is deterministic
+            given its disturbances, as all are here, can take 1.
+        progress: whether there is a bar.
+        callback: called some twenty times as ``callback(done, total, history)``, with the steps of
+            all lanes and the `History` so far.
+        checkpoint: a folder in which the training is kept as often, and from which a call with the
+            same arguments goes on to the same bits.
+
+    Returns:
+        `FailurePolicy`; its ``history.alpha`` is 0 and ``critic_loss`` the mean square of the
+        table's errors. Its start is a mixture fitted to p(x0) exp(V(s0) - lambda d(s0)), as that of
+        `sac`. A KeyboardInterrupt ends the training after its last whole stretch and gives what was
+        learned by then (it is raised again where there is none). `jast.save` does not take it.
+
+    Raises:
+        ValueError: for settings out of range, a table that does not fit into memory, a ``cell``
+            that does not return one whole number, a simulator that breaks its contract, a
+            disturbance that is not of floats or cannot be tilted (named), and a checkpoint of
+            another training.
+    """
+    random_key("q_learning", key)
+    contract(sim)
+    counts = dict(episodes=episodes, lanes=lanes)
+    episodes, lanes = (whole("q_learning", name, value) for name, value in counts.items())
+    values = whole("q_learning", "values", values, 2)
+    plan = settings.plan("q_learning", episodes, sim.horizon, lanes)
+    auto_scale = settings.auto(scale)
+    scale = None if auto_scale else settings.positive("q_learning", "scale", scale)
+    number = lambda name, value, holds, expected: settings.number(
+        "q_learning", name, value, holds, expected
+    )
+    rates = T.Rates(
+        learning_rate=number(
+            "learning_rate", learning_rate, lambda v: 0 < v <= 1, "above 0 and at most 1"
+        ),
+        epsilon=number("epsilon", epsilon, lambda v: 0 <= v <= 1, "of 0 to 1"),
+        total=float(plan.total),
+    )
+    reach = settings.positive("q_learning", "reach", reach)
+    widen = settings.widening("q_learning", widen)
+    n, n0 = sizes(sim, "q_learning")
+    (m,) = outline(sim).observation
+    ranges = _ranges(ranges, m)
+    cell, rows = _cells(cells, cell, m, sim.horizon)
+    kept = f"a table of {rows} cells and {values}^{n} values of the disturbance"
+    require("q_learning", 8 * rows * values**n, kept, "use fewer cells or values")
+    looked_at = max(min(LOOKED_AT, lanes * (plan.nominal + plan.around)), lanes)
+    shape = E.Shape(m, n, n0, (), 1, False, lanes, 0, looked_at)
+    about = dict(
+        sim=sim,
+        shape=shape,
+        plan=plan,
+        rates=rates,
+        cell=cell,
+        rows=rows,
+        ranges=ranges,
+        values=values,
+        reach=reach,
+        scale=scale,
+        widen=widen,
+    )
+
+    for_first, for_steps, for_start = jax.random.split(key, 3)
+    rates = jax.tree.map(jnp.float32, rates)
+    apply = T.lookup(cell, sim.horizon)
+    begin = lambda: E.first(for_first, sim, shape, T.learner(rows, T.actions(n, values, reach), m))
+    look = lambda training, steps: E.look(for_steps, sim, shape, apply, training, steps)
+    run = lambda training, steps: jax.block_until_ready(
+        T.stretch(for_steps, sim, shape, cell, rates, training, steps)
+    )
+
+    def first():
+        training, curve = course.look(begin(), look, plan, sim.horizon, scale, widen)
+        return T.spread(training, ranges), curve
+
+    with stored("q_learning", checkpoint, key, **about) as store:
+        training, curve = course.learn(
+            "q_learning",
+            first,
+            run,
+            plan,
+            auto_scale=auto_scale,
+            progress=progress,
+            callback=callback,
+            store=store,
+            like=jax.eval_shape(begin)._replace(buffer=()),
+        )
+    tilt = T.tilt(for_start, sim, shape, cell, training) if n0 else ()
+    learned = Learned(training.learner.actor, (), training.net, tilt, jnp.zeros(()), training.scale)
+    return assemble(sim, apply, False, learned, history(curve[1:]))
+
+
+def _ranges(ranges, m):
+    """[m, 2], or None for "auto"."""
+    if settings.auto(ranges):
+        return None
+    try:
+        known = np.asarray(ranges, np.float64)
+        good = known.shape == (m, 2) and np.all(np.isfinite(known))
+        good = good and np.all(known[:, 0] < known[:, 1])
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ValueError(
+            f'q_learning: ranges must be "auto" or [{m}, 2], the least and the greatest of each'
+            f" number observed, received {ranges!r}"
+        )
+    return known
+
+
+def _cells(cells, cell, m, horizon):
+    """The function of a cell, and how many there are."""
+    if cell is None:
+        several = isinstance(cells, Sequence) and not isinstance(cells, str)
+        each = tuple(whole("q_learning", "cells", c) for c in (cells if several else [cells] * m))
+        if len(each) != m:
+            raise ValueError(
+                f"q_learning: cells must be a whole number or {m} of them, one for each number"
+                f" observed, received {cells!r}"
+            )
+        return T.grid(each), horizon * math.prod(each)
+    cells = whole("q_learning", "cells", cells)
+    like = jax.eval_shape(cell, *(jax.ShapeDtypeStruct(*s) for s in (((m,), "f4"), ((), "i4"))))
+    if not (getattr(like, "shape", None) == () and jnp.issubdtype(like.dtype, np.integer)):
+        raise ValueError(
+            f"q_learning: cell must return one whole number, the number of a cell, received {like}"
+        )
+    return T.given(cell, cells), cells
