@@ -268,6 +268,12 @@ class Wide:
 def samples() -> Samples:
     """Disturbances drawn from the model p(x | s): always possible, also where the density is
     unknown (`jast.distributions.seeds`).
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> jast.actions.samples().draw(jax.random.key(0), D.Normal(0.0, 1.0)).shape
+        ()
     """
     return Samples()
 
@@ -276,9 +282,20 @@ def quantiles(proposal: DistributionLike | None = None) -> Quantiles:
     """Points of [0, 1]^d, turned into disturbances by the quantile function of p(x | s); uniform
     points are draws of p.
 
-    ``proposal``: a distribution with a quantile function in place of p(x | s), the same at every
-    step, from which a search is to draw instead. What it chooses is still scored by p(x | s), and a
-    random start is drawn from its own distribution. ValueError where it has no quantile function.
+    Args:
+        proposal: a distribution with a quantile function in place of p(x | s), the same at every
+            step, from which a search is to draw instead. What it chooses is still scored by p(x |
+            s), and a random start is drawn from its own distribution.
+
+    Raises:
+        ValueError: where the proposal has no quantile function.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> chosen = jast.actions.quantiles(D.Normal(0.0, 3.0))
+        >>> chosen.draw(jax.random.key(0), D.Normal(0.0, 1.0)).shape
+        ()
     """
     if proposal is not None and not (
         isinstance(proposal, D.Distribution) and D.has_quantile(proposal)
@@ -291,15 +308,29 @@ def quantiles(proposal: DistributionLike | None = None) -> Quantiles:
 
 
 def wide(width: chex.Numeric | None = None) -> Wide:
-    """Draws of the model with wider noise: x is at the normal numbers width z, z ~ N(0, I), where z
-    itself gives draws of p(x | s) (`jast.distributions.from_normal`). So it reaches the tails of
-    any distribution with a quantile function, in any unit, and never leaves its support; a random
-    start is widened likewise where it has such a function.
+    """Draws of the model with wider noise, which reach the tails of any distribution with a
+    quantile function.
 
-    ``width``: above 0; 1 is the model. None: a search takes the first of 1, 1.5, 2, 3, 4, 6 at
-    which a hundredth of a small batch of episodes fails; where none reaches that the one at which
-    most fail, and where none fails at all the one that comes nearest. It is the default of searches
-    where disturbances have a quantile function. ValueError for a width that is not above 0.
+    x is at the normal numbers width z, z ~ N(0, I), where z itself gives draws of p(x | s)
+    (`jast.distributions.from_normal`). So it works in any unit and never leaves the support. A
+    random start is widened likewise where it has a quantile function. It is the default of searches
+    where disturbances have one.
+
+    Args:
+        width: above 0; 1 is the model. None: a search takes the first of 1, 1.5, 2, 3, 4, 6 at
+            which a hundredth of a small batch of episodes fails. Where none reaches that, it takes
+            the one at which most fail, and where none fails at all the one that comes nearest.
+
+    Raises:
+        ValueError: for a width that is not above 0.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> draw = lambda key: jast.actions.wide(3.0).draw(key, D.Normal(0.0, 1.0))
+        >>> x = jax.vmap(draw)(jax.random.split(jax.random.key(0), 1000))
+        >>> bool(2.5 < jnp.std(x) < 3.5)
+        True
     """
     if width is not None and not is_traced(width) and not width > 0:
         raise ValueError(f"actions.wide: width must be above 0, received {width!r}")
@@ -307,11 +338,21 @@ def wide(width: chex.Numeric | None = None) -> Wide:
 
 
 def uniform(low: chex.ArrayTree, high: chex.ArrayTree) -> UniformBox:
-    """Disturbances uniform on the box ``[low, high]``: scalars, arrays that broadcast to x, or
-    pytrees of them where x is one.
+    """Disturbances uniform on a box. The ferry's published actions are ``uniform(0., 1.)``.
 
-    The ferry's published actions are ``uniform(0., 1.)``. Raises ValueError where ``low`` is above
-    ``high``, unless they are traced.
+    Args:
+        low, high: corners of the box: scalars, arrays that broadcast to x, or pytrees of them where
+            x is one.
+
+    Raises:
+        ValueError: where ``low`` is above ``high``, unless they are traced.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> x = jast.actions.uniform(-3.0, 3.0).draw(jax.random.key(0), D.Normal(0.0, 1.0))
+        >>> -3.0 <= float(x) <= 3.0
+        True
     """
     if not is_traced(low, high):
         _ordered(low, high)

@@ -41,9 +41,17 @@ SCALARS = ("log_prob", "distance", "failure", "length", "reward")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """The n best distinct failures, by falling reward: a sequence of them. ``len(failures)`` is n,
-    ``failures[i]`` the i-th best `Episode`, a slice is an archive of its own, and a loop goes over
-    the episodes. Also a pytree of arrays.
+    """The n best distinct failures, by falling reward: a sequence of them. Also a pytree of arrays.
+
+    ``len(failures)`` is n, ``failures[i]`` the i-th best `Episode`, a slice is an archive of its
+    own, and a loop runs over the episodes.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+        >>> all(episode.failure for episode in found[:3])
+        True
     """
 
     episodes: Episode
@@ -149,15 +157,37 @@ def collect(
     seen: int | None = None,
     top: int = 64,
 ) -> Failures:
-    """The ``top`` best distinct failures among candidate ``episodes`` (an `Episode` with a leading
-    axis [m], NumPy or JAX): `Failures`.
+    """The best distinct failures among candidate episodes.
 
     Every candidate whose ``failure`` holds is replayed; one that no longer fails is dropped and
     counted. Episodes with the same bytes of x0 and of the first ``length`` disturbances are one
-    failure, their counts added. ``tree`` and ``simulation`` [m]: where each was found (default:
-    tree 0, its position); ``seen``: failing episodes simulated, where more than the candidates were
-    (default: the failing candidates). Ranked by ``reward``, of which more is better. ValueError for
-    axes that disagree, ``top`` below 1, or disturbances that do not fit ``sim``.
+    failure, and their counts are added.
+
+    Args:
+        sim: the simulator.
+        reward: ranks the failures; more is better.
+        episodes: the candidates, an `Episode` with a leading axis [m], NumPy or JAX.
+        tree: [m]: the tree where each was found. Default: 0.
+        simulation: [m]: the simulation where each was found. Default: its position.
+        seen: failing episodes simulated, where they were more than the candidates. Default: the
+            failing candidates.
+        top: distinct failures kept.
+
+    Returns:
+        `Failures`.
+
+    Raises:
+        ValueError: for axes that disagree, ``top`` below 1, and disturbances that do not fit
+            ``sim``.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> keys = jax.random.split(jax.random.key(0), 200)
+        >>> many = jax.vmap(jast.rollout, (0, None))(keys, sim)
+        >>> found = jast.failures.collect(sim, jast.rewards.standard(), many, top=3)
+        >>> len(found), int(found.seen) == int(many.failure.sum())
+        (3, True)
     """
     episodes = jax.device_get(episodes._replace(states=None))
     m = np.shape(episodes.length)[0] if np.ndim(episodes.length) == 1 else None
@@ -202,10 +232,24 @@ def collect(
 
 
 def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
-    """The ``top`` best distinct failures of two archives of one simulator and one reward:
-    `Failures`; ``seen`` and ``dropped`` are added.
+    """The best distinct failures of two archives of one simulator and one reward; ``seen`` and
+    ``dropped`` are added.
 
-    ValueError where the shapes of the two disagree or ``top`` is below 1.
+    Args:
+        a, b: `Failures`.
+        top: distinct failures kept.
+
+    Raises:
+        ValueError: where the shapes of the two disagree, or ``top`` is below 1.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> search = lambda seed: jast.search.monte_carlo(jax.random.key(seed), sim, episodes=500)
+        >>> a, b = search(0).failures, search(1).failures
+        >>> both = jast.failures.merge(a, b)
+        >>> int(both.seen) == int(a.seen + b.seen)
+        True
     """
     outline = [
         (
@@ -227,10 +271,23 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
 
 
 def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = None) -> None:
-    """`jast.save` of an archive, with ``settings`` (a dict that JSON can hold: method, seed, counts
-    ...) beside it; goes with the next version: save the result of the search, which has both.
+    """Write an archive to a file, with settings beside it. Deprecated: use `jast.save` on the
+    result of the search, which has both; this function goes with the next version.
 
-    ValueError for settings that JSON cannot hold.
+    Args:
+        path: of the file.
+        failures: the archive.
+        settings: a dict that JSON can hold: method, seed, counts ...
+
+    Raises:
+        ValueError: for settings that JSON cannot hold.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     jast.failures.save(os.path.join(folder, "failures.npz"), found)
     """
     try:
         settings = json.loads(json.dumps({} if settings is None else settings, default=_plain))
@@ -240,8 +297,25 @@ def save(path: PathLike, failures: Failures, settings: dict[str, Any] | None = N
 
 
 def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[str, Any]]:
-    """``(Failures, settings)`` of a file of `save`: `jast.load` of an archive and the settings
-    beside it; goes with the next version.
+    """An archive and the settings beside it, from a file of `save`. Deprecated: use `jast.load`;
+    this function goes with the next version.
+
+    Args:
+        path: of the file.
+        sim: as for `jast.load`.
+
+    Returns:
+        ``(Failures, settings)``.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "failures.npz")
+        ...     jast.failures.save(path, found, {"seed": 0})
+        ...     jast.failures.load(path, sim)[1]
+        {'seed': 0}
     """
     failures, header = files.restore(path, "jast failures", sim)
     return failures, header["settings"]

@@ -124,8 +124,18 @@ def hosted(sim):
 
 
 def incidents(sim: Simulator) -> tuple[Incident, ...]:
-    """What has gone wrong so far in the host code behind ``sim``, by kind and message: a tuple of
-    `Incident`; ``()`` for a simulator in JAX.
+    """What has gone wrong so far in the host code behind a simulator, by kind and message.
+
+    Args:
+        sim: the simulator.
+
+    Returns:
+        A tuple of `Incident`; ``()`` for a simulator in JAX.
+
+    Example:
+        >>> import jast
+        >>> jast.incidents.incidents(jast.simulators.walk1d())
+        ()
     """
     return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
 

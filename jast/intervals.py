@@ -14,12 +14,25 @@ SKEWED = 0.4
 
 
 def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact (low, high) of a binomial probability after ``k`` events in ``n`` trials: covers at
-    least ``level`` of the time (Clopper and Pearson, 1934).
+    """Exact (low, high) of a binomial probability: covers at least ``level`` of the time (Clopper
+    and Pearson, 1934).
 
     low is the alpha/2 quantile of Beta(k, n - k + 1), high the 1 - alpha/2 quantile of Beta(k + 1,
-    n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n. Raises ValueError unless 0 <= k <= n, n >= 1
-    and 0 < level < 1.
+    n - k), alpha = 1 - level; 0 at k = 0, 1 at k = n.
+
+    Args:
+        k: events.
+        n: trials.
+        level: of confidence, in (0, 1).
+
+    Raises:
+        ValueError: unless 0 <= k <= n, n >= 1 and 0 < level < 1.
+
+    Example:
+        >>> from jast.estimate import clopper_pearson
+        >>> low, high = clopper_pearson(0, 1000)
+        >>> low, round(high, 6)
+        (0.0, 0.003682)
     """
     _counts("clopper_pearson", k, n, level)
     k, n, tail = int(k), int(n), (1 - level) / 2
@@ -87,11 +100,24 @@ def _betainc(a, b, x):
 
 
 def chernoff(k: int, n: int, level: float = 0.95) -> float:
-    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided: the u
-    above k/n with n KL(k/n || u) = log(1 / (1 - level)).
+    """One-sided upper bound of a binomial probability: the u above k/n with n KL(k/n || u) = log(1
+    / (1 - level)).
 
-    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17): it covers at least ``level`` of
-    the time, and is not below Clopper and Pearson's. Raises ValueError as `clopper_pearson`.
+    Chernoff's bound in its sharp form (Lipkis and Agogino, eq. 17). It covers at least ``level`` of
+    the time, and is not below Clopper and Pearson's.
+
+    Args:
+        k: events.
+        n: trials.
+        level: of confidence, in (0, 1).
+
+    Raises:
+        ValueError: as `clopper_pearson`.
+
+    Example:
+        >>> from jast.estimate import chernoff
+        >>> round(chernoff(0, 1000), 6)
+        0.002991
     """
     _counts("chernoff", k, n, level)
     k, n = int(k), int(n)
@@ -103,11 +129,23 @@ def chernoff(k: int, n: int, level: float = 0.95) -> float:
 
 
 def delta_bound(k: int, n: int, level: float = 0.95) -> float:
-    """Upper bound of a binomial probability after ``k`` events in ``n`` trials, one-sided, as
-    Lipkis and Agogino print it (eq. 17): k/n + delta with exp(-n delta^2) = 1 - level, at most 1.
+    """One-sided upper bound of a binomial probability as Lipkis and Agogino print it (eq. 17): k/n
+    + delta with exp(-n delta^2) = 1 - level, at most 1.
 
-    Valid and loose: Hoeffding's inequality has exp(-2 n delta^2), and `chernoff` is sharp. Raises
-    ValueError as `clopper_pearson`.
+    Valid and loose: Hoeffding's inequality has exp(-2 n delta^2), and `chernoff` is sharp.
+
+    Args:
+        k: events.
+        n: trials.
+        level: of confidence, in (0, 1).
+
+    Raises:
+        ValueError: as `clopper_pearson`.
+
+    Example:
+        >>> from jast.estimate import delta_bound
+        >>> round(delta_bound(0, 1000), 4)
+        0.0547
     """
     _counts("delta_bound", k, n, level)
     return min(1.0, int(k) / int(n) + math.sqrt(-math.log1p(-level) / int(n)))
@@ -117,8 +155,19 @@ def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[flo
     """(low, high) of a normal distribution, mean -+ z standard_error, as Lipkis and Agogino print
     it (eq. 15 and 16). ``low`` may be below 0: `jast.estimate.Estimate` has a log-normal interval.
 
-    Raises ValueError for a mean that is not finite, a standard error that is negative or not
-    finite, and a level outside (0, 1).
+    Args:
+        mean: of the estimate.
+        standard_error: of the mean, at least 0.
+        level: of confidence, in (0, 1).
+
+    Raises:
+        ValueError: for a mean that is not finite, a standard error that is negative or not finite,
+            and a level outside (0, 1).
+
+    Example:
+        >>> from jast.estimate import normal
+        >>> [round(end, 2) for end in normal(1.0, 0.1)]
+        [0.8, 1.2]
     """
     from statistics import NormalDist  # here: slow to import
 
@@ -129,11 +178,23 @@ def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[flo
 
 
 def jeffreys(k: int, n: int, level: float = 0.95) -> float:
-    """Upper end of the one-sided interval of ``level`` under Jeffreys' prior (Lipkis and Agogino,
-    eq. 18): that quantile of Beta(k + 1/2, n - k + 1/2).
+    """Upper end of the one-sided interval under Jeffreys' prior (Lipkis and Agogino, eq. 18): a
+    quantile of Beta(k + 1/2, n - k + 1/2).
 
-    A Bayesian bound: below the exact one, and not promised to cover in each case. Raises ValueError
-    as `clopper_pearson`.
+    A Bayesian bound: below the exact one, and not promised to cover in each case.
+
+    Args:
+        k: events.
+        n: trials.
+        level: the quantile, in (0, 1).
+
+    Raises:
+        ValueError: as `clopper_pearson`.
+
+    Example:
+        >>> from jast.estimate import jeffreys
+        >>> round(jeffreys(0, 1000), 6)
+        0.001918
     """
     _counts("jeffreys", k, n, level)
     return _solve(lambda p: _betainc(int(k) + 0.5, int(n) - int(k) + 0.5, p) - level)

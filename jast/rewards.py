@@ -166,12 +166,21 @@ class Lexicographic:
 
 
 def standard(event_bonus: chex.Numeric = 0.0, density: Density = "raw") -> Standard:
-    """Sum of every step's log p, plus ``event_bonus`` at a failure or less the miss distance at
-    another end.
+    """Sum of every step's log p, plus a bonus at a failure, or less the miss distance at any other
+    end.
 
-    Thesis of Moss eq. 3.1, Lipkis and Agogino eq. 3, MCFS-AP eq. 1 as a sum of logs; unlike the
-    first two as printed, the last step's log p counts. ``density="mode"`` counts log p less its
-    value at the mode. The published ferry reward is ``standard(event_bonus=30., density="mode")``.
+    Eq. 3.1 of Moss's thesis, eq. 3 of Lipkis and Agogino, eq. 1 of MCFS-AP as a sum of logs. Unlike
+    in the first two as printed, the last step's log p counts. The published ferry reward is
+    ``standard(event_bonus=30., density="mode")``.
+
+    Args:
+        event_bonus: paid at a failure.
+        density: "mode" counts log p less its value at the mode, "raw" the log density itself.
+
+    Example:
+        >>> import jast
+        >>> float(jast.rewards.standard()(-1.0, False, 3.0, True))
+        -4.0
     """
     return Standard(event_bonus, _checked("standard", density))
 
@@ -181,13 +190,22 @@ def episodic(
     density: Density = "raw",
     mode: Literal["default", "thesis"] = "default",
 ) -> Episodic:
-    """log p - d at a non-failing end; at a failure log p - d + (bonus - 1) max(-d, 0): thesis eq.
-    3.2, ``(log p - d) bonus``, made monotone.
+    """log p - d at a non-failing end; at a failure log p - d + (bonus - 1) max(-d, 0).
 
-    As printed (``mode="thesis"``) the equation multiplies log p < 0 by the bonus as well, so a
-    failure less deep than -log p scores far below a miss, and searches turn away from it; here only
-    the depth of the failure (a negative miss distance) is multiplied. Warns (UserWarning) of that
-    mode.
+    This is eq. 3.2 of Moss's thesis, ``(log p - d) bonus``, made monotone. As printed the equation
+    multiplies log p < 0 by the bonus as well, so a failure less deep than -log p scores far below a
+    miss, and searches turn away from it. Here only the depth of the failure (a negative miss
+    distance) is multiplied.
+
+    Args:
+        bonus: factor of the depth of a failure.
+        density: "mode" counts log p less its value at the mode, "raw" the log density itself.
+        mode: "thesis" is the equation as printed; it warns (UserWarning).
+
+    Example:
+        >>> import jast
+        >>> float(jast.rewards.episodic(bonus=10.0)(-1.0, True, -2.0, True))
+        19.0
     """
     if mode not in ("default", "thesis"):
         raise ValueError(f'rewards.episodic: mode must be "default" or "thesis", received {mode!r}')
@@ -204,12 +222,22 @@ def episodic(
 def shaped(
     scale: chex.Numeric, event_bonus: chex.Numeric = 0.0, density: Density = "raw"
 ) -> Shaped:
-    """log p + scale (d(s) - d(s')) at every step, plus ``event_bonus`` on arrival at a failure:
-    Lipkis and Agogino eq. 21, paid once.
+    """log p + scale (d(s) - d(s')) at every step, plus a bonus on arrival at a failure: eq. 21 of
+    Lipkis and Agogino, paid once.
 
     The shaping telescopes to scale (d(s0) - d(sT)), so it moves no optimum between episodes of
-    equal start and end distance; for an episodic system, whose distance means nothing before its
-    end, to -scale d(sT).
+    equal start and end distance. For an episodic system, whose distance means nothing before its
+    end, it is -scale d(sT).
+
+    Args:
+        scale: worth of a unit of miss distance.
+        event_bonus: paid at a failure.
+        density: "mode" counts log p less its value at the mode, "raw" the log density itself.
+
+    Example:
+        >>> import jast
+        >>> float(jast.rewards.shaped(2.0)(-1.0, False, 3.0, False, 0.5))
+        0.0
     """
     return Shaped(scale, event_bonus, _checked("shaped", density))
 
@@ -244,6 +272,13 @@ def lexicographic(
     Raises:
         ValueError: for a scale that is not above 0, an unknown density; when called without its
             scales.
+
+    Example:
+        >>> import jast
+        >>> reward = jast.rewards.lexicographic(near=2.0, rare=10.0)
+        >>> failure, miss = reward(-10.0, True, 0.0, True), reward(-1.0, False, 2.0, True)
+        >>> float(failure), float(miss)
+        (0.5, -0.5)
     """
     for name, value in (("near", near), ("rare", rare)):
         if value is not None and not is_traced(value) and not value > 0:
@@ -257,26 +292,60 @@ def lexicographic(
 
 def likelihood(sim: Simulator) -> LogLikelihood:
     """The log density as a reward, free of units where it can be: relative to the mode where the
-    disturbances of ``sim`` have modes.
+    disturbances have modes.
+
+    Args:
+        sim: the simulator.
+
+    Example:
+        >>> import jast
+        >>> jast.rewards.likelihood(jast.simulators.walk1d()).density
+        'mode'
     """
     return LogLikelihood(outline(sim).density)
 
 
 def density_of(reward: Reward) -> Density:
-    """The density, "raw" or "mode", that ``reward`` wants its log p in."""
+    """The density, "raw" or "mode", that a reward wants its log p in.
+
+    Args:
+        reward: any reward.
+
+    Example:
+        >>> import jast
+        >>> jast.rewards.density_of(jast.rewards.standard(density="mode"))
+        'mode'
+    """
     return getattr(getattr(reward, "func", reward), "density", "raw")
 
 
 def once(reward: Reward) -> bool:
-    """Whether ``reward`` is of whole episodes: called with the sum of their log p, and what it
-    returns at the end is the episode's reward.
+    """Whether a reward is one of whole episodes: it is called with the sum of their log p, and what
+    it returns at the end is the episode's reward.
+
+    Args:
+        reward: any reward.
+
+    Example:
+        >>> import jast
+        >>> jast.rewards.once(jast.rewards.lexicographic())
+        True
     """
     return getattr(getattr(reward, "func", reward), "once", False)
 
 
 def as_pytree(reward: Reward) -> Reward:
-    """``reward`` as what `jax.jit` takes: a plain function becomes a `jax.tree_util.Partial`,
-    static by identity.
+    """A reward as what `jax.jit` takes: a plain function becomes a `jax.tree_util.Partial`, static
+    by identity.
+
+    Args:
+        reward: any reward.
+
+    Example:
+        >>> import jax, jast
+        >>> reward = jast.rewards.as_pytree(lambda log_p, event, d, terminal, approach: log_p)
+        >>> jax.tree.leaves(reward)
+        []
     """
     return Partial(reward) if jax.tree_util.all_leaves([reward]) and callable(reward) else reward
 

@@ -36,6 +36,13 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
         ``x`` [n, horizon, ...], the disturbances, of which the rows from ``length`` on mean
         nothing; with a random start ``x0`` [n, ...]. Where a disturbance is a structure, each of
         its arrays has its own entry, as "x.gust" or "x.0".
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+        >>> jast.failures.to_numpy(found)["x"].shape == (len(found), 30)
+        True
     """
     e = jax.tree.map(np.asarray, failures.episodes)
     out = {name: getattr(e, name) for name in OF_EPISODE}
@@ -67,6 +74,16 @@ def to_csv(path: PathLike, failures: Any) -> None:
     Args:
         path: of the file; an older one of that name is replaced.
         failures: a `jast.failures.Failures`.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0).failures
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "failures.csv")
+        ...     jast.failures.to_csv(path, found)
+        ...     print(open(path).readline().strip())
+        failure,step,x
     """
     arrays = to_numpy(failures)
     of_start = {k: v for k, v in arrays.items() if k == "x0" or k.startswith("x0.")}
@@ -100,6 +117,16 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
 
     Raises:
         ValueError: for a file that holds no failure, or one of another simulator.
+
+    Example:
+        >>> import json, os, tempfile, jast
+        >>> steps = {"name": "", "values": [2.0] * 6, "dtype": "float32"}  # as the page writes it
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "failure-1.json")
+        ...     with open(path, "w") as file:
+        ...         json.dump({"x0": [], "disturbances": [steps]}, file)
+        ...     bool(jast.failures.from_json(path, jast.simulators.walk1d()).failure)
+        True
     """
     try:
         given = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -8,7 +8,8 @@ import jax
 import pytest
 from doors import DOORS, exported, functions
 
-READY = ["jast", "jast.search"]
+READY = ["jast", "jast.search", "jast.estimate", "jast.explain", "jast.failures", "jast.specs"]
+READY += ["jast.incidents", "jast.rewards", "jast.actions", "jast.stress_testing", "jast.sweeping"]
 """Rooms whose docstrings are whole."""
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 

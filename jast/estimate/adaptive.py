@@ -77,63 +77,77 @@ def failure_probability(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
-    """The failure probability of ``sim`` with ``budget`` simulated episodes, by a proposal of its
-    own finding: `Estimate`.
+    """The probability that a system fails, by a proposal that this function finds itself.
 
-    An episode is a point of normal numbers (x_t the quantile of p(x | s) at Phi(z_t)). Design
-    points come from gradients of the miss distance (``gradients``; where they lead nowhere, nothing
-    depends on them) and from noise that is wide first and then cooled; a population from subset
-    simulation where gradients did not help. Mixtures of Gaussians are fitted to weighted failures
-    of a few batches. A guard, a population that is kept out of what the proposal covers, looks for
-    lost failure modes, which are taken in, or else the estimate is UNRELIABLE. Systems of 30 steps
-    or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with tilts
-    of each step's own disturbance by the state and the time, fitted by cross-entropy, of choices
-    by their odds; others where the Gaussians promise few effective draws. What is left of
-    the budget, about half, is drawn from the proposal as it then stands: the estimate and its
-    interval are of these episodes alone. A tenth of them or more, up to two fifths where the
-    standard error stays below 1 %, are the model's own draws, which meet what no explorer was led
-    to; ``unseen`` bounds what they did not meet. Where plain Monte Carlo would be more exact, or
-    the proposal is given up and the model fails often enough, all are drawn from the model; where
-    it does not, the answer is subset simulation's, and UNRELIABLE. So is one of a system whose
-    floats are too coarse (`jast.rounding`).
+    An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). Design
+    points come from gradients of the miss distance and from noise that is wide first and then
+    cooled, and from a population of subset simulation where gradients did not help. Mixtures of
+    Gaussians are fitted to the weighted failures of a few batches. A guard, a population that is
+    kept out of what the proposal covers, looks for lost failure modes; what it finds is taken in,
+    or else the estimate is UNRELIABLE. Systems of 30 steps or more, or whose disturbances hold
+    choices (Bernoulli, Categorical), are first tried with tilts: each step's own disturbance is
+    tilted by the state and the time, choices by their odds, and the tilts are fitted by
+    cross-entropy. Others are tried with tilts where the Gaussians promise few effective draws.
 
-    With fewer than 5000 episodes (50 at least), for systems that cost a second each, a Gaussian
-    process learns the limit state from two thirds of them, 240 at most: the miss distance of the
-    safe ones, and where failures are. The others, drawn at random, correct it: the interval is of
-    these, and holds the surrogate's error. Batches of calls suit black boxes with workers. One call
-    that changes much, a relative standard error above 25 % or fewer than 10 failures make the
-    estimate UNRELIABLE; where none was found, draws of the model give an upper bound. Above some 20
+    What is left of the budget, about half, is drawn from the proposal as it then stands. The
+    estimate and its interval come from these episodes alone. A tenth of them or more, up to two
+    fifths where the standard error stays below 1 %, are the model's own draws, which meet what no
+    explorer was led to; ``unseen`` bounds what they did not meet. All are drawn from the model
+    where plain Monte Carlo would be more exact, and where the proposal is given up but the model
+    fails often enough. Where it does not, the answer is subset simulation's, and UNRELIABLE. So is
+    that of a system whose floats are too coarse (`jast.rounding`).
+
+    Fewer than 5000 episodes are for systems that cost a second each. A Gaussian process learns the
+    limit state from two thirds of them, 240 at most: the miss distance of the safe ones, and where
+    failures are. The others, drawn at random, correct it: the interval comes from these, and holds
+    the surrogate's error. Batches of calls suit black boxes with workers. The estimate is
+    UNRELIABLE if one call changes much, the relative standard error is above 25 %, or there are
+    fewer than 10 failures; if there are none, draws of the model give an upper bound. Above some 20
     numbers an episode it mostly ends so. The method itself takes some 4 CPU seconds for 200 calls,
     more where NumPy's threads wait for one another (OPENBLAS_NUM_THREADS=1); their number changes
     what is drawn.
 
-    ``failures``: known ones (an archive, `jast.failures`), which join what the explorers find, so
-    that no mode among them is lost. They lead to a proposal and never enter the estimate.
+    A failure mode below ``unseen`` that all explorers miss is missing without a sign. A
+    KeyboardInterrupt during the last part ends it with the estimate of the draws so far; before
+    that, with an UNRELIABLE estimate from the batches of the search, and it is raised where there
+    is none yet. Host loop, not for `jax.jit` or `jax.vmap`.
 
-    ``near``: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
-    fitted to two or three batches, takes the place of the search where it serves; the guard and the
-    last draws are as ever. One without a proposal that fits changes nothing.
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        budget: episodes to simulate, at least 50.
+        failures: known ones (an archive, `jast.failures`), which join what the explorers find, so
+            that no mode among them is lost. They lead to a proposal and never enter the estimate.
+        near: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
+            fitted to two or three batches, takes the place of the search where it serves; the guard
+            and the last draws stay. One without a proposal that fits changes nothing.
+        gradients: differentiate the miss distance. Where its gradients lead nowhere, nothing
+            depends on them.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each chunk of the last part.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    A failure mode below ``unseen`` that all explorers miss is missing without a sign. ``modes`` are
-    parts of the estimate by direction. ``proposal`` serves `jast.estimate.failure_samples`;
-    ``history`` tells how the search went. ``evaluations`` counts each episode, and three for one
-    with its gradient.
+    Returns:
+        `Estimate`. ``modes`` are parts of the estimate by direction; ``proposal`` serves
+        `jast.estimate.failure_samples`; ``history`` tells how the search went; ``evaluations``
+        counts each episode, and three for one with its gradient.
 
-    The key is consumed. Host loop, not for `jax.jit` or `jax.vmap`. ``progress``, ``callback(done,
-    total, None)`` and a KeyboardInterrupt as in `importance`, for the last part. One that comes
-    before it ends in an UNRELIABLE estimate from the batches of the search, and is raised where
-    there is none yet.
+    Raises:
+        ValueError: for a budget below 50, a level outside (0, 1), disturbances without a quantile
+            function, and where the simulator's functions do not fit together.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
-    Units are of the last part; of what comes before it the checkpoint keeps what the system
-    answered, so that it is not asked again.
-
-    Raises ValueError for a budget below 50, a level outside (0, 1),
-    disturbances without a quantile function, and where the simulator's functions do not fit
-    together.
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.8)  # 8e-10 is the truth
+        >>> found = jast.estimate.failure_probability(jax.random.key(0), sim, 6000)
+        >>> truth = float(jast.simulators.landing_probability(b=0.8))
+        >>> 0.8 < found.mean / truth < 1.25
+        True
     """
     name = NAME
     random_key(name, key)
@@ -309,12 +323,36 @@ def monte_carlo(
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
     """How probable is a failure, by counting alone? Crude Monte Carlo, the baseline of estimators:
-    `Estimate` with an exact interval, and Chernoff's and Jeffreys' upper bounds also where no
-    failure was seen. `jast.nominal` is for a first look at a system, and
-    `jast.search.monte_carlo` keeps the failures.
+    an exact interval, and Chernoff's and Jeffreys' upper bounds also where no failure was seen.
 
-    Any simulator. In float32 the normal numbers of a step end at 5.42 standard deviations.
-    Arguments and errors as in `importance`.
+    `jast.nominal` is for a first look at a system, and `jast.search.monte_carlo` keeps the
+    failures. In float32 the normal numbers of a step end at 5.42 standard deviations. A
+    KeyboardInterrupt is treated as in `importance`.
+
+    Args:
+        key: consumed.
+        sim: any simulator.
+        samples: episodes, at least 2.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each chunk.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
+
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: as `importance`.
+
+    Example:
+        >>> import jax, jast
+        >>> found = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> found.interval[0] < found.mean < found.interval[1]
+        True
     """
     name = "monte_carlo"
     random_key(name, key)
@@ -336,13 +374,31 @@ def monte_carlo(
 def adaptive_cross_entropy(
     key: chex.PRNGKey, sim: Simulator, budget: int = 100_000, *, level: float = 0.95
 ) -> Estimate:
-    """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005), one
-    Gaussian, then importance sampling with the rest: `Estimate`.
+    """The multi-level cross-entropy method (de Boer, Kroese, Mannor and Rubinstein 2005) with one
+    Gaussian, then importance sampling with the rest of the budget.
 
-    Of ``budget``, ``budget // 100`` episodes in each of 20 iterations find the proposal
-    (`jast.estimate.failure_proposal`). It settles on one failure mode without a sign of the
-    others: a baseline, and quick where there is one. ValueError for a budget below 5000 and as
-    `failure_proposal`.
+    Each of 20 iterations spends ``budget // 100`` episodes on finding the proposal
+    (`jast.estimate.failure_proposal`). It settles on one failure mode without a sign of the others:
+    a baseline, and quick where there is only one.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        budget: episodes in all, at least 5000.
+        level: of the interval, in (0, 1).
+
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: for a budget below 5000, and as `failure_proposal`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing()
+        >>> found = jast.estimate.adaptive_cross_entropy(jax.random.key(0), sim, 5000)
+        >>> found.episodes
+        5000
     """
     name = "adaptive_cross_entropy"
     random_key(name, key)

@@ -79,20 +79,35 @@ def exceedance(
     *,
     level: float | None = None,
 ) -> Exceedance:
-    """The distribution of the miss distance in its tail: `Exceedance`, the probability that an
-    episode fails or comes as near as each of ``thresholds``; below 0, where the miss distance goes
-    on, that it fails by so much. No further episode.
+    """The distribution of the miss distance in its tail: the probability that an episode fails or
+    comes as near as each threshold. Below 0, where the miss distance continues, it is the
+    probability of failing by that much. No further episode is simulated.
 
-    Those of an ``estimate`` of `failure_probability` are drawn around failures, so this is sharp
-    from the failure inwards and some way outwards. Farther out the model's own share of the draws
-    carries it: an event that comes near and leads to no failure is met by these alone, and below
-    ``unseen`` it may be missing without a sign. ``reliable`` is False, and the numbers are NaN,
-    where the weights within a threshold have the signs for which an estimate is UNRELIABLE; of
-    plain counts intervals are exact, and nothing is NaN but where nothing was seen.
+    The draws of `failure_probability` lie around failures, so this is sharp from the failure
+    inwards and some way outwards. Farther out the model's own share of the draws carries it: an
+    event that comes near and leads to no failure is met by these alone, and below ``unseen`` it may
+    be missing without a sign.
 
-    ``thresholds``: [k] numbers (default: 64, from the least distance that a hundred draws reach to
-    the median of the model). ``level``: of the interval (default: the estimate's). ValueError for
-    thresholds that are not finite numbers, and an estimate without draws.
+    Args:
+        estimate: of `failure_probability`, `monte_carlo` or `importance`, with its draws.
+        thresholds: [k] numbers. Default: 64, from the least distance that a hundred draws reach to
+            the median of the model.
+        level: of the interval. Default: the estimate's.
+
+    Returns:
+        `Exceedance`. ``reliable`` is False, and the numbers are NaN, where the weights within a
+        threshold have the signs for which an estimate is UNRELIABLE. For plain counts the intervals
+        are exact, and nothing is NaN unless nothing was seen.
+
+    Raises:
+        ValueError: for thresholds that are not finite numbers, and an estimate without draws.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> curve = jast.estimate.exceedance(counted, [0.0, 1.0, 2.0])
+        >>> bool((curve.probability[1:] >= curve.probability[:-1]).all())
+        True
     """
     name = "exceedance"
     draws, level = asked(name, estimate, level)
@@ -114,12 +129,28 @@ def exceedance(
 def distance_quantile(
     estimate: Estimate, probability: float, *, level: float | None = None
 ) -> tuple[float, tuple[float, float]]:
-    """The miss distance within which an episode comes with this ``probability``: (distance, (low,
-    high)), the inverse of `exceedance`. No further episode.
+    """The miss distance that an episode comes within with a given probability, the inverse of
+    `exceedance`. No further episode is simulated.
 
-    NaN where the draws do not tell: below the probability of a failure where the distance stops at
-    0 there, and beyond what `exceedance` believes. An end of the interval that the draws do not
-    reach is infinite. ValueError for a probability outside (0, 1), and an estimate without draws.
+    Args:
+        estimate: of `failure_probability`, `monte_carlo` or `importance`, with its draws.
+        probability: in (0, 1).
+        level: of the interval. Default: the estimate's.
+
+    Returns:
+        (distance, (low, high)). NaN where the draws do not tell: below the probability of a failure
+        where the distance stops at 0 there, and beyond what `exceedance` believes. An end of the
+        interval that the draws do not reach is infinite.
+
+    Raises:
+        ValueError: for a probability outside (0, 1), and an estimate without draws.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> distance, (low, high) = jast.estimate.distance_quantile(counted, 0.3)
+        >>> low <= distance <= high
+        True
     """
     name = "distance_quantile"
     draws, level = asked(name, estimate, level)
@@ -140,11 +171,27 @@ def distance_quantile(
 
 
 def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureTimes:
-    """When the system fails: `FailureTimes`, the probability of a failure at each step with its
-    interval, and quantiles of the time given a failure. No further episode.
+    """When the system fails: the probability of a failure at each step with its interval, and
+    quantiles of the time given a failure. No further episode is simulated.
 
-    An episodic system is judged at the end of its episodes, and fails then. ValueError for an
-    estimate without draws or without a failure.
+    An episodic system is judged at the end of its episodes, and fails then.
+
+    Args:
+        estimate: of `failure_probability`, `monte_carlo` or `importance`, with its draws.
+        level: of the intervals. Default: the estimate's.
+
+    Returns:
+        `FailureTimes`.
+
+    Raises:
+        ValueError: for an estimate without draws or without a failure.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> times = jast.estimate.failure_times(counted)
+        >>> sorted(times.quantiles) == list(times.quantiles)
+        True
     """
     name = "failure_times"
     draws, level = asked(name, estimate, level)

@@ -18,13 +18,26 @@ K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
 
 
 def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
-    """Shape k of the generalised Pareto distribution of the greatest of ``log_weights`` (those
-    above 0, of ``samples`` in all): a float.
+    """Shape k of the generalised Pareto distribution of the greatest weights.
 
     Below 0.5 the weights look as if they had a variance, above 0.7 no standard error can be trusted
     (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The tail is min(n / 5, 3 sqrt(n)) weights, and
-    at most a fifth of ``failures``, how many are above 0 in all (default: of those given). NaN for
-    fewer than 5, and where one is NaN; -inf where the greatest are all equal.
+    at most a fifth of the failures.
+
+    Args:
+        log_weights: [m]: logs of the weights above 0.
+        samples: how many weights there are in all, n.
+        failures: how many are above 0 in all. Default: those given.
+
+    Returns:
+        A float; NaN for fewer than 5 weights, and where one is NaN; -inf where the greatest are all
+        equal.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> heavy = 0.9 * np.random.default_rng(0).exponential(size=10000)  # Pareto, k = 0.9
+        >>> 0.8 < jast.estimate.pareto_k(heavy, 10000) < 1.0
+        True
     """
     log_w = np.sort(np.asarray(log_weights, np.float64))
     if np.isnan(log_w).any():

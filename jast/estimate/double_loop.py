@@ -72,6 +72,14 @@ def double_loop(
     Raises:
         ValueError: for counts out of range, a level outside (0, 1), a proposal of several
             components or without a density, and where the simulator's functions do not fit.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.pendulum()
+        >>> model = jast.Policy(sim.start, lambda state, t: sim.disturbance(state))
+        >>> counted = jast.estimate.double_loop(jax.random.key(0), sim, model, 100, 5)
+        >>> int(counted.evaluations)
+        500
     """
     random_key("double_loop", key)
     starts = whole("double_loop", "starts", starts, 2)

@@ -115,6 +115,15 @@ def events(
     Raises:
         ValueError: for an estimate without draws or without a failure, of another simulator, an
             event that is no function or returns no bool, another ``of``, and a missing proposal.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), sim, 1000)
+        >>> sides = {"above": lambda s: s > 0, "below": lambda s: s < 0}
+        >>> found = jast.estimate.events(sim, counted, sides)
+        >>> round(found["above"].given_failure + found["below"].given_failure, 6)
+        1.0
     """
     name = "events"
     draws, level = asked(name, estimate, level)
@@ -147,6 +156,15 @@ def given_start(
 
     Raises:
         ValueError: as `events`, and for draws below 1.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.pendulum()
+        >>> counted = jast.estimate.monte_carlo(key, sim, 3000)
+        >>> near = {"tilted": lambda s: abs(s[0]) > 0.1}
+        >>> found = jast.estimate.given_start(key, sim, counted, near, draws=1000)
+        >>> list(found)
+        ['tilted']
     """
     name = "given_start"
     random_key(name, key)

@@ -81,17 +81,37 @@ def failure_samples(
     moves: int = 20,
     checkpoint: PathLike | None = None,
 ) -> FailureSamples:
-    """``samples`` failures nearly from p(x | failure): weighted failures of a proposal are
-    resampled, each then makes Markov moves: `FailureSamples`.
+    """Failures drawn nearly from p(x | failure): weighted failures of a proposal are resampled, and
+    each then makes Markov moves.
 
-    ``source``: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with
-    densities; ``10 * samples`` episodes are drawn from it. The ``moves`` change the latent normal
-    numbers (conditional sampling) and keep p(x | failure): they do not bring in a failure mode that
-    the proposal lacks, and the shares of modes are those of the weights. ``checkpoint``: a folder
-    that keeps what the system answered; the same call goes on where it was ended, by whatever, to
-    the same result (docs/scale.md). Raises ValueError for a source without a proposal or without a
-    failure among its episodes, a count below 1, disturbances without a quantile function, and a
-    checkpoint of another call.
+    The moves change the latent normal numbers (conditional sampling) and keep p(x | failure). They
+    bring in no failure mode that the proposal lacks, and the shares of modes are those of the
+    weights.
+
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        source: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with
+            densities; ``10 * samples`` episodes are drawn from it.
+        samples: failures to return.
+        moves: Markov moves of each.
+        checkpoint: a folder that keeps what the system answered. The same call then goes on where
+            it was stopped, to the same result (docs/scale.md).
+
+    Returns:
+        `FailureSamples`.
+
+    Raises:
+        ValueError: for a source without a proposal or without a failure among its episodes, a count
+            below 1, disturbances without a quantile function, and a checkpoint of another call.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing()
+        >>> proposal = jast.estimate.failure_proposal(key, sim, samples=200).policy
+        >>> drawn = jast.estimate.failure_samples(key, sim, proposal, 50)
+        >>> bool(drawn.failures.failure.all())
+        True
     """
     name = "failure_samples"
     random_key(name, key)

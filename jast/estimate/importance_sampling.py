@@ -79,14 +79,32 @@ def log_weights(
     *,
     mode: Literal["default", "paper"] = "default",
 ) -> Traces:
-    """``samples`` episodes drawn from ``proposal`` (a `Proposal` or a `Policy` with densities):
-    `Traces`, for estimates of your own.
+    """Episodes drawn from a proposal, with their weights, for estimates of your own.
 
-    A trace's component is drawn once, and it is weighted by the full mixture (eq. 20): w = p(x) /
-    sum_k a_k q_k(x). Pure, for `jax.jit` and `jax.vmap`; all in memory. ``mode="default"`` weighs
-    x0 and the steps to the end of the episode, as what comes after decides nothing; ``"paper"``
-    goes on to the horizon, as the paper does. Both are unbiased. ValueError for another mode or
-    proposal.
+    A trace's component is drawn once, and it is weighted by the full mixture (eq. 20 of Lipkis and
+    Agogino): w = p(x) / sum_k a_k q_k(x). Pure, for `jax.jit` and `jax.vmap`; all in memory.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        proposal: a `Proposal`, or a `jast.Policy` with densities.
+        samples: episodes n.
+        mode: "default" weighs x0 and the steps to the end of the episode, as what comes after
+            decides nothing; "paper" goes on to the horizon, as the paper does. Both are unbiased.
+
+    Returns:
+        `Traces`, with a leading axis [n].
+
+    Raises:
+        ValueError: for another mode or proposal.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> model = jast.Policy(sim.start, lambda state, t: sim.disturbance(state))
+        >>> traces = jast.estimate.log_weights(jax.random.key(0), sim, model, 100)
+        >>> bool(jnp.allclose(traces.log_weight, 0.0, atol=1e-4))
+        True
     """
     random_key("log_weights", key)
     if mode not in ("default", "paper"):
@@ -111,25 +129,43 @@ def importance(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
-    """Estimate the failure probability of ``sim`` with ``samples`` episodes of a proposal:
-    `Estimate`.
+    """Estimate the failure probability of a system with episodes of a proposal.
 
-    ``proposal``: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities.
-    Unbiased where it can draw all that the model can: one that holds no share of the model is tried
-    on a few of the model's own episodes. It says nothing of failures that it hardly draws:
-    `Estimate` on how to know. ``mode`` as in `log_weights`; ``level`` of the interval. Memory does
-    not grow with ``samples``. The key is consumed; chunk i is drawn with ``jax.random.fold_in(key,
-    i)``. ``progress=True`` shows a bar, ``callback(done, total, None)`` is called after each chunk;
-    a KeyboardInterrupt ends it with the estimate of the whole chunks, and a word in ``warnings``.
-    Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
+    Unbiased where the proposal can draw all that the model can; one that holds no share of the
+    model is tried on a few of the model's own episodes. It says nothing of failures that it hardly
+    draws: see `Estimate` on how to know. Memory does not grow with ``samples``; chunk i is drawn
+    with ``jax.random.fold_in(key, i)``. A KeyboardInterrupt ends it with the estimate of the whole
+    chunks, and a word in ``warnings``. Host loop: for `jax.jit` and `jax.vmap` see `log_weights`.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
+    Args:
+        key: consumed.
+        sim: the simulator.
+        proposal: of `trace_proposal` or `policy_proposal`, or any `jast.Policy` with densities.
+        samples: episodes, at least 2.
+        mode: as for `log_weights`.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each chunk.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    Raises ValueError for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
-    without a density, and where the simulator's functions do not fit together.
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: for fewer than 2 samples, another mode, a level outside (0, 1), a proposal
+            without a density, and where the simulator's functions do not fit together.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing()
+        >>> proposal = jast.estimate.failure_proposal(key, sim, samples=200).policy
+        >>> found = jast.estimate.importance(jax.random.key(1), sim, proposal, 2000)
+        >>> bool(found.failing > 100)
+        True
     """
     random_key("importance", key)
     samples = whole("importance", "samples", samples, 2)

@@ -105,27 +105,45 @@ def failure_proposal(
     smoothing: float = 0.3,
     floor: float = 0.7,
 ) -> FailureProposal:
-    """Find a proposal under which the failures of ``sim`` are frequent: `FailureProposal`, whose
-    ``policy`` is for `jast.rollout` and importance sampling.
+    """Find a proposal under which failures are frequent. Its ``policy`` is for `jast.rollout` and
+    importance sampling.
 
-    Each of ``iterations`` simulates ``samples`` episodes, whose disturbances are x_t = Q(Phi(z_t)),
-    Q the quantile function of p(x | s) and z_t ~ N(m_t, s_t^2), from N(0, 1), the model itself, on.
-    The share ``quantile`` of least miss distance are the elites, all failing episodes once that
-    many fail. m_t and s_t are fitted to the elites with importance ratios for weights, over the
-    steps that an episode took; the share ``smoothing`` of the last ones is kept, s_t >= ``floor``.
-    A random start is tilted likewise where it has a quantile function, else it is drawn from its
-    own distribution. A proposal that is much narrower than the model in many steps gives weights
-    with heavy tails; in one or two dimensions a lower floor is sharper.
+    The disturbances are x_t = Q(Phi(z_t)), Q the quantile function of p(x | s) and z_t ~ N(m_t,
+    s_t^2), beginning at N(0, 1), the model itself. In each iteration m_t and s_t are fitted to the
+    elites, the episodes of least miss distance, with importance ratios for weights, over the steps
+    that an episode took. A random start is tilted likewise where it has a quantile function, else
+    it is drawn from its own distribution. A proposal that is much narrower than the model in many
+    steps gives weights with heavy tails; in one or two dimensions a lower ``floor`` is sharper.
 
-    The result is a proposal, not an estimate: estimate with new episodes, under it alone. It is one
-    Gaussian, its steps independent: where failures lie in several places it may settle on one of
-    them, or between, and an estimate misses the others without a sign of it. Look at ``reached``
-    first.
+    The result is a proposal, not an estimate: estimate with new episodes, drawn under it alone. It
+    is one Gaussian with independent steps. Where failures lie in several places it may settle on
+    one of them, or between, and an estimate misses the others without a sign of it. Look at
+    ``reached`` first. An invalid episode is counted and never an elite. One program, works under
+    `jax.jit` and `jax.vmap`.
 
-    Counts are static, real-valued settings (``quantile`` above 0 and below 1, ``smoothing`` from 0
-    to below 1, ``floor`` above 0) traced; one program, works under `jax.jit` and `jax.vmap`. The
-    key is consumed. An invalid episode is counted and never an elite. Raises ValueError for a count
-    below 1, a setting outside its range, and a disturbance that cannot be tilted.
+    Args:
+        key: consumed.
+        sim: the simulator.
+        samples: episodes in an iteration; static, like ``iterations``.
+        iterations: how many.
+        quantile: share of the episodes that are elites, above 0 and below 1; all failing episodes
+            once that many fail. Traced, like those below.
+        smoothing: share of the last m_t and s_t that is kept, from 0 to below 1.
+        floor: the least s_t, above 0.
+
+    Returns:
+        `FailureProposal`.
+
+    Raises:
+        ValueError: for a count below 1, a setting outside its range, and a disturbance that cannot
+            be tilted.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing()
+        >>> found = jast.estimate.failure_proposal(jax.random.key(0), sim, samples=200)
+        >>> bool(found.reached)
+        True
     """
     random_key("failure_proposal", key)
     samples, iterations = (

@@ -62,22 +62,37 @@ def trace_proposal(
     mixing: Literal["step", "trace"] = "step",
     tilt_start: bool = True,
 ) -> Proposal:
-    """The proposal of recorded failures, the paper's Algorithm 1 (one trace) and eq. 19-20
-    (several): `Proposal` of one component a trace.
+    """The proposal of recorded failures, Algorithm 1 (one trace) and eq. 19-20 (several) of Lipkis
+    and Agogino.
 
-    ``episodes``: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a
-    list of either. Each is replayed; its disturbance x*_t moves p(x | s) so that its middle is
-    where x*_t lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq.
-    10-11), in general `jast.distributions.tilted`, which keeps within bounds and suits whole
-    numbers too. Steps after the end of a trace are the model's own.
+    Each episode is replayed. Its disturbance x*_t moves p(x | s) so that its middle is where x*_t
+    lies in the recorded state: for a normal distribution q = p(x + E[X] - x*_t) (eq. 10-11), in
+    general `jast.distributions.tilted`, which keeps within bounds and suits whole numbers too.
+    Steps after the end of a trace are the model's own.
 
-    ``epsilon``: the share of the model, above 0 and at most 1 (traced). With ``mixing="step"`` it
-    is mixed in at each step, as in the paper (eq. 12; of T steps all are moved with probability (1
-    - epsilon)^T only); ``"trace"``: one more component is the model itself, for long horizons.
-    ``tilt_start=False`` draws x0 from the model.
+    Args:
+        sim: the simulator.
+        episodes: an `Episode`, a batch with a leading axis [K] (``result.failures.episodes``), or a
+            list of either.
+        epsilon: the share of the model, above 0 and at most 1 (traced).
+        mixing: "step" mixes the model in at each step, as in the paper (eq. 12; of T steps all are
+            moved with probability (1 - epsilon)^T only); "trace" makes the model itself one more
+            component, for long horizons.
+        tilt_start: whether x0 is moved too; False draws it from the model.
 
-    Raises ValueError for another epsilon or mixing, episodes that do not fit the simulator, and a
-    disturbance that cannot be tilted (named).
+    Returns:
+        `Proposal` of one component a trace.
+
+    Raises:
+        ValueError: for another epsilon or mixing, episodes that do not fit the simulator, and a
+            disturbance that cannot be tilted (named).
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(6, 2.0))
+        >>> jast.estimate.trace_proposal(sim, failure, mixing="trace").log_weights.shape
+        (2,)
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
     contract(sim, observed=False)
@@ -121,17 +136,35 @@ def policy_proposal(
     tilt_start: bool = True,
     mixing: Literal["step", "trace"] = "step",
 ) -> Proposal:
-    """The proposal of a failure policy, the paper's Algorithm 2: p(x | s) moved to the policy's
-    value pi*(s), its mode, at each step (eq. 23-28): `Proposal`.
+    """The proposal of a failure policy, Algorithm 2 of Lipkis and Agogino: p(x | s) moved to the
+    policy's value pi*(s), its mode, at each step (eq. 23-28).
 
-    ``tilt_start``: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from
-    the model alone, as Algorithm 2 is printed. Where x0 decides whether the system fails that
-    estimate is not to be trusted, whatever the policy: see `jast.estimate.Estimate`. ``epsilon``
-    and ``mixing`` as in `trace_proposal`. A policy that itself draws from all failures can be given
-    to `importance` as it is.
+    Where x0 decides whether the system fails, an estimate with a start from the model is not to be
+    trusted, whatever the policy: see `jast.estimate.Estimate`. A policy that itself draws from all
+    failures can be given to `importance` as it is.
 
-    Raises ValueError for another epsilon or mixing, what is no `jast.Policy`, and a disturbance
-    that cannot be tilted (named).
+    Args:
+        sim: the simulator.
+        policy: a `jast.Policy`.
+        epsilon: as for `trace_proposal`.
+        tilt_start: x0 is drawn from ``policy.start()``, mixed with the model's; False draws it from
+            the model alone, as Algorithm 2 is printed.
+        mixing: as for `trace_proposal`.
+
+    Returns:
+        `Proposal`.
+
+    Raises:
+        ValueError: for another epsilon or mixing, what is no `jast.Policy`, and a disturbance that
+            cannot be tilted (named).
+
+    Example:
+        >>> import jast
+        >>> from jast import distributions as D
+        >>> sim = jast.simulators.walk1d()
+        >>> push = jast.Policy(sim.start, lambda state, t: D.Normal(1.0, 1.0))
+        >>> jast.estimate.policy_proposal(sim, push).log_weights.shape
+        (1,)
     """
     epsilon = _epsilon("policy_proposal", epsilon, mixing)
     contract(sim, observed=False)

@@ -46,22 +46,41 @@ def subset_simulation(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
-    """Subset simulation (Au and Beck 2001) by ``replicates`` independent populations of
-    ``samples``: `Estimate`, the mean of theirs.
+    """Subset simulation (Au and Beck 2001): the mean of several independent populations.
 
-    The interval is that of the replicates, log-normal; ``ess`` and ``max_share`` are of them too,
-    ``samples`` counts the members of the last populations. It needs a miss distance that leads to
-    failures, and no gradient; a mode that few members reach is lost at times, and the others do not
-    show it. A population gives up below a probability of 1e-300. ``progress=True`` shows a bar,
-    ``callback(done, total, None)`` is called after each population; a KeyboardInterrupt ends it
-    with the estimate of those that are done, UNRELIABLE, and is raised where they are fewer than 3.
+    The interval is that of the populations, log-normal; ``ess`` and ``max_share`` are of them too,
+    and ``samples`` counts the members of the last ones. It needs a miss distance that leads to
+    failures, and no gradient. A mode that few members reach is lost at times, and the others do not
+    show it. A population gives up below a probability of 1e-300. A KeyboardInterrupt ends it with
+    the estimate of the populations that are done, UNRELIABLE, and is raised where they are fewer
+    than 3.
 
-    ``checkpoint``: a folder that keeps finished units of the work; the same call goes on where it
-    was ended, by whatever, to the same result. ``executor``: has ``submit(function, *args)``, as
-    those of `concurrent.futures` and of Dask; ``devices``: some of `jax.devices()`, a thread each.
-    Neither changes a result (`jast.units`; docs/scale.md).
+    Args:
+        key: consumed.
+        sim: the simulator; its disturbances have quantile functions.
+        samples: members of a population, at least 100.
+        replicates: populations, at least 3.
+        level: of the interval, in (0, 1).
+        progress: whether to show a progress bar.
+        callback: called as ``callback(done, total, None)`` after each population.
+        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
+            it was stopped, to the same result.
+        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
+            of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
 
-    Raises ValueError for fewer than 100 samples or 3 replicates, and as `failure_probability`.
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: for fewer than 100 samples or 3 replicates, and as `failure_probability`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.5)
+        >>> found = jast.estimate.subset_simulation(jax.random.key(0), sim, 300, replicates=4)
+        >>> 0 < found.mean < 1e-2
+        True
     """
     name = "subset_simulation"
     random_key(name, key)

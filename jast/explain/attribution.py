@@ -92,6 +92,14 @@ def attribution(
     Raises:
         ValueError: for another method, where the distance has no finite gradient, and where
             ``episode`` is not one failure of this simulator.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.5).at[3].set(5.0))
+        >>> found = jast.explain.attribution(sim, failure, permutations=10)
+        >>> int(jnp.argmax(jnp.abs(found.values)))
+        3
     """
     name = "attribution"
     if method not in METHODS:

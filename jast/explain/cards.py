@@ -41,6 +41,14 @@ def cards(
 
     Raises:
         ValueError: as `minimal`.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> found = jast.search.gradient(key, sim, starts=4, refine=0)
+        >>> ways = jast.search.modes(sim, found.failures)
+        >>> len(jast.explain.cards(key, sim, ways, budget=2000)) == len(ways)
+        True
     """
     name = "cards"
     _checks.random_key(name, key)

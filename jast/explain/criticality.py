@@ -87,6 +87,14 @@ def criticality(
 
     Raises:
         ValueError: for bad arguments, and where ``episode`` does not fit the simulator.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(6, 2.0))
+        >>> found = jast.explain.criticality(jax.random.key(0), sim, failure, draws=100)
+        >>> bool(found.probability[-1] == 1.0)
+        True
     """
     name = "criticality"
     _checks.random_key(name, key)

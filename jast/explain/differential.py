@@ -56,6 +56,13 @@ def differential(
 
     Raises:
         ValueError: as `regression` and `jast.stress`.
+
+    Example:
+        >>> import jax, jast
+        >>> old, new = jast.simulators.walk1d(threshold=10.0), jast.simulators.walk1d(threshold=8.0)
+        >>> report = jast.explain.differential(jax.random.key(0), old, new, 1000)
+        >>> bool(report.failures.best.failure)
+        True
     """
     from jast.stress_testing import stress
 
@@ -80,6 +87,14 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
 
     Raises:
         ValueError: where the disturbances of the two, or of their starts, differ in shape.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> old, new = jast.simulators.walk1d(threshold=10.0), jast.simulators.walk1d(threshold=8.0)
+        >>> both = jast.explain.regression(old, new)
+        >>> there, back = jnp.ones(9), -jnp.ones(9)  # only the new version fails at 9
+        >>> bool(jast.replay(both, jnp.concatenate([there, back, jnp.zeros(12)])).failure)
+        True
     """
     a, b = outline(sim_a), outline(sim_b)
     for part, one, other in (("disturbance", a.x, b.x), ("start", a.x0, b.x0)):

@@ -130,6 +130,14 @@ def indices(
     Raises:
         ValueError: for an estimate without draws or without a failure, one by a policy, or of
             another simulator.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing(b=0.5)
+        >>> estimate = jast.estimate.failure_probability(key, sim, 6000)
+        >>> found = jast.explain.indices(key, sim, estimate, draws=50)
+        >>> len(found.rows)  # the start and ten steps
+        11
     """
     name = "indices"
     _checks.random_key(name, key)

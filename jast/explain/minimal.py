@@ -85,6 +85,13 @@ def minimal(
 
     Raises:
         ValueError: for bad arguments, and where ``episode`` is not one failure of this simulator.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.01).at[3].set(12.0))
+        >>> int(jast.explain.minimal(sim, failure, orders=2).needed.sum())
+        1
     """
     name = "minimal"
     orders, budget = whole(name, "orders", orders, 1), whole(name, "budget", budget, 1)

@@ -153,6 +153,14 @@ def monitor(
     Raises:
         ValueError: for bad arguments, episodes that are not what they should be, and too few.
         ImportError: without scikit-learn.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> watch = jast.explain.monitor(sim, found, model="logistic", episodes=100)
+        >>> 0.0 <= watch.probability([9.5]) <= 1.0
+        True
     """
     name = "monitor"
     learner(name, "ensemble")

@@ -145,6 +145,14 @@ def rules(
     Raises:
         ValueError: for bad arguments, episodes that are not what they should be, and too few.
         ImportError: without scikit-learn.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d(form="one-sided")
+        >>> found = jast.search.gradient(jax.random.key(0), sim, starts=4, refine=0)
+        >>> told = jast.explain.rules(sim, found, episodes=100)
+        >>> len(told.rules) >= 1
+        True
     """
     name = "rules"
     trees = learner(name, "tree")

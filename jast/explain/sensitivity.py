@@ -86,6 +86,14 @@ def sensitivity(
     Raises:
         ValueError: where no parameter is bound, the estimate has no proposal for this simulator, or
             none of the draws fails.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.5)
+        >>> estimate = jast.estimate.failure_probability(jax.random.key(0), sim, 6000)
+        >>> found = jast.explain.sensitivity(sim, estimate, samples=2000)
+        >>> len(found.rows) > 0
+        True
     """
     name = "sensitivity"
     key = jax.random.key(0) if key is None else key

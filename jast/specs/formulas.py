@@ -145,6 +145,12 @@ def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
     Raises:
         ValueError: where ``fn`` is no function or ``name`` no text. What ``fn`` returns is looked
             at where the formula is used.
+
+    Example:
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> print(~low)
+        ~(s < 5)
     """
     if not callable(fn):
         raise ValueError(f"predicate: fn must be a function of the state, received {fn!r}")
@@ -168,6 +174,13 @@ def always(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
 
     Raises:
         ValueError: for what is no formula, and for a window that is negative or reversed.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> print(float(specs.robustness(specs.always(low), jnp.array([1.0, 4.0, 2.0]), 1.0)))
+        1.0
     """
     return _temporal("always", f, a, b)
 
@@ -184,6 +197,14 @@ def eventually(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
 
     Raises:
         ValueError: for what is no formula, and for a window that is negative or reversed.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> late = specs.eventually(low, 1.0, 2.0)  # from 1 to 2 seconds on
+        >>> print(float(specs.robustness(late, jnp.array([1.0, 4.0, 2.0]), 1.0)))
+        3.0
     """
     return _temporal("eventually", f, a, b)
 
@@ -203,6 +224,15 @@ def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> For
 
     Raises:
         ValueError: for what is no formula, and for a window that is negative or reversed.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> over = specs.predicate(lambda s: s - 3.0, "s > 3")
+        >>> rule = specs.until(low, over)
+        >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
+        1.0
     """
     f, g = _formula("until", "f", f), _formula("until", "g", g)
     return Until(f, g, *_window("until", g, a, b))
@@ -219,6 +249,15 @@ def implies(f: Formula, g: Formula) -> Formula:
 
     Raises:
         ValueError: for what is no formula.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> fast = specs.predicate(lambda s: s - 3.0, "s > 3")
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> rule = specs.always(specs.implies(fast, low))
+        >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
+        1.0
     """
     return Implies(_formula("implies", "f", f), _formula("implies", "g", g))
 

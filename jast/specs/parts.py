@@ -73,6 +73,14 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
 
     Raises:
         ValueError: as `robustness`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> found = specs.parts(specs.always(low), jnp.array([1.0, 6.0, 2.0]), 1.0)
+        >>> "s < 5" in str(found)
+        True
     """
     dt = R.spacing("parts", dt)
     R.robustness(formula, trace, dt, goes_on=goes_on)  # its checks

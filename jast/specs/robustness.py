@@ -82,6 +82,15 @@ def robustness(
             trace or begins after its end; for a predicate that raises, or does not return a float
             scalar, or a NaN that matters (not looked at while traced: NaN); for leaves of ``trace``
             of different lengths, another dt or temperature.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import specs
+        >>> rule = specs.always(specs.predicate(lambda s: 5.0 - s, "s < 5"))
+        >>> trace = jnp.array([1.0, 4.0, 2.0])
+        >>> slope = jax.grad(lambda trace: specs.robustness(rule, trace, 1.0))(trace)
+        >>> slope.tolist()  # the sample that decides
+        [-0.0, -1.0, -0.0]
     """
     dt, length = spacing("robustness", dt), _length("robustness", trace)
     if temperature is not None:

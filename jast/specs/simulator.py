@@ -92,6 +92,14 @@ def under(
         ValueError: naming the sub-formula, for a window beyond the horizon or that holds no sample,
             and for a predicate that raises, as over a field that the state lacks, or that returns
             no float scalar. A NaN from a predicate makes an episode invalid, as any other NaN.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> sim = specs.under(jast.simulators.walk1d(), specs.always(low))
+        >>> bool(jast.replay(sim, jnp.ones(30)).failure)
+        True
     """
     if not isinstance(formula, Formula):
         raise ValueError(f"under: formula must be a jast.specs formula, received {formula!r}")
@@ -140,6 +148,14 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
 
     Raises:
         ValueError: for an episode without states, or of another system.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> sim = specs.under(jast.simulators.walk1d(), specs.always(low))
+        >>> print(specs.trace_of(jast.replay(sim, jnp.ones(30))))
+        [0. 1. 2. 3. 4. 5. 6.]
     """
     _monitored("trace_of", episode)
     n = int(episode.length) + 1
@@ -161,6 +177,14 @@ def goes_on(episode: Episode) -> bool:
 
     Raises:
         ValueError: as `trace_of`.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> sim = specs.under(jast.simulators.walk1d(), specs.always(low))
+        >>> specs.goes_on(jast.replay(sim, jnp.ones(30)))  # ended at 6, long before the horizon
+        True
     """
     return bool(np.asarray(_monitored("goes_on", episode).goes_on)[int(episode.length)])
 
