@@ -188,7 +188,7 @@ def main(argv=None):
     there = lambda m: m not in NEEDED or importlib.util.find_spec(NEEDED[m])
     installed = [m for m in METHODS if there(m) and m != "bayesian"]
     cases = args.cases or size(args, list(CASES), ["CC2"], ["CC1"])
-    methods = args.methods or size(args, installed, ["falsify", "random", "cem"], ["falsify"])
+    methods = args.methods or size(args, installed, ["falsify", "cem"], ["falsify"])
     seeds = args.seeds or size(args, 50, 3, 2)
     report = run(cases, methods, seeds, args.budget or size(args, None, None, 20))
     if args.json:
