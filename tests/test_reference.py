@@ -10,6 +10,7 @@ from doors import DOORS, exported, functions
 
 READY = ["jast", "jast.search", "jast.estimate", "jast.explain", "jast.failures", "jast.specs"]
 READY += ["jast.incidents", "jast.rewards", "jast.actions", "jast.stress_testing", "jast.sweeping"]
+READY += ["jast.simulators", "jast.distributions"]
 """Rooms whose docstrings are whole."""
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 

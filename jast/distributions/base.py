@@ -39,6 +39,22 @@ class Distribution(metaclass=_Kind):
     A subclass defines ``event_shape`` (a pytree of shapes: that of one value),
     ``_sample_n(key, n)`` (n values on a new leading axis) and ``log_prob(value)``; where they
     exist, ``mode()``, and ``quantile(u)`` with ``cdf(x)``, its inverse.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> class Rayleigh(jast.distributions.Distribution):
+        ...     event_shape = ()
+        ...
+        ...     def __init__(self, scale):
+        ...         self.scale = jnp.asarray(scale)
+        ...
+        ...     def _sample_n(self, key, n):
+        ...         return self.scale * jnp.sqrt(2 * jax.random.exponential(key, (n,)))
+        ...
+        ...     def log_prob(self, x):
+        ...         return jnp.log(x) - 2 * jnp.log(self.scale) - (x / self.scale) ** 2 / 2
+        >>> Rayleigh(2.0).sample(seed=0, sample_shape=5).shape
+        (5,)
     """
 
     event_shape: Any
@@ -110,7 +126,16 @@ _introduced = False
 
 
 def is_distribution(d: Any) -> bool:
-    """Whether ``d`` is a distribution of jast or of distrax, or draws and scores as they do."""
+    """Whether something is a distribution of jast or of distrax, or draws and scores as they do.
+
+    Args:
+        d: anything.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.is_distribution(D.Normal(0.0, 1.0)), D.is_distribution(0.0)
+        (True, False)
+    """
     return isinstance(d, Distribution) or (
         not isinstance(d, type)
         and callable(getattr(d, "sample", None))

@@ -25,6 +25,13 @@ class Independent(Distribution):
 
     Raises:
         ValueError: where values are structures, or there are fewer axes than that.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Independent(D.Normal(jnp.zeros(3), 1.0), 1)
+        >>> d.event_shape
+        (3,)
     """
 
     def __init__(self, distribution: Any, reinterpreted_batch_ndims: int | None = None) -> None:
@@ -93,6 +100,12 @@ class Joint(Distribution):
 
     Raises:
         ValueError: where a leaf is no distribution, or the batch shapes differ.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Joint({"gust": D.Normal(0.0, 1.0), "late": D.Bernoulli(probs=0.1)})
+        >>> sorted(d.sample(seed=0))
+        ['gust', 'late']
     """
 
     def __init__(self, distributions: Any) -> None:

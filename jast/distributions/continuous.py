@@ -23,7 +23,15 @@ LOG_2 = math.log(2.0)
 
 
 class Laplace(Symmetric):
-    """Density exp(-|x - loc| / scale) / (2 scale)."""
+    """Density exp(-|x - loc| / scale) / (2 scale).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Laplace(0.0, 0.5)
+        >>> float(jnp.exp(d.log_prob(0.0)))
+        1.0
+    """
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self.loc[None] + self.scale[None] * jax.random.laplace(key, **self._like_n(n))
@@ -39,7 +47,15 @@ class Laplace(Symmetric):
 
 
 class Logistic(Symmetric):
-    """Distribution function 1 / (1 + exp(-(x - loc) / scale))."""
+    """Distribution function 1 / (1 + exp(-(x - loc) / scale)).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Logistic(0.0, 1.0)
+        >>> float(D.cdf(d, jnp.array(0.0)))
+        0.5
+    """
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         tiny = jnp.finfo(self.dtype).tiny
@@ -58,7 +74,14 @@ class Logistic(Symmetric):
 
 
 class Uniform(Distribution):
-    """On [``low``, ``high``], which broadcast."""
+    """On [``low``, ``high``], which broadcast.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Uniform(-1.0, 3.0)
+        >>> float(d.mean())
+        1.0
+    """
 
     event_shape: Any = ()
 
@@ -131,7 +154,14 @@ class _Pair(Distribution):
 
 
 class Gamma(_Pair):
-    """Density proportional to x^(concentration - 1) exp(-rate x), x > 0."""
+    """Density proportional to x^(concentration - 1) exp(-rate x), x > 0.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Gamma(2.0, 4.0)
+        >>> float(d.mean())
+        0.5
+    """
 
     def __init__(self, concentration: chex.Numeric, rate: chex.Numeric) -> None:
         super().__init__(concentration, rate)
@@ -167,7 +197,14 @@ class Gamma(_Pair):
 
 
 class Beta(_Pair):
-    """Density proportional to x^(alpha - 1) (1 - x)^(beta - 1) on [0, 1]."""
+    """Density proportional to x^(alpha - 1) (1 - x)^(beta - 1) on [0, 1].
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Beta(2.0, 2.0)
+        >>> float(d.mean())
+        0.5
+    """
 
     def __init__(self, alpha: chex.Numeric, beta: chex.Numeric) -> None:
         super().__init__(alpha, beta)

@@ -69,7 +69,14 @@ class _Counts(Distribution):
 
 
 class Geometric(_Counts):
-    """How many failures come before the first success, of probability ``probs``: 0, 1, 2, ..."""
+    """How many failures come before the first success, of probability ``probs``: 0, 1, 2, ...
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Geometric(0.5)
+        >>> int(d.mode())
+        0
+    """
 
     def __init__(self, probs: chex.Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
@@ -98,7 +105,14 @@ class Geometric(_Counts):
 
 
 class Poisson(_Counts):
-    """Of mean ``rate``."""
+    """Of mean ``rate``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Poisson(3.5)
+        >>> int(d.mode())
+        3
+    """
 
     def __init__(self, rate: chex.Numeric) -> None:
         self.rate: jax.Array = float_array(rate)
@@ -125,7 +139,14 @@ class Poisson(_Counts):
 
 
 class Binomial(_Counts):
-    """How many of ``total_count`` trials succeed, each with probability ``probs``."""
+    """How many of ``total_count`` trials succeed, each with probability ``probs``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Binomial(10.0, 0.5)
+        >>> int(d.mode())
+        5
+    """
 
     def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
@@ -174,6 +195,13 @@ class Binomial(_Counts):
 class TiltedCounts(Distribution):
     """A family of counts with z ~ N(mean, deviation^2): only the probabilities of its numbers
     change. Exact.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.tilted(D.Poisson(3.0), jnp.array(2.0), jnp.array(0.5))
+        >>> int(d.sample(seed=0)) > 1
+        True
     """
 
     def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:

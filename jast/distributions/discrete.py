@@ -41,7 +41,15 @@ class _Choice(Distribution):
 
 
 class Bernoulli(_Choice):
-    """1 with probability ``probs`` = sigmoid(``logits``), else 0, as ``dtype``."""
+    """1 with probability ``probs`` = sigmoid(``logits``), else 0, as ``dtype``.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Bernoulli(probs=0.25)
+        >>> float(jnp.exp(d.log_prob(1)))
+        0.25
+    """
 
     def __init__(
         self,
@@ -92,6 +100,13 @@ class Bernoulli(_Choice):
 class Categorical(_Choice):
     """i = 0 .. k - 1 with probabilities proportional to ``probs`` [..., k] = exp(``logits``), as
     ``dtype``.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Categorical(probs=jnp.array([1.0, 3.0]))
+        >>> int(d.mode())
+        1
     """
 
     def __init__(

@@ -23,7 +23,14 @@ __all__ = ["Deterministic", "Fixed", "Seeds", "Tent", "Where", "seeds", "tent", 
 
 
 class Fixed(Distribution):
-    """The certain, empty disturbance ``()``: a system with one start."""
+    """The certain, empty disturbance ``()``: a system with one start.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Fixed()
+        >>> d.sample(seed=0)
+        ()
+    """
 
     event_shape: Any = ()
 
@@ -47,6 +54,13 @@ class Fixed(Distribution):
 class Deterministic(Distribution):
     """All mass on ``value``, a pytree of arrays: a recorded disturbance. ``log_prob`` is 0: it is a
     point, not a density.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.Deterministic(jnp.array(2.0))
+        >>> float(d.sample(seed=0))
+        2.0
     """
 
     def __init__(self, value: Any) -> None:
@@ -76,6 +90,12 @@ class Deterministic(Distribution):
 class Seeds(Distribution):
     """Random seeds of ``shape``, uint32, for a system whose disturbance density is unknown:
     ``log_prob`` is 0 and there is no mode.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Seeds((2,))
+        >>> d.sample(seed=0).shape
+        (2,)
     """
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
@@ -100,6 +120,12 @@ class Tent(Distribution):
 
     With ``width=1`` on [0, 1] its mode-normalised log density is ``ln(1 - |x - center|)``, the step
     reward of the MCFS-AP paper (eq. 1 as a sum of logs).
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Tent(0.25)
+        >>> float(d.mode())
+        0.25
     """
 
     event_shape: Any = ()
@@ -163,6 +189,12 @@ class Tent(Distribution):
 class Where(Distribution):
     """``a`` where the scalar ``pred`` holds, else ``b``: two classes of distribution over the same
     kind of value.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Where(True, D.Normal(1.0, 1.0), D.Normal(0.0, 1.0))
+        >>> float(d.mode())
+        1.0
     """
 
     def __init__(self, pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> None:
@@ -212,21 +244,55 @@ def tent(
     low: chex.Numeric = 0.0,
     high: chex.Numeric = 1.0,
 ) -> Tent:
-    """A `Tent`: likeliest at ``center`` (any shape, elementwise), falling linearly to zero
-    ``width`` away, cut to ``[low, high]``.
+    """Likeliest at a centre, falling linearly to zero on both sides, and cut to an interval.
+
+    Args:
+        center: of any shape, elementwise.
+        width: from the centre to where the density is zero.
+        low, high: ends of the interval.
+
+    Returns:
+        `Tent`.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> float(D.log_density(D.tent(0.5), 1.0, "mode"))  # ln(1 - 0.5)
+        -0.6931...
     """
     return Tent(center, width, low, high)
 
 
 def seeds(shape: Sequence[int] = ()) -> Seeds:
-    """`Seeds` of ``shape``, uint32: the density of the disturbance is unknown (log p = 0), only its
+    """Random seeds, uint32, for a system whose disturbance density is unknown (log p = 0): only the
     seed is chosen.
+
+    Args:
+        shape: of the seeds.
+
+    Returns:
+        `Seeds`.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.seeds((2,)).sample(seed=0).dtype.name
+        'uint32'
     """
     return Seeds(shape)
 
 
 def where(pred: chex.Array | bool, a: DistributionLike, b: DistributionLike) -> Where:
-    """`Where`: distribution ``a`` where the scalar ``pred`` holds, else ``b``; both over values of
-    one shape and dtype.
+    """One of two distributions over values of one shape and dtype.
+
+    Args:
+        pred: scalar: whether it is ``a``.
+        a, b: the two.
+
+    Returns:
+        `Where`.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> float(D.mode(D.where(False, D.Normal(1.0, 1.0), D.Normal(0.0, 1.0))))
+        0.0
     """
     return Where(pred, a, b)

@@ -71,7 +71,14 @@ class Symmetric(LocationScale):
 
 
 class Normal(Symmetric):
-    """Of mean ``loc`` and standard deviation ``scale``."""
+    """Of mean ``loc`` and standard deviation ``scale``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.Normal(1.0, 2.0)
+        >>> float(d.mode())
+        1.0
+    """
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return self._placed(jax.random.normal(key, **self._like_n(n)))
@@ -137,6 +144,13 @@ class MultivariateNormalDiag(_Vector):
 
     Raises:
         ValueError: where neither is given, one is a scalar, or their last axes differ.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.MultivariateNormalDiag(jnp.zeros(2), jnp.array([1.0, 3.0]))
+        >>> d.event_shape
+        (2,)
     """
 
     def __init__(self, loc: Any = None, scale_diag: Any = None) -> None:
@@ -181,6 +195,13 @@ class MultivariateNormalTri(_Vector):
 
     Raises:
         ValueError: where neither is given, or their shapes do not fit.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.MultivariateNormalTri(scale_tri=jnp.array([[1.0, 0.0], [1.0, 1.0]]))
+        >>> d.covariance().tolist()
+        [[1.0, 1.0], [1.0, 2.0]]
     """
 
     def __init__(self, loc: Any = None, scale_tri: Any = None, is_lower: bool = True) -> None:

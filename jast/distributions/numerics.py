@@ -16,12 +16,32 @@ __all__ = ["float_dtype", "fraction", "log_tails", "normal_of_log_tails", "norma
 
 
 def float_dtype(dtype: Any) -> Any:
-    """``dtype`` where it is floating, else the default float."""
+    """The dtype itself where it is floating, else the default float.
+
+    Args:
+        dtype: any.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> D.float_dtype(jnp.dtype("int32")).name
+        'float32'
+    """
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.zeros(()).dtype
 
 
 def phi(z: jax.Array) -> jax.Array:
-    """The normal distribution function, kept below 1."""
+    """The normal distribution function, kept below 1.
+
+    Args:
+        z: normal numbers.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.phi(jnp.array(0.0)))
+        0.5
+    """
     return jnp.minimum(ndtr(z), 1 - jnp.finfo(z.dtype).epsneg)
 
 
@@ -38,8 +58,17 @@ def inside(u: jax.Array) -> jax.Array:
 
 
 def fraction(x: chex.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1]; 0.5 where there is
-    no way.
+    """The part of the way from ``low`` to ``high`` at which ``x`` is, in [0, 1].
+
+    Args:
+        x: where.
+        low, high: the ends; 0.5 where they are the same.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.fraction(jnp.array(3.0), jnp.array(2.0), jnp.array(6.0)))
+        0.25
     """
     none = high == low
     return jnp.where(none, 0.5, jnp.clip((x - low) / jnp.where(none, 1, high - low), 0, 1))

@@ -72,7 +72,14 @@ def solved(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, An
 
 
 class StudentT(LocationScale):
-    """Student's t of ``df`` degrees of freedom, moved by ``loc`` and stretched by ``scale``."""
+    """Student's t of ``df`` degrees of freedom, moved by ``loc`` and stretched by ``scale``.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> d = D.StudentT(3.0)
+        >>> float(d.mode())
+        0.0
+    """
 
     def __init__(
         self, df: chex.Numeric, loc: chex.Numeric = 0.0, scale: chex.Numeric = 1.0
@@ -156,6 +163,15 @@ class MixtureSameFamily(Distribution):
     Args:
         mixture_distribution: a Categorical of k, over the batch.
         components_distribution: a batch of distributions of numbers [..., k].
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.MixtureSameFamily(
+        ...     D.Categorical(probs=jnp.array([0.5, 0.5])), D.Normal(jnp.array([-2.0, 2.0]), 0.1)
+        ... )
+        >>> abs(float(d.sample(seed=0))) > 1.0
+        True
     """
 
     event_shape: Any = ()

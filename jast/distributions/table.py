@@ -44,22 +44,30 @@ _NOTHING = Row()
 def register(family: Any, **functions: Any) -> Any:
     """Tell jast what a family of distributions knows of itself.
 
+    What was registered before under the names given is replaced, the rest is kept.
+
     Args:
-        family: a class; or "package:Class", of a class that need not be imported yet (of any module
-            of that package).
-        **functions: by the names of `Row`: each a function whose first argument is the
-            distribution, vectorised like its ``log_prob``. With ``quantile`` and ``cdf`` a search
-            can place its samples and a proposal can move them; with ``from_normal`` and
-            ``to_normal`` both are exact where Phi(z) rounds to 0 or 1, too.
+        family: a class; or "package:Class", for a class that need not be imported yet (of any
+            module of that package).
+        functions: by the names of `Row`: each a function whose first argument is the distribution,
+            vectorised like its ``log_prob``. With ``quantile`` and ``cdf`` a search can place its
+            samples and a proposal can move them. With ``from_normal`` and ``to_normal`` both are
+            also exact where Phi(z) rounds to 0 or 1.
 
     Returns:
-        ``family``. What stood there of the names given is replaced, the rest is kept.
+        ``family``.
 
     Raises:
-        ValueError: of a name that no row has, of a value that is not a function.
+        ValueError: for a name that no row has, and a value that is not a function.
 
     Example:
-        ``register(Rayleigh, from_normal=lambda d, z: d.scale * jnp.sqrt(-2 * log_tails(z)[1]))``
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> class Shifted(D.Normal):
+        ...     pass
+        >>> Shifted = D.register(Shifted, from_normal=lambda d, z: d.loc + d.scale * z)
+        >>> float(D.from_normal(Shifted(1.0, 2.0), jnp.array(0.5)))
+        2.0
     """
     for name, function in functions.items():
         if name not in Row._fields:

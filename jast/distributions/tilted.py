@@ -26,6 +26,13 @@ __all__ = ["Tilted", "tilted", "untiltable"]
 class Tilted(Distribution):
     """What `tilted` makes of a distribution of floats that has a quantile function and its inverse,
     taken number by number.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> d = D.tilted(D.Uniform(0.0, 1.0), jnp.array(1.0), jnp.array(0.5))
+        >>> 0.0 < float(d.sample(seed=0)) < 1.0
+        True
     """
 
     def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
@@ -59,14 +66,24 @@ class Tilted(Distribution):
 def tilted(
     dist: DistributionLike, mean: chex.ArrayTree, deviation: chex.ArrayTree
 ) -> DistributionLike:
-    """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of
-    ``dist``; ``mean`` and ``deviation`` are like a value, floats.
+    """The distribution of x = Q(Phi(z)), z ~ N(mean, deviation^2), Q the quantile function of a
+    distribution.
 
-    It has samples and log densities. Normal distributions are shifted and scaled, of whole numbers
+    It has samples and log densities. Normal distributions are shifted and scaled; of whole numbers
     only the probabilities change: these are exact. Others are as exact as `from_normal`.
 
+    Args:
+        dist: a distribution.
+        mean, deviation: like a value, floats.
+
     Raises:
-        ValueError: naming a distribution that cannot.
+        ValueError: naming a distribution that cannot be tilted.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.mode(D.tilted(D.Normal(0.0, 1.0), jnp.array(2.0), jnp.array(0.5))))
+        2.0
     """
     known = row(dist, "tilt", "quantile").tilt
     if known is not None:
@@ -83,7 +100,16 @@ def tilted(
 
 
 def untiltable(dist: DistributionLike) -> str | None:
-    """Why `tilted` cannot serve ``dist``; None where it can."""
+    """Why `tilted` cannot serve a distribution; None where it can.
+
+    Args:
+        dist: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.untiltable(D.Normal(0.0, 1.0)) is None, D.untiltable(D.seeds()) is None
+        (True, False)
+    """
     full = lambda v: jax.tree.map(
         lambda s: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist)
     )

@@ -39,15 +39,34 @@ __all__ = [
 
 
 def sample(d: DistributionLike, key: chex.PRNGKey) -> chex.ArrayTree:
-    """One draw from ``d``."""
+    """One draw from a distribution.
+
+    Args:
+        d: a distribution.
+        key: consumed.
+
+    Example:
+        >>> import jax
+        >>> from jast import distributions as D
+        >>> D.sample(D.Normal(0.0, 1.0), jax.random.key(0)).shape
+        ()
+    """
     return d.sample(seed=key)
 
 
 def mode(d: DistributionLike) -> chex.ArrayTree:
-    """The likeliest value of ``d``; its median where no mode is known.
+    """The likeliest value of a distribution; its median where no mode is known.
+
+    Args:
+        d: a distribution.
 
     Raises:
         ValueError: if there is neither.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> float(D.mode(D.tent(0.25)))
+        0.25
     """
     known = row(d, "mode").mode
     try:
@@ -66,14 +85,32 @@ def mode(d: DistributionLike) -> chex.ArrayTree:
 
 
 def log_mode(d: DistributionLike) -> jax.Array:
-    """The log density of ``d`` at its mode: scalar."""
+    """The log density of a distribution at its mode: scalar.
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> float(D.log_mode(D.Uniform(0.0, 1.0)))
+        0.0
+    """
     known = row(d, "log_mode").log_mode
     return known(d) if known is not None else d.log_prob(mode(d))
 
 
 def log_density(d: DistributionLike, x: chex.ArrayTree, density: Density = "raw") -> jax.Array:
-    """Log density of ``x``: ``"raw"``, or ``"mode"``: less that of the mode, so that the likeliest
-    value has 0.
+    """Log density of a value.
+
+    Args:
+        d: a distribution.
+        x: a value of it.
+        density: "raw", or "mode": less that of the mode, so that the likeliest value has 0.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> float(D.log_density(D.Normal(0.0, 1.0), 2.0, "mode"))
+        -2.0
     """
     if density == "raw":
         return d.log_prob(x)
@@ -82,14 +119,23 @@ def log_density(d: DistributionLike, x: chex.ArrayTree, density: Density = "raw"
 
 
 def quantile(d: DistributionLike, u: chex.ArrayTree) -> chex.ArrayTree:
-    """The value of ``d`` at the quantile ``u`` in [0, 1] (a pytree like a value of ``d``, floats),
-    so that ``u ~ U(0, 1)`` gives a draw of ``d``.
+    """The value of a distribution at a quantile, so that ``u ~ U(0, 1)`` gives a draw of it.
 
     Vectors are taken coordinate by coordinate; integers by the inverse of their distribution
     function.
 
+    Args:
+        d: a distribution.
+        u: in [0, 1]: a pytree like a value, of floats.
+
     Raises:
-        ValueError: naming a distribution that cannot.
+        ValueError: naming a distribution that has no quantile function.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.quantile(D.Uniform(2.0, 6.0), jnp.array(0.25)))
+        3.0
     """
     known = row(d, "quantile").quantile
     if known is None:
@@ -98,14 +144,23 @@ def quantile(d: DistributionLike, u: chex.ArrayTree) -> chex.ArrayTree:
 
 
 def cdf(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
-    """The inverse of `quantile`: the ``u`` in [0, 1] (a pytree like ``x``, floats) with
-    ``quantile(d, u) == x`` up to rounding, for a value ``x`` of ``d``.
+    """The inverse of `quantile`: the ``u`` in [0, 1] with ``quantile(d, u) == x`` up to rounding.
 
-    An integer has the middle of the interval of ``u`` that gives it. Outside of the support: 0 or
-    1.
+    Args:
+        d: a distribution.
+        x: a value of it. An integer has the middle of the interval of ``u`` that gives it.
+
+    Returns:
+        A pytree like ``x`` of floats; 0 or 1 outside the support.
 
     Raises:
-        ValueError: naming a distribution that cannot.
+        ValueError: naming a distribution that has none.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.cdf(D.Normal(0.0, 1.0), jnp.array(0.0)))
+        0.5
     """
     if row(d, "quantile").quantile is None:
         raise ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
@@ -119,59 +174,133 @@ def cdf(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
 
 
 def from_normal(d: DistributionLike, z: chex.ArrayTree) -> chex.ArrayTree:
-    """The value of ``d`` at the normal number ``z`` (a pytree like a value, floats): ``quantile(d,
-    Phi(z))``, so that ``z ~ N(0, I)`` gives a draw of ``d``.
+    """The value of a distribution at a normal number: ``quantile(d, Phi(z))``, so that ``z ~ N(0,
+    I)`` gives a draw of ``d``.
 
     Exact in both tails where `has_exact_tails`; else by way of Phi(z), a float below 1.
 
+    Args:
+        d: a distribution.
+        z: a pytree like a value, of floats.
+
     Raises:
         ValueError: naming a distribution that has no quantile function.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.from_normal(D.Normal(1.0, 2.0), jnp.array(3.0)))
+        7.0
     """
     known = row(d, "from_normal", "quantile").from_normal
     return known(d, z) if known is not None else quantile(d, jax.tree.map(phi, z))
 
 
 def to_normal(d: DistributionLike, x: chex.ArrayTree) -> chex.ArrayTree:
-    """The inverse of `from_normal`: z with ``from_normal(d, z) == x``, for a whole number the
+    """The inverse of `from_normal`: z with ``from_normal(d, z) == x``; for a whole number the
     middle (in probability) of those.
+
+    Args:
+        d: a distribution.
+        x: a value of it.
 
     Raises:
         ValueError: naming a distribution for which none is known.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.to_normal(D.Normal(1.0, 2.0), jnp.array(7.0)))
+        3.0
     """
     known = row(d, "to_normal", "quantile", "cdf").to_normal
     return known(d, x) if known is not None else jax.tree.map(normal_score, cdf(d, x))
 
 
 def has_mode(d: DistributionLike) -> bool:
-    """Whether `mode` is defined for ``d`` (host-side)."""
+    """Whether `mode` is defined for a distribution (host-side).
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.has_mode(D.tent(0.5)), D.has_mode(D.seeds())
+        (True, False)
+    """
     return _defined(lambda: mode(d))
 
 
 def has_quantile(d: DistributionLike) -> bool:
-    """Whether `quantile` is defined for ``d`` (host-side)."""
+    """Whether `quantile` is defined for a distribution (host-side).
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.has_quantile(D.Poisson(3.0)), D.has_quantile(D.seeds())
+        (True, False)
+    """
     return _defined(lambda: quantile(d, _half(d)))
 
 
 def has_cdf(d: DistributionLike) -> bool:
-    """Whether `cdf` is defined for ``d`` (host-side)."""
+    """Whether `cdf` is defined for a distribution (host-side).
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.has_cdf(D.Normal(0.0, 1.0)), D.has_cdf(D.seeds())
+        (True, False)
+    """
     return _defined(lambda: cdf(d, sample(d, jax.random.key(0))))
 
 
 def has_exact_tails(d: DistributionLike) -> bool:
-    """Whether `from_normal` of ``d`` is exact however far out (host-side); where it is not, in
-    float32 all z > 5.4 are one value.
+    """Whether `from_normal` is exact however far out (host-side). Where it is not, in float32 all z
+    > 5.4 are one value.
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.has_exact_tails(D.Normal(0.0, 1.0)), D.has_exact_tails(D.tent(0.5))
+        (True, False)
     """
     known = row(d, "from_normal", "quantile")
     return known.from_normal is not None and (known.exact is None or known.exact(d))
 
 
 def event_like(d: DistributionLike) -> chex.ArrayTree:
-    """Shapes and dtypes of one value of ``d``."""
+    """Shapes and dtypes of one value of a distribution.
+
+    Args:
+        d: a distribution.
+
+    Example:
+        >>> from jast import distributions as D
+        >>> D.event_like(D.Normal(0.0, 1.0)).shape
+        ()
+    """
     return jax.eval_shape(lambda: sample(d, jax.random.key(0)))
 
 
 def sum_parts(parts: chex.ArrayTree) -> jax.Array:
-    """The sum of a pytree of scalars, in the widest of their dtypes."""
+    """The sum of a pytree of scalars, in the widest of their dtypes.
+
+    Args:
+        parts: a pytree of scalars.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import distributions as D
+        >>> float(D.sum_parts({"a": jnp.array(1.0), "b": jnp.array(2.0)}))
+        3.0
+    """
     leaves = jax.tree.leaves(parts)
     dtype = jnp.result_type(*leaves)
     return sum(

@@ -143,7 +143,7 @@ def failure_probability(
 
     Example:
         >>> import jax, jast
-        >>> sim = jast.simulators.landing(b=0.8)  # 8e-10 is the truth
+        >>> sim = jast.simulators.landing(b=0.8)  # truly 6e-9
         >>> found = jast.estimate.failure_probability(jax.random.key(0), sim, 6000)
         >>> truth = float(jast.simulators.landing_probability(b=0.8))
         >>> 0.8 < found.mean / truth < 1.25

@@ -26,12 +26,23 @@ __all__ = ["autoregression"]
 def autoregression(
     rate: chex.Numeric = 0.1, threshold: chex.Numeric = 5.0, horizon: int = 100
 ) -> Simulator:
-    """The process from 0, a `Simulator` with a scalar state of variance below 1 and a standard
-    normal x (scalar).
+    """An autoregressive process from 0: a `Simulator` with a scalar state of variance below 1 and a
+    standard normal x (scalar). It fails where the state reaches a threshold; miss distance:
+    max(threshold - s, 0).
 
-    ``rate``: of forgetting, a step keeps a = exp(-rate) of the state; ``threshold``: in stationary
-    standard deviations; both traced. ``horizon`` (steps) is static. Miss distance: max(threshold -
-    s, 0). ValueError for a parameter that is not positive or a horizon below 1.
+    Args:
+        rate: of forgetting: a step keeps exp(-rate) of the state; traced.
+        threshold: in stationary standard deviations; traced.
+        horizon: steps; static.
+
+    Raises:
+        ValueError: for a parameter that is not positive, or a horizon below 1.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.autoregression(threshold=3.0, horizon=50)
+        >>> bool(jast.rollout(jax.random.key(0), sim).distance >= 0)
+        True
     """
     rate, threshold = positive("autoregression", rate=rate, threshold=threshold)
     return Simulator(

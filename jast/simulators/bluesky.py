@@ -82,24 +82,38 @@ class Flight(NamedTuple):
 def bluesky(
     waypoints: int = 4, tolerance: float = 1.0, *, workers: int = 1, time_limit: float | None = None
 ) -> Simulator:
-    """Routes of ``waypoints`` random waypoints flown by BlueSky, an episodic `Simulator` of as many
-    steps through `jast.blackbox.from_python`.
+    """Routes of random waypoints flown by BlueSky: an episodic `Simulator` of as many steps,
+    through `jast.blackbox.from_python`.
 
-    x [4], four normals (`MEANS`, `SIGMAS`) that place the next waypoint: true course (degrees) and
-    distance (nmi, at least 0.1) from the last one, wind there: direction (degrees, blown towards)
-    and speed (kt); BlueSky interpolates the wind. Miss distance: ln(``tolerance`` / e), e the
-    greatest ``nearest - allowed`` (nmi; see `Flight`) of a waypoint, as in the thesis's eq. 3.4; a
-    failure where it is not positive. e counts as at least ``tolerance`` / 1000, and as
-    ``tolerance`` at least where the flight did not end in time, which thus is a failure. Works in
-    float32 and float64.
+    x [4] are four normals (`MEANS`, `SIGMAS`) that place the next waypoint: true course (degrees)
+    and distance (nmi, at least 0.1) from the last one, and the wind there: direction (degrees,
+    blown towards) and speed (kt). BlueSky interpolates the wind. Miss distance: ln(``tolerance`` /
+    e), e the greatest ``nearest - allowed`` (nmi; see `Flight`) of a waypoint, as in eq. 3.4 of
+    Moss's thesis; a failure where it is not positive. e counts as at least ``tolerance`` / 1000,
+    and as ``tolerance`` at least where the flight did not end in time, which thus is a failure.
+    Works in float32 and float64, and gives the same to the bit for the same disturbances.
 
-    ``workers``, ``time_limit``: as of `from_python`. BlueSky is one a process: with ``workers=0``
-    it is this process's, and is reset for every episode. The first start (10 s) makes ``~/bluesky``
-    with a cache, and the settings there are used; later ones take 2 s, a flight about 0.3 s. No
-    network.
+    There is one BlueSky in each process. With ``workers=0`` it is this process's, and is reset for
+    every episode. The first start (10 s) makes ``~/bluesky`` with a cache, and the settings there
+    are used; later ones take 2 s, a flight about 0.3 s. No network.
 
-    Raises ImportError where BlueSky is not installed, ValueError for settings out of range. Gives
-    the same to the bit for the same disturbances.
+    Args:
+        waypoints: of a route.
+        tolerance: see above (nmi).
+        workers, time_limit: as for `jast.blackbox.from_python`.
+
+    Raises:
+        ImportError: where BlueSky is not installed.
+        ValueError: for settings out of range.
+
+    Example:
+        >>> import jast
+        >>> try:
+        ...     horizon = jast.simulators.bluesky(waypoints=3).horizon
+        ... except ImportError:  # the extra `bluesky`
+        ...     horizon = 3
+        >>> horizon
+        3
     """
     waypoints = whole("bluesky", "waypoints", waypoints)
     tolerance = float(
@@ -118,8 +132,25 @@ def bluesky(
 
 
 def bluesky_flight(disturbances: chex.Array) -> Flight:
-    """The `Flight` of the disturbances [T, 4] of an episode of `bluesky`, flown by the BlueSky of
-    this process. ImportError, ValueError for another shape.
+    """The flight of one episode of `bluesky`, flown by the BlueSky of this process.
+
+    Args:
+        disturbances: [T, 4], of the episode.
+
+    Returns:
+        `Flight`.
+
+    Raises:
+        ImportError: where BlueSky is not installed.
+        ValueError: for another shape.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> try:
+        ...     jast.simulators.bluesky_flight(np.zeros(3))
+        ... except (ImportError, ValueError):  # no BlueSky here, or not [T, 4]
+        ...     print("refused")
+        refused
     """
     x = np.asarray(disturbances, np.float64)
     if x.ndim != 2 or x.shape[1] != 4 or not len(x) or not np.isfinite(x).all():

@@ -35,6 +35,12 @@ def draw(state: chex.ArrayTree) -> str:
 
     Raises:
         ValueError: for a state of another system.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> sim = jast.simulators.pendulum()
+        >>> jast.simulators.draw(sim.init(jnp.zeros(2)))[:4]
+        '<svg'
     """
     for kind, picture in DRAWN.items():
         if isinstance(state, kind):

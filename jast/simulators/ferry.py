@@ -43,17 +43,28 @@ class FerryState(NamedTuple):
 def ferry(
     adversary: tuple[float, float] = (16.0, 0.0), observation: Literal["code", "text"] = "code"
 ) -> Simulator:
-    """The S0 ferry, a `Simulator` of horizon 21; ``adversary``: where the steered vessel starts
-    ((17, 0) is the easier S0b). ``observation``: what networks see. "code": the five numbers of the
-    published code, the ferry's x and the adversary's x and y over 100, and half of the sine and
-    cosine of its heading plus a half; "text": x and y over 100 and heading (radians) of both
-    vessels, the six numbers that the published text names.
+    """The S0 ferry: a `Simulator` of horizon 21.
 
     A step turns the adversary by (10 a - 5) pi / 100 radians, a in [0, 1] its seed (0.5: straight
     on), then moves both vessels by 5. The first seed is uniform, each next one tent-shaped around
     the last: mode-normalised log p is ln(1 - |a_t - a_{t-1}|). Failure: centres closer than 5 at a
-    step's end. Ends after 21 steps, when the ferry has left the plane (x > 100). ValueError unless
-    ``adversary`` is two numbers, and for another observation.
+    step's end. Ends after 21 steps, when the ferry has left the plane (x > 100).
+
+    Args:
+        adversary: where the steered vessel starts; (17, 0) is the easier S0b.
+        observation: what networks see. "code": the five numbers of the published code: the ferry's
+            x and the adversary's x and y over 100, and half of the sine and cosine of its heading
+            plus a half. "text": x and y over 100 and heading (radians) of both vessels, the six
+            numbers that the published text names.
+
+    Raises:
+        ValueError: unless ``adversary`` is two numbers, and for another observation.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.ferry()
+        >>> bool(jast.replay(sim, jnp.full(21, 0.5)).failure)  # straight on
+        False
     """
     if observation not in OBSERVATIONS:
         raise ValueError(

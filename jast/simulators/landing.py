@@ -39,12 +39,22 @@ class LandingState(NamedTuple):
 def landing(
     b: chex.Numeric = 1.0, sigma_i: chex.Numeric = 0.1, sigma_t: chex.Numeric = 0.03
 ) -> Simulator:
-    """The landing, a `Simulator` of ten steps, episodic, with the initial offset as x0 (scalar) and
-    the drift of a step as x (scalar).
+    """A landing: an episodic `Simulator` of ten steps, with the initial offset as x0 (scalar) and
+    the drift of a step as x (scalar). Miss distance: max(b - abs(offset), 0) at the end.
 
-    ``b``: half width of the runway, ``sigma_i`` and ``sigma_t``: standard deviations of the initial
-    offset and of a step's drift; all traced. Miss distance: max(b - abs(x2), 0) at the end.
-    ValueError for a parameter that is not positive.
+    Args:
+        b: half width of the runway; traced, like the others.
+        sigma_i: standard deviation of the initial offset.
+        sigma_t: standard deviation of a step's drift.
+
+    Raises:
+        ValueError: for a parameter that is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.landing()
+        >>> bool(jast.replay(sim, jnp.full(10, 0.1), x0=0.1).failure)
+        True
     """
     b, sigma_i, sigma_t = positive("landing", b=b, sigma_i=sigma_i, sigma_t=sigma_t)
     return Simulator(
@@ -63,6 +73,14 @@ def landing_probability(
 ) -> chex.Array:
     """The failure probability of `landing` in closed form: 2 Phi(-b / sqrt(sigma_i^2 + 10
     sigma_t^2)).
+
+    Args:
+        b, sigma_i, sigma_t: as for `landing`.
+
+    Example:
+        >>> import jast
+        >>> 5e-9 < float(jast.simulators.landing_probability(0.8)) < 7e-9
+        True
     """
     b, sigma_i, sigma_t = (jnp.asarray(v) for v in (b, sigma_i, sigma_t))
     return 2 * ndtr(-b / jnp.sqrt(sigma_i**2 + STEPS * sigma_t**2))

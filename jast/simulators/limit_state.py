@@ -25,13 +25,25 @@ __all__ = ["limit_state"]
 
 
 def limit_state(g: Callable[[Any], chex.Array], dimension: int) -> Simulator:
-    """One step, x ~ N(0, I_dimension) [dimension]; failure where g(x) <= 0, miss distance max(g(x),
-    0): a `Simulator`, episodic.
+    """A limit state function as an episodic `Simulator` of one step, x ~ N(0, I) [dimension]: a
+    failure where g(x) <= 0, miss distance max(g(x), 0).
 
-    ``g``: [dimension] -> float scalar; a plain function is static by identity, what a
-    `jax.tree_util.Partial` binds is traced. Observed are the first 64 coordinates. Raises
-    ValueError for a dimension below 1 and a ``g`` that is no function or does not return a float
-    scalar.
+    ``observe`` shows the first 64 coordinates.
+
+    Args:
+        g: [dimension] -> float scalar. A plain function is static by identity; what a
+            `jax.tree_util.Partial` binds is traced.
+        dimension: of x.
+
+    Raises:
+        ValueError: for a dimension below 1, and a ``g`` that is no function or does not return a
+            float scalar.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.limit_state(lambda x: 3.0 - x[0] - x[1], 2)
+        >>> bool(jast.replay(sim, jnp.array([[2.0, 2.0]])).failure)
+        True
     """
     if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
         raise ValueError(

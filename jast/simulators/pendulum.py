@@ -44,12 +44,22 @@ def pendulum(
     sigma_omega: chex.Numeric = 0.5,
     limit: chex.Numeric = jnp.pi / 4,
 ) -> Simulator:
-    """The pendulum, a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the error of the
-    observation as x [2].
+    """A controlled pendulum: a `Simulator` of 40 steps, with (theta0, omega0) as x0 [2] and the
+    error of the observation as x [2]. Miss distance: max(limit - abs(theta), 0).
 
-    ``noise``: standard deviation of both errors, ``sigma_theta`` and ``sigma_omega``: of the start,
-    ``limit``: the angle (radians) of a failure; all traced. Miss distance: max(limit - abs(theta),
-    0). ValueError for a parameter that is not positive.
+    Args:
+        noise: standard deviation of both errors; traced, like the others.
+        sigma_theta, sigma_omega: standard deviations of the start.
+        limit: the angle (radians) of a failure.
+
+    Raises:
+        ValueError: for a parameter that is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.pendulum()
+        >>> bool(jast.replay(sim, jnp.zeros((40, 2)), x0=jnp.zeros(2)).failure)
+        False
     """
     noise, sigma_theta, sigma_omega, limit = positive(
         "pendulum", noise=noise, sigma_theta=sigma_theta, sigma_omega=sigma_omega, limit=limit

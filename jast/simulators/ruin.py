@@ -27,12 +27,23 @@ __all__ = ["ruin", "ruin_probability"]
 
 
 def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 371) -> Simulator:
-    """The gambler, a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0
-    (lost), int32.
+    """A gambler: a `Simulator` with his fortune as the state (int32 scalar) and x = 1 (won) or 0
+    (lost), int32. Reaching the goal is the failure; miss distance: max(goal - fortune, 0).
 
-    ``up`` (0 < up < 1) is traced, and so are the whole numbers ``start`` and ``goal`` (0 < start <
-    goal); ``horizon`` (steps) is static. Miss distance: max(goal - fortune, 0). ValueError for
-    parameters outside of these ranges.
+    Args:
+        up: probability of winning, between 0 and 1; traced.
+        start: his fortune at first, above 0; traced.
+        goal: above ``start``; traced.
+        horizon: steps; static.
+
+    Raises:
+        ValueError: for parameters outside these ranges.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.ruin(goal=5)
+        >>> bool(jast.replay(sim, jnp.ones(4, jnp.int32)).failure)
+        True
     """
     up = _probability("ruin", up)
     start, goal = (
@@ -56,7 +67,16 @@ def ruin_probability(
     up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int | None = None
 ) -> chex.Array:
     """The failure probability of `ruin`, scalar: in closed form without a horizon, else exactly,
-    step by step. ``start``, ``goal``, ``horizon``: ints.
+    step by step.
+
+    Args:
+        up, start, goal: as for `ruin`.
+        horizon: steps, or None for a game without end.
+
+    Example:
+        >>> import jast
+        >>> round(float(jast.simulators.ruin_probability(0.5, 1, 4)), 6)
+        0.25
     """
     up = _probability("ruin_probability", up)
     if horizon is None:

@@ -31,12 +31,23 @@ def walk1d(
     threshold: chex.Numeric = 10.0,
     horizon: int | None = None,
 ) -> Simulator:
-    """s += x, x ~ N(0, sigma^2), from s = 0: a `Simulator` with a scalar state.
+    """A random walk from 0, s += x with x ~ N(0, sigma^2): a `Simulator` with a scalar state.
 
-    ``form="two-sided"`` fails where abs(s) >= threshold within 30 steps, miss distance
-    max(threshold - abs(s), 0); ``"one-sided"`` where s >= threshold within 10 steps, max(threshold
-    - s, 0). ``sigma`` (of a step) and ``threshold`` are traced, ``horizon`` (steps, default by the
-    form) is static. ValueError for another form, or a parameter that is not positive.
+    Args:
+        form: "two-sided" fails where abs(s) >= threshold within 30 steps, miss distance
+            max(threshold - abs(s), 0); "one-sided" where s >= threshold within 10 steps,
+            max(threshold - s, 0).
+        sigma: of a step; traced.
+        threshold: see ``form``; traced.
+        horizon: steps; static. Default: by the form.
+
+    Raises:
+        ValueError: for another form, or a parameter that is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> bool(jast.replay(jast.simulators.walk1d(), jnp.ones(30)).failure)
+        True
     """
     if form not in HORIZON:
         raise ValueError(f'walk1d: form must be "two-sided" or "one-sided", received {form!r}')

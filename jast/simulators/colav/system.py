@@ -94,36 +94,51 @@ def colav(
     """A ferry with collision avoidance meets an adversary: a `Simulator` of 25 to 27 steps of 3 s,
     with states of 90 numbers.
 
-    ``scenario``: "head-on", "crossing", "overtaking", "sharp turn", or a `Scenario` of your own
-    (``from jast.simulators.colav import Scenario``). ``disturbances``, one or several of:
+    The disturbances are one or several of these kinds. With one kind x is its array (scalar,
+    scalar, [4]), with several a dict of them by name.
 
     - "delay": the ferry's sensors show the adversary as it was a x ``longest_delay`` seconds ago
-      (at most 40, and nothing before the start), a in [0, 1] drawn each step: tent-shaped around
-      ``delay_easing`` times the last a, of half width ``delay_change``. Undisturbed: 0.
+      (nothing before the start), a in [0, 1] drawn each step: tent-shaped around ``delay_easing``
+      times the last a, of half width ``delay_change``. Undisturbed: 0.
     - "steering": the adversary turns at a - 0.5 rad/s on top of its route; a in [0, 1], tent-shaped
       around the last, of half width ``steering_change``. Undisturbed: 0.5.
     - "noise": errors of the sensed position (two, in m) and velocity (two, in m/s), normal of
       standard deviations ``noise``, one draw a step. Undisturbed: 0.
 
-    With one kind x is its array (scalar, scalar, [4]), with several a dict of them by name. The
-    published step rewards of delay and steering are ln(1 - |a - a'|) up to a factor, with -0.5 a
-    for a delay (for which the easing stands here); the published steering stands in place of a
+    The published step rewards of delay and steering are ln(1 - |a - a'|) up to a factor, with -0.5
+    a for a delay (for which the easing stands here); the published steering stands in place of a
     route, the published noise is within 0.5 and costs its mean absolute value. The past is kept at
     the ends of steps and read in between (`tracker`), not as a buffer of samples.
 
-    In a step the planner looks at the track and commands a speed (`planner`); then, ``substeps``
-    times (static), the adversary moves, the tracker takes in what the sensors show, and the ferry
-    follows its path (`vessels`). Miss distance: least distance between the centres at substeps;
-    failure below 1 m. Ends when the ferry is at the dock (99 m). Distances are in metres; the dtype
-    is JAX's default float. The published code has 30 simulator steps of 0.1 s in a search step: the
-    default. The published text says 20: ``substeps=20`` are as many in the same 3 s, of 0.15 s
-    each. At 30 the ferry's path is right to 10 cm; one substep of 3 s is unstable but for small
-    motions and serves measurements of time. The planner's choice is among speeds, so the miss
-    distance has no useful gradient in delays and noise.
+    In a step the planner looks at the track and commands a speed (`planner`). Then, in each
+    substep, the adversary moves, the tracker takes in what the sensors show, and the ferry follows
+    its path (`vessels`). Miss distance: least distance (m) between the centres at substeps; failure
+    below 1 m. An episode ends when the ferry is at the dock (99 m). The dtype is JAX's default
+    float. The planner's choice is among speeds, so the miss distance has no useful gradient in
+    delays and noise.
 
-    Raises ValueError for an unknown scenario or disturbance, a scenario that is not finite or has
-    other shapes, a delay beyond the buffer, substeps below 1, scales that are not positive and
-    finite, and an easing above 1.
+    Args:
+        scenario: one of the names, or a `Scenario` of your own (``from jast.simulators.colav import
+            Scenario``).
+        disturbances: "delay", "steering", "noise", or several of them.
+        substeps: of a step; static. The published code has 30 simulator steps of 0.1 s in a search
+            step: the default. The published text says 20: ``substeps=20`` are as many in the same 3
+            s, of 0.15 s each. At 30 the ferry's path is right to 10 cm; one substep of 3 s is
+            unstable but for small motions and serves measurements of time.
+        longest_delay: seconds, at most 40.
+        delay_change, delay_easing, steering_change, noise: see above.
+
+    Raises:
+        ValueError: for an unknown scenario or disturbance, a scenario that is not finite or has
+            other shapes, a delay beyond the buffer, substeps below 1, scales that are not positive
+            and finite, and an easing above 1.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.colav("head-on", substeps=5)
+        >>> episode = jast.replay(sim, jnp.zeros(sim.horizon))  # no delay
+        >>> bool(episode.failure)
+        False
     """
     kinds = _kinds(disturbances)
     if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:

@@ -71,25 +71,39 @@ def fms(
     snap: bool = True,
     database: bool = False,
 ) -> Simulator:
-    """The predictor on routes from KSFO to KLAX, an episodic `Simulator` of ``waypoints`` steps: x
-    places the next waypoint, the path is judged at the end.
+    """A path predictor on routes from KSFO to KLAX: an episodic `Simulator`. A step places the next
+    waypoint; the path is judged at the end.
 
-    x [4], four normals (`MEANS`, `SIGMAS`): true course (degrees) and distance (nmi) from the last
-    waypoint, negative ones backwards; wind direction (degrees, blown towards) and speed (kt). With
-    ``database=True`` the next waypoint is one of 26 named beacons more than 5 nmi away, all as
-    likely as each other: x = {"fix": int, "wind": [2]}, a baseline on which nothing fails.
+    x [4] are four normals (`MEANS`, `SIGMAS`): true course (degrees) and distance (nmi) from the
+    last waypoint, negative ones backwards; wind direction (degrees, blown towards) and speed (kt).
+    Only the event "arc length" sees the defect, and with ``snap=False`` only "disconnection".
 
-    ``eps`` (nmi): on legs shorter than that the defect acts, where the turns at both ends have
-    opposite senses (``guard="s-turns"``) or always ("all"); ``fixed=True``: never, a negative
-    control on which a search must find nothing. ``bank`` (degrees) and ``tas`` (true air speed, kt)
-    set the radii of turns. ``snap=False`` leaves overlapping turns disconnected. ``earth``: "wgs84"
-    or "sphere". ``event``: which miss distance counts, a failure where it is not positive: "arc
-    length", "kink" (radians), "disconnection" (ft) or "course" (radians); `fms_misses` gives all
-    four. Only the first sees the defect, with ``snap=False`` only "disconnection". ``waypoints``,
-    ``event`` and ``database`` are static, the rest is traced.
+    Args:
+        eps: nmi. The defect acts on legs shorter than that; traced, like what is not static.
+        bank: degrees; sets the radii of turns, like ``tas``.
+        tas: true air speed (kt).
+        waypoints: steps of an episode; static.
+        guard: the defect acts where the turns at both ends of the leg have opposite senses
+            ("s-turns"), or always ("all").
+        event: which miss distance counts, a failure where it is not positive: "arc length", "kink"
+            (radians), "disconnection" (ft) or "course" (radians); static. `fms_misses` gives all
+            four.
+        fixed: the defect never acts: a negative control, on which a search must find nothing.
+        earth: "wgs84" or "sphere".
+        snap: False leaves overlapping turns disconnected.
+        database: the next waypoint is one of 26 named beacons more than 5 nmi away, all as likely
+            as each other: x = {"fix": int, "wind": [2]}, a baseline on which nothing fails; static.
 
-    Needs float64: ValueError unless made and used inside ``with jax.enable_x64(True):`` or with
-    JAX_ENABLE_X64=1; and for settings out of range.
+    Raises:
+        ValueError: unless it is made and used in float64, inside ``with jax.enable_x64(True):`` or
+            with JAX_ENABLE_X64=1; and for settings out of range.
+
+    Example:
+        >>> import jax, jast
+        >>> with jax.enable_x64(True):
+        ...     episode = jast.rollout(jax.random.key(0), jast.simulators.fms(waypoints=3))
+        >>> int(episode.length)
+        3
     """
     _double()
     waypoints = whole("fms", "waypoints", waypoints)
@@ -136,15 +150,49 @@ def fms(
 
 
 def fms_path(sim: Simulator, episode: Episode | FmsState) -> Path:
-    """The lateral path of an `Episode` (or of an `FmsState`) of ``sim``:
-    `jast.simulators.fms.Path`. ValueError for those of another system.
+    """The lateral path of an episode of `fms`.
+
+    Args:
+        sim: a simulator of `fms`.
+        episode: an `Episode`, or an `FmsState`.
+
+    Returns:
+        `jast.simulators.fms.Path`.
+
+    Raises:
+        ValueError: for a simulator or an episode of another system.
+
+    Example:
+        >>> import jax, jast
+        >>> with jax.enable_x64(True):
+        ...     sim = jast.simulators.fms(waypoints=3)
+        ...     path = jast.simulators.fms_path(sim, jast.rollout(jax.random.key(0), sim))
+        >>> type(path).__name__
+        'Path'
     """
     return _path(*_route("fms_path", sim, episode))
 
 
 def fms_misses(sim: Simulator, episode: Episode | FmsState) -> Misses:
-    """The miss distances of all four events, of an `Episode` (or of an `FmsState`) of ``sim``:
-    `jast.simulators.fms.Misses`. ValueError as for `fms_path`.
+    """The miss distances of all four events of an episode of `fms`.
+
+    Args:
+        sim: a simulator of `fms`.
+        episode: an `Episode`, or an `FmsState`.
+
+    Returns:
+        `jast.simulators.fms.Misses`.
+
+    Raises:
+        ValueError: as `fms_path`.
+
+    Example:
+        >>> import jax, jast
+        >>> with jax.enable_x64(True):
+        ...     sim = jast.simulators.fms(waypoints=3)
+        ...     misses = jast.simulators.fms_misses(sim, jast.rollout(jax.random.key(0), sim))
+        >>> len(misses)
+        4
     """
     return _misses(*_route("fms_misses", sim, episode))
 
