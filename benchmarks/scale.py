@@ -1,12 +1,13 @@
 """What the driver of units costs, what a second worker gains, and whether killed calls go on to the
-same result: ``python -m benchmarks.scale [--json] [--quick | --smoke]``.
+same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--kills N]``.
 
 ``overhead``: CPU time of a call to that with a plain loop over the same units in its place.
 ``checkpoint``: CPU time with a checkpoint to that without. Runs of the two alternate; medians.
 ``workers``: wall time with one process to that with two, of an executor of spawned processes, on
 the ferry (S0) and on a black box that waits for 5 ms. ``kills``: calls killed at random moments
 (SIGKILL) and made again: how many gave the result of the uninterrupted call to the bit, and how
-many units that had ended were not on disk.
+many units that had ended were not on disk. ``--kills N`` does only this, N times in all, and also
+with the chains, whose steps depend on one another: a forest with heads, a training, a validation.
 """
 
 import argparse
@@ -35,6 +36,7 @@ from jast.checkpoints import PARTS  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
 from jast.ledger import records  # noqa: E402
 from jast.simulators import ferry, landing  # noqa: E402
+from jast.weakness import default  # noqa: E402
 
 KEY, WAIT = jax.random.key(0), 0.005
 
@@ -55,6 +57,32 @@ def calls(episodes, trees, budget):
         "failure_probability": lambda **how: jast.estimate.failure_probability(
             KEY, landing(), budget, **how
         ),
+    }
+
+
+def guessed(inputs):
+    """A classifier that answers in 5 ms."""
+    time.sleep(WAIT)
+    return (inputs.sum(axis=1) > 0).astype(int)
+
+
+def validated(**how):
+    inputs = np.random.default_rng(0).normal(size=(400, 3))
+    labels = (inputs[:, 0] > 0).astype(int)
+    selector = default(first=40, growth=0.0)
+    return jast.weakness.validate(KEY, guessed, inputs, labels, selector=selector, **how)
+
+
+def chains():
+    """Calls by name, of which all or a part is no sum of units."""
+    return {
+        "forest with heads": lambda **how: jast.search.forest(
+            KEY, ferry(), trees=8, prunes=4, simulations=200, lanes=2, heads="rollout", **how
+        ),
+        "sac": lambda **how: jast.policies.sac(
+            KEY, landing(), episodes=800, lanes=8, hidden=(32, 32), batch=64, updates=1, **how
+        ),
+        "validate": validated,
     }
 
 
@@ -131,18 +159,28 @@ def black_box(episodes):
 
 
 def same(a, b):
-    """Whether two results are the same to the bit."""
-    a, b = (jax.tree.leaves(r._replace(settings=None)) for r in (a, b))
+    """Whether two results are the same to the bit; their settings and functions aside."""
+    a, b = (jax.tree.leaves(_numbers(r)) for r in (a, b))
     equal = lambda x, y: np.asarray(x).tobytes() == np.asarray(y).tobytes()
     return len(a) == len(b) and all(map(equal, a, b))
 
 
+def _numbers(result):
+    if isinstance(result, jast.policies.FailurePolicy):
+        return result.learned, result.history
+    heads = getattr(result, "heads", None)
+    if heads is not None:
+        result = result._replace(heads=(heads.policy.params, heads.inputs, heads.returns))
+    return result._replace(settings=None) if "settings" in result._fields else result
+
+
+ALL = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 CHILD = """
 import sys
 from benchmarks import scale
 log, name, folder, *sizes = sys.argv[1:]
 scale.logged(log)
-scale.calls(*map(int, sizes))[name](checkpoint=folder)
+(scale.calls(*map(int, sizes)) | scale.chains())[name](checkpoint=folder)
 """
 
 
@@ -163,15 +201,18 @@ def logged(path):
             module.Task = task
 
 
-def killed(name, sizes, moment, folder):
+def killed(name, sizes, moment, folder, programs):
     """Units that had ended, and parts on disk, of a call whose process was killed ``moment``
-    seconds after its first part; None where it was done before.
+    seconds after it had begun to keep any; None where it was done before. ``programs``: a folder
+    of compiled ones, as all these processes compile the same.
     """
-    ended, checkpoint = Path(folder, "ended"), Path(folder, "run.jast")
+    ended, checkpoint = folder / "ended", folder / "run.jast"
     ended.touch()
     command = [sys.executable, "-W", "ignore", "-c", CHILD, ended, name, checkpoint, *sizes]
-    process = subprocess.Popen([str(word) for word in command])
-    while not parts(checkpoint) and process.poll() is None:
+    env = os.environ | {"JAX_COMPILATION_CACHE_DIR": programs} | ALL
+    process = subprocess.Popen([str(word) for word in command], env=env)
+    begun = lambda: parts(checkpoint) or (checkpoint / "state.jast").exists()
+    while not begun() and process.poll() is None:
         time.sleep(0.002)
     try:
         process.wait(moment)
@@ -179,8 +220,8 @@ def killed(name, sizes, moment, folder):
         process.kill()
     if process.wait() == 0:
         return None
-    found = parts(checkpoint)
-    return ended.stat().st_size, sum(not name.startswith("answer") for name in found)
+    units = [name for name in parts(checkpoint) if name.startswith("unit")]
+    return ended.stat().st_size, len(units)
 
 
 def parts(checkpoint):
@@ -189,17 +230,30 @@ def parts(checkpoint):
     return [r.header["name"] for r in records(path)] if path.exists() else []
 
 
-def kills(name, sizes, runs, longest):
-    """``runs`` calls, each killed once and made again."""
-    call, rng = calls(*sizes)[name], random.Random(0)
-    whole, met, lost, equal = call(), 0, 0, 0
-    for _ in range(runs):
-        with tempfile.TemporaryDirectory() as folder:
-            seen = killed(name, sizes, rng.uniform(0, longest), folder)
+def kills(name, sizes, runs):
+    """``runs`` calls, each killed once, at a moment of the time that it takes, and made again."""
+    call, rng = (calls(*sizes) | chains())[name], random.Random(0)
+    whole = call()
+    begin = time.perf_counter()
+    call()  # compiled
+    longest, met, lost, equal = time.perf_counter() - begin, 0, 0, 0
+    with tempfile.TemporaryDirectory() as all_folders:
+        for i in range(runs):
+            folder = Path(all_folders, str(i))
+            folder.mkdir()
+            seen = killed(name, sizes, rng.uniform(0, longest), folder, f"{all_folders}/programs")
             if seen is not None:
                 met, lost = met + 1, max(lost, seen[0] - seen[1])
-            equal += same(call(checkpoint=Path(folder, "run.jast")), whole)
+            equal += same(call(checkpoint=folder / "run.jast"), whole)
     return dict(runs=runs, killed=met, equal=equal, most_units_lost=lost)
+
+
+def many_kills(n):
+    """`kills` of all calls, ``n`` in all."""
+    sizes = (300_000, 16, 20_000)
+    names = [*calls(*sizes), *chains()]
+    each = {name: n // len(names) + (i < n % len(names)) for i, name in enumerate(names)}
+    return {name: kills(name, sizes, runs) for name, runs in each.items() if runs}
 
 
 def report(args):
@@ -215,21 +269,24 @@ def report(args):
         of_ferry = lambda **how: jast.nominal(KEY, ferry(), n, **how)
         found["workers"]["S0"] = speedup(of_ferry, repeats)
         found["workers"]["black box, 5 ms"] = speedup(black_box(episodes), repeats)
-    runs, longest = size(args, (25, 1.5), (2, 0.5), (1, 0.1))
     for name in names or size(args, list(calls(*sizes)), ["nominal", "forest"], None):
-        found["kills"][name] = kills(name, sizes, runs, longest)
+        found["kills"][name] = kills(name, sizes, size(args, 25, 2, 1))
     return found
 
 
-def table(found):
-    lines = ["| call | CPU s | driver | checkpoint |", "|---|---|---|---|"]
-    for name, cost in found["overhead"].items():
-        kept = found["checkpoint"][name]["more"]
-        lines.append(f"| {name} | {cost['seconds']:.2f} | {cost['more']:+.1%} | {kept:+.1%} |")
-    lines += ["", "| system | s, one worker | speedup of two |", "|---|---|---|"]
-    for name, gain in found["workers"].items():
-        lines.append(f"| {name} | {gain['seconds']:.2f} | {gain['speedup']:.2f} |")
-    lines += ["", "| call | killed | equal | most units lost |", "|---|---|---|---|"]
+def tables(found):
+    """What `report` or `many_kills` found, as text."""
+    lines = []
+    if "overhead" in found:
+        lines += ["| call | CPU s | driver | checkpoint |", "|---|---|---|---|"]
+        for name, cost in found["overhead"].items():
+            kept = found["checkpoint"][name]["more"]
+            lines.append(f"| {name} | {cost['seconds']:.2f} | {cost['more']:+.1%} | {kept:+.1%} |")
+        lines += ["", "| system | s, one worker | speedup of two |", "|---|---|---|"]
+        for name, gain in found["workers"].items():
+            lines.append(f"| {name} | {gain['seconds']:.2f} | {gain['speedup']:.2f} |")
+        lines.append("")
+    lines += ["| call | killed | equal | most units lost |", "|---|---|---|---|"]
     for name, of in found["kills"].items():
         killed = f"{of['killed']} of {of['runs']}"
         lines.append(f"| {name} | {killed} | {of['equal']} | {of['most_units_lost']} |")
@@ -238,9 +295,11 @@ def table(found):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    args = options(parser, "less of everything: two kills of two calls").parse_args(argv)
-    found = report(args)
-    print(json.dumps(found, indent=1) if args.json else table(found))
+    options(parser, "less of everything: two kills of two calls")
+    parser.add_argument("--kills", type=int, metavar="N", help="only kills, N in all")
+    args = parser.parse_args(argv)
+    found = report(args) if args.kills is None else dict(kills=many_kills(args.kills))
+    print(json.dumps(found, indent=1) if args.json else tables(found))
 
 
 if __name__ == "__main__":
