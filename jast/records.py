@@ -26,6 +26,8 @@ RECORDS = {
     "Tried": "jast.stress_testing.report:Tried",
     "Mode": "jast.search.failure_modes:Mode",
     "Modes": "jast.search.failure_modes:Modes",
+    "Sweep": "jast.sweeping.table:Sweep",
+    "Crossing": "jast.sweeping.table:Crossing",
     "Roots": "jast.search.tree.prune:Roots",
     "Branches": "jast.search.tree.edges:Branches",
     "Lesson": "jast.heads.training:Lesson",

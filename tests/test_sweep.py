@@ -129,6 +129,20 @@ def test_a_row_of_nan_is_one_row(key):
     assert table.results[0].failing > 0
 
 
+def test_a_file_gives_a_sweep_back(key, tmp_path, equal):
+    with pytest.warns(UserWarning, match="invalid"):
+        table = crude(key, [0.5, math.nan, "text"], lambda limit: make(limit + 0))
+    jast.save(tmp_path / "table.jast", table)
+    again = jast.load(tmp_path / "table.jast")
+    assert str(again) == str(table) and again.settings == table.settings
+    assert again.errors == table.errors and again.simulators == (None,) * 3
+    equal(again.probability, table.probability)
+    equal(again.interval, table.interval)
+    jast.save(tmp_path / "at.jast", table_of([1.0, 2.0], [100, 10]).crossing(0.05))
+    at = jast.load(tmp_path / "at.jast")
+    assert at == table_of([1.0, 2.0], [100, 10]).crossing(0.05)
+
+
 def test_rows_run_on_an_executor(key, equal):
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         equal(crude(key, executor=pool).interval, crude(key).interval)
