@@ -27,23 +27,12 @@ def write(path, format, version, header, arrays, *, quick=False):
     nor waited for until it is on the disk, so it outlives the end of the process but perhaps not
     that of the machine.
     """
-    from jast import __version__  # not at import: the package imports this module
-
-    header = dict(format=format, version=version, package=__version__) | header
-    header["dtypes"] = {name: a.dtype.name for name, a in arrays.items()}
-    header["sha256"] = _checksum(header, arrays)
-
     path = os.fspath(path)
-    # extended floats have no NumPy name in a file, so they are stored as bits
-    bits = {
-        name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a
-        for name, a in arrays.items()
-    }
     part = f"{path}.{os.getpid()}.part"
+    entries = _entries(format, version, header, arrays)
     try:
         with open(part, "wb") as file:
-            save = np.savez if quick else np.savez_compressed
-            save(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
+            (np.savez if quick else np.savez_compressed)(file, **entries)
             file.flush()
             if not quick:
                 os.fsync(file.fileno())
@@ -51,6 +40,13 @@ def write(path, format, version, header, arrays, *, quick=False):
     finally:
         if os.path.exists(part):
             os.unlink(part)
+
+
+def packed(format, version, header, arrays):
+    """The bytes of a file of `write`."""
+    file = io.BytesIO()
+    np.savez(file, **_entries(format, version, header, arrays))
+    return file.getvalue()
 
 
 def read(path, format, version, kind):
@@ -61,7 +57,11 @@ def read(path, format, version, kind):
     other than ``version``, or damaged.
     """
     with open(path, "rb") as file:
-        data = file.read()
+        return unpacked(file.read(), path, format, version, kind)
+
+
+def unpacked(data, path, format, version, kind):
+    """`read` of the bytes of a file; ``path``: what errors call it."""
     if data[:2] != b"PK":
         raise ValueError(f"load: {path} is not {kind}")
     try:
@@ -207,6 +207,21 @@ def check_part(
     check_structure(path, "sim", name, structure, like)
     for a, s in zip(arrays, jax.tree.leaves(like), strict=True):
         check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)
+
+
+def _entries(format, version, header, arrays):
+    """What `numpy.savez` is to write."""
+    from jast import __version__  # not at import: the package imports this module
+
+    header = dict(format=format, version=version, package=__version__) | header
+    header["dtypes"] = {name: a.dtype.name for name, a in arrays.items()}
+    header["sha256"] = _checksum(header, arrays)
+    # extended floats have no NumPy name in a file, so they are stored as bits
+    bits = {
+        name: a.view(f"u{a.dtype.itemsize}") if a.dtype.kind == "V" else a
+        for name, a in arrays.items()
+    }
+    return dict(header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
 
 
 def _checksum(header, arrays):

@@ -130,6 +130,18 @@ def restore(path: Any, format: str, sim: Any = None, heads: Any = None) -> tuple
     return _whole(path, format, header, arrays, sim, heads), header
 
 
+def packed(result: Any) -> bytes:
+    """What `save` writes, as bytes, of a result of any kind."""
+    return archive.packed("jast result", KINDS["jast result"].version, *parts(result))
+
+
+def unpacked(data: bytes, path: str, sim: Any = None) -> Any:
+    """What `packed` was given, as `load` gives it; ``path``: what errors call it."""
+    kind = KINDS["jast result"]
+    header, arrays = archive.unpacked(data, path, "jast result", kind.version, kind.words)
+    return _whole(path, "jast result", header, arrays, sim, None)
+
+
 def parts(value: Any) -> tuple[dict, dict[str, np.ndarray]]:
     """Of a result that is a record: ``(header, arrays)``."""
     arrays = {}

@@ -34,6 +34,8 @@ class Ways(NamedTuple):
     store: Store | None = None
     name: str = "unit"
     """Of the parts in the store."""
+    keeps: Callable[[Any], bool] = lambda result: True
+    """Whether the store is to hold a result."""
 
 
 HERE = Ways()
@@ -176,14 +178,14 @@ class _Desk:
     """
 
     def __init__(self, task: Task, place: Place, ways: Ways, watch: Watch):
-        self._place, self._store, self._name, self._watch = place, ways.store, ways.name, watch
+        self._place, self._ways, self._store, self._watch = place, ways, ways.store, watch
         self._structure = functools.cache(lambda: jax.tree.structure(task.like()))
         self._tries, self._error, self._any = Counter(), None, False
         self.ready, self.lost, self.incidents, self.interruption = {}, [], (), None
 
     def begin(self, number: int) -> None:
         """Have a unit run, or take what a checkpoint holds of it."""
-        arrays = None if self._store is None else self._store.get(number, self._name)
+        arrays = None if self._store is None else self._store.get(number, self._ways.name)
         if arrays is None:
             self._place.submit(number)
         else:
@@ -234,8 +236,8 @@ class _Desk:
             return self._again(number, error)
         if self._place.elsewhere:
             result = self._structure().unflatten(result)
-        if self._store is not None:
-            self._store.put(number, jax.tree.leaves(result), self._name)
+        if self._store is not None and self._ways.keeps(result):
+            self._store.put(number, jax.tree.leaves(result), self._ways.name)
         self._any = True
         self.incidents = merged(self.incidents, incidents)
         self.ready[number] = result

@@ -280,6 +280,8 @@ BAD = {
     "one for each value, received Simulator": dict(simulators=make(1.0)),
     "one for each value, received int": dict(simulators=3),
     "function must be callable, received 3": dict(function=3),
+    "executor must have submit": dict(executor=3),
+    "checkpoint must be the path of a folder, received 3": dict(checkpoint=3),
     "key must be a jax.random.key": dict(key=3),
 }
 
@@ -369,9 +371,84 @@ def test_rows_of_an_executor_do_not_follow(key):
 
 
 def test_each_row_has_a_checkpoint_of_its_own(key, tmp_path):
-    given = lambda key, sim, checkpoint: checkpoint
+    given = lambda key, sim, checkpoint: str(checkpoint)
     table = jast.sweep(key, make, {"limit": [1.0, 2.0]}, given, checkpoint=tmp_path)
-    assert table.results == (tmp_path / "row-0", tmp_path / "row-1")
+    assert table.results == (str(tmp_path / "row-0"), str(tmp_path / "row-1"))
+
+
+CALLS = []
+
+
+def counted(key, sim):
+    CALLS.append(sim.horizon)
+    if sim.horizon == 2:
+        raise RuntimeError("too short")
+    return jast.nominal(key, sim, episodes=200)
+
+
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_rows_that_are_done_are_not_done_again(key, where, tmp_path, equal):
+    def stop(done, total, _):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    sims = [jast.simulators.walk1d(threshold=v) for v in (2.0, 3.0, 4.0)]
+    sims, values = [*sims, jast.simulators.walk1d(horizon=2)], {"row": range(4)}
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        how = dict(executor=pool if where == "elsewhere" else None)
+        go = lambda **more: jast.sweep(key, sims, values, counted, **how, **more)
+        alone = go()
+        part = go(checkpoint=tmp_path, callback=stop)
+        assert len(part.results) == 2 and part.settings["interrupted"] == "after 2 of 4 values"
+        CALLS.clear()
+        whole = go(checkpoint=tmp_path)
+        assert len(CALLS) <= 2
+        CALLS.clear()
+        again = go(checkpoint=tmp_path)
+        assert CALLS == [2]  # the row that raised
+    for table in (whole, again):
+        assert str(table) == str(alone) and table.settings == alone.settings
+        for a, b in zip(table.results, alone.results):
+            equal(a and a[:7], b and b[:7])
+        assert table.errors == (None, None, None, "RuntimeError: too short")
+    with pytest.raises(ValueError, match="sweep: checkpoint .* another call: values.row.0 is"):
+        jast.sweep(key, sims, {"row": range(1, 5)}, counted, checkpoint=tmp_path)
+
+
+def test_a_row_that_follows_is_the_same_from_a_checkpoint(key, tmp_path):
+    go = lambda **how: jast.sweep(key, after_five, {"limit": [8.0, 8.3]}, budget=5000, **how)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    assert len(go(checkpoint=tmp_path, callback=stop).results) == 1
+    table, alone = go(checkpoint=tmp_path), go()
+    assert "proposal of a similar system" in " ".join(table.results[1].history)
+    for a, b in zip(table.results, alone.results):
+        assert repr(tuple(a)) == repr(tuple(b))
+
+
+def test_what_no_file_holds_cannot_be_kept(key, tmp_path):
+    with pytest.raises(ValueError, match="save: result must be an array, a number or a text"):
+        jast.sweep(key, make, {"limit": [1.0]}, lambda key, sim: object(), checkpoint=tmp_path)
+
+
+class Dying:
+    """An executor whose process dies at the second row."""
+
+    def __init__(self):
+        self.pool = concurrent.futures.ThreadPoolExecutor(1)
+
+    def submit(self, function, *args):
+        if args[-1] == 1:
+            return self.pool.submit(lambda: 1 / 0)
+        return self.pool.submit(function, *args)
+
+
+def test_a_row_whose_process_dies_has_an_error(key):
+    table = crude(key, executor=Dying())
+    assert [e is None for e in table.errors] == [True, False, True, True]
+    assert "failed again and again" in table.errors[1]
 
 
 def test_follow_skips_rows_that_raise(key):

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from jast._checks import random_key
-from jast._jax import was_interrupted
+from jast.checkpoints import stored
 from jast.estimate import failure_probability
+from jast.places import executor_of
 from jast.results import asked
 from jast.simulator import Simulator
 from jast.sweeping.batch import batch, kinds
+from jast.sweeping.rows import Rows, elsewhere, here, options_of
 from jast.sweeping.table import Sweep
-from jast.watch import Watch
+from jast.watch import Watch, terminable
 
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback, Executor
+    from jast.typing import Callback, Executor, PathLike
 
 __all__ = ["sweep"]
 
@@ -34,6 +35,7 @@ def sweep(
     *,
     follow: bool | None = None,
     executor: Executor | None = None,
+    checkpoint: PathLike | None = None,
     progress: bool = False,
     callback: Callback | None = None,
     **options: Any,
@@ -67,23 +69,27 @@ def sweep(
             the last result. `jast.estimate.failure_probability` then looks for no proposal of its
             own where that of the neighbour serves; its draws are new. So put values in order.
             Default: with this function, where rows run one after the other.
-        executor: where rows run, anything with ``submit(function, *args)`` that returns an object
-            with ``result()``, as of `concurrent.futures`; default: one after the other, here.
-            Processes need a ``make`` and a ``function`` that can be pickled: those of a module.
+        executor: where rows run, anything with ``submit(function, *args)`` as of
+            `concurrent.futures` (docs/scale.md); default: one after the other, here. So values
+            that share no program run side by side. Processes need a ``make`` and a ``function``
+            that can be sent: those of a module. A row whose process dies is tried again twice.
+        checkpoint: a folder that keeps the rows that are done; the same call goes on where it was
+            ended, by whatever, to the same result. Rows that raised are tried again. Where rows run
+            here, and ``function`` takes a ``checkpoint``, each row has one of its own in it.
+            Results are then as `jast.load` gives them.
         progress: whether there is a bar.
         callback: called as ``callback(done, N, None)`` after each row.
-        **options: settings of ``function``, such as ``budget``; ``checkpoint``, a folder, has one
-            in it for each row.
+        **options: settings of ``function``, such as ``budget``.
 
     Returns:
         `Sweep`, a table with a row for each value. A value for which ``simulators`` or ``function``
-        raises has the error in its row. A KeyboardInterrupt ends it with the rows that are done,
-        and is raised where there is none.
+        raises has the error in its row. A KeyboardInterrupt or SIGTERM ends it with the rows that
+        are done, and is raised where there is none.
 
     Raises:
         ValueError: for no values, values of unequal numbers, a number of simulators that is not
-            theirs, ``follow`` with an executor, and what is no function; and what the first row
-            raised where all raise.
+            theirs, ``follow`` with an executor, what is no function, and a checkpoint of another
+            call; and what the first row raised where all raise.
 
     Example:
         >>> import jax, jast
@@ -95,36 +101,37 @@ def sweep(
         True
     """
     random_key("sweep", key)
-    columns, rows = _rows(values)
+    columns, settings_of = _rows(values)
     if not callable(function):
         raise ValueError(f"sweep: function must be callable, received {function!r}")
+    executor_of("sweep", executor)
     if follow is None:
         follow = function is failure_probability and executor is None
     if follow and executor is not None:
         raise ValueError("sweep: follow must be False with an executor, whose rows do not wait")
-    made = batch(_checked(simulators, len(rows)), rows)
-    each_with = [_options(options, i) for i in range(len(rows))]
-    keys = [jax.random.fold_in(key, i) for i in range(len(rows))]
-    work = list(zip(keys, made, each_with, strict=True))
-    found: list[tuple[Any, Exception | None]] = []
-    with Watch("sweep", len(rows), "value", progress, callback) as watch:
-        try:
-            for each in _outcomes(executor, follow, function, work):
-                found.append(each)
-                watch.more(1)
-                if _ended_early(each[0]):
-                    raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            if not found:
-                raise
+    n = len(settings_of)
+    made = batch(_checked(simulators, n), settings_of)
+    keys = [jax.random.fold_in(key, i) for i in range(n)]
+    about = dict(row=function, follow=bool(follow), values=columns, simulators=made)
+    with (
+        stored("sweep", checkpoint, key, **about, options=options) as store,
+        Watch("sweep", n, "value", progress, callback) as watch,
+        terminable(),
+    ):
+        own = options_of(function, options, None if executor else checkpoint, n)
+        rows = Rows(function, keys, made, own, store is not None)
+        if executor is None:
+            found, ended = here(rows, follow, store, watch)
+        else:
+            found, ended = elsewhere(rows, executor, store, watch)
     outcomes, errors = zip(*found, strict=True)
-    if all(e is not None for e in errors) and len(found) == len(rows):
+    if all(e is not None for e in errors) and len(found) == n:
         raise errors[0]
     settings = asked(
         "sweep", key, function=_name(function), follow=bool(follow), programs=kinds(made)
     )
-    if len(found) < len(rows):
-        settings["interrupted"] = f"after {len(found)} of {len(rows)} values"
+    if len(found) < n:
+        settings["interrupted"] = f"after {len(found)} of {n} values{ended}"
     return Sweep(
         {k: v[: len(found)] for k, v in columns.items()},
         outcomes,
@@ -132,55 +139,6 @@ def sweep(
         tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
         settings,
     )
-
-
-def _options(options, i):
-    """What row ``i`` gives the function."""
-    if options.get("checkpoint") is None:
-        return options
-    return options | {"checkpoint": Path(options["checkpoint"]) / f"row-{i}"}
-
-
-def _outcomes(executor, follow, function, work):
-    """(result or None, error or None) of each row, in order; ``work``: the key, the simulator and
-    the options of each.
-    """
-    if executor is None:
-        near = {}
-        for key, sim, options in work:
-            result, error = _tried(_row, function, key, sim, options | near)
-            if follow and error is None:
-                near = {"near": result}
-            yield result, error
-        return
-    futures = [executor.submit(_row, function, *each) for each in work]
-    try:
-        yield from (_tried(future.result) for future in futures)
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _tried(work, *args):
-    try:
-        return work(*args), None
-    except Exception as error:
-        if was_interrupted(error):
-            raise KeyboardInterrupt from error
-        return None, error
-
-
-def _row(function, key, sim, options):
-    if isinstance(sim, Exception):
-        raise sim
-    return function(key, sim, **options)
-
-
-def _ended_early(result):
-    """Whether a KeyboardInterrupt ended a row, which returned what it had by then."""
-    settings = getattr(result, "settings", None) or {}
-    notes = getattr(result, "warnings", None) or ()
-    return "interrupted" in settings or any(str(n).startswith("interrupted") for n in notes)
 
 
 def _rows(values):
