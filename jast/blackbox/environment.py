@@ -104,17 +104,36 @@ def gymnasium_system(
     """A system for `from_python` from a Gymnasium environment: the agent is under test, the
     disturbances are what happens to its actions.
 
-    ``make``: () -> environment, e.g. ``lambda: gymnasium.make("Pendulum-v1")``. ``distance``:
-    `Moment` -> float, the miss distance; ``event``: `Moment` -> bool, the failure, by default that
-    the environment has terminated. ``agent``: observation -> action, and ``apply``: (action,
-    disturbance) -> action, what is done in its place; with neither of them the disturbance is the
-    action, and without an agent the action that ``apply`` gets is None. The environment is reset
-    with ``seed``, or with x0 where the start is random (``start=jast.distributions.seeds``).
     Terminated or truncated ends the episode; transitions after that do nothing. Observations that
-    are arrays of numbers are observed.
+    are arrays of numbers are observed. With neither ``agent`` nor ``apply`` the disturbance is the
+    action.
 
-    Raises ValueError for what is no function, and an agent without ``apply``: no disturbance would
-    reach the environment.
+    Args:
+        make: () -> environment, such as ``lambda: gymnasium.make("Pendulum-v1")``.
+        distance: `Moment` -> float, the miss distance.
+        event: `Moment` -> bool, the failure. Default: that the environment has terminated.
+        agent: observation -> action.
+        apply: (action, disturbance) -> action, what is done in its place; without an agent the
+            action that it gets is None.
+        seed: of each reset; x0 stands in its place where the start is random
+            (``start=jast.distributions.seeds``).
+
+    Raises:
+        ValueError: for what is no function, and an agent without ``apply``: no disturbance would
+            reach the environment.
+
+    Example:
+        >>> import gymnasium, jax, jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> system = jast.blackbox.gymnasium_system(
+        ...     lambda: gymnasium.make("Pendulum-v1"),
+        ...     distance=lambda now: float(now.observation[0] + 1.0),  # hanging straight down
+        ...     event=lambda now: bool(now.observation[0] < -0.99),
+        ... )
+        >>> torque = D.Independent(D.Normal(jnp.zeros(1), 1.0), 1)
+        >>> sim = jast.blackbox.from_python(system, horizon=5, disturbance=torque)
+        >>> jast.rollout(jax.random.key(0), sim).disturbances.shape
+        (5, 1)
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(

@@ -58,15 +58,32 @@ class Program(NamedTuple):
 def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> Callable[..., Any]:
     """A system for `from_python` that runs an external program, once for each episode.
 
-    ``command``: the program and its arguments, a list or one string (split as by a POSIX shell,
-    without one). It reads one JSON object from standard input, ``{"x0": ..., "disturbances":
-    [...]}`` (the horizon's rows; lists and objects as the disturbance is; x0 is null with one
-    start), and prints as the last line of its standard output ``{"event": false, "distance":
-    1.5}``. Another exit status than 0, another last line, and where a time limit is set no answer
-    within it, are incidents, not errors. ``folder``: where it runs.
+    The program reads one JSON object from standard input, ``{"x0": ..., "disturbances": [...]}``
+    (the horizon's rows; lists and objects as the disturbance is; x0 is null with one start). It
+    prints ``{"event": false, "distance": 1.5}`` as the last line of its standard output. Another
+    exit status than 0, another last line, and no answer within a time limit are incidents, not
+    errors.
 
-    Raises ValueError for an empty command, and a program that is not found or is no executable
-    file.
+    Args:
+        command: the program and its arguments, a list or one string (split as by a POSIX shell,
+            without one).
+        folder: where it runs.
+
+    Raises:
+        ValueError: for an empty command, and a program that is not found or is no executable file.
+
+    Example:
+        >>> import sys, jax, jast
+        >>> from jast import distributions as D
+        >>> code = '''
+        ... import json, sys
+        ... total = sum(json.load(sys.stdin)["disturbances"])
+        ... print(json.dumps({"event": total > 3.0, "distance": max(3.0 - total, 0.0)}))
+        ... '''
+        >>> run = jast.blackbox.program([sys.executable, "-c", code])
+        >>> sim = jast.blackbox.from_python(run, horizon=3, disturbance=D.Normal(0.0, 1.0))
+        >>> bool(jast.rollout(jax.random.key(0), sim).distance >= 0.0)
+        True
     """
     parts = tuple(shlex.split(command) if isinstance(command, str) else map(os.fspath, command))
     if not parts:

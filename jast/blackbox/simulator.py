@@ -82,59 +82,88 @@ def from_python(
     """A system in plain Python, NumPy or another language as a `jast.Simulator`: it is called on
     the host, once for all lanes of a batch.
 
-    ``system``: one of
-     - a function ``run(disturbances) -> (event, distance)``, or ``run(disturbances, x0)`` where
-       ``start`` is random: a whole episode at once, ``disturbances`` [horizon, ...] in NumPy (a
-       pytree where a disturbance is one); `jast.blackbox.program` makes one of an external program;
-     - a class, or a function without arguments that makes an object, with the methods
-       ``initialize()`` (``initialize(x0)`` where the start is random), ``transition(x)``,
-       ``miss_distance() -> float``, ``is_event() -> bool``, and if there are any ``evaluate()``
-       (runs the system under test), ``is_terminal() -> bool`` and ``observe() -> vector``: Table
-       3.1 of the thesis. ``initialize`` puts an object back to the start, as it serves many
-       episodes; `jast.blackbox.gymnasium_system` makes one of an environment.
+    The system is one of two kinds:
 
-    ``disturbance``: a distribution of `jast.distributions`, the same at each step, or a function
-    state -> distribution in JAX of the state `Record` or `Standing` (``like``: a value of it, where
-    it cannot tell its shape without one); None: `distributions.seeds`, one uint32 a step of unknown
-    density. ``start``: p(x0) likewise, () -> distribution. ``observe``: state -> float vector, 64
-    numbers at most; by default what the object's ``observe`` returns (``seen`` of `Standing`, of
-    any length where ``observe`` chooses from it), else t / horizon and the last disturbance (an
-    unsigned integer over its greatest value).
+    - a function ``run(disturbances) -> (event, distance)``, or ``run(disturbances, x0)`` where
+      ``start`` is random: a whole episode at once, ``disturbances`` [horizon, ...] in NumPy (a
+      pytree where a disturbance is one). `jast.blackbox.program` makes one of an external program.
+    - a class, or a function without arguments that makes an object, with the methods
+      ``initialize()`` (``initialize(x0)`` where the start is random), ``transition(x)``,
+      ``miss_distance() -> float``, ``is_event() -> bool``, and optionally ``evaluate()`` (runs the
+      system under test), ``is_terminal() -> bool`` and ``observe() -> vector``: Table 3.1 of Moss's
+      thesis. ``initialize`` puts an object back to the start, as it serves many episodes.
+      `jast.blackbox.gymnasium_system` makes one of an environment.
 
-    ``episodic``: when the system is judged. None, the default: a function at the end, an object
-    at every state. False, objects only: ``evaluate``, ``is_event``, ``miss_distance`` and
-    ``is_terminal`` are asked after ``initialize`` and after each transition, and the first failure
-    ends the episode; one host call a step for all lanes. An object is kept under its history for
-    the next disturbance; a tree that comes back to an older state repeats the history in another
-    one. True: the system is run once, at the end of an episode, which always has ``horizon``
-    disturbances (fewer are an invalid episode): ``initialize``, each ``transition``, then
-    ``evaluate``; one host call an episode. That suits an ``is_event`` that means something only at
-    the end, or that remembers what has happened. One that says "is it failing now" loses the
-    failures that are over by then: `jast.check` looks for some and warns.
+    What goes wrong (an exception, no answer in time, a process that dies, another answer than a
+    bool and a finite number) makes an episode invalid, never a failure, and does not stop the
+    search: see `jast.incidents.incidents`. Outcomes have no gradient: NaN. A simulator is known by
+    its identity: make it once.
 
-    ``likelihood``: what the system says of the probability of its disturbances, on top of the
-    density of ``disturbance``. "log_prob": ``transition`` returns log p of its disturbance;
-    "prob": p itself (a density may exceed 1). Then it must return a number, and a function of whole
-    episodes returns ``(p, event, distance)``, p or log p of all. An ``evaluate`` may return
-    ``(p, event, distance)`` too, Table 3.1's <p, e, d>: they stand in place of ``is_event``,
-    ``miss_distance`` and all p that ``transition`` returned since the last ``evaluate``. None, the
-    default: where the density is unknown (``disturbance`` left out, or
-    `jast.distributions.seeds`), a number that an object returns is log p; elsewhere only
-    ``disturbance`` counts. Give ``likelihood`` with a known density only where the object's p is
-    of other things: both count.
+    Args:
+        system: see above.
+        horizon: disturbances of an episode.
+        disturbance: a distribution of `jast.distributions`, the same at each step, or a function
+            state -> distribution in JAX of the state `Record` or `Standing`. None:
+            `jast.distributions.seeds`, one uint32 a step of unknown density.
+        start: p(x0), a distribution or a function () -> distribution.
+        episodic: when the system is judged. None: a function at the end, an object at every state.
+            False, for objects only: ``evaluate``, ``is_event``, ``miss_distance`` and
+            ``is_terminal`` are asked after ``initialize`` and after each transition, and the first
+            failure ends the episode; one host call a step for all lanes. An object is kept under
+            its history for the next disturbance; a tree that comes back to an older state repeats
+            the history in another one. True: the system is run once, at the end of an episode,
+            which always has ``horizon`` disturbances (fewer are an invalid episode):
+            ``initialize``, each ``transition``, then ``evaluate``; one host call an episode. That
+            suits an ``is_event`` that means something only at the end, or that remembers what has
+            happened. One that says "is it failing now" loses the failures that are over by then:
+            `jast.check` looks for some and warns.
+        likelihood: what the system says of the probability of its disturbances, on top of the
+            density of ``disturbance``. "log_prob": ``transition`` returns log p of its disturbance;
+            "prob": p itself (a density may exceed 1). Then it must return a number, and a function
+            of whole episodes returns ``(p, event, distance)``, p or log p of all. An ``evaluate``
+            may return ``(p, event, distance)`` too, Table 3.1's <p, e, d>: they stand in place of
+            ``is_event``, ``miss_distance`` and all p that ``transition`` returned since the last
+            ``evaluate``. None: where the density is unknown (``disturbance`` left out, or
+            `jast.distributions.seeds`), a number that an object returns is log p; elsewhere only
+            ``disturbance`` counts. Give it with a known density only where the object's p is of
+            other things: both count.
+        workers: 0 runs the system in this process; n >= 1 in n processes of their own (``pip
+            install 'jast[blackbox]'``), started on first use and ended with this one.
+        time_limit: seconds for a run, or for a transition; needs a worker. One that hangs where
+            nothing interrupts it costs its limit, about a second more and the start of a process.
+        observe: state -> float vector, 64 numbers at most. Default: what the object's ``observe``
+            returns (``seen`` of `Standing`, of any length where ``observe`` chooses from it), else
+            t / horizon and the last disturbance (an unsigned integer over its greatest value).
+        like: a value of the disturbance, where a function ``disturbance`` cannot tell its shape
+            without one.
 
-    ``workers``: 0 runs the system in this process; n >= 1 in so many processes of their own (``pip
-    install 'jast[blackbox]'``), started on first use and ended with this one. ``time_limit``:
-    seconds for a run, or for a transition; needs a worker. One that hangs where nothing interrupts
-    it costs its limit, about a second more and the start of a process. What goes wrong (an
-    exception, no answer in time, a process that dies, another answer than a bool and a finite
-    number) makes an episode invalid, never a failure, and does not stop the search: see
-    `jast.incidents.incidents`. Outcomes have no gradient: NaN.
+    Returns:
+        `jast.Simulator`.
 
-    A simulator is known by its identity: make it once. Raises ValueError for a system that is none
-    of these (what it lacks is named), that cannot be sent to a worker, or whose first object cannot
-    be made; for another horizon, disturbance, start, number of workers or time limit. RuntimeError
-    inside of a search where a worker process cannot load the system.
+    Raises:
+        ValueError: for a system that is neither kind (what it lacks is named), that cannot be sent
+            to a worker, or whose first object cannot be made; for another horizon, disturbance,
+            start, number of workers or time limit.
+        RuntimeError: inside a search, where a worker process cannot load the system.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> class Tank:
+        ...     def initialize(self):
+        ...         self.level = 5.0
+        ...
+        ...     def transition(self, x):
+        ...         self.level += float(x)
+        ...
+        ...     def miss_distance(self):
+        ...         return max(self.level, 0.0)
+        ...
+        ...     def is_event(self):
+        ...         return self.level <= 0.0
+        >>> sim = jast.blackbox.from_python(Tank, horizon=10, disturbance=D.Normal(0.0, 1.0))
+        >>> int(jast.rollout(jax.random.key(0), sim).length) <= 10
+        True
     """
     horizon, workers = whole(NAME, "horizon", horizon), whole(NAME, "workers", workers, 0)
     if episodic is not None and not isinstance(episodic, bool):
@@ -204,8 +233,25 @@ def from_python(
 
 
 def calls(sim: Simulator) -> Calls:
-    """`Calls`: how often the system behind a black box has run so far, and for how long. ValueError
-    for a simulator without one.
+    """How often the system behind a black box has run so far, and for how long.
+
+    Args:
+        sim: of `from_python`.
+
+    Returns:
+        `Calls`.
+
+    Raises:
+        ValueError: for a simulator without a black box.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> run = lambda x: (bool(x.sum() > 5.0), float(max(5.0 - x.sum(), 0.0)))
+        >>> sim = jast.blackbox.from_python(run, horizon=10, disturbance=D.Normal(0.0, 1.0))
+        >>> found = jast.nominal(jax.random.key(0), sim, 50)
+        >>> jast.blackbox.calls(sim).episodes >= 50
+        True
     """
     counts = [source.calls() for source in sources(sim, "calls")]
     if not counts:

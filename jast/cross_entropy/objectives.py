@@ -42,30 +42,43 @@ def sierra(
     order: Literal["code", "thesis"] = "code",
     log: bool = False,
 ) -> Objective:
-    """Less the density at x [2] of 49 Gaussians of equal weight: a mountain range upside down, for
-    optimisers (R. J. Moss's thesis, chapter 2).
+    """Less the density of 49 Gaussians of equal weight: a mountain range upside down, for
+    optimisers (chapter 2 of R. J. Moss's thesis).
 
-    The central one has covariance I / ``sharpness`` (eta) about ``mean`` (mu). Around it are four
-    corners, (+-spacing, +-spacing) (delta); of each, six components go out both ways, p in (0,0),
-    (1,1), (2,0), (3,1), (0,2), (1,3), to mean + corner +- variance p, the i-th of covariance
-    i^decay variance / sharpness I. ``variance`` is sigma, and the length of a path's step too.
-    ``order="thesis"`` has (3,1) and (0,2) in each other's place, as printed; the default is that of
-    the published code.
+    The central Gaussian has covariance I / ``sharpness`` about ``mean``. Around it are four
+    corners, (+-spacing, +-spacing). Of each, six components go out both ways, p in (0,0), (1,1),
+    (2,0), (3,1), (0,2), (1,3), to mean + corner +- variance p, the i-th of covariance i^decay
+    variance / sharpness I.
 
-    Minima with the default settings: -0.0220023684 at 0 (the next is -0.0154475), or -0.0219510551
-    with the thesis's order; 17 in all.
+    With the default settings there are 17 minima: -0.0220023684 at 0 (the next is -0.0154475), or
+    -0.0219510551 with the thesis's order.
 
-    ``log=True`` returns less the log of the density: the same order of values, so the same minima,
-    and it does not underflow. Use it where values are only compared, above all in float32, in which
-    sierra itself is 0 from about 23 away from all its centres.
+    Args:
+        mean: [2]: mu of the thesis. The dtype is that of the float arrays given, the wider one,
+            else the default; the value's is that of x.
+        variance: sigma, and the length of a path's step too.
+        spacing: delta.
+        sharpness: eta.
+        decay: see above.
+        order: "thesis" has (3,1) and (0,2) in each other's place, as printed; "code" is that of the
+            published code.
+        log: return less the log of the density: the same order of values, so the same minima, and
+            it does not underflow. Use it where values are only compared, above all in float32, in
+            which sierra itself is 0 from about 23 away from all its centres.
 
-    The dtype is that of the float arrays given, the wider one, else the default; the value's is
-    that of x.
+    Returns:
+        A `jax.tree_util.Partial` of x [2] that binds the components: the settings are traced, and
+        another sierra is no new program. Every setting but the last two may be traced.
 
-    Returns a `jax.tree_util.Partial` that binds the components: the settings are traced, and
-    another sierra is no new program. Every setting but the last two may be traced. Raises
-    ValueError for a mean that is not two finite numbers, a variance or sharpness that is not
-    positive and an unknown order.
+    Raises:
+        ValueError: for a mean that is not two finite numbers, a variance or sharpness that is not
+            positive, and an unknown order.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> round(float(ce.sierra()(jnp.zeros(2))), 4)
+        -0.022
     """
     if order not in _PATHS:
         raise ValueError(f'sierra: order must be "code" or "thesis", received {order!r}')
@@ -110,11 +123,20 @@ def _log_sierra(means, variances, x):
 
 
 def branin(x: chex.Array) -> chex.Array:
-    """Branin's function of x [2]: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8
-    pi)) cos x1 + 10.
+    """Branin's function: (x2 - 5.1 x1^2 / (4 pi^2) + 5 x1 / pi - 6)^2 + 10 (1 - 1 / (8 pi)) cos x1
+    + 10.
 
     Usually on [-5, 10] x [0, 15]. Three minima of 5 / (4 pi) = 0.397887: (-pi, 12.275), (pi, 2.275)
     and (3 pi, 2.475).
+
+    Args:
+        x: [2].
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> round(float(ce.branin(jnp.array([jnp.pi, 2.275]))), 4)
+        0.3979
     """
     x1, x2 = _vector("branin", x, 2)
     return (
@@ -125,10 +147,19 @@ def branin(x: chex.Array) -> chex.Array:
 
 
 def ackley(x: chex.Array) -> chex.Array:
-    """Ackley's function of x [d]: 20 - 20 exp(-0.2 sqrt(mean x_i^2)) + e - exp(mean cos(2 pi x_i)).
+    """Ackley's function: 20 - 20 exp(-0.2 sqrt(mean x_i^2)) + e - exp(mean cos(2 pi x_i)).
 
-    Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0); a local
-    minimum near every point of whole numbers.
+    Its least value is 0, at 0, where it is not differentiable (the gradient is given as 0). There
+    is a local minimum near every point of whole numbers.
+
+    Args:
+        x: [d].
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> abs(float(ce.ackley(jnp.zeros(2)))) < 1e-5
+        True
     """
     x = _vector("ackley", x)
     r2 = jnp.mean(x**2)
@@ -139,7 +170,17 @@ def ackley(x: chex.Array) -> chex.Array:
 
 
 def paraboloid(x: chex.Array) -> chex.Array:
-    """The sum of squares of x [d]: 0 at 0."""
+    """The sum of squares; 0 at 0.
+
+    Args:
+        x: [d].
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> float(ce.paraboloid(jnp.array([3.0, 4.0])))
+        25.0
+    """
     return jnp.sum(_vector("paraboloid", x) ** 2)
 
 

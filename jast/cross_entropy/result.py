@@ -115,11 +115,25 @@ class Scores(NamedTuple):
 
 
 def scores(result: CEResult, optimum: chex.Array | None) -> Scores:
-    """The `Scores` of a batch of runs, a `CEResult` with a leading axis [runs], after each
-    iteration: arrays [K], the last of which is the outcome.
+    """How good a batch of runs is after each iteration. On the host.
 
-    ``optimum`` [d]: where the objective is least. On the host. ValueError for a result of one run,
-    and an optimum of another dimension.
+    Args:
+        result: a `CEResult` with a leading axis [runs].
+        optimum: [d]: where the objective is least.
+
+    Returns:
+        `Scores`: arrays [K], the last of which is the outcome.
+
+    Raises:
+        ValueError: for a result of one run, and an optimum of another dimension.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> run = lambda key: ce.ce_method(key, ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> runs = jax.vmap(run)(jax.random.split(jax.random.key(0), 5))
+        >>> len(ce.scores(runs, jnp.zeros(2)).best_value)
+        10
     """
     x, value = (
         np.asarray(result.history.best_x, float),

@@ -21,7 +21,13 @@ __all__ = ["counts", "geometric", "manual", "uniform"]
 
 
 def uniform() -> Schedule:
-    """The same in every iteration; what is left over goes to the first ones, one each."""
+    """The same in every iteration; what is left over goes to the first ones, one each.
+
+    Example:
+        >>> from jast.cross_entropy import schedules
+        >>> schedules.uniform()(10, 3)
+        (4, 3, 3)
+    """
 
     def schedule(budget, iterations):
         each, left = divmod(budget, iterations)
@@ -31,13 +37,24 @@ def uniform() -> Schedule:
 
 
 def geometric(p: float = 0.1, normaliser: Literal["before", "after"] = "before") -> Schedule:
-    """Most in the first iteration, and ever fewer: floor(budget pmf(k)) in iteration k = 1 .. K -
-    1, the rest in the last (R. J. Moss's thesis, Algorithm 6).
+    """Most samples in the first iteration, and ever fewer: floor(budget pmf(k)) in iteration k = 1
+    .. K - 1, the rest in the last (Algorithm 6 of R. J. Moss's thesis).
 
-    pmf(k) is proportional to p (1 - p)^k and sums to one over 1 .. K with ``normaliser="before"``,
-    over 0 .. K with "after": a truncated geometric distribution by Distributions.jl before and
-    after 2021-08-27. "After" leaves the share of k = 0 to the last iteration, which then gets most
-    of all. Raises ValueError for a p that is not between 0 and 1 and an unknown normaliser.
+    pmf(k) is proportional to p (1 - p)^k. It is a truncated geometric distribution.
+
+    Args:
+        p: between 0 and 1.
+        normaliser: pmf sums to one over 1 .. K ("before"), or over 0 .. K ("after"), as in
+            Distributions.jl before and after 2021-08-27. "after" leaves the share of k = 0 to the
+            last iteration, which then gets most of all.
+
+    Raises:
+        ValueError: for a p that is not between 0 and 1, and an unknown normaliser.
+
+    Example:
+        >>> from jast.cross_entropy import schedules
+        >>> schedules.geometric(0.5)(100, 3)
+        (57, 28, 15)
     """
     if isinstance(p, bool) or not isinstance(p, int | float) or not 0 < p < 1:
         raise ValueError(f"geometric: p must be a number between 0 and 1, received {p!r}")
@@ -59,8 +76,18 @@ def geometric(p: float = 0.1, normaliser: Literal["before", "after"] = "before")
 
 
 def manual(counts: Sequence[int]) -> Schedule:
-    """These very ``counts``; ValueError when they are not as many as the iterations, or do not sum
-    to the budget. That of the source: 20, 15, 9, 8 x 7.
+    """These very counts. That of the source is 20, 15, 9, 8 x 7.
+
+    Args:
+        counts: of each iteration.
+
+    Raises:
+        ValueError: when they are not as many as the iterations, or do not sum to the budget.
+
+    Example:
+        >>> from jast.cross_entropy import schedules
+        >>> schedules.manual([20, 10])(30, 2)
+        (20, 10)
     """
     sizes = _whole(counts)
 
@@ -76,12 +103,26 @@ def manual(counts: Sequence[int]) -> Schedule:
 
 
 def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]:
-    """How many samples each iteration gets, a tuple of ints, by what a user gives as ``schedule``.
+    """How many samples each iteration gets, by what a user gives as ``schedule``.
 
-    None or "uniform": ``samples`` in each of ``iterations``. A function, such as `geometric`
-    returns: what it makes of ``samples * iterations`` and ``iterations``, which must sum to that
-    budget. A sequence of counts: these, whatever ``samples`` and ``iterations`` are. A count may be
-    0, not all of them. Raises ValueError, naming ``samples``, ``iterations`` or ``schedule``.
+    Args:
+        schedule: None or "uniform": ``samples`` in each of ``iterations``. A function, such as
+            `geometric` returns: what it makes of ``samples * iterations`` and ``iterations``, which
+            must sum to that budget. A sequence of counts: these, whatever ``samples`` and
+            ``iterations`` are. A count may be 0, but not all of them.
+        samples: in an iteration, on the average.
+        iterations: how many.
+
+    Returns:
+        A tuple of ints.
+
+    Raises:
+        ValueError: that names ``samples``, ``iterations`` or ``schedule``.
+
+    Example:
+        >>> from jast.cross_entropy import schedules
+        >>> schedules.counts("uniform", 10, 3)
+        (10, 10, 10)
     """
     if not callable(schedule) and not isinstance(schedule, str) and schedule is not None:
         return _whole(schedule)

@@ -38,7 +38,7 @@ __all__ = ["Stress", "over"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Stress:
-    """See `over`. A pytree."""
+    """The search for failures of a system as a minimisation; see `over`. A pytree."""
 
     sim: Any
     reward: Any
@@ -89,30 +89,47 @@ class Stress:
 
 
 def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | None = None) -> Stress:
-    """The search for failures of ``sim`` as a minimisation: `Stress`, with ``objective`` and
+    """The search for failures of a system as a minimisation, with an ``objective`` and a
     ``proposal`` for the methods of `jast.cross_entropy`.
 
-        stress = over(sim) result = ce_surrogate(key, stress.objective, stress.proposal,
-        samples=100, elites=30, iterations=10) print(stress.failures(result))
-
     A point z [D] holds normal numbers: first those of x0, where the start is random, then those of
-    x_1 .. x_horizon; D is ``stress.proposal.mean.size``. Each x_t is the quantile of p(x | s) at
-    Phi(z_t) (``actions.quantiles()``, the default), or that point of a box (``actions.uniform(low,
-    high)``; a start is never of the box). A Gaussian needs more elites than D for its covariance;
-    with tens of dimensions and few evaluations that of `ce_method` collapses before a failure is
-    found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
+    x_1 .. x_horizon; D is ``stress.proposal.mean.size``. A Gaussian needs more elites than D for
+    its covariance. With tens of dimensions and few evaluations that of `ce_method` collapses before
+    a failure is found: take `ce_surrogate`, or `jast.search.cem`, whose steps are independent.
 
     Without a ``reward`` the order is lexicographic, whatever the units. An episode that does not
     fail has its miss distance, at least 0. One that fails has -1 / (1 + c), where c >= 0 is how far
     its log density is below that of the mode at each of its steps: any failure is below all else, a
     likelier one below a less likely one. (Where a distribution names no mode, c is less the raw log
-    density, and -1 + c where c < 0, which goes on smoothly.) With a ``reward`` (`jast.rewards`) the
-    objective is less the reward. An episode whose numbers are not finite, or that is impossible,
-    has NaN, which a method counts.
+    density, and the value is -1 + c where c < 0, which continues smoothly.) An episode whose
+    numbers are not finite, or that is impossible, has NaN, which a method counts.
 
-    Pure JAX, for `jax.jit`, `jax.vmap` (over simulators too) and ask and tell. Raises ValueError
-    for actions that are neither of the two, a distribution without quantile function where one is
-    needed, and what `jast.check` finds in the simulator's functions by tracing them.
+    Pure JAX, for `jax.jit`, `jax.vmap` (over simulators too) and ask and tell.
+
+    Args:
+        sim: the simulator.
+        reward: of `jast.rewards`: the objective is less the reward.
+        actions: ``jast.actions.quantiles()``, the default: x_t is the quantile of p(x | s) at
+            Phi(z_t). ``uniform(low, high)``: it is that point of a box; a start is never of the
+            box.
+
+    Returns:
+        `Stress`; ``stress.failures(result)`` is the archive of the failures of a result.
+
+    Raises:
+        ValueError: for actions that are neither of the two, a distribution without a quantile
+            function where one is needed, and what `jast.check` finds in the simulator's functions
+            by tracing them.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import cross_entropy as ce
+        >>> stress = ce.over(jast.simulators.landing(b=0.3))
+        >>> result = ce.ce_method(
+        ...     jax.random.key(0), stress.objective, stress.proposal, samples=100, elites=30
+        ... )
+        >>> len(stress.failures(result)) > 0
+        True
     """
     if reward is not None and not callable(reward):
         raise ValueError(

@@ -88,6 +88,13 @@ class Heads:
     ``policy.apply(params, s)`` gives logits [d, bins] for the normalised observation s [n],
     ``value.apply(params, s and x [n + d])`` a scalar; n numbers are observed, a disturbance has d.
     A search fills in the moments that normalise what goes in and out.
+
+    Example:
+        >>> import jax, jast
+        >>> value = jast.heads.make_head(jax.random.key(0), 2)  # observes s, sees x
+        >>> heads = jast.heads.Heads(value=value)
+        >>> heads.policy is None
+        True
     """
 
     policy: Any = None

@@ -70,11 +70,28 @@ class Histogram(D.Distribution):
 
 
 def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeric = 1.0) -> Policy:
-    """The policy head of ``heads`` as a `jast.Policy` of ``sim``, with the ``actions`` that it was
-    trained on; x0 is drawn from the system's own start.
+    """The policy head of some heads as a `jast.Policy`; x0 is drawn from the system's own start.
 
-    ``power`` as in `jast.heads.HeadSettings`: 1 is the histogram that was learned. ValueError
-    without a policy head, and for disturbances that hold integers.
+    Args:
+        sim: the simulator.
+        heads: `Heads` with a policy head.
+        actions: those that it was trained on.
+        power: as in `HeadSettings`: 1 is the histogram that was learned.
+
+    Raises:
+        ValueError: without a policy head, and for disturbances that hold integers.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> few = jast.heads.settings(round=2, hidden=(8,), steps=(5, 5), bins=4)
+        >>> found = jast.search.forest(
+        ...     jax.random.key(0), sim, trees=4, prunes=1, simulations=50, heads="rollout",
+        ...     actions=jast.actions.wide(2.0), head_settings=few, refine=0,
+        ... )
+        >>> policy = jast.heads.as_policy(sim, found.heads, jast.actions.wide(2.0))
+        >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
+        (30,)
     """
     if heads.policy is None:
         raise ValueError("heads.as_policy: expected heads with a policy head, received none")

@@ -48,13 +48,31 @@ def make_head(
     activation: Literal["gelu", "relu", "silu", "tanh"] = "relu",
     first_activation: bool = True,
 ) -> Head:
-    """A dense Flax network from [inputs] to ``outputs``, a shape: ``(params, apply)``, a `Head`.
+    """A dense Flax network.
 
-    ``outputs=()`` is a value head, ``(d, bins)`` a rollout-policy head for a disturbance of d
-    numbers. ``hidden``: widths of the layers; ``activation``: "gelu", "relu", "silu" or "tanh";
-    ``first_activation=False`` leaves it out after the first layer, as the published networks do,
-    which are ``hidden=(64, 124, 64)``. Weights and biases start uniform in +-1/sqrt(fan-in). The
-    key is consumed. ValueError for sizes below 1 and unknown activations.
+    Weights and biases start uniform in +-1/sqrt(fan-in).
+
+    Args:
+        key: consumed.
+        inputs: numbers that it sees.
+        outputs: shape of what it returns: ``()`` for a value head, ``(d, bins)`` for a
+            rollout-policy head for a disturbance of d numbers.
+        hidden: widths of the layers; the published networks have ``(64, 124, 64)``.
+        activation: after each hidden layer.
+        first_activation: whether there is one after the first layer; the published networks have
+            none.
+
+    Returns:
+        ``(params, apply)``, a `Head`.
+
+    Raises:
+        ValueError: for sizes below 1, and unknown activations.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> params, apply = jast.heads.make_head(jax.random.key(0), 3, (2, 10))
+        >>> apply(params, jnp.zeros(3)).shape
+        (2, 10)
     """
     sizes = (inputs, *hidden, *outputs)
     if not hidden or any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in sizes):

@@ -149,7 +149,7 @@ CHOICES = dict(
 def settings(
     mode: Literal["default", "code", "text", "paper"] = "default", **changes: Any
 ) -> HeadSettings:
-    """`HeadSettings` of a mode, with changes: ``settings("code", round=8)``.
+    """The settings of heads in a mode, with changes.
 
     "default" is what works. "code" is the published code of MCFS-AP, of which "paper" is the
     earlier name; "text" is what its text says (section 3.3, eq. 3), which departs from the code:
@@ -166,8 +166,20 @@ def settings(
 
     Both sum the logs of likelihoods where eq. 1 has a product.
 
+    Args:
+        mode: see above.
+        changes: fields of `HeadSettings`, by name.
+
+    Returns:
+        `HeadSettings`.
+
     Raises:
-        ValueError: names an unknown mode or setting, and one that is out of range.
+        ValueError: that names an unknown mode or setting, or one that is out of range.
+
+    Example:
+        >>> import jast
+        >>> jast.heads.settings("code", round=8).round
+        8
     """
     if mode not in MODES:
         raise ValueError(f"heads.settings: mode must be one of {sorted(MODES)}, received {mode!r}")

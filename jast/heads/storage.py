@@ -27,23 +27,49 @@ HEADS, MOMENTS = ("policy", "value"), ("inputs", "returns")
 
 
 def save(path: PathLike, heads: Heads) -> None:
-    """`jast.save` of heads; goes with the next version.
+    """Write `Heads` to a file. Deprecated: use `jast.save`; this function goes with the next
+    version.
 
-    The function of a network of `jast.heads.make_head` is in the file by its sizes and its
-    activation; a function of your own cannot be, and `load` asks for it. ValueError for heads with
-    neither head, for parameters and moments that are not arrays of numbers, and for levels that are
-    no integer.
+    The function of a network of `make_head` is in the file by its sizes and its activation; a
+    function of your own cannot be, and `load` asks for it.
+
+    Args:
+        path: of the file.
+        heads: what to write.
+
+    Raises:
+        ValueError: for heads with neither head, for parameters and moments that are not arrays of
+            numbers, and for levels that are no integer.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> heads = jast.heads.Heads(value=jast.heads.make_head(jax.random.key(0), 2))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     jast.heads.save(os.path.join(folder, "heads.npz"), heads)
     """
     files.store(path, "jast heads", heads)
 
 
 def load(path: PathLike, heads: Heads | None = None) -> Heads:
-    """`jast.load` of heads, with ``heads=heads``; goes with the next version.
+    """`Heads` from a file. Deprecated: use `jast.load`; this function goes with the next version.
 
-    A network of `jast.heads.make_head` gets the very function that such networks of one shape
-    share, so that what was compiled for them serves here too. ``heads`` (`Heads`) is needed where a
-    head has a function of your own: its functions are taken, the file's parameters must be like its
-    own (structure, shapes, kinds of number; the precision may differ), and the rest is the file's.
+    A network of `make_head` gets the very function that such networks of one shape share, so that
+    what was compiled for them serves here too.
+
+    Args:
+        path: of the file.
+        heads: needed where a head has a function of your own. Its functions are taken, the file's
+            parameters must be like its own (structure, shapes, kinds of number; the precision may
+            differ), and the rest is the file's.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> heads = jast.heads.Heads(value=jast.heads.make_head(jax.random.key(0), 2))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "heads.npz")
+        ...     jast.heads.save(path, heads)
+        ...     jast.heads.load(path).policy is None
+        True
     """
     return files.restore(path, "jast heads", heads=heads)[0]
 

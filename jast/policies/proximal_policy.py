@@ -105,6 +105,14 @@ def ppo(
     Raises:
         ValueError: for settings out of range, a simulator that breaks its contract, a disturbance
             that is not of floats or cannot be tilted (named), a checkpoint of another call.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, epochs=1)
+        >>> policy = jast.policies.ppo(jax.random.key(0), sim, **small)
+        >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
+        (30,)
     """
     random_key("ppo", key)
     contract(sim)

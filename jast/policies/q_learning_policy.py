@@ -104,6 +104,13 @@ def q_learning(
             that does not return one whole number, a simulator that breaks its contract, a
             disturbance that is not of floats or cannot be tilted (named), and a checkpoint of
             another training.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d(form="one-sided")
+        >>> policy = jast.policies.q_learning(jax.random.key(0), sim, episodes=500, cells=20)
+        >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
+        (10,)
     """
     random_key("q_learning", key)
     contract(sim)

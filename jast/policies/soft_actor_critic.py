@@ -60,60 +60,75 @@ def sac(
     callback: Callback | None = None,
     checkpoint: PathLike | None = None,
 ) -> FailurePolicy:
-    """Teach a policy to make ``sim`` fail in the likeliest ways: `FailurePolicy`, a `jast.Policy`
-    with its start, for `jast.rollout` and importance sampling.
+    """Teach a policy by soft actor-critic to make a system fail in the likeliest ways: a
+    `jast.Policy` with its start, for `jast.rollout` and importance sampling.
 
     The policy acts in the latents z of a disturbance, x = Q(Phi(z)) with z ~ N(0, I) under p(x |
-    s): any disturbance of floats that has a quantile function and its inverse will do, whatever its
-    units. Its networks see ``observe(state)``, d(s) and t / horizon. The reward of a step is -|z|^2
+    s). Any disturbance of floats that has a quantile function and its inverse will do, whatever its
+    units. The networks see ``observe(state)``, d(s) and t / horizon. The reward of a step is -|z|^2
     / 2 (log p relative to its mode) + lambda (d(s) - d(s')) + ``bonus`` at a failure, undiscounted
-    (Lipkis and Agogino eq. 21; d is the miss distance, and counts 0 at a failure). Starts are drawn
-    ``widen`` times as wide as p(x0), and the start that is handed out is a mixture fitted to p(x0)
-    exp(V(s0) - lambda d(s0)) by the critics, 5 % of it p(x0); a start that is not of floats with
-    quantiles is left as it is.
-
-    ==================  ============================================================================
-    ``episodes``        in all, of full length; where they end early there are more of them. At
-                        least 4 a lane
-    ``scale``           lambda, a number above 0, per unit of distance: above the log-likelihood
-                        that the last unit costs. "auto": 1.5 E[d] / Var[d] of the nominal miss
-                        distance (that cost were d normal and linear in z; 64 over a typical
-                        distance gone where d does not vary), raised by half after each twentieth of
-                        the training in which less than a fifth of the episodes failed, up to three
-                        quarters of it
-    ``shaping``         "steps": d counts at every state, also of an ``episodic`` system, where it
-                        must then mean something on the way (as in `landing`); "end": only at the
-                        end of an episode, a sparse reward; "auto": "end" for an episodic black box,
-                        else "steps"
-    ``alpha``           temperature, a number above 0; with 1 the best policy is the disturbances
-                        given failure, and V the log of their probability. "auto": such that the
-                        mean entropy of a latent is ``entropy`` above that of N(0, 1) (on `landing`
-                        1.1 to 1.2, and no sharper)
-    ``components``      of the policy, a mixture of normal distributions of z: so many ways out of
-                        one state. Its ``mode`` is the middle of the heaviest
-    ``widen``           at least 1. "auto": 3, or where that is more a third of E[d] over the
-                        deviation of d, at most 10
-    ``lanes``           episodes side by side; after each step of all come ``updates`` of all
-                        networks ("auto": one, or as many as make 5000 in all), each on ``batch`` of
-                        the last ``buffer`` transitions
-    ``learning_rate``   of Adam; falls to a twentieth. ``polyak``: rate of the target networks.
-                        ``hidden``: widths of their layers
-    ==================  ============================================================================
-
-    ``progress`` shows a bar; ``callback(done, total, history)`` is called twenty times, with the
-    steps of all lanes and the `History` so far. A KeyboardInterrupt or SIGTERM ends the training
-    after its last whole stretch and gives what was learned by then (it is raised again where there
-    is none). ``checkpoint``: a folder that keeps where the training stands after each stretch; the
-    same call goes on from there, whatever ended it, to the same bits (docs/scale.md). The loop runs
-    on the host, so not under `jax.jit` or `jax.vmap`; the result does. The key is consumed.
+    (eq. 21 of Lipkis and Agogino; d is the miss distance, and counts 0 at a failure). The start
+    that is handed out is a mixture fitted to p(x0) exp(V(s0) - lambda d(s0)) by the critics, 5 % of
+    it p(x0); a start that is not of floats with quantiles is left as it is.
 
     Transitions in which a number is not finite are counted (``history.invalid``), end their episode
-    and are never learned from. More ways to fail out of one certain state than ``components`` are
-    left out, and so are they all but one in a proposal that is moved to the ``mode``: importance
-    sampling from the policy itself has both of two.
+    and are never learned from. Where there are more ways to fail out of one certain state than
+    ``components``, the others are left out. A proposal that is moved to the ``mode`` has only one
+    of them; importance sampling from the policy itself has both of two.
 
-    Raises ValueError for settings out of range, a simulator that breaks its contract, a disturbance
-    that is not of floats or cannot be tilted (named), and a checkpoint of another call.
+    The loop runs on the host, so not under `jax.jit` or `jax.vmap`; the result does.
+
+    Args:
+        key: consumed.
+        sim: the simulator.
+        episodes: in all, of full length; where they end early there are more of them. At least 4
+            for each lane.
+        scale: lambda, above 0, per unit of distance: above the log-likelihood that the last unit
+            costs. "auto" begins with 1.5 E[d] / Var[d] of the nominal miss distance (that cost were
+            d normal and linear in z), or, where d does not vary, with what makes the loss of a
+            typical distance worth 64. It is raised by half after each twentieth of the training in
+            which less than a fifth of the episodes failed, up to three quarters of the training.
+        bonus: of the reward at a failure.
+        alpha: temperature, above 0. With 1 the best policy is the disturbances given failure, and V
+            the log of their probability. "auto": such that the mean entropy of a latent is
+            ``entropy`` above that of N(0, 1) (on `landing` 1.1 to 1.2, and no sharper).
+        entropy: see ``alpha``.
+        shaping: "steps": d counts at every state, also of an ``episodic`` system, where it must
+            then mean something on the way (as in `landing`). "end": only at the end of an episode,
+            a sparse reward. "auto": "end" for an episodic black box, else "steps".
+        widen: starts are drawn this many times as wide as p(x0), at least 1. "auto": 3, or, where
+            that is more, a third of E[d] over the deviation of d, at most 10.
+        components: of the policy, a mixture of normal distributions of z: the ways out of one
+            state. Its ``mode`` is the middle of the heaviest.
+        lanes: episodes side by side.
+        hidden: widths of the networks' layers.
+        learning_rate: of Adam; falls to a twentieth.
+        batch: transitions of one update.
+        buffer: transitions that are kept to learn from.
+        polyak: rate of the target networks.
+        updates: of all networks after each step of all lanes. "auto": one, or as many as make 5000
+            in all.
+        progress: whether to show a progress bar.
+        callback: called twenty times as ``callback(done, total, history)``, with the steps of all
+            lanes and the `History` so far.
+        checkpoint: a folder that keeps where the training stands after each stretch. The same call
+            then goes on from there, to the same bits (docs/scale.md).
+
+    Returns:
+        `FailurePolicy`. A KeyboardInterrupt or SIGTERM ends the training after its last whole
+        stretch and gives what was learned by then (it is raised again where there is none).
+
+    Raises:
+        ValueError: for settings out of range, a simulator that breaks its contract, a disturbance
+            that is not of floats or cannot be tilted (named), and a checkpoint of another call.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, updates=1)
+        >>> policy = jast.policies.sac(jax.random.key(0), sim, **small)
+        >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
+        (30,)
     """
     random_key("sac", key)
     contract(sim)

@@ -32,15 +32,47 @@ __all__ = ["load", "save"]
 
 
 def save(path: PathLike, policy: FailurePolicy) -> None:
-    """`jast.save` of a `FailurePolicy`; goes with the next version. ValueError for a policy of
-    another kind.
+    """Write a `FailurePolicy` to a file. Deprecated: use `jast.save`; this function goes with the
+    next version.
+
+    Args:
+        path: of the file.
+        policy: what to write.
+
+    Raises:
+        ValueError: for a policy of another kind.
+
+    Example:
+        >>> import jast
+        >>> sim = jast.simulators.walk1d()
+        >>> model = jast.Policy(sim.start, lambda s, t: sim.disturbance(s))
+        >>> try:
+        ...     jast.policies.save("policy.npz", model)
+        ... except ValueError:
+        ...     print("only what was learned")
+        only what was learned
     """
     files.store(path, "jast policy", policy)
 
 
 def load(path: PathLike, sim: Simulator) -> FailurePolicy:
-    """`jast.load` of a `FailurePolicy`, with the simulator that it was taught on, or one like it;
-    goes with the next version.
+    """A `FailurePolicy` from a file. Deprecated: use `jast.load`; this function goes with the next
+    version.
+
+    Args:
+        path: of the file.
+        sim: the simulator that the policy was taught on, or one like it.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, updates=1)
+        >>> policy = jast.policies.sac(jax.random.key(0), sim, **small)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "policy.npz")
+        ...     jast.policies.save(path, policy)
+        ...     type(jast.policies.load(path, sim)).__name__
+        'FailurePolicy'
     """
     return files.restore(path, "jast policy", sim)[0]
 

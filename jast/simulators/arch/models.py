@@ -63,6 +63,11 @@ def chasing_cars(
 
     Raises:
         ValueError: for an unknown name and a number of segments that does not divide the samples.
+
+    Example:
+        >>> import jast
+        >>> jast.simulators.arch.chasing_cars("CC1", segments=5).horizon
+        5
     """
     return _driven("chasing_cars", cars, "CC", requirement, segments, disturbance)
 
@@ -92,6 +97,11 @@ def automatic_transmission(
 
     Raises:
         ValueError: for an unknown name and a number of segments that does not divide the samples.
+
+    Example:
+        >>> import jast
+        >>> jast.simulators.arch.automatic_transmission("AT1", segments=5).horizon
+        5
     """
     return _driven("automatic_transmission", transmission, "AT", requirement, segments, disturbance)
 
@@ -119,6 +129,14 @@ def simulate(
     Raises:
         ValueError: for another model, times that do not rise from 0, inputs out of their range or
             of another shape, another interpolation.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> trace, dt = jast.simulators.arch.simulate(
+        ...     "chasing cars", np.array([0.0]), np.array([[1.0, 0.0]])
+        ... )
+        >>> dt
+        0.05
     """
     if model not in MODELS:
         raise ValueError(f"simulate: model must be one of {list(MODELS)}, received {model!r}")
