@@ -364,6 +364,14 @@ def opposite(table):
     return q._replace(means=-q.means)
 
 
+def test_an_executor_that_is_shut_down_leaves_the_rows_that_are_done(key):
+    pool = concurrent.futures.ThreadPoolExecutor(1)
+    close = lambda *_: pool.shutdown(wait=False, cancel_futures=True)
+    table = crude(key, np.linspace(0.3, 1.5, 40), executor=pool, callback=close)
+    assert 0 < len(table.results) < 40 and None not in table.results
+    assert "the executor takes no more work" in table.settings["interrupted"]
+
+
 def test_rows_of_an_executor_do_not_follow(key):
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         with pytest.raises(ValueError, match="follow must be False with an executor"):

@@ -23,7 +23,7 @@ from systems import line
 
 import jast
 from jast import places, units
-from jast.checkpoints import PARTS, Store
+from jast.checkpoints import PARTS, Store, stored
 from jast.estimate import (
     Estimate,
     failure_probability,
@@ -419,6 +419,35 @@ def test_a_full_disk_is_told(key, tmp_path, monkeypatch, same):
     same(CALLS["nominal"](key, checkpoint=tmp_path), CALLS["nominal"](key))
 
 
+def test_a_state_that_cannot_be_written_leaves_the_last_one(key, tmp_path, monkeypatch):
+    def full(file, **entries):
+        file.write(b"a half")
+        raise OSError(28, "No space left on device")
+
+    with stored("sac", tmp_path, key) as store:
+        store.replace({"at": 1}, {"a": np.arange(3)})
+        with monkeypatch.context() as patch:
+            patch.setattr(np, "savez", full)
+            with pytest.raises(OSError, match="sac: checkpoint .* No space left"):
+                store.replace({"at": 2}, {"a": np.arange(4)})
+    with stored("sac", tmp_path, key) as store:
+        header, arrays = store.state()
+        assert header["at"] == 1 and arrays["a"].tolist() == [0, 1, 2]
+        (tmp_path / "state.jast").write_bytes(b"PK damaged")
+        assert store.state() is None  # the chain begins anew
+
+
+def test_a_call_goes_on_with_another_executor(key, tmp_path, same):
+    executor = ThreadPoolExecutor(1)
+    close = lambda *_: executor.shutdown(wait=False, cancel_futures=True)
+    call = lambda **how: jast.nominal(key, walk1d(), 20 * EPISODES, **how)
+    part = call(checkpoint=tmp_path, executor=executor, callback=close)
+    assert 0 < part.episodes < 20 * EPISODES
+    assert "the executor takes no more work" in part.settings["interrupted"]
+    with ThreadPoolExecutor(1) as another:
+        same(call(checkpoint=tmp_path, executor=another), call())
+
+
 def test_places_are_refused_inside_of_transformations(key, tmp_path):
     run = lambda key: monte_carlo(key, walk1d(), episodes=8, refine=0, checkpoint=tmp_path).steps
     with pytest.raises(ValueError, match="checkpoint must be None inside of jax.jit"):
@@ -486,6 +515,23 @@ def test_processes_of_an_executor_are_as_good_as_this_one(make, key, same, tmp_p
             same(call(key, executor=executor), call(key))
         if make is dask:
             made.cluster.close()
+
+
+# Python 3.11's pool raises in a thread of its own where futures of a broken pool are cancelled
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.long
+def test_a_pool_that_breaks_leaves_what_is_done(key, tmp_path, same):
+    """The system kills a process, as it does where memory is short."""
+    call = lambda **how: jast.nominal(key, walk1d(), 100 * EPISODES, checkpoint=tmp_path, **how)
+    with spawned() as executor:
+        ended = call(executor=executor, callback=lambda *_: _kill_one(executor))
+    assert ended.episodes < 100 * EPISODES
+    assert "BrokenProcessPool" in ended.settings["interrupted"]
+    same(call(), jast.nominal(key, walk1d(), 100 * EPISODES))
+
+
+def _kill_one(executor):
+    os.kill(next(iter(executor._processes)), signal.SIGKILL)
 
 
 @pytest.mark.long
