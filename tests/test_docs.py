@@ -1,5 +1,8 @@
 """The documentation: it builds without a warning, and what it shows runs."""
 
+import ast
+import inspect
+import operator
 import os
 import re
 import subprocess
@@ -44,6 +47,20 @@ def test_it_builds_without_a_warning(tmp_path):
     pytest.importorskip("myst_nb", reason="needs the extra `docs`")
     python("-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", ".", str(tmp_path), cwd=ROOT)
     assert (tmp_path / "docs/index.html").exists()
+
+
+def test_code_that_needs_other_machines_names_what_exists():
+    """That of docs/scale.md is not run: it is Python, and its calls and their settings exist."""
+    page = (ROOT / "docs/scale.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert blocks
+    for block in blocks:
+        for call in (n for n in ast.walk(ast.parse(block)) if isinstance(n, ast.Call)):
+            name = ast.unparse(call.func)
+            if name.startswith("jast."):
+                function = operator.attrgetter(name.removeprefix("jast."))(jast)
+                settings = {k.arg: None for k in call.keywords}
+                inspect.signature(function).bind(*call.args, **settings)
 
 
 def test_every_room_has_a_page():
