@@ -3,9 +3,9 @@ standard deviation, by the published code and by the published text.
 
 ``python -m benchmarks.table1_seeds [--json] [--quick | --smoke] [--seeds N] [--trees N] [--rows
 NAME ...]``. A row is a variant and a mode of its heads (`jast.heads.settings`); "tree" behind it:
-statistics of roots are counted at the end of the tree. The trees of a seed with heads are one
-sequence, taught after each tree, so they are not independent: a run is one figure. Every tree has
-18 x 500 simulations.
+statistics of roots are counted at the end of the tree; "mcts" is MCTS-SA, a tree without prunes.
+The trees of a seed with heads are one sequence, taught after each tree, so they are not
+independent: a run is one figure. Every tree has 18 x 500 simulations.
 """
 
 import argparse
@@ -18,14 +18,15 @@ import jast
 from benchmarks.ferry import BOX, REWARD, TABLE, timed
 from benchmarks.sizes import options, size
 
-VARIANTS = {"none": "-/-", "rollout": "RP/-", "value": "-/VN", "both": "RP/VN"}
-"""Heads: the paper's name of the row."""
+VARIANTS = {"mcts": "MCTS-SA", "none": "-/-", "rollout": "RP/-", "value": "-/VN", "both": "RP/VN"}
+"""The search or its heads: the paper's name of the row."""
 ROWS = {
+    "mcts": (None, "code", "turn"),
     "none": (None, "code", "turn"),
     **{
         f"{heads}, {mode}": (heads, mode, "turn")
         for mode in ("code", "text")
-        for heads in [*VARIANTS][1:]
+        for heads in [*VARIANTS][2:]
     },
     "rollout, code, tree": ("rollout", "code", "tree"),
 }
@@ -39,17 +40,13 @@ def search(row, trees, simulations):
         if heads is None
         else dict(heads=heads, head_settings=jast.heads.settings(mode, counted=counted))
     )
+    common = dict(trees=trees, mode=mode, reward=REWARD, actions=BOX)
+    if row == "mcts":
+        sim = jast.simulators.ferry()
+        return lambda key: jast.search.mcts(key, sim, simulations=18 * simulations, **common)
     sim = jast.simulators.ferry(observation=mode)
     return lambda key: jast.search.forest(
-        key,
-        sim,
-        trees=trees,
-        prunes=18,
-        simulations=simulations,
-        mode=mode,
-        reward=REWARD,
-        actions=BOX,
-        **more,
+        key, sim, prunes=18, simulations=simulations, **common, **more
     )
 
 
