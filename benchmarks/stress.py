@@ -184,8 +184,8 @@ def main(argv=None):
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
-    there = [m for m in METHODS if m != "cma_es" or importlib.util.find_spec("cma")]
-    there = [m for m in there if m not in SINGLE]
+    absent = () if importlib.util.find_spec("cma") else ("cma_es",)
+    there = [m for m in METHODS if m not in (*SINGLE, *absent)]
     methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)
