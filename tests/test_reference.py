@@ -11,6 +11,7 @@ from doors import DOORS, exported, functions
 READY = ["jast", "jast.search", "jast.estimate", "jast.explain", "jast.failures", "jast.specs"]
 READY += ["jast.incidents", "jast.rewards", "jast.actions", "jast.stress_testing", "jast.sweeping"]
 READY += ["jast.simulators", "jast.distributions", "jast.policies", "jast.blackbox", "jast.heads"]
+READY += ["jast.weakness"]
 READY += ["jast.simulators.arch", "jast.cross_entropy", "jast.cross_entropy.schedules"]
 """Rooms whose docstrings are whole."""
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

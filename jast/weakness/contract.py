@@ -50,7 +50,19 @@ class Step(NamedTuple):
 
 
 class Selector(NamedTuple):
-    """A way of choosing inputs: `default`, `thesis`, `random`, or your own."""
+    """A way of choosing inputs: `default`, `thesis`, `random`, or your own.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> from jast.weakness import Selector, Step
+        >>> def step(key, data, memory, seen, ask):  # in the order of the file
+        ...     chosen = np.flatnonzero(~seen.tried)[:10]
+        ...     ask(chosen)
+        ...     return Step(memory, np.full(data.size, 0.5), chosen, 0.0)
+        >>> mine = Selector("in order", {}, lambda key, data: {}, step)
+        >>> mine.name
+        'in order'
+    """
 
     name: str
     settings: dict[str, Any]

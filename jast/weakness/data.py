@@ -132,7 +132,21 @@ def idx(path: PathLike) -> np.ndarray:
 
     Y. LeCun, C. Cortes, C. Burges, "The MNIST database of handwritten digits": two zero bytes, a
     code of the type, the number of dimensions, each dimension as a big-endian 32-bit number, then
-    the numbers row by row. ValueError for a file that is damaged or none of these.
+    the numbers row by row.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ValueError: for a file that is damaged or of another format.
+
+    Example:
+        >>> import pathlib, tempfile, jast
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder, "labels")
+        ...     done = path.write_bytes(bytes([0, 0, 8, 1, 0, 0, 0, 2, 7, 9]))
+        ...     jast.weakness.idx(path).tolist()
+        [7, 9]
     """
     raw = _content(path)
     if len(raw) < 4 or raw[:2] != b"\0\0":
@@ -164,12 +178,33 @@ def idx(path: PathLike) -> np.ndarray:
 
 
 def from_idx(folder: PathLike, name: str = "t10k") -> tuple[np.ndarray, np.ndarray]:
-    """``(inputs [n, height, width] float32 in [0, 1], labels [n] int32)`` of a folder of IDX files:
-    MNIST's, by default its test images.
+    """A labelled set of images from a folder of IDX files: MNIST's, by default its test images.
 
     The files are ``<name>-images-idx3-ubyte`` and ``<name>-labels-idx1-ubyte``, or with a dot
-    before ``idx``, and ``.gz`` after it or not. FileNotFoundError where there are none; ValueError
-    where they are damaged, or hold something else than n images and n labels of unsigned bytes.
+    before ``idx``, and ``.gz`` after it or not.
+
+    Args:
+        folder: of the files.
+        name: how both begin.
+
+    Returns:
+        ``(inputs [n, height, width] float32 in [0, 1], labels [n] int32)``.
+
+    Raises:
+        FileNotFoundError: where there are none.
+        ValueError: where they are damaged, or hold something else than n images and n labels of
+            unsigned bytes.
+
+    Example:
+        >>> import pathlib, tempfile, jast
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     images = pathlib.Path(folder, "t10k-images-idx3-ubyte")
+        ...     labels = pathlib.Path(folder, "t10k-labels-idx1-ubyte")
+        ...     sizes = lambda *n: b"".join(size.to_bytes(4, "big") for size in n)
+        ...     done = images.write_bytes(bytes([0, 0, 8, 3]) + sizes(1, 2, 2) + bytes(4))
+        ...     done = labels.write_bytes(bytes([0, 0, 8, 1]) + sizes(1) + bytes([7]))
+        ...     [part.shape for part in jast.weakness.from_idx(folder)]
+        [(1, 2, 2), (1,)]
     """
     images, labels = (
         _named(folder, f"{name}-{part}", f"idx{dims}-ubyte", dims)
@@ -184,8 +219,16 @@ def from_idx(folder: PathLike, name: str = "t10k") -> tuple[np.ndarray, np.ndarr
 
 
 def digits() -> tuple[np.ndarray, np.ndarray]:
-    """``(inputs [1797, 8, 8] float32 in [0, 1], labels [1797] int32)``: the handwritten digits that
-    come with scikit-learn, of E. Alpaydin and C. Kaynak.
+    """The handwritten digits that come with scikit-learn, of E. Alpaydin and C. Kaynak.
+
+    Returns:
+        ``(inputs [1797, 8, 8] float32 in [0, 1], labels [1797] int32)``.
+
+    Example:
+        >>> import jast
+        >>> inputs, labels = jast.weakness.digits()
+        >>> inputs.shape, labels.shape
+        ((1797, 8, 8), (1797,))
     """
     try:
         from sklearn.datasets import load_digits

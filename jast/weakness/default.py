@@ -35,24 +35,33 @@ def default(
     system, and works on images and tables.
 
     Before any call, a committee of small networks is cross-validated on the inputs and their
-    labels: an input that those who have not seen it get wrong is a hard one for most classifiers.
-    After each batch a second committee imitates the system: it learns the system's answers where
+    labels: an input that members who have not seen it get wrong is a hard one for most classifiers.
+    After each batch a second committee imitates the system. It learns the system's answers where
     they are known (each with the weight of ten) and the labels elsewhere, and again each input is
     judged by members that have not seen it. A logistic regression on the inputs that were run
-    blends these opinions and that of an input's nearest neighbours; a Gaussian process over inputs
+    blends these opinions with that of an input's nearest neighbours. A Gaussian process over inputs
     with the same label adds what they all miss, such as a region of easy inputs that the system
     gets wrong.
 
-    A batch is the inputs with the highest probability of failure, but for a share that is drawn at
-    random from the others: ``exploration`` over the least probability in the batch, at most a
-    fifth: the less a call yields, the more of them are spent on what is not known. ``first``: calls
-    of the first batch (default: half a per cent of the inputs, at least 10), then ``growth`` times
-    the calls so far, at least ``first``. ``repeats``: how often each input is left out; each
-    repetition is five networks for each of two views. The scores are probabilities of failure.
-    ``expected`` is their sum over what was not run, corrected by how the random calls turned out
-    once there are twenty: a rough guide, in the runs measured between a seventh and six times the
-    truth, as suspicious inputs teach little about easy ones; random choice expects without bias. In
-    a state, ``memory["difficulty"]`` is the committee's word before any call, as log odds.
+    A batch is the inputs with the highest probability of failure, except for a share that is drawn
+    at random from the others. The scores are probabilities of failure. ``expected`` is their sum
+    over what was not run, corrected by how the random calls turned out once there are twenty. It is
+    a rough guide: in the runs measured it was between a seventh and six times the truth, as
+    suspicious inputs teach little about easy ones; random choice expects without bias. In a state,
+    ``memory["difficulty"]`` is the committee's opinion before any call, as log odds.
+
+    Args:
+        first: calls of the first batch. Default: half a per cent of the inputs, at least 10.
+        growth: each later batch has this multiple of the calls so far, and at least ``first``.
+        exploration: the random share is this over the least probability in the batch, at most a
+            fifth: the less a call yields, the more of them are spent on what is not known.
+        repeats: how often each input is left out; each repetition is five networks for each of two
+            views.
+
+    Example:
+        >>> import jast
+        >>> jast.weakness.default(first=20).settings["first"]
+        20
     """
     first = first if first is None else whole("default", "first", first)
     repeats = whole("default", "repeats", repeats)

@@ -72,6 +72,15 @@ def encoded(
 
     Raises:
         ValueError: for a result of another selector, and for inputs or labels that are not its own.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> small = jast.weakness.thesis(iterations=1, sample=50, hidden=(8,), encoder_epochs=1)
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(jax.random.key(0), wrong, inputs, labels, selector=small)
+        >>> jast.weakness.encoded(found, inputs, labels).scores.shape
+        (200,)
     """
     data = of_result("encoded", result, inputs, labels, classes)
     name, settings = json.loads(result.state.selector)

@@ -35,16 +35,32 @@ def influence(
     at: chex.Array | Sequence[int] | None = None,
     classes: int | None = None,
 ) -> np.ndarray:
-    """[k, ...]: what each number of k inputs contributes to the log odds that the system gets them
-    wrong, in the shape of the inputs; above 0: to failure.
+    """What each number of an input contributes to the log odds that the system gets it wrong.
 
-    The gradient of these log odds times the input's difference from the mean input, by five
+    It is the gradient of these log odds times the input's difference from the mean input, by five
     networks that have learned the system's answers where ``result`` has them, and the labels
     elsewhere, whatever selector found them. A first-order picture of an imitation, not of the
-    system itself. ``inputs``, ``labels``, ``classes``: those of `validate`. ``at``: which inputs;
-    default: the failures found. The key is consumed.
+    system itself.
 
-    ValueError for other inputs or labels than the result's, and indices out of range.
+    Args:
+        key: consumed.
+        result: of `validate`.
+        inputs, labels, classes: those of the validation.
+        at: which inputs, k of them. Default: the failures found.
+
+    Returns:
+        [k, ...], in the shape of the inputs; above 0: towards failure.
+
+    Raises:
+        ValueError: for other inputs or labels than the result's, and indices out of range.
+
+    Example:
+        >>> import jax, jast
+        >>> key, (inputs, labels) = jax.random.key(0), (a[:100] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(key, wrong, inputs, labels, selector="random")
+        >>> jast.weakness.influence(key, found, inputs, labels, at=[0, 1]).shape
+        (2, 8, 8)
     """
     random_key("influence", key)
     data = of_result("influence", result, inputs, labels, classes)

@@ -50,10 +50,23 @@ class Judgement(NamedTuple):
 
 
 def roc(scores: chex.Array, failed: chex.Array) -> Roc:
-    """The `Roc` of ``scores`` [n] (high: suspect) against ``failed`` [n] bool; equal scores are one
-    point. NaN shares where all fail or none.
+    """The receiver operating characteristic of scores; equal scores are one point.
 
-    ValueError for arrays of other lengths, and scores that are NaN.
+    Args:
+        scores: [n]: how suspect each input is.
+        failed: [n] bool: which fail.
+
+    Returns:
+        `Roc`; its shares are NaN where all inputs fail or none.
+
+    Raises:
+        ValueError: for arrays of other lengths, and scores that are NaN.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> curve = jast.weakness.roc(np.array([0.9, 0.2, 0.4]), np.array([True, False, True]))
+        >>> curve.true_positive.tolist()
+        [0.0, 0.5, 1.0, 1.0]
     """
     scores, failed = _pair("roc", scores, failed)
     order = np.argsort(-scores, kind="stable")
@@ -74,8 +87,23 @@ def roc(scores: chex.Array, failed: chex.Array) -> Roc:
 
 
 def auc(scores: chex.Array, failed: chex.Array) -> float:
-    """Area under the ROC curve: the chance that a failure has the higher score of a random pair,
-    equal ones count half. NaN where all inputs fail or none.
+    """Area under the ROC curve: the chance that a failure has the higher score of a random pair;
+    equal scores count half.
+
+    Args:
+        scores: [n]: how suspect each input is.
+        failed: [n] bool: which fail.
+
+    Returns:
+        A float; NaN where all inputs fail or none.
+
+    Raises:
+        ValueError: as `roc`.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> jast.weakness.auc(np.array([0.9, 0.2, 0.4]), np.array([True, False, True]))
+        1.0
     """
     return roc(scores, failed).area
 
@@ -83,12 +111,35 @@ def auc(scores: chex.Array, failed: chex.Array) -> float:
 def judge(
     result: Result, failed: chex.Array, *, threshold: float = 0.5, top: int | None = None
 ) -> Judgement:
-    """The `Judgement` of a result's iterations by the truth on all inputs: ``failed`` [n] bool,
-    which only a study knows that has run the system on all.
+    """How good the scores of each iteration are, by the truth on all inputs.
 
-    Candidates are the inputs with a score of at least ``threshold``, or, with ``top``, the so many
-    with the highest. The scores of inputs that were run are those of models that have not seen
-    their outcomes (the thesis's adversary has: as published).
+    Candidates are the inputs with a score of at least ``threshold``. The scores of inputs that were
+    run are those of models that have not seen their outcomes (the thesis's adversary has: as
+    published).
+
+    Args:
+        result: of `validate`.
+        failed: [n] bool, which only a study knows that has run the system on all inputs.
+        threshold: of a candidate's score.
+        top: with it, the candidates are this many inputs with the highest scores.
+
+    Returns:
+        `Judgement`.
+
+    Raises:
+        ValueError: for what is no result, a ``failed`` of another shape or type, and a threshold
+            that is no number.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> told = jast.weakness.judge(found, wrong(inputs) != labels, top=20)
+        >>> told.candidates.tolist() == [20] * len(told.auc)
+        True
     """
     if not isinstance(result, Result):
         raise ValueError(f"judge: result must be a Result, received {type(result).__name__}")

@@ -14,8 +14,15 @@ __all__ = ["default", "random", "thesis"]
 
 
 def random(*, batch: int | None = None) -> Selector:
-    """Inputs in random order, ``batch`` at once (default: a tenth of those not yet run, at least
-    10): the baseline, whose failure rate is unbiased.
+    """Inputs in random order: the baseline, whose failure rate is unbiased.
+
+    Args:
+        batch: inputs at once. Default: a tenth of those not yet run, at least 10.
+
+    Example:
+        >>> import jast
+        >>> jast.weakness.random(batch=5).settings
+        {'batch': 5}
     """
     batch = batch if batch is None else whole("random", "batch", batch)
 

@@ -19,12 +19,44 @@ PLAIN = ("selector", "data", "complete", "finished")
 
 
 def save(path: PathLike, state: State) -> None:
-    """`jast.save` of a `State`; goes with the next version."""
+    """Write the state of a validation to a file. Deprecated: use `jast.save`; this function goes
+    with the next version.
+
+    Args:
+        path: of the file.
+        state: what to write.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> inputs, labels = (a[:50] for a in jast.weakness.digits())
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), lambda x: labels[: len(x)], inputs, labels, selector="random"
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     jast.weakness.save(os.path.join(folder, "state.npz"), found.state)
+    """
     files.store(path, "jast validation", state)
 
 
 def load(path: PathLike) -> State:
-    """`jast.load` of a `State`; goes with the next version."""
+    """The state of a validation from a file. Deprecated: use `jast.load`; this function goes with
+    the next version.
+
+    Args:
+        path: of the file.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> inputs, labels = (a[:50] for a in jast.weakness.digits())
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), lambda x: labels[: len(x)], inputs, labels, selector="random"
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "state.npz")
+        ...     jast.weakness.save(path, found.state)
+        ...     jast.weakness.load(path).selector == found.state.selector
+        True
+    """
     return files.restore(path, "jast validation", None)[0]
 
 

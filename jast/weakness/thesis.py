@@ -35,23 +35,39 @@ def thesis(
     batch: int | None = None,
     replacement: bool = False,
 ) -> Selector:
-    """The selector of Moss's thesis, chapter 4: a failure classifier on what an autoencoder makes
+    """The selector of chapter 4 of Moss's thesis: a failure classifier on what an autoencoder makes
     of the inputs, without their labels.
 
-    The autoencoder (``hidden`` widths; default: `networks.sizes`, the published 392 and 64 for 784
-    pixels) is trained on all inputs before any call, for ``encoder_epochs`` by Adam at
-    ``encoder_rate``, in minibatches of ``batch`` (default: a tenth of the inputs, at most 1000; the
-    text's 1000 for its 10,000). Each of the ``iterations`` draws ``sample`` inputs without
-    replacement, runs the first half, and trains the adversary on their codes for ``epochs`` by Adam
-    at ``rate``, row by row, shuffled each epoch, each failure there and ``copies`` more times; its
-    weights go on to the next iteration, Adam starts anew. Those of the second half with a score of
-    at least ``threshold`` are the candidates, and are run. What was run before is not run again; it
-    is learned from again only if drawn again. ``replacement=True`` draws with replacement, as the
-    published code does: an input may come twice, also once in each half.
+    The autoencoder is trained on all inputs before any call. Each iteration draws inputs without
+    replacement, runs the first half, and trains the adversary on their codes, row by row, shuffled
+    each epoch. The adversary's weights carry over to the next iteration; Adam starts anew. Those of
+    the second half with a score of at least ``threshold`` are the candidates, and are run. What was
+    run before is not run again; it is learned from again only if drawn again.
 
     Images are scaled to [0, 1] as a whole, tables column by column. The scores are the adversary's
-    output, on inputs it was trained on too, as published. ``expected``: the failure rate of the
+    output, on inputs it was trained on too, as published. ``expected`` is the failure rate of the
     random halves, of what was run there first, for every input not yet run.
+
+    Args:
+        iterations: how many.
+        sample: inputs drawn in each.
+        threshold: of a candidate's score.
+        copies: how many more times a failure is learned from in an epoch.
+        epochs: of the adversary, by Adam.
+        rate: of its Adam.
+        hidden: widths of the autoencoder. Default: `networks.sizes`, the published 392 and 64 for
+            784 pixels.
+        encoder_epochs: of the autoencoder, by Adam.
+        encoder_rate: of its Adam.
+        batch: its minibatches. Default: a tenth of the inputs, at most 1000; the text's 1000 for
+            its 10,000.
+        replacement: draw with replacement, as the published code does: an input may come twice,
+            also once in each half.
+
+    Example:
+        >>> import jast
+        >>> jast.weakness.thesis(iterations=3).settings["iterations"]
+        3
     """
     whole_ = functools.partial(whole, "thesis")
     iterations, sample, epochs, encoder_epochs = (

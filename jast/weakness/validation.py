@@ -51,35 +51,54 @@ def validate(
     progress: bool = False,
     callback: Callback | None = None,
 ) -> Result:
-    """Find the inputs of a labelled data set that a classifier gets wrong, with at most ``budget``
-    calls of it: a `Result`.
+    """Find the inputs of a labelled data set that a classifier gets wrong, with few calls of it.
 
-    ``predict(inputs [m, ...]) -> labels [m]``: the system under test, any Python callable. It is
-    called with up to 1024 inputs at once, in the dtype of ``inputs``, and never twice on one input.
-    ``inputs`` [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns].
-    ``labels`` [n]: the true classes, whole numbers in 0 ... ``classes`` - 1 (default: the largest
-    and 1), as the predictions must be. ``budget``: calls, those of ``state`` included; default: all
-    n. The iteration in which it is spent is cut short.
+    The search ends with a RuntimeWarning where ``predict`` raises, or answers with something else
+    than m labels in range, and at a KeyboardInterrupt or SIGTERM. The result so far says so in
+    ``incidents``, with the batch: nothing that was answered is lost, and the same batch is asked
+    again by a run that continues. So it is where anything else raises after the first answer:
+    ``callback``, the checkpoint's disk, a selector.
 
-    ``selector``: "default" learns from the labels how hard each input is, and from each answer
-    where the system differs (`default`); "thesis" is the adversary on encodings of Moss's thesis,
-    chapter 4 (`thesis`); "random"; or a `Selector` with settings of your own.
+    Args:
+        key: consumed. A ``state`` continues with its own.
+        predict: inputs [m, ...] -> labels [m]: the system under test, any Python callable. It is
+            called with up to 1024 inputs at once, in the dtype of ``inputs``, and never twice on
+            one input.
+        inputs: [n, ...]: images [n, height, width] and the like, or rows of a table [n, columns].
+        labels: [n]: the true classes, whole numbers in 0 ... ``classes`` - 1, as the predictions
+            must be.
+        budget: calls, those of ``state`` included. Default: all n. The iteration in which it is
+            spent is cut short.
+        selector: "default" learns from the labels how hard each input is, and from each answer
+            where the system differs (`default`); "thesis" is the adversary on encodings of chapter
+            4 of Moss's thesis (`thesis`); "random"; or a `Selector` with settings of your own.
+        classes: how many there are. Default: the largest label and 1.
+        state: of an earlier result of the same data and selector, to continue from: after an
+            interruption as if there had been none, after a budget that was spent with new batches.
+        checkpoint: a folder that keeps the state after every call of ``predict``. The same call
+            then goes on where it was stopped, to the same result (docs/scale.md), and with a larger
+            budget as from a ``state``.
+        progress: whether to show a progress bar, of calls.
+        callback: called as ``callback(done, total, result)`` after each iteration, with the calls
+            and the result so far.
 
-    ``state``: of an earlier result of the same data and selector, to go on from there: after an
-    interruption as if there had been none, after a budget that was spent with new batches.
-    ``checkpoint``: a folder that keeps the state after every call of ``predict``; the same call
-    goes on from there, whatever ended it, to the same result (docs/scale.md), and with a larger
-    budget as from a ``state``. ``progress=True`` shows a bar of calls; ``callback(done, total,
-    result)`` is called after each iteration, with the calls and the result so far. The key is
-    consumed; a ``state`` goes on with its own.
+    Returns:
+        `Result`.
 
-    Where ``predict`` raises, or answers with something else than m labels in range, or at a
-    KeyboardInterrupt or SIGTERM, the search ends, with a RuntimeWarning, and the result so far says
-    so in ``incidents``, with the batch: nothing that was answered is lost, and the same batch is
-    asked again by a run that goes on. So it does where anything else raises after the first answer:
-    ``callback``, the checkpoint's disk, a selector. ValueError for an answer that is none at the
-    very first call; for inputs that are not finite, labels out of range, a state of other data or
-    of another selector, a checkpoint of another call.
+    Raises:
+        ValueError: for a wrong answer at the very first call; for inputs that are not finite,
+            labels out of range, a state of other data or of another selector, and a checkpoint of
+            another call.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> found.calls, len(found.failures) > 20
+        (50, True)
     """
     data = arrays("validate", inputs, labels, classes)
     chosen = _selector(selector)
