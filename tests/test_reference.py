@@ -3,22 +3,17 @@
 import doctest
 import inspect
 import re
+import sys
 
 import jax
 import pytest
 from doors import DOORS, exported, functions
 
-READY = ["jast", "jast.search", "jast.estimate", "jast.explain", "jast.failures", "jast.specs"]
-READY += ["jast.incidents", "jast.rewards", "jast.actions", "jast.stress_testing", "jast.sweeping"]
-READY += ["jast.simulators", "jast.distributions", "jast.policies", "jast.blackbox", "jast.heads"]
-READY += ["jast.weakness"]
-READY += ["jast.simulators.arch", "jast.cross_entropy", "jast.cross_entropy.schedules"]
-"""Rooms whose docstrings are whole."""
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-def of_rooms(pairs, rooms):
-    return [(name, value) for name, value in pairs if name.rpartition(".")[0] in rooms]
+def of_door(pairs, door):
+    return [(name, value) for name, value in pairs if name.rpartition(".")[0] == door]
 
 
 def explained(text):
@@ -28,16 +23,16 @@ def explained(text):
     return {name.strip(" *") for line in lines for name in line.split(",")}
 
 
-@pytest.mark.parametrize("room", READY)
-def test_every_argument_is_explained(room):
-    for name, function in of_rooms(functions(), [room]):
+@pytest.mark.parametrize("door", DOORS)
+def test_every_argument_is_explained(door):
+    for name, function in of_door(functions(), door):
         left = set(inspect.signature(function).parameters) - explained(inspect.getdoc(function))
         assert not left, f"{name}: {left}"
 
 
-@pytest.mark.parametrize("room", READY)
-def test_every_function_has_an_example(room):
-    for name, function in of_rooms(functions(), [room]):
+@pytest.mark.parametrize("door", DOORS)
+def test_every_function_has_an_example(door):
+    for name, function in of_door(functions(), door):
         assert "\nExample:\n    >>> " in inspect.getdoc(function), name
 
 
@@ -47,6 +42,8 @@ def run(name, value):
     with jax.enable_x64(False):
         for test in doctest.DocTestFinder(recurse=False).find(value, name, globs={}):
             doctest.DocTestRunner(optionflags=OPTIONS).run(test, out=said.append)
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
     assert not said, "".join(said)
 
 
@@ -58,5 +55,5 @@ def test_a_quick_example_runs(name):
 @pytest.mark.long
 @pytest.mark.parametrize("door", DOORS)
 def test_the_examples_of_a_room_run(door):
-    for name, value in of_rooms(exported(), [door]):
+    for name, value in of_door(exported(), door):
         run(name, value)

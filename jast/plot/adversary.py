@@ -45,6 +45,15 @@ def confusion(
     Raises:
         ValueError: for what is no result, a ``failed`` of another shape or type, and a threshold
             that is no number in 0 .. 1.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> ax = jast.plot.confusion(found, wrong(inputs) != labels)
     """
     caller = "confusion"
     scores = np.asarray(checked_result(caller, result).scores)
@@ -84,6 +93,15 @@ def threshold_sweep(
 
     Raises:
         ValueError: as `confusion`, and for fewer thresholds.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> ax = jast.plot.threshold_sweep(found, wrong(inputs) != labels)
     """
     caller = "threshold_sweep"
     scores = np.asarray(checked_result(caller, result).scores)
@@ -127,6 +145,17 @@ def likely_failures(
     Raises:
         ValueError: for what is no `Encoded`, inputs that are no such images, a ``failed`` of
             another shape or type, another kind, a count below 1, no such input, and too few axes.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> small = jast.weakness.thesis(iterations=1, sample=50, hidden=(8,), encoder_epochs=1)
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(jax.random.key(0), wrong, inputs, labels, selector=small)
+        >>> networks = jast.weakness.encoded(found, inputs, labels)
+        >>> kind, failed = "likely failures", wrong(inputs) != labels
+        >>> len(jast.plot.likely_failures(networks, inputs, failed, kind, count=3))
+        9
     """
     caller = "likely_failures"
     networks = _networks(caller, networks)
@@ -181,6 +210,14 @@ def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
 
     Raises:
         ValueError: for what is no `Encoded`, and one of other inputs than images.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> small = jast.weakness.thesis(iterations=1, sample=50, hidden=(8,), encoder_epochs=1)
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(jax.random.key(0), wrong, inputs, labels, selector=small)
+        >>> ax = jast.plot.pixel_likelihood(jast.weakness.encoded(found, inputs, labels))
     """
     networks = _networks("pixel_likelihood", networks)
     if len(networks.shape) != 2:

@@ -45,19 +45,32 @@ def colav(
     axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:
     """One colav `Episode` as the planner saw it, at some moments: a panel each, x east (m), y north
-    (m). Returns the list of Axes.
+    (m).
 
     In a panel: the paths so far, the track that the ferry believes (dashed, a thin line from it to
     the truth), the safety zones around the believed adversary, and, in the title, the time and the
     speed that the ferry orders on that picture (at the episode's end: the last order). Ships are
     drawn 8 m long, not to the scale of a collision (1 m).
 
-    ``moments``: step numbers, or how many: then the last is the closest approach (or the end, where
-    that comes too soon for so many), the others are spread evenly before it. The states are those
-    of the episode, or of its replay on ``sim``. With ``axes``, the title is that of their figure.
+    Args:
+        episode: with its states, or to be replayed on ``sim``.
+        sim: its simulator.
+        moments: step numbers, or how many: then the last is the closest approach (or the end, where
+            that comes too soon for so many), the others are spread evenly before it.
+        axes: one for each moment, whose figure gets the title; None: a new figure.
 
-    Raises ValueError for many episodes, states that are missing or another system's, moments
-    outside the episode and too few axes.
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for many episodes, states that are missing or another system's, moments outside
+            the episode, and too few axes.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.colav("head-on", substeps=5)
+        >>> len(jast.plot.colav(jast.rollout(jax.random.key(0), sim), moments=2))
+        2
     """
     states = _states("colav", episode, sim)
     log, moments = _log(states), _moments(moments, states)
@@ -85,11 +98,27 @@ def colav_story(
     episode: Episode, sim: Simulator | None = None, axes: Sequence[Axes] | None = None
 ) -> list[Axes]:
     """One colav `Episode` over time (s): a panel for each kind of disturbance, then the distances
-    (m), then the ferry's speed (m/s). Returns the list of Axes.
+    (m), then the ferry's speed (m/s).
 
-    The delay is in seconds where ``sim`` is given, which knows the longest, else a share of it;
-    steering is the turn (rad/s) on top of the route; noise is the size of its errors in position
-    (m) and velocity (m/s). States and errors as for `colav`.
+    Steering is the turn (rad/s) on top of the route; noise is the size of its errors in position
+    (m) and velocity (m/s).
+
+    Args:
+        episode: as for `colav`.
+        sim: its simulator. With it the delay is in seconds, else it is a share of the longest.
+        axes: one for each panel; None: a new figure.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: as `colav`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.colav("head-on", substeps=5)
+        >>> len(jast.plot.colav_story(jast.rollout(jax.random.key(0), sim), sim))
+        3
     """
     states = _states("colav_story", episode, sim)
     kinds, log, edges = (
@@ -164,12 +193,30 @@ def colav_animation(
     path: PathLike | None = None,
     smooth: int = 3,
 ) -> FuncAnimation:
-    """A panel of `colav` that moves: ``smooth`` frames a step, between states by straight lines.
-    Returns the matplotlib FuncAnimation.
+    """A panel of `colav` that moves. In a notebook: ``HTML(animation.to_jshtml())``.
 
-    In a notebook: ``HTML(animation.to_jshtml())``. ``path``: save it too, as .html, .gif or .mp4,
-    ``fps`` frames a second. States and errors as for `colav`; ValueError too for a path that
-    nothing here can write, and for ``fps`` and ``smooth`` that are not positive.
+    Args:
+        episode, sim: as for `colav`.
+        fps: frames a second.
+        path: save it too, as .html, .gif or .mp4.
+        smooth: frames a step, between states by straight lines.
+
+    Returns:
+        The matplotlib FuncAnimation.
+
+    Raises:
+        ValueError: as `colav`, for a path that nothing here can write, and for ``fps`` and
+            ``smooth`` that are not positive.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.colav("head-on", substeps=5)
+        >>> episode = jast.rollout(jax.random.key(0), sim)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "meeting.gif")
+        ...     movie = jast.plot.colav_animation(episode, path=path, smooth=1)
+        ...     os.path.exists(path)
+        True
     """
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -55,6 +55,12 @@ def failing_trees(
     Raises:
         ValueError: for anything but results of searches, names that differ, and numbers that are
             not above 0.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> ax = jast.plot.failing_trees({"chance": found}, {"chance": 2.0})
     """
     rows, costs = _checked("failing_trees", results, seconds, costs)
     with style.axes(ax, (6.8, 4.2)) as ax:
@@ -94,7 +100,20 @@ def simulation_times(
     figure 5 of Lytskjold and Mengshoel. Searches that keep states (``memoize`` of
     `jast.search.forest`) take fewer steps a simulation, which pays the more the slower a step is.
 
-    Args, errors and what is returned are those of `failing_trees`.
+    Args:
+        results, seconds, costs, ax: as for `failing_trees`.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: as `failing_trees`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> ax = jast.plot.simulation_times({"chance": found}, {"chance": 2.0})
     """
     rows, costs = _checked("simulation_times", results, seconds, costs)
     with style.axes(ax, (6.8, 4.2)) as ax:

@@ -35,21 +35,37 @@ def proposal_contours(
     elites: int = 5,
 ) -> list[Axes]:
     """How the proposal of one run moved over an objective of two numbers, a panel an iteration
-    (figure 2.2 of the thesis). Returns the list of Axes.
+    (figure 2.2 of the thesis).
 
     In a panel: the objective (the darker the lower), the 1 and 2 standard deviation ellipses of the
     proposal that the iteration drew from (of a `Mixture`, those of each component, fainter where
-    its weight is small), the points evaluated in it, and of all evaluated so far the ``elites``
-    best and the very best.
+    its weight is small), the points evaluated in it, and of all evaluated so far the best ones and
+    the very best.
 
-    ``result``: a `CEResult` without leading axes. ``objective``: x [2] -> number, in JAX or not, or
-    None to leave it out. ``iterations``: which ones, counted from 1 as ``print(result)`` does;
-    default: four of those that were run. ``bounds``: ((low, high), (low, high)) of all panels,
-    which then say how many points lie outside; default: each panel holds its points, and has at
-    least a twentieth of the widest one's side.
+    Args:
+        result: a `CEResult` without leading axes.
+        objective: x [2] -> number, in JAX or not, or None to leave it out.
+        axes: one for each iteration; None: a new figure.
+        iterations: which ones, counted from 1 as ``print(result)`` does. Default: four of those
+            that were run.
+        bounds: ((low, high), (low, high)) of all panels, which then say how many points lie
+            outside. Default: each panel holds its points, and has at least a twentieth of the
+            widest one's side.
+        elites: how many of the best points so far are marked.
 
-    Raises ValueError for many runs, dimensions other than 2, iterations that were not run, bounds
-    that are none, elites below 1 and too few axes.
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for many runs, dimensions other than 2, iterations that were not run, bounds
+            that are none, elites below 1, and too few axes.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from jast import cross_entropy as ce
+        >>> found = ce.ce_method(jax.random.key(0), ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> len(jast.plot.proposal_contours(found, ce.paraboloid, iterations=[1, 5]))
+        2
     """
     import matplotlib.pyplot as plt
 
@@ -122,14 +138,30 @@ def surrogate_samples(
     bounds: Any = None,
 ) -> list[Axes]:
     """One iteration of a run with a surrogate, for an objective of two numbers (figure 2.4 of the
-    thesis). Returns the list of two Axes.
+    thesis).
 
     Left: the points that were truly evaluated, and the proposal. Right: those that only the
     surrogate judged, and the next proposal.
 
-    ``result``, ``objective`` and ``bounds`` as for `proposal_contours`, but the default bounds
-    leave out the farthest points; ``iteration`` counts from 1. Raises ValueError as that does, and
-    for a run without a surrogate.
+    Args:
+        result, objective: as for `proposal_contours`.
+        iteration: which one, counted from 1.
+        axes: two; None: a new figure.
+        bounds: as for `proposal_contours`, but the default leaves out the farthest points.
+
+    Returns:
+        The list of two Axes.
+
+    Raises:
+        ValueError: as `proposal_contours`, and for a run without a surrogate.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from jast import cross_entropy as ce
+        >>> wide = ce.normal(jnp.ones(2), 4.0)
+        >>> found = ce.ce_surrogate(jax.random.key(0), ce.paraboloid, wide, iterations=3)
+        >>> len(jast.plot.surrogate_samples(found, ce.paraboloid, 2))
+        2
     """
     caller = "surrogate_samples"
     log = _log(caller, result)
@@ -184,13 +216,31 @@ def convergence(
     axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:
     """Best value so far by true evaluations: the mean over runs and its 95 % band, 1.96 standard
-    errors (figure 2.3 of the thesis). Returns the list of Axes.
+    errors (figure 2.3 of the thesis).
 
-    ``results``: a batch of runs, a `CEResult` with a leading axis as `jax.vmap` makes it, or a dict
-    of name -> batch. ``optimum`` [d]: where the objective is least; with it, a second panel with
-    the mean distance of the best point to it, on a logarithmic axis. Means are those of
-    `jast.cross_entropy.scores`; nothing is drawn while a run has no finite value. Raises ValueError
-    for what is no batch of runs, an optimum of another dimension and too few axes.
+    Means are those of `jast.cross_entropy.scores`; nothing is drawn while a run has no finite
+    value.
+
+    Args:
+        results: a batch of runs, a `CEResult` with a leading axis as `jax.vmap` makes it, or a dict
+            of name -> batch.
+        optimum: [d]: where the objective is least. With it, a second panel has the mean distance of
+            the best point to it, on a logarithmic axis.
+        axes: one or two; None: a new figure.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for what is no batch of runs, an optimum of another dimension, and too few axes.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from jast import cross_entropy as ce
+        >>> run = lambda key: ce.ce_method(key, ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> runs = jax.vmap(run)(jax.random.split(jax.random.key(0), 5))
+        >>> len(jast.plot.convergence(runs, jnp.zeros(2)))
+        2
     """
     caller = "convergence"
     results = results if isinstance(results, dict) else {"": results}

@@ -29,12 +29,18 @@ def exceedance(
         curves: a `jast.estimate.Exceedance`, an `Estimate` that holds draws, or a dict of name ->
             either.
         truth: threshold -> probability, of an array, where it is known: dots.
+        ax: Axes to draw in; None: a new figure.
 
     Returns:
         The Axes.
 
     Raises:
         ValueError: for anything else, an estimate without draws, and where nothing is known.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> ax = jast.plot.exceedance({"counting": counted})
     """
     caller = "plot.exceedance"
     named = curves if isinstance(curves, dict) else {None: curves}

@@ -34,15 +34,33 @@ def first_failures(
     axes: Sequence[Axes] | None = None,
 ) -> list[Axes]:
     """The first failures found, a tile each: what the system said, what it is, and the input's
-    number. The thesis's figure 4.5 is `likely_failures`.
+    number. Figure 4.5 of the thesis is `likely_failures`.
 
-    ``inputs`` and ``labels`` [n]: those of the validation; images [n, height, width], or [n,
-    height, width, channels] of 1, 3 or 4 channels. Numbers of colours are shares of 1, or of 255
-    where whole. ``names``: of the classes. Returns the list of Axes, one a tile; a single one that
-    says so where no failure was found.
+    Args:
+        result: a `jast.weakness.Result`.
+        inputs, labels: [n]: those of the validation; images [n, height, width], or [n, height,
+            width, channels] of 1, 3 or 4 channels. Numbers of colours are shares of 1, or of 255
+            where they are whole.
+        count: tiles, at most.
+        names: of the classes.
+        axes: one for each tile; None: a new figure.
 
-    ValueError for what is no `jast.weakness.Result`, other numbers of inputs or labels, rows of a
-    table, labels by which its failures are none, too few names, and too few axes.
+    Returns:
+        The list of Axes, one for each tile; a single one that says so where no failure was found.
+
+    Raises:
+        ValueError: for what is no `jast.weakness.Result`, other numbers of inputs or labels, rows
+            of a table, labels by which its failures are none, too few names, and too few axes.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> len(jast.plot.first_failures(found, inputs, labels, count=6))
+        6
     """
     import matplotlib.pyplot as plt
 
@@ -113,18 +131,31 @@ def contributions(
     ax: Axes | None = None,
 ) -> Axes:
     """Which features mark the weakness: the mean magnitude of their contributions to the log odds
-    of failure. Returns the Axes. The thesis's figure 4.6 is `pixel_likelihood`.
+    of failure. Figure 4.6 of the thesis is `pixel_likelihood`.
 
-    ``values`` [k, ...]: the signed contributions of each feature, for k inputs
-    (`jast.weakness.influence`). Of images [k, height, width] or [k, height, width, channels], whose
-    magnitudes are summed over the channels: a map, over ``background`` [height, width(, channels)],
-    in grey, for example the mean image. Of rows of a table [k, columns]: the 15 columns of the
-    greatest mean magnitude, by their ``names``, with the mean of the signed contributions, which
-    raises the odds of failure or lowers them. Of k = 0, as a result without failures gives: axes
-    that say so.
+    Images are drawn as a map, whose magnitudes are summed over the channels. Of rows of a table the
+    15 columns of the greatest mean magnitude are drawn, with the mean of the signed contributions,
+    which raises the odds of failure or lowers them. With k = 0, as a result without failures gives,
+    the axes say so.
 
-    ValueError for values of another shape or that are not finite, names or a background that do not
-    fit or are for the other kind of inputs.
+    Args:
+        values: [k, ...]: the signed contributions of each feature, for k inputs
+            (`jast.weakness.influence`): images [k, height, width] or [k, height, width, channels],
+            or rows [k, columns].
+        names: of the columns of a table.
+        background: of images, in grey, [height, width(, channels)]: for example the mean image.
+        ax: Axes to draw in; None: a new figure.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for values of another shape or that are not finite, and names or a background
+            that do not fit or are for the other kind of inputs.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> ax = jast.plot.contributions(np.array([[0.1, -2.0], [0.3, 1.0]]), ["speed", "gap"])
     """
     caller = "contributions"
     values = _numbers(values)

@@ -49,6 +49,7 @@ def failure_fan(
         modes: `jast.search.Modes`, by which failures are told apart (by their direction,
             moved in time), or the number of the mode of each, from 0. Default: those of a report.
         units: name -> unit, for the label of a field.
+        ax: Axes to draw in; None: a new figure.
 
     Returns:
         The Axes.
@@ -56,6 +57,12 @@ def failure_fan(
     Raises:
         ValueError: for samples of another kind, a value that is not one number or no field, and
             ``most`` below 1.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> ax = jast.plot.failure_fan(found, sim)
     """
     caller = "failure_fan"
     g = given(caller, samples, sim, modes, most)

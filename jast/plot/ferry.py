@@ -21,12 +21,23 @@ __all__ = ["ferry"]
 
 
 def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None) -> Axes:
-    """Both vessels of one ferry `Episode`: their paths with a dot a step and a number every fifth,
-    and the closest approach.
+    """Both vessels of one ferry `Episode`: their paths with a dot for each step and a number at
+    every fifth, and the closest approach.
 
-    The states are those of the episode, or of its replay on ``sim`` (default:
-    `jast.simulators.ferry` S0). Returns the Axes. ValueError for an episode of another system or
-    for many episodes.
+    Args:
+        episode: with its states, or to be replayed on ``sim``.
+        sim: its simulator. Default: `jast.simulators.ferry` S0.
+        ax: Axes to draw in; None: a new figure.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for an episode of another system, or for many episodes.
+
+    Example:
+        >>> import jax, jast
+        >>> ax = jast.plot.ferry(jast.rollout(jax.random.key(0), jast.simulators.ferry()))
     """
     states = style.one("ferry", episode).states
     if states is None:

@@ -35,13 +35,30 @@ UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " r
 def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) -> list[Axes]:
     """One `Episode` of an fms simulator: the route on a map (left; degrees), and the turn with the
     largest error of its arc, enlarged (right; nmi from its waypoint). Where the defect acted, it is
-    the second of the turns that overlap. Returns the list of Axes.
+    the second of the turns that overlap.
 
     The path is blue, the arc in question vermilion: from the direction of its start s around its
     centre c to its end e, as its packet says; dashed, the turn as it was built. Grey: the legs, and
     on the map the beacons of `jast.simulators.fms.FIXES` for orientation. Needs float64, as the
-    simulator does. ValueError for another system's simulator, for many episodes and for fewer than
-    two axes.
+    simulator does.
+
+    Args:
+        episode: one.
+        sim: its simulator.
+        axes: two; None: a new figure.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for another system's simulator, for many episodes, and for fewer than two axes.
+
+    Example:
+        >>> import jax, jast
+        >>> with jax.enable_x64(True):
+        ...     sim = jast.simulators.fms(waypoints=4)
+        ...     len(jast.plot.fms(jast.rollout(jax.random.key(0), sim), sim))
+        2
     """
     import matplotlib.pyplot as plt
 

@@ -32,11 +32,21 @@ def history(
     """How the best reward grew with the episodes of a tree: the mean over trees with its 95 % band,
     and (dashed) the best over trees.
 
-    ``total=True``: the best over trees with the episodes of all trees, by which searches of
-    different numbers of trees compare.
+    Args:
+        results: a search result, or a dict of name -> result, whose ``history`` has ``simulations``
+            [C] and ``best_reward`` [C, trees].
+        ax: Axes to draw in; None: a new figure.
+        total: draw the best over trees with the episodes of all trees, by which searches of
+            different numbers of trees compare.
 
-    ``results``: a search result, or a dict of name -> result, whose ``history`` has ``simulations``
-    [C] and ``best_reward`` [C, trees]. Returns the Axes.
+    Returns:
+        The Axes.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.cem(jax.random.key(0), sim, samples=50, elites=5, iterations=4)
+        >>> ax = jast.plot.history({"cross-entropy": found})
     """
     from matplotlib.ticker import EngFormatter
 
@@ -116,6 +126,12 @@ def disturbances(
     Raises:
         ValueError: for no or many episodes, too few axes, and a simulator with a distribution that
             has no quantile function.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> len(jast.plot.disturbances(jast.rollout(jax.random.key(0), sim)))
+        1
     """
     style.one("disturbances", episode)
     n = int(episode.length)
@@ -184,11 +200,26 @@ def distances(
     bins: int = 40,
     ax: Axes | None = None,
 ) -> Axes:
-    """Histogram of the miss distances of one or several batches of episodes (each an `Episode` with
-    leading axes); failures are ticks on the axis.
+    """Histogram of the miss distances of one or several batches of episodes; failures are ticks on
+    the axis. Episodes whose distance is not finite are left out.
 
-    ``labels``: one name a batch. Episodes whose distance is not finite are left out. Returns the
-    Axes. ValueError where no episode or no label fits.
+    Args:
+        episodes: one or several batches, each an `Episode` with leading axes.
+        labels: one name for each batch.
+        bins: of the histogram.
+        ax: Axes to draw in; None: a new figure.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: where no episode or no label fits.
+
+    Example:
+        >>> import jax, jast
+        >>> keys = jax.random.split(jax.random.key(0), 50)
+        >>> many = jax.vmap(jast.rollout, (0, None))(keys, jast.simulators.walk1d())
+        >>> ax = jast.plot.distances(many, labels=["nominal"])
     """
     if not episodes or not all(isinstance(e, Episode) for e in episodes):
         raise ValueError(

@@ -33,6 +33,13 @@ def training(
 
     Raises:
         ValueError: for what is no failure policy, and for too few axes.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, updates=1)
+        >>> len(jast.plot.training(jast.policies.sac(jax.random.key(0), sim, **small)))
+        2
     """
     policies = policies if isinstance(policies, dict) else {"": policies}
     _check("training", "policies", policies, FailurePolicy)
@@ -62,6 +69,12 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
 
     Raises:
         ValueError: for what is no such result, and a batch of runs.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing()
+        >>> found = jast.estimate.failure_proposal(jax.random.key(0), sim, samples=200)
+        >>> ax = jast.plot.levels(found)
     """
     proposals = proposals if isinstance(proposals, dict) else {"": proposals}
     _check("levels", "proposals", proposals, FailureProposal)

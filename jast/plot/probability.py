@@ -22,13 +22,25 @@ def probability(
     estimates: Estimate | Mapping[str, Any], truth: float | None = None, ax: Axes | None = None
 ) -> Axes:
     """Failure probabilities with their intervals on a logarithmic axis, a row each; an UNRELIABLE
-    one is a dashed line and a cross, and named so.
+    one is a dashed line and a cross, and named so. Where no failure was seen an arrow points down
+    from the upper bound.
 
-    ``estimates``: an `Estimate` or a dict of name -> `Estimate` or list of them, which share a row
-    (several seeds). Where no failure was seen an arrow points down from the upper bound. ``truth``:
-    the known probability, a vertical line. Returns the Axes.
+    Args:
+        estimates: an `Estimate`, or a dict of name -> `Estimate` or list of them, which share a row
+            (several seeds).
+        truth: the known probability, a vertical line.
+        ax: Axes to draw in; None: a new figure.
 
-    ValueError for anything else, a truth outside (0, 1] and estimates below the least double.
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for anything else, a truth outside (0, 1], and estimates below the least double.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> ax = jast.plot.probability({"counting": counted})
     """
     caller = "probability"
     rows = estimates if isinstance(estimates, dict) else {None: estimates}
@@ -93,15 +105,28 @@ def probability(
 
 
 def weights(traces: Traces, ax: Axes | None = None) -> Axes:
-    """The greatest weights of an estimate: which share of the episodes has a weight above so many
-    times the mean, both axes logarithmic. Returns the Axes.
+    """The greatest weights of an estimate: the share of the episodes whose weight is above a
+    multiple of the mean weight, both axes logarithmic.
 
     Black over the tail: the Pareto distribution of the shape k-hat (`jast.estimate.pareto_k`)
     through the tail's median. Its slope falls to -1/k-hat: the flatter, the fewer episodes decide;
     above 0.7 no standard error is to be trusted. A failure mode that is missing does not show.
 
-    ``traces``: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`.
-    ValueError for anything else, and with fewer than 2 failures.
+    Args:
+        traces: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`.
+        ax: Axes to draw in; None: a new figure.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for anything else, and with fewer than 2 failures.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing()
+        >>> proposal = jast.estimate.failure_proposal(key, sim, samples=200).policy
+        >>> ax = jast.plot.weights(jast.estimate.log_weights(key, sim, proposal, 1000))
     """
     from matplotlib.ticker import LogLocator
 

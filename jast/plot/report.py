@@ -72,6 +72,11 @@ def report(
 
     Raises:
         ValueError: for anything but a report.
+
+    Example:
+        >>> import jax, jast
+        >>> found = jast.stress(jax.random.key(0), jast.simulators.walk1d(), 1000)
+        >>> figure = jast.plot.report(found)
     """
     import matplotlib.pyplot as plt
 

@@ -39,6 +39,11 @@ def sierra(
 
     Raises:
         ValueError: for settings that are no pairs, those that sierra refuses, and too few axes.
+
+    Example:
+        >>> import jast
+        >>> len(jast.plot.sierra([(6.0, 1.0)]))
+        1
     """
     try:
         pairs = [(float(eta), float(decay)) for eta, decay in settings]

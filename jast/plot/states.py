@@ -75,6 +75,13 @@ def traces(
 
     Raises:
         ValueError: for samples of another kind, and a field that there is not.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.gradient(jax.random.key(0), sim, starts=4, refine=0)
+        >>> len(jast.plot.traces(found, sim, nominal=20)) > 0
+        True
     """
     caller = "traces"
     g = given(caller, samples, sim, modes, most)
@@ -168,12 +175,19 @@ def phase(
         samples, sim, modes, nominal, units, most: as of `traces`.
         fields: two names, across and up. Default: the first two numbers that go otherwise than
             undisturbed.
+        ax: Axes to draw in; None: a new figure.
 
     Returns:
         The Axes.
 
     Raises:
         ValueError: as `traces`, and where there are not two fields.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.pendulum()
+        >>> found = jast.search.gradient(jax.random.key(0), sim, starts=4, refine=0)
+        >>> ax = jast.plot.phase(found, sim, nominal=20)
     """
     caller = "phase"
     g = given(caller, samples, sim, modes, most)

@@ -34,6 +34,7 @@ def sweep(
         against: the setting, of numbers; default: the only one that varies.
         level: a probability whose crossing is drawn: where the line crosses it, and the interval.
         truth: value of the setting -> probability, of an array, where it is known: dots.
+        ax: Axes to draw in; None: a new figure.
 
     Returns:
         The Axes.
@@ -41,6 +42,14 @@ def sweep(
     Raises:
         ValueError: for anything but a `Sweep`, one without a probability, and as
             `Sweep.crossing`.
+
+    Example:
+        >>> import jax, jast
+        >>> make = lambda threshold: jast.simulators.walk1d(threshold=threshold)
+        >>> table = jast.sweep(
+        ...     jax.random.key(0), make, {"threshold": [8.0, 12.0]}, jast.nominal, episodes=500
+        ... )
+        >>> ax = jast.plot.sweep(table)
     """
     caller = "plot.sweep"
     if not isinstance(table, Sweep):

@@ -38,6 +38,13 @@ def tree(
 
     Raises:
         ValueError: for a result that holds no trees, and a number that it does not have.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.mcts(jax.random.key(0), sim, simulations=500, keep_trees=True)
+        >>> len(jast.plot.tree(found))
+        2
     """
     nodes = nodes_of("plot.tree", result, tree)
     path = nodes.path[: levels + 1]
@@ -87,6 +94,16 @@ def tree_page(result: Any, path: PathLike, *, tree: int | None = None) -> None:
 
     Raises:
         ValueError: for a result that holds no trees, and a number that it does not have.
+
+    Example:
+        >>> import os, tempfile, jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.mcts(jax.random.key(0), sim, simulations=500, keep_trees=True)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "tree.html")
+        ...     jast.plot.tree_page(found, path)
+        ...     os.path.exists(path)
+        True
     """
     from jast.page.tree import write_tree
 

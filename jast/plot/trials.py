@@ -30,16 +30,33 @@ def trials(
     mode: Literal["default", "thesis"] = "default",
 ) -> list[Axes]:
     """Over the simulations of a tree: the mean miss distance so far, the least so far, and how many
-    failures so far, a panel each. Returns the list of Axes.
+    failures so far, a panel each.
 
-    ``results``: a search result, or a dict of name -> result, searched with ``record=True``. Of
-    several trees: each tree's running figure averaged over the trees, with a light band from
+    Of several trees each tree's running figure is averaged over the trees, with a light band from
     quartile to quartile; drawn from where every tree has a valid episode.
 
-    ``mode="thesis"`` is figure 3.7 as printed: a logarithmic axis of simulations, distances
-    negated, so that a failure lies above the event horizon at 0, and the band about the mean is one
-    standard deviation of the episodes so far (of several trees: its mean). ValueError for a result
-    without trials and another mode.
+    Args:
+        results: a search result, or a dict of name -> result, searched with ``record=True``.
+        axes: three; None: a new figure.
+        mode: "thesis" is figure 3.7 of Moss's thesis as printed: a logarithmic axis of simulations,
+            distances negated, so that a failure lies above the event horizon at 0, and the band
+            about the mean is one standard deviation of the episodes so far (of several trees: its
+            mean).
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: for a result without trials, and another mode.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(
+        ...     jax.random.key(0), sim, episodes=500, refine=0, record=True
+        ... )
+        >>> len(jast.plot.trials(found))
+        3
     """
     results, printed = _named("trials", results), _printed("trials", mode)
     with style.axes(axes, (7.2, 7.4), 3) as axes:
@@ -94,11 +111,31 @@ def trial_distances(
     mode: Literal["default", "thesis"] = "default",
 ) -> list[Axes]:
     """Histograms over all trees: the miss distances of the episodes, and log p of those that
-    failed, a panel each. Returns the list of Axes.
+    failed, a panel each.
 
-    ``results`` as for `trials`, and so the errors; ``bins``: the most of a histogram, shared by the
-    searches. log p depends on the units of the disturbances: compare differences, not ratios.
-    ``mode="thesis"`` is figure 3.8 as printed: distances negated, and the event horizon at 0.
+    log p depends on the units of the disturbances: compare differences, not ratios.
+
+    Args:
+        results: as for `trials`.
+        bins: the most of a histogram, shared by the searches.
+        axes: two; None: a new figure.
+        mode: "thesis" is figure 3.8 of Moss's thesis as printed: distances negated, and the event
+            horizon at 0.
+
+    Returns:
+        The list of Axes.
+
+    Raises:
+        ValueError: as `trials`.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(
+        ...     jax.random.key(0), sim, episodes=500, refine=0, record=True
+        ... )
+        >>> len(jast.plot.trial_distances(found))
+        2
     """
     import matplotlib.pyplot as plt
 

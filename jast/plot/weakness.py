@@ -26,16 +26,31 @@ def failures_found(
     ax: Axes | None = None,
 ) -> Axes:
     """Failures found against calls of the system, call by call, and beside them the most that can
-    be found: each call a failure. Returns the Axes.
+    be found: each call a failure.
 
-    ``results``: a `jast.weakness.Result`, a list of them (several seeds: their mean, and a band
-    from the least to the greatest, as far as all of them go), or a dict of name -> either.
-    ``failed`` [n] bool: which of all n inputs fail, as only an exhaustive study knows; with it, the
-    number of all failures, and a random choice: its mean, and 2 standard deviations
-    (hypergeometric) to both sides.
+    Args:
+        results: a `jast.weakness.Result`, a list of them (several seeds: their mean, and a band
+            from the least to the greatest, as far as all of them go), or a dict of name -> either.
+        failed: [n] bool: which of all n inputs fail, as only an exhaustive study knows. With it,
+            the number of all failures is drawn, and a random choice: its mean, and 2 standard
+            deviations (hypergeometric) to both sides.
+        ax: Axes to draw in; None: a new figure.
 
-    ValueError for what is no result, for results of different n, and for a ``failed`` of another
-    shape or type, or that contradicts what the calls found.
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for what is no result, for results of different n, and for a ``failed`` of
+            another shape or type, or that contradicts what the calls found.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> ax = jast.plot.failures_found(found, wrong(inputs) != labels)
     """
     caller = "failures_found"
     rows = _rows(caller, results)
@@ -106,13 +121,30 @@ def roc(
     with the area under it (figure 4.4 of the thesis).
 
     R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford, 2021, chapter
-    4. ``failed`` [n] bool: which of all n inputs fail, which only an exhaustive study knows.
-    ``iterations``: which ones, counted from 1 as ``print(result)`` does; default: up to four,
-    evenly, the last one included. Where all inputs fail or none there is no curve, and the area is
-    "-". Returns the Axes.
+    4. Where all inputs fail or none there is no curve, and the area is "-".
 
-    ValueError for what is no `jast.weakness.Result`, one without iterations, iterations that were
-    not made, and a ``failed`` of another shape or type.
+    Args:
+        result: a `jast.weakness.Result`.
+        failed: [n] bool: which of all n inputs fail, which only an exhaustive study knows.
+        iterations: which ones, counted from 1 as ``print(result)`` does. Default: up to four,
+            evenly, the last one included.
+        ax: Axes to draw in; None: a new figure.
+
+    Returns:
+        The Axes.
+
+    Raises:
+        ValueError: for what is no `jast.weakness.Result`, one without iterations, iterations that
+            were not made, and a ``failed`` of another shape or type.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> ax = jast.plot.roc(found, wrong(inputs) != labels)
     """
     caller = "roc"
     made = len(checked_result(caller, result).history.scores)
