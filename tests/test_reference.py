@@ -54,6 +54,7 @@ def test_a_quick_example_runs(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize("door", DOORS)
-def test_the_examples_of_a_room_run(door):
+def test_the_examples_of_a_room_run(door, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
     for name, value in of_door(exported(), door):
         run(name, value)
