@@ -1,13 +1,15 @@
 """What the driver of units costs, what a second worker gains, and whether killed calls go on to the
-same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--kills N]``.
+same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--costs] [--kills N]``.
 
 ``overhead``: CPU time of a call to that with a plain loop over the same units in its place.
 ``checkpoint``: CPU time with a checkpoint to that without. Runs of the two alternate; medians.
 ``workers``: wall time with one process to that with two, of an executor of spawned processes, on
 the ferry (S0) and on a black box that waits for 5 ms. ``kills``: calls killed at random moments
 (SIGKILL) and made again: how many gave the result of the uninterrupted call to the bit, and how
-many units that had ended were not on disk. ``--kills N`` does only this, N times in all, and also
-with the chains, whose steps depend on one another: a forest with heads, a training, a validation.
+many units that had ended were not on disk.
+
+``--costs``: only the first two. ``--kills N``: only kills, N in all, and also of the chains, whose
+steps depend on one another: a forest with heads, a training, a validation.
 """
 
 import argparse
@@ -258,44 +260,57 @@ def many_kills(n):
 
 def report(args):
     sizes = size(args, (100_000, 200, 100_000), (100_000, 16, 20_000), (2000, 8, 5000))
-    repeats, names = size(args, 15, 3, 1), size(args, None, None, ["nominal"])
-    found = dict(overhead={}, checkpoint={}, workers={}, kills={})
-    for name in names or calls(*sizes):
-        call = calls(*sizes)[name]
-        found["overhead"][name] = ratio(call, looped(call), repeats)
-        found["checkpoint"][name] = ratio(kept(call), call, repeats)
+    names = size(args, None, None, ["nominal"])
+    found = costs(sizes, names or calls(*sizes), size(args, 15, 3, 1))
+    if args.costs:
+        return found
     if not args.smoke:
         n, episodes, repeats = size(args, (4_000_000, 1280, 5), (1_000_000, 640, 1), None)
         of_ferry = lambda **how: jast.nominal(KEY, ferry(), n, **how)
-        found["workers"]["S0"] = speedup(of_ferry, repeats)
-        found["workers"]["black box, 5 ms"] = speedup(black_box(episodes), repeats)
-    for name in names or size(args, list(calls(*sizes)), ["nominal", "forest"], None):
-        found["kills"][name] = kills(name, sizes, size(args, 25, 2, 1))
+        waiting = speedup(black_box(episodes), repeats)
+        found["workers"] = {"S0": speedup(of_ferry, repeats), "black box, 5 ms": waiting}
+    each = names or size(args, list(calls(*sizes)), ["nominal", "forest"], None)
+    found["kills"] = {name: kills(name, sizes, size(args, 25, 2, 1)) for name in each}
+    return found
+
+
+def costs(sizes, names, repeats):
+    """What the driver and a checkpoint cost these calls."""
+    found = dict(overhead={}, checkpoint={})
+    for name in names:
+        call = calls(*sizes)[name]
+        found["overhead"][name] = ratio(call, looped(call), repeats)
+        found["checkpoint"][name] = ratio(kept(call), call, repeats)
     return found
 
 
 def tables(found):
-    """What `report` or `many_kills` found, as text."""
-    lines = []
+    """What was found, as text."""
+    parts = []
     if "overhead" in found:
-        lines += ["| call | CPU s | driver | checkpoint |", "|---|---|---|---|"]
+        rows = ["| call | CPU s | driver | checkpoint |", "|---|---|---|---|"]
         for name, cost in found["overhead"].items():
             kept = found["checkpoint"][name]["more"]
-            lines.append(f"| {name} | {cost['seconds']:.2f} | {cost['more']:+.1%} | {kept:+.1%} |")
-        lines += ["", "| system | s, one worker | speedup of two |", "|---|---|---|"]
+            rows.append(f"| {name} | {cost['seconds']:.2f} | {cost['more']:+.1%} | {kept:+.1%} |")
+        parts.append(rows)
+    if "workers" in found:
+        rows = ["| system | s, one worker | speedup of two |", "|---|---|---|"]
         for name, gain in found["workers"].items():
-            lines.append(f"| {name} | {gain['seconds']:.2f} | {gain['speedup']:.2f} |")
-        lines.append("")
-    lines += ["| call | killed | equal | most units lost |", "|---|---|---|---|"]
-    for name, of in found["kills"].items():
-        killed = f"{of['killed']} of {of['runs']}"
-        lines.append(f"| {name} | {killed} | {of['equal']} | {of['most_units_lost']} |")
-    return "\n".join(lines)
+            rows.append(f"| {name} | {gain['seconds']:.2f} | {gain['speedup']:.2f} |")
+        parts.append(rows)
+    if "kills" in found:
+        rows = ["| call | killed | equal | most units lost |", "|---|---|---|---|"]
+        for name, of in found["kills"].items():
+            killed = f"{of['killed']} of {of['runs']}"
+            rows.append(f"| {name} | {killed} | {of['equal']} | {of['most_units_lost']} |")
+        parts.append(rows)
+    return "\n\n".join(map("\n".join, parts))
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options(parser, "less of everything: two kills of two calls")
+    parser.add_argument("--costs", action="store_true", help="only the driver and a checkpoint")
     parser.add_argument("--kills", type=int, metavar="N", help="only kills, N in all")
     args = parser.parse_args(argv)
     found = report(args) if args.kills is None else dict(kills=many_kills(args.kills))
