@@ -78,13 +78,13 @@ def validated(**how):
 def chains():
     """Calls by name, of which all or a part is no sum of units."""
     return {
-        "forest with heads": lambda **how: jast.search.forest(
-            KEY, ferry(), trees=8, prunes=4, simulations=200, lanes=2, heads="rollout", **how
-        ),
         "sac": lambda **how: jast.policies.sac(
             KEY, landing(), episodes=800, lanes=8, hidden=(32, 32), batch=64, updates=1, **how
         ),
         "validate": validated,
+        "forest with heads": lambda **how: jast.search.forest(
+            KEY, ferry(), trees=8, prunes=4, simulations=200, lanes=2, heads="rollout", **how
+        ),
     }
 
 
@@ -251,11 +251,14 @@ def kills(name, sizes, runs):
 
 
 def many_kills(n):
-    """`kills` of all calls, ``n`` in all."""
-    sizes = (300_000, 16, 20_000)
+    """`kills` of all calls, ``n`` in all; tells of each as it ends, as this takes long."""
+    sizes, found = (300_000, 16, 20_000), {}
     names = [*calls(*sizes), *chains()]
-    each = {name: n // len(names) + (i < n % len(names)) for i, name in enumerate(names)}
-    return {name: kills(name, sizes, runs) for name, runs in each.items() if runs}
+    for i, name in enumerate(names):
+        if runs := n // len(names) + (i < n % len(names)):
+            found[name] = kills(name, sizes, runs)
+            print(name, found[name], file=sys.stderr, flush=True)
+    return found
 
 
 def report(args):
