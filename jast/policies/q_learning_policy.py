@@ -95,9 +95,9 @@ def q_learning(
 
     Returns:
         `FailurePolicy`; its ``history.alpha`` is 0 and ``critic_loss`` the mean square of the
-        table's errors. Its start is a mixture fitted to p(x0) exp(V(s0) - lambda d(s0)), as that of
-        `sac`. A KeyboardInterrupt ends the training after its last whole stretch and gives what was
-        learned by then (it is raised again where there is none). `jast.save` does not take it.
+        table's errors. Its start is a mixture fitted to p(x0) exp(V(s0)), V the best of a row. A
+        KeyboardInterrupt ends the training after its last whole stretch and gives what was learned
+        by then (it is raised again where there is none). `jast.save` does not take it.
 
     Raises:
         ValueError: for settings out of range, a table that does not fit into memory, a ``cell``

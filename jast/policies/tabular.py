@@ -223,6 +223,6 @@ def tilt(
 ) -> Tilt:
     """The `Tilt` of the start that the table asks for."""
     table = training.learner.actor
-    # E.tilt takes the V of rewards with a potential
+    # before the end of an episode the potential that E.tilt takes from V is 0 here
     value = lambda inputs: jnp.max(_row(cell, sim.horizon, table, inputs))
     return E.tilt(key, sim, shape, training, jnp.zeros(()), value)
