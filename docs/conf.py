@@ -18,6 +18,7 @@ abouts = ["CHANGELOG.md", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md", "SECURITY.md"
 include_patterns = ["docs/**", "notebooks/**", *abouts]
 exclude_patterns = ["docs/build"]
 html_theme, html_title = "sphinx_book_theme", "jast"
+html_static_path, html_css_files = ["static"], ["page.css"]
 
 nb_execution_mode = "off"  # notebooks are committed with what they printed
 myst_enable_extensions = ["attrs_inline", "dollarmath"]

@@ -94,6 +94,15 @@ def test_the_front_page_moves_and_every_lesson_has_a_picture():
         assert f"thumbnails/{notebook.stem}.png" in gallery
 
 
+@pytest.mark.long
+def test_the_film_is_made_by_its_script(tmp_path):
+    """As many frames as the committed one, of the same size."""
+    image = pytest.importorskip("PIL.Image", reason="comes with matplotlib")
+    python("docs/film.py", str(tmp_path / "failure.gif"), cwd=ROOT)
+    with image.open(tmp_path / "failure.gif") as new, image.open(ROOT / "docs/failure.gif") as old:
+        assert new.n_frames == old.n_frames and new.size == old.size
+
+
 def test_the_list_of_figures_has_every_page_and_its_commands():
     pages = {path.stem: path.read_text() for path in (ROOT / "docs/figures").glob("*.md")}
     rows = re.findall(
