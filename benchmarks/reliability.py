@@ -18,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 
 from benchmarks.limit_states import LIMITS  # noqa: E402
+from benchmarks.structural import PROBLEMS  # noqa: E402
 
 __all__ = ["METHODS", "run"]
 
@@ -167,9 +168,17 @@ def run(method, g_batch, dimension, budget, seed, levels=13, starts=()):
     }
 
 
+def _levels(truth):
+    """What subset simulation and NAIS are told: a tenth survives each level."""
+    levels = int(np.ceil(-np.log10(truth))) + 1
+    return {"subset": levels, "nais": levels}
+
+
 def row(method, case, budget, seeds):
     """The report of several seeds."""
-    limit, (starts, levels), cpu = LIMITS[case], CASES[case], time.process_time()
+    limit = (LIMITS | PROBLEMS)[case]
+    starts, levels = CASES[case] if case in CASES else ((), _levels(limit.truth))
+    cpu = time.process_time()
     runs = [
         run(method, limit.batch, limit.dimension, budget, seed, levels.get(method), starts)
         for seed in range(seeds)
@@ -206,10 +215,10 @@ def main(argv=None):
     parser.add_argument(
         "--cases",
         nargs="+",
-        choices=CASES,
+        choices=CASES | PROBLEMS,
         default=list(CASES),
         metavar="CASE",
-        help=", ".join(CASES),
+        help=", ".join(CASES) + "; " + ", ".join(PROBLEMS) + " (no starts by hand)",
     )
     parser.add_argument(
         "--methods",
