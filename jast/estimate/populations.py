@@ -163,7 +163,7 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
         levels.append(level)
 
 
-def cool(key, sim, chains):
+def cool(key, sim, chains, *, covered=None):
     """Failing points of small norm, one a chain, found without a miss distance that could mislead:
     `Explored`.
 
@@ -171,9 +171,9 @@ def cool(key, sim, chains):
     ``FAILING`` fail (nothing is found where none does). ``chains`` of these failures go on, each by
     Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain
     replaces another one, no failure mode is lost on the way, however little of the probability it
-    has.
+    has. ``covered`` as in `explore`.
     """
-    chain = Chain(key, sim, chains)
+    chain = Chain(key, sim, chains, covered)
     for width in WIDTHS:
         drawn = [chain.draw(width) for _ in range(DRAWS)]
         people = Population(*map(np.concatenate, zip(*drawn, strict=True)))

@@ -14,8 +14,8 @@ from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.guard import LOST
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
-from jast.estimate.populations import LAST, QUANTILE, explore
-from jast.estimate.tilt_search import TiltSeeker, from_near, seek_tilts
+from jast.estimate.populations import LAST, QUANTILE, Chain, cool, explore
+from jast.estimate.tilt_search import TiltSeeker, from_near, only, seek_tilts
 from jast.units import Ways
 from jast.watch import Watch
 
@@ -33,6 +33,10 @@ COVERED, MET, GUARD, THIN, WRONG = 50.0, 20, 0.15, 0.06, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
 what the search for lost failures may cost, of the budget; a part of the probability that may lie,
 by all batches, where the proposal does not cover it; standard errors that may be lost.
+"""
+CHAINS, MOVES, FEW = (8, 24), 10, 3
+"""Failures that wide noise leads to; their moves as the model has them; of those that the tilts
+hardly draw, as many as are taken in.
 """
 
 
@@ -73,8 +77,43 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     cover. What is found is taken in, and else becomes a reason against the estimate.
     """
     s.reasons = []  # others are about the Gaussians
+    _elsewhere(s, t)
     if _lost(s, t, True):
         _lost(s, t, False)
+
+
+def _elsewhere(s, t):
+    """Take in failures that wide noise leads to and the tilts hardly draw: their levels of the miss
+    distance may all have been on the way to one failure mode.
+    """
+    nothing = t.tilts(t.q), math.inf
+    cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, *CHAINS)), covered=nothing)
+    if not (n := len(cold.points)):
+        return
+    chain = Chain(s.next_key(), s.sim, n, nothing)
+    start = chain.judge(cold.points.astype(s.dtype))
+    people = chain.move(start, np.arange(n), -math.inf, 1.0, MOVES)
+    o, log_q, trace = of_the_model(s.sim, nothing[0], people.z)
+    bare = (np.asarray(o.score) == -np.inf) & (log_q < -t.log_mean - _covered(s))
+    rows = np.flatnonzero(bare)
+    paid = cold.evaluations + chain.evaluations
+    s.note(f"guard (cooled): {len(rows)} of {n} failures not covered", paid)
+    most = int(min(GUARD * s.budget, REST * (s.budget - s.spent)))
+    if len(rows) >= FEW and most >= t.batch:
+        _taken(s, t, only(trace, rows), np.asarray(o.length)[rows], len(rows) / n, most)
+
+
+def _covered(s):
+    """How far below the mean of log q - log p a failure may lie, to be covered."""
+    return math.log(max(COVERED, THIN * (s.budget - s.spent) / MET))
+
+
+def _taken(s, t, trace, length, share, most):
+    """Take in failures that carry about ``share``, at the cost of at most ``most``."""
+    before, told = t.spent, len(t.history)
+    t.widen(trace, length, share, t.spent + most)
+    s.spent += t.spent - before
+    s.history += t.history[told:]
 
 
 def _lost(s, t, takes):
@@ -85,7 +124,7 @@ def _lost(s, t, takes):
     if not size:
         s.reasons.append("the budget did not last to look for lost failure modes")
         return False
-    covered = math.log(max(COVERED, THIN * (s.budget - s.spent) / MET))
+    covered = _covered(s)
     q, threshold = t.tilts(t.q), -t.log_mean - covered
     p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=room)
     share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
@@ -110,10 +149,7 @@ def _lost(s, t, takes):
         )
         return False
     o, _, trace = of_the_model(s.sim, q, p.points.astype(s.dtype))
-    before, told = t.spent, len(t.history)
-    t.widen(trace, np.asarray(o.length), share, t.spent + most)
-    s.spent += t.spent - before
-    s.history += t.history[told:]
+    _taken(s, t, trace, np.asarray(o.length), share, most)
     return True
 
 

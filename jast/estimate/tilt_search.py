@@ -27,7 +27,7 @@ from jast.estimate.tilt_fit import (
 )
 from jast.limit_state import normal_numbers
 
-__all__ = ["TiltSeeker", "seek_tilts"]
+__all__ = ["TiltSeeker", "from_near", "only", "seek_tilts"]
 
 COMPONENTS = (3, 5)
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
@@ -211,9 +211,14 @@ def rows_of(b: Drawn, level: float) -> Drawn:
     """Those of the episodes that come to ``level``, at most `KEPT`."""
     near = np.flatnonzero(b.score <= level)
     rows = near[:KEPT]
-    trace = Trace(*(a[rows] for a in b.trace[:3]), *(a[:, rows] for a in b.trace[3:]))
+    trace = only(b.trace, rows)
     size = b.size * len(rows) // max(len(near), 1)
     return Drawn(b.mixture, trace, b.score[rows], b.length[rows], b.log_weight[rows], size)
+
+
+def only(trace: Trace, rows: np.ndarray) -> Trace:
+    """The traces of ``rows``."""
+    return Trace(*(a[rows] for a in trace[:3]), *(a[:, rows] for a in trace[3:]))
 
 
 def joined(traces: list[Trace]) -> Trace:
