@@ -14,13 +14,18 @@ LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches
 see there.
 """
+THIN = 0.06
+"""A part of the probability that may lie, by all batches, where the proposal does not cover it."""
 CUT = 0.3
 """How far on the way to a known mode the first population may go, as a share of the log density
 ratio there.
 """
 MOST = 0.85
 """Of the budget, where the search ends."""
-LEAST, MOVES = 50, 10
+LEAST, MOVES, FEW = 50, 10, 40
+"""Points of a population, which come in as many; moves of the failures that wide noise led to; one
+of as many of them, or one, may lie where the proposal does not cover it.
+"""
 
 
 def guarded(s, i, last):
@@ -76,6 +81,8 @@ def guarded(s, i, last):
     if i == 0 and len(s.seeds):
         found += _forgotten(s)
     if not found:
+        if thin > THIN:
+            s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
         s.lost = asked
@@ -113,7 +120,7 @@ def _forgotten(s):
     s.note(
         f"guard (cooled): {rows.mean():.0%} of {len(rows)} failures not covered", chain.evaluations
     )
-    return [(0.0, z[rows], used[rows])] if rows.sum() > 2 else []
+    return [(0.0, z[rows], used[rows])] if rows.sum() > max(len(rows) // FEW, 1) else []
 
 
 def _unit(s):

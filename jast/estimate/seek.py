@@ -28,6 +28,7 @@ from jast.estimate.gaussians import (
 from jast.estimate.guard import guarded
 from jast.estimate.populations import cool, explore
 from jast.incidents import hosted
+from jast.judge import judged
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
@@ -38,11 +39,17 @@ COVERED = 50.0
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
+LIFTS = 1.0, 1.05, 1.1, 1.2
+"""How much farther out than a failure its mirror image is looked for."""
 NEAR, GOOD, SERVES = 2, 0.2, 0.05
 """Of the proposal of a similar system: the batches that it is fitted to; effective draws of a draw
 with which it is taken as it is, and with which it serves once it is fitted.
 """
 RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
+LEAST, MINOR = 0.05, 0.2
+"""Share of the draws that a direction has at least, and all of those together: what a few failures
+tell of its mass is mostly too little.
+"""
 
 
 class Seeker:
@@ -195,6 +202,8 @@ def _explore(s, gradients):
     points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
     around("design points by cooling", distinct(points, POINTS), cold.evaluations)
     s.seeds = points[s.rng.permutation(len(points))]
+    if len(s.anchors):
+        around("their mirror images", *_mirrored(s))
     if not differentiable:
         population = explore(s.next_key(), s.sim, s.size, most=int(0.4 * s.budget))
         s.note(
@@ -205,6 +214,17 @@ def _explore(s, gradients):
             s.populations.append(population)
             parts.append(s.fitted(population.points, population.used))
     return parts
+
+
+def _mirrored(s):
+    """Failures opposite to those known: what fails to the left often fails to the right. Points,
+    the nearest first, and evaluations.
+    """
+    lifted = -np.array(LIFTS)[:, None, None] * s.anchors
+    failure = judged(s.sim, lifted.reshape(-1, s.dimension).astype(s.dtype)).failure
+    failure = failure.reshape(lifted.shape[:2])
+    points = lifted[np.argmax(failure, axis=0), np.arange(len(s.anchors))][failure.any(axis=0)]
+    return distinct(points, POINTS), failure.size
 
 
 def _look(s):
@@ -298,6 +318,7 @@ def _failing(batches):
 def _by_owner(s, points, log_w, owner):
     """A `Latent`: Gaussians fitted to the points of each owner apart."""
     parts, w, owners = [], np.exp(log_w - log_w.max()), np.unique(owner)
+    least = min(LEAST, MINOR / len(owners))
     for i in owners:
         rows = np.flatnonzero(owner == i)
         mass = w[rows].sum() / w.sum()
@@ -315,7 +336,7 @@ def _by_owner(s, points, log_w, owner):
             limit=max(POINTS // len(owners), 2),
             anchors=s.anchors,
         )
-        parts.append(g._replace(weights=g.weights * max(mass, 0.003 if power == 1 else 0.02)))
+        parts.append(g._replace(weights=g.weights * max(mass, least)))
     return as_latent(
         _defended(
             Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))), 0.0, s.rare

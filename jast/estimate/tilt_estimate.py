@@ -11,7 +11,7 @@ from jast.counter import generator
 from jast.estimate import diagnostics
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
-from jast.estimate.guard import LOST
+from jast.estimate.guard import LOST, THIN
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
 from jast.estimate.populations import LAST, QUANTILE, Chain, cool, explore
@@ -29,10 +29,9 @@ GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
-COVERED, MET, GUARD, THIN, WRONG = 50.0, 20, 0.15, 0.06, 1.5
+COVERED, MET, GUARD, WRONG = 50.0, 20, 0.15, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
-what the search for lost failures may cost, of the budget; a part of the probability that may lie,
-by all batches, where the proposal does not cover it; standard errors that may be lost.
+what the search for lost failures may cost, of the budget; standard errors that may be lost.
 """
 CHAINS, MOVES, FEW = (8, 24), 10, 3
 """Failures that wide noise leads to; their moves as the model has them; of those that the tilts
