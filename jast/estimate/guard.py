@@ -7,15 +7,17 @@ import math
 import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
-from jast.estimate.gaussians import as_latent, unit
+from jast.estimate.gaussians import as_latent, effective, unit
 from jast.estimate.populations import LAST, QUANTILE, Chain, explore
 
 LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches
 see there.
 """
-THIN = 0.06
-"""A part of the probability that may lie, by all batches, where the proposal does not cover it."""
+THIN, MET = 0.06, 10
+"""A part of the probability that may lie, by all batches, where the proposal does not cover it, and
+effective draws of it from which they know it.
+"""
 CUT = 0.3
 """How far on the way to a known mode the first population may go, as a share of the log density
 ratio there.
@@ -70,8 +72,8 @@ def guarded(s, i, last):
         rows = _bare(s, p.points, p.used)
         found.append((rows.mean(), p.points[rows], p.used[rows]))
     log_w, _ = balanced(s.batches)
-    w = np.exp(log_w - log_w.max())
-    thin = w[log_w > -s.thin()].sum() / w.sum()
+    w, rows = np.exp(log_w - log_w.max()), log_w > -s.thin()
+    thin = w[rows].sum() / w.sum()
     asked = s.asked = max((share for share, *_ in found), default=0.0)
     s.note(
         f"guard: {asked:.2%} of the probability where the proposal is thin, {thin:.2%} by its own"
@@ -81,7 +83,7 @@ def guarded(s, i, last):
     if i == 0 and len(s.seeds):
         found += _forgotten(s)
     if not found:
-        if thin > THIN:
+        if thin > THIN and effective(log_w[rows]) < MET:
             s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
