@@ -39,6 +39,7 @@ COVERED = 50.0
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
+ROUNDS, ALONE = 3, 0.1
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
 NEAR, GOOD, SERVES = 2, 0.2, 0.05
@@ -198,9 +199,8 @@ def _explore(s, gradients):
     differentiable = found is not None and around(
         "design points by gradients", found.points, found.evaluations
     )
-    cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, 8, CHAINS)))
-    points = np.where(np.arange(s.dimension)[None] < cold.used[:, None], cold.points, 0.0)
-    around("design points by cooling", distinct(points, POINTS), cold.evaluations)
+    points, evaluations = _cooled(s)
+    around("design points by cooling", distinct(points, POINTS), evaluations)
     s.seeds = points[s.rng.permutation(len(points))]
     if len(s.anchors):
         around("their mirror images", *_mirrored(s))
@@ -214,6 +214,25 @@ def _explore(s, gradients):
             s.populations.append(population)
             parts.append(s.fitted(population.points, population.used))
     return parts
+
+
+def _cooled(s):
+    """Failures [n, D] by noise that is wide first and then cooled, and evaluations. Chains are
+    started again where more than `ALONE` of them end in a direction that no other one has: so much
+    of what they may lead to is still to be met (Good 1953).
+    """
+    points, evaluations, n = np.zeros((0, s.dimension)), 0, int(np.clip(s.budget // 800, 8, CHAINS))
+    for _ in range(ROUNDS):
+        cold = cool(s.next_key(), s.sim, n)
+        used = np.arange(s.dimension)[None] < cold.used[:, None]
+        points = np.concatenate([points, np.where(used, cold.points, 0.0)])
+        evaluations += cold.evaluations
+        if not len(points):
+            break
+        owner = nearest(points, distinct(points, len(points)))
+        if (np.bincount(owner) == 1).sum() <= ALONE * len(points):
+            break
+    return points, evaluations
 
 
 def _mirrored(s):
@@ -257,7 +276,7 @@ def _refine(s, most):
             f" ESS {ess:.4g}; next: {name}",
             s.batch,
         )
-        if own < 1.15 * before and own > 0.1 * s.batch or name == "as it was":
+        if before and own > 0.1 * s.batch and (own < 1.15 * before or name == "as it was"):
             return
         before = own
 
