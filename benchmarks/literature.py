@@ -130,7 +130,7 @@ def _looked_up(values, h, rate, np=jnp):
     column = np.clip((h - ALTITUDES[0]) / 20, 0, 20)
     row = np.clip(rate - RATES[0], 0, 20)
     i, j = (np.clip(v.astype(int), 0, 19) for v in (row, column))
-    u, v = row - i, column - j
+    u, v = row - i.astype(row.dtype), column - j.astype(row.dtype)
     below = (1 - v) * values[..., i, j] + v * values[..., i, j + 1]
     above = (1 - v) * values[..., i + 1, j] + v * values[..., i + 1, j + 1]
     return (1 - u) * below + u * above
