@@ -87,8 +87,8 @@ def host_call(
     """``callback(*args)`` on the host, with NumPy arrays as XLA gives them. One call under any
     number of `jax.vmap`. No derivatives.
 
-    `jax.pure_callback` makes JAX arrays of the arguments first. To read those in the callback can
-    wait for a thread of XLA's, and where all of them are inside of callbacks that is for ever
+    `jax.pure_callback` makes JAX arrays of the arguments first. Reading those in the callback may
+    block on an XLA thread; if every thread is inside a callback, this deadlocks
     (https://github.com/jax-ml/jax/issues/24255). Otherwise this is the same, with
     ``vmap_method="expand_dims"``.
 

@@ -21,11 +21,11 @@ __all__ = ["write"]
 
 def write(path, format, version, header, arrays, *, quick=False):
     """Write ``arrays``, a dict of NumPy arrays, and ``header``, a dict that JSON can hold, to the
-    one file ``path``.
+    file ``path``.
 
-    An older file of that name stays whole until the new one is. ``quick``: it is neither compressed
-    nor waited for until it is on the disk, so it outlives the end of the process but perhaps not
-    that of the machine.
+    The write is atomic: an existing file is replaced only once the new one is complete. A ``quick``
+    write is not compressed and does not wait for the disk, so it survives the end of the process
+    but perhaps not a crash of the machine.
     """
     path = os.fspath(path)
     part = f"{path}.{os.getpid()}.part"

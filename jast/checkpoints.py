@@ -65,8 +65,8 @@ class Store:
             return None
 
     def replace(self, header: dict, arrays: dict[str, np.ndarray]) -> None:
-        """Keep the next `state`; the last one stays whole until it is. OSError where it cannot be
-        written.
+        """Keep the next `state`. The write is atomic: the last one is replaced only once the new
+        one is complete. OSError where it cannot be written.
         """
         with self._told():
             archive.write(self._state, STATE, VERSION, header, arrays, quick=True)

@@ -36,6 +36,12 @@ def test_every_function_has_an_example(door):
         assert "\nExample:\n    >>> " in inspect.getdoc(function), name
 
 
+def test_every_distribution_has_an_example():
+    """Other classes are results and settings, which the examples of functions show."""
+    for name, value in of_door(exported(), "jast.distributions"):
+        assert "\nExample:\n    >>> " in inspect.getdoc(value), name
+
+
 def run(name, value):
     """The example of a name, as in a fresh session with JAX's default precision."""
     said = []

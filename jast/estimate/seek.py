@@ -35,7 +35,7 @@ WIDE, MODEL = 0.2, 0.1
 no weight is without variance; where failures are not rare the model itself.
 """
 COVERED = 50.0
-"""A failure is covered where its weight is at most so many times the mean."""
+"""A failure is covered where its weight is at most this multiple of the mean."""
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16

@@ -55,7 +55,9 @@ def document(title: str, body: str, data: Any, *scripts: str) -> str:
 
 
 def write(path: str | os.PathLike, page: str) -> None:
-    """Write ``page`` to the one file ``path``; an older file stays whole until the new one is."""
+    """Write ``page`` to a file. The write is atomic: an existing file is replaced only once the new
+    one is complete.
+    """
     path = os.fspath(path)
     part = f"{path}.{os.getpid()}.part"
     try:

@@ -90,7 +90,7 @@ class Report(NamedTuple):
         versions, and the exact disturbances to copy. All words are escaped.
 
         Args:
-            path: of the file; an older one of that name stays whole until the new one is.
+            path: of the file; an existing one is replaced only once the new one is complete.
             sim: plays the failures again, for their states; default: the report's own. Without
                 one (a report from `jast.load`) the page shows disturbances alone.
             draw: one state -> an SVG or HTML fragment, which the page shows as it is, at the step
