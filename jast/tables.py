@@ -82,7 +82,8 @@ def to_csv(path: PathLike, failures: Any) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = os.path.join(folder, "failures.csv")
         ...     jast.failures.to_csv(path, found)
-        ...     print(open(path).readline().strip())
+        ...     with open(path) as file:
+        ...         print(file.readline().strip())
         failure,step,x
     """
     arrays = to_numpy(failures)
