@@ -253,6 +253,9 @@ def main(argv=None):
         metavar="FAMILY",
         help=", ".join(FAMILIES),
     )
+    parser.add_argument(
+        "--first", type=int, default=50_000, help="number of the first problem of a family"
+    )
     parser.add_argument("--budget", type=int, help="default 100,000")
     parser.add_argument(
         "--cases",
@@ -322,7 +325,7 @@ def main(argv=None):
     if "coverage" in parts:
         report["coverage"], total = {}, []
         for family in size(args, args.families, ("two_sided", "branches"), ("branches",)):
-            problems = [draw(family, 50_000 + seed)[1:] for seed in range(seeds(20, 3, 1))]
+            problems = [draw(family, args.first + seed)[1:] for seed in range(seeds(20, 3, 1))]
             report["coverage"][family] = r = ours(problems, budget)
             total.append(r)
             say(line(family, r))
