@@ -14,6 +14,7 @@ from jax.tree_util import Partial
 from scipy.special import logsumexp
 
 import jast
+from benchmarks import limit_states
 from benchmarks.limit_states import walk_probability
 from jast import distributions as D
 from jast import limit_state as L
@@ -826,3 +827,27 @@ def test_another_budget_and_parameter_compile_nothing(key):
             assert not seen and error < 5 * found.relative_error
     finally:
         jax.monitoring.unregister_event_duration_listener(listener)
+
+
+LOST = [("walks", 16), ("walks", 32), ("scaled", 25), ("union", 33), ("branches", 22)]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("family, seed", LOST)
+def test_no_mode_is_lost_in_silence_with_few_evaluations(family, seed):
+    """These lost a half to a twentieth of the probability at 10,000 evaluations, and said nothing:
+    a side of a walk, of two planes, of eight, one of four branches.
+    """
+    _, sim, truth = limit_states.draw(family, 50_000 + seed)
+    r = failure_probability(jax.random.key(10_000 + seed), sim, 10_000)
+    assert not r.reliable or abs(r.mean / truth - 1) < 4 * r.relative_error
+
+
+def test_mirror_images_of_failures(key):
+    """Of two planes the other one is found a tenth farther out, not where it is out of reach."""
+    for down, lifts in ((4.4, [1.1]), (8.0, [])):
+        s = seek.Seeker(key, planes(4.0, down), BUDGET)
+        s.anchors = np.full((1, 4), 2.001)
+        points, evaluations = seek._mirrored(s)
+        assert evaluations == len(seek.LIFTS) and len(points) == len(lifts)
+        assert np.allclose(points, [-lift * s.anchors[0] for lift in lifts] or points)

@@ -40,6 +40,9 @@ REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
 ROUNDS, ALONE = 3, 0.25
+"""Times that wide noise is cooled, at most; the share of its failures that may be alone in their
+direction.
+"""
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
 NEAR, GOOD, SERVES = 2, 0.2, 0.05
