@@ -405,6 +405,16 @@ def test_cdf_names_the_distribution_that_has_no_quantile():
 # tent
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_far_out_a_tent_still_has_a_density(dtype):
+    """Its foot has none, and a search that came there would call the simulator's numbers bad."""
+    with jax.enable_x64(dtype == "float64"):
+        for center in (0.0, 0.3, 1.0):
+            d = D.tent(jnp.asarray(center, dtype))
+            x = D.quantile(d, jnp.asarray([0.0, 1e-30, 0.5, 1.0], dtype))
+            assert jnp.isfinite(d.log_prob(x)).all() and jnp.isfinite(d.log_prob_from_mode(x)).all()
+
+
 @pytest.mark.parametrize(
     "center, width, low, high",
     [(0.5, 1, 0, 1), (0.0, 1, 0, 1), (1.0, 1, 0, 1), (0.9, 0.3, 0, 1), (2.0, 5, -1, 4)],

@@ -174,6 +174,8 @@ class Tent(Distribution):
         z = jnp.where(
             mass < 0.5, jnp.sqrt(2 * mass) - 1, 1 - jnp.sqrt(jnp.maximum(2 - 2 * mass, 0))
         )
+        edge = 1 - 4 * jnp.finfo(z.dtype).eps  # at the foot of the tent there is no density
+        z = jnp.clip(z, -edge, edge)
         return jnp.clip(self._center + self._width * z, self._low, self._high)
 
     def cdf(self, value: Any) -> Any:

@@ -39,8 +39,8 @@ COVERED = 50.0
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
-ROUNDS, ALONE = 3, 0.25
-"""Times that wide noise is cooled, at most; the share of its failures that may be alone in their
+ENOUGH, ALONE = 36, 0.25
+"""Failures that wide noise is cooled to, where more than this share of them are alone in their
 direction.
 """
 LIFTS = 1.0, 1.05, 1.1, 1.2
@@ -220,12 +220,12 @@ def _explore(s, gradients):
 
 
 def _cooled(s):
-    """Failures [n, D] by noise that is wide first and then cooled, and evaluations. Chains are
-    started again where more than `ALONE` of them end in a direction that no other one has: so much
-    of what they may lead to is still to be met (Good 1953).
+    """Failures [n, D] by noise that is wide first and then cooled, and evaluations. A few chains
+    are started again where more than `ALONE` of them end in a direction that no other one has: so
+    much of what they may lead to is still to be met (Good 1953).
     """
     points, evaluations, n = np.zeros((0, s.dimension)), 0, int(np.clip(s.budget // 800, 8, CHAINS))
-    for _ in range(ROUNDS):
+    while len(points) < ENOUGH:
         cold = cool(s.next_key(), s.sim, n)
         used = np.arange(s.dimension)[None] < cold.used[:, None]
         points = np.concatenate([points, np.where(used, cold.points, 0.0)])
