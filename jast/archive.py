@@ -56,6 +56,8 @@ def read(path, format, version, kind):
     ValueError says why a file is refused: not ``kind`` (which is of this ``format``), a version
     other than ``version``, or damaged.
     """
+    if os.path.isdir(path):
+        raise ValueError(f"load: {path} is not {kind}: it is a folder, as checkpoint= makes")
     with open(path, "rb") as file:
         return unpacked(file.read(), path, format, version, kind)
 

@@ -39,9 +39,9 @@ COVERED = 50.0
 REFITTING = 0.5
 """Of the budget, where refits end."""
 REFITS, GUARDS, CHAINS, POINTS = 8, 3, 128, 16
-ENOUGH, ALONE = 36, 0.25
-"""Failures that wide noise is cooled to, where more than this share of them are alone in their
-direction.
+ENOUGH, COOLED, ALONE = 36, 0.2, 0.25
+"""Failures that wide noise is cooled to, and the share of the budget at which that ends, where more
+than the last share of them are alone in their direction.
 """
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
@@ -225,7 +225,7 @@ def _cooled(s):
     much of what they may lead to is still to be met (Good 1953).
     """
     points, evaluations, n = np.zeros((0, s.dimension)), 0, int(np.clip(s.budget // 800, 8, CHAINS))
-    while len(points) < ENOUGH:
+    while len(points) < ENOUGH and evaluations < COOLED * s.budget:
         cold = cool(s.next_key(), s.sim, n)
         used = np.arange(s.dimension)[None] < cold.used[:, None]
         points = np.concatenate([points, np.where(used, cold.points, 0.0)])
