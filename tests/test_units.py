@@ -201,7 +201,7 @@ def test_what_is_done_is_not_done_again(key, tmp_path, monkeypatch, same):
 
 @pytest.mark.parametrize("ended_by", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_a_call_with_what_is_done(key, ended_by):
-    episodes = 20 * EPISODES  # many units, as those that run beside the interrupted one are kept
+    episodes = 200 * EPISODES  # many units, as those that run beside the interrupted one are kept
     end = lambda *_: os.kill(os.getpid(), ended_by)
     found = jast.nominal(key, walk1d(), episodes, callback=end)
     assert 0 < found.episodes < episodes and found.settings["interrupted"].startswith("after ")
