@@ -154,7 +154,7 @@ def main(argv=None):
     parser.add_argument("--cases", nargs="+", choices=CASES, metavar="CASE")
     parser.add_argument("--seeds", type=int, help="default 10")
     args = parser.parse_args(argv)
-    seeds = args.seeds or size(args, 10, 3, 1)
+    seeds = args.seeds or size(args, 10, 3, 2)
     names = args.cases or list(CASES)[: size(args, None, 4, 1)]
     report = {}
     for name in names:
