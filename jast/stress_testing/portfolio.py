@@ -14,6 +14,7 @@ from jast.contract import check
 from jast.crude import nominal
 from jast.episode import rollout
 from jast.estimate import adaptive, few_calls
+from jast.estimate.redrawn import redrawn
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["stress"]
 
+DRAWN = 400
+"""Draws of the estimate's proposal, where only it found failures."""
 LEAST, ESTIMABLE, SMALL = 300, 5000, 20
 """Evaluations of a call, and of an estimate that finds its own proposal; numbers of an episode up
 to which a surrogate does with fewer.
@@ -285,12 +288,12 @@ class _Work:
             self.tell_shares(p.proposal)
 
     def take(self, q):
-        """Failures of which the estimate has made its proposal, where the search found none."""
-        points = np.asarray(q.means)[np.isfinite(np.asarray(q.log_weights))]
-        haul = of_points(self.sim, points)
+        """Failures that the estimate's proposal draws, where the search found none."""
+        points, drawn, _ = redrawn(self.next_key(), self.sim, q, DRAWN)
+        haul = of_points(self.sim, np.asarray(points)[np.asarray(drawn.failure)])
         self.pool = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
         best = _best(self.pool)
-        self.note("the estimate's failures", len(points), haul.failing, best)
+        self.note("the estimate's failures", DRAWN + haul.evaluations, haul.failing, best)
         self.refine()
 
     def counted(self):
