@@ -14,7 +14,6 @@ all from the likeliest failure that `jast.search.cem` found.
 
 import argparse
 import json
-import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -30,7 +29,7 @@ from benchmarks.literature import CASES as LITERATURE
 from benchmarks.sizes import options, size
 from jast import limit_state as latent
 from jast.estimate import failure_probability, failure_samples
-from jast.estimate.populations import Chain
+from jast.estimate.populations import settled
 from jast.judge import judged
 
 __all__ = ["density_and_coverage", "run"]
@@ -119,9 +118,7 @@ def chain(key, sim, n, budget):
     start = latent.normal_of(sim, best.failures.episodes)[:1]
     if not len(start):
         return np.full((1, latent.dimension(sim)), np.inf), best.episodes
-    chain = Chain(second, sim, n)
-    people = chain.judge(np.repeat(start, n, axis=0).astype(chain.dtype))
-    people = chain.move(people, np.arange(n), -math.inf, 1.0, budget // n)
+    people, chain = settled(second, sim, np.repeat(start, n, axis=0), budget // n)
     return _numbers(sim, people.z), best.episodes + chain.evaluations
 
 

@@ -4,7 +4,6 @@ a user looks at.
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,7 +20,7 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.populations import Chain
+from jast.estimate.populations import settled
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
 from jast.journal import answered, kept
@@ -158,9 +157,7 @@ def _sampled(name, key, sim, q, samples, moves):
             " failures are frequent"
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
-    chain = Chain(key, sim, samples)
-    people = chain.judge(np.asarray(z[rows], chain.dtype))
-    people = chain.move(people, np.arange(samples), -math.inf, 1.0, moves)
+    people, chain = settled(key, sim, z[rows], moves)
     episodes = answered(partial(latent.episodes, sim), people.z)
     # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
     # side in another program

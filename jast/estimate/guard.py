@@ -8,7 +8,7 @@ import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
 from jast.estimate.gaussians import as_latent, effective, unit
-from jast.estimate.populations import LAST, QUANTILE, Chain, explore
+from jast.estimate.populations import LAST, QUANTILE, explore, settled
 
 LOST = 0.005
 """A share of the probability that may lie where the proposal is thin, beyond what its own batches
@@ -113,10 +113,7 @@ def _forgotten(s):
     """Failures near the seeds, drawn from the model given failure, that the proposal does not
     cover; what they weigh is left to the next batches.
     """
-    chain = Chain(s.next_key(), s.sim, len(s.seeds))
-    people = chain.move(
-        chain.judge(s.seeds.astype(s.dtype)), np.arange(len(s.seeds)), -math.inf, 1.0, MOVES
-    )
+    people, chain = settled(s.next_key(), s.sim, s.seeds, MOVES)
     z, used = np.asarray(people.z), np.asarray(people.used)
     rows = _bare(s, z, used) & (np.asarray(people.score) == -np.inf)
     s.note(

@@ -20,7 +20,7 @@ from jast.judge import judged
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import WIDTHS, proposed
 
-__all__ = ["cool", "explore"]
+__all__ = ["cool", "explore", "settled"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 FAILING, COLD, COOLING, DRAWS = 0.1, 0.25, 60, 4
@@ -188,6 +188,15 @@ def cool(key, sim, chains, *, covered=None):
     for width in widths:
         people = chain.move(people, np.arange(chains), -math.inf, width, 1)
     return chain.end(people, math.nan, widths)
+
+
+def settled(key, sim, points, moves, *, covered=None):
+    """Failures as the model has them: ``points`` [n, D], failures, after so many Markov moves that
+    keep p(x | failure): (`Population`, the `Chain`). ``covered`` as in `explore`.
+    """
+    chain, rows = Chain(key, sim, len(points), covered), np.arange(len(points))
+    people = chain.judge(np.asarray(points, chain.dtype))
+    return chain.move(people, rows, -math.inf, 1.0, moves), chain
 
 
 def _next(score, last):

@@ -11,10 +11,10 @@ from jast.counter import generator
 from jast.estimate import diagnostics
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
-from jast.estimate.guard import LOST, THIN
+from jast.estimate.guard import LOST, MOVES, THIN
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, log_weight, numbers, of_the_model, played
-from jast.estimate.populations import LAST, QUANTILE, Chain, cool, explore
+from jast.estimate.populations import LAST, QUANTILE, cool, explore, settled
 from jast.estimate.tilt_search import TiltSeeker, from_near, only, seek_tilts
 from jast.units import Ways
 from jast.watch import Watch
@@ -33,9 +33,8 @@ COVERED, MET, GUARD, WRONG = 50.0, 20, 0.15, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
 what the search for lost failures may cost, of the budget; standard errors that may be lost.
 """
-CHAINS, MOVES, FEW = (8, 24), 10, 3
-"""Failures that wide noise leads to; their moves as the model has them; of those that the tilts
-hardly draw, as many as are taken in.
+CHAINS, FEW = (8, 24), 3
+"""Failures that wide noise leads to; of those that the tilts hardly draw, as many as are taken in.
 """
 
 
@@ -89,9 +88,7 @@ def _elsewhere(s, t):
     cold = cool(s.next_key(), s.sim, int(np.clip(s.budget // 800, *CHAINS)), covered=nothing)
     if not (n := len(cold.points)):
         return
-    chain = Chain(s.next_key(), s.sim, n, nothing)
-    start = chain.judge(cold.points.astype(s.dtype))
-    people = chain.move(start, np.arange(n), -math.inf, 1.0, MOVES)
+    people, chain = settled(s.next_key(), s.sim, cold.points, MOVES, covered=nothing)
     o, log_q, trace = of_the_model(s.sim, nothing[0], people.z)
     bare = (np.asarray(o.score) == -np.inf) & (log_q < -t.log_mean - _covered(s))
     rows = np.flatnonzero(bare)
