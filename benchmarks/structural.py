@@ -9,7 +9,6 @@ quadrature where that is one number, else over 2^20 points of a Sobol sequence.
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,12 +50,12 @@ def exponential():
 class Problem:
     """Inputs that are independent of each other, and ``g``, which fails below 0."""
 
-    def __init__(self, inputs: list, g: Callable, given: Callable, last: int = 0):
+    def __init__(self, inputs: list, g: Callable, truth: Callable):
         """``g(x, np)``: of as many arrays as there are ``inputs``, with either array library.
-        ``given``: the probability given all of them but number ``last``, None where it is whole.
+        ``truth``: of the problem itself.
         """
         self.known, self.noise = zip(*inputs, strict=True)
-        self.g, self.given, self.last = g, given, last
+        self.g, self._truth = g, truth
 
     @property
     def dimension(self) -> int:
@@ -89,26 +88,28 @@ class Problem:
 
     @cached_property
     def truth(self) -> float:
-        others = self.dimension - 1
+        return float(self._truth(self))
+
+
+def averaged(inputs: list, g: Callable, given: Callable, last: int = 0) -> Problem:
+    """A `Problem` whose truth is the mean of ``given(distribution, x)``, the probability given all
+    inputs but number ``last``, whose distribution it is.
+    """
+
+    def truth(problem):
+        others = problem.dimension - 1
         if others == 1:
             z = np.linspace(-REACH, REACH, POINTS)
             weights = stats.norm.pdf(z)
             u = np.zeros((POINTS, 2))
-            u[:, 1 - self.last] = z
+            u[:, 1 - last] = z
         else:
             engine = stats.qmc.Sobol(others, seed=0)
             u = stats.norm.ppf(engine.random_base2(SOBOL))
-            u, weights = np.insert(u, self.last, 0.0, axis=1), np.ones(len(u))
-        x = self.inputs_of(u)
-        return float(np.average(self.given(self.known[self.last], x), weights=weights))
+            u, weights = np.insert(u, last, 0.0, axis=1), np.ones(len(u))
+        return np.average(given(problem.known[last], problem.inputs_of(u)), weights=weights)
 
-
-class Known(Problem):
-    """One of closed form."""
-
-    def __init__(self, inputs, g, truth):
-        super().__init__(inputs, g, None)
-        self.__dict__["truth"] = float(truth)
+    return Problem(inputs, g, truth)
 
 
 TWO = [normal(), normal()]
@@ -150,7 +151,7 @@ def _rp55(x, np):
     return np.minimum(near - np.abs(across) / 2**0.5, far - np.abs(across))
 
 
-def _rp55_truth():
+def _rp55_truth(problem):
     """The difference of the two has the density 1/2 - abs(x) / 4."""
     across = np.linspace(-2, 2, 4_000_001)
     fails = _rp55((across, 0.0), np) < 0
@@ -197,12 +198,12 @@ def _rp60_truth(problem):
     return np.average(1 - one.sf(load) * safe, weights=stats.norm.pdf(z))
 
 
-def _rp63_truth():
+def _rp63_truth(problem):
     z = np.linspace(0, 300, POINTS)
     return np.average(stats.norm.sf(0.1 * z - 4.5), weights=stats.chi2(99).pdf(z))
 
 
-def _rp77_truth():
+def _rp77_truth(problem):
     """x1 - x2 is normal, and so is x2."""
     x3 = np.linspace(4 - REACH, 4 + REACH, POINTS)
     gap = stats.norm(10, 1.25**0.5).cdf(x3)
@@ -235,115 +236,116 @@ def _product(d, x, limit):
     return np.where(x[1] > 0, d.sf(edge), d.cdf(-edge))
 
 
-RP60 = Problem(
-    [
-        log_normal(m, s)
-        for m, s in ((2200, 220), (2100, 210), (2300, 230), (2000, 200), (1200, 480))
-    ],
-    _rp60,
-    None,
-)
-RP60.__dict__["truth"] = float(_rp60_truth(RP60))
-
-PROBLEMS: dict[str, Any] = {
-    "RP8": Problem(
+PROBLEMS: dict[str, Problem] = {
+    "RP8": averaged(
         [log_normal(120, 12) for _ in range(4)] + [log_normal(50, 10), log_normal(40, 8)],
         lambda x, np: x[0] + 2 * x[1] + 2 * x[2] + x[3] - 5 * x[4] - 5 * x[5],
         lambda d, x: d.sf((x[0] + 2 * x[1] + 2 * x[2] + x[3] - 5 * x[5]) / 5),
         4,
     ),
-    "RP14": Problem(
+    "RP14": averaged(
         [uniform(70, 80), normal(39, 0.1), gumbel(1500, 350), normal(400, 0.1)]
         + [normal(250_000, 35_000)],
         _rp14,
         _rp14_given,
         4,
     ),
-    "RP22": Problem(
+    "RP22": averaged(
         TWO,  # of the sum and of the difference, over sqrt 2
         lambda x, np: 2.5 - (x[0] + x[1]) / 2**0.5 + 0.1 * (x[0] - x[1]) ** 2,
         lambda d, x: d.sf(2.5 + 0.2 * x[1] ** 2),
     ),
-    "RP24": Problem(
+    "RP24": averaged(
         [normal(10, 3), normal(10, 3)],
         lambda x, np: 2.5 - 0.2357 * (x[0] - x[1]) + 0.00463 * (x[0] + x[1] - 20) ** 4,
         lambda d, x: stats.norm.sf(
             (2.5 + 0.00463 * 2**2 * (x[1] - 10) ** 4) / (0.2357 * 3 * 2**0.5)
         ),
     ),
-    "RP25": Problem(
+    "RP25": averaged(
         TWO,
         lambda x, np: np.maximum(x[0] ** 2 - 8 * x[1] + 16, -16 * x[0] + x[1] + 32),
         lambda d, x: np.maximum(d.cdf(16 * x[0] - 32) - d.cdf((x[0] ** 2 + 16) / 8), 0),
         1,
     ),
-    "RP28": Problem(
+    "RP28": averaged(
         [normal(78_064, 11_710), normal(0.0104, 0.00156)],
         lambda x, np: x[0] * x[1] - 146.14,
         lambda d, x: 1 - _product(d, x, 146.14),
     ),
-    "RP31": Problem(
+    "RP31": averaged(
         TWO,
         lambda x, np: 2 - x[1] + 256 * x[0] ** 4,
         lambda d, x: d.sf(2 + 256 * x[0] ** 4),
         1,
     ),
-    "RP33": Problem(
+    "RP33": averaged(
         [normal()] * 3,
         lambda x, np: np.minimum(-x[0] - x[1] - x[2] + 3 * 3**0.5, 3 - x[2]),
         lambda d, x: d.sf(np.minimum(3, 3 * 3**0.5 - x[0] - x[1])),
         2,
     ),
-    "RP35": Problem(TWO, _rp35, _rp35_given, 1),
-    "RP38": Problem(
+    "RP35": averaged(TWO, _rp35, _rp35_given, 1),
+    "RP38": averaged(
         [normal(m, m / 10) for m in (350, 50.8, 3.81, 173, 9.38, 33.1, 0.036)],
         lambda x, np: 15.59e4 - x[0] * _rp38_rest(x),
         lambda d, x: d.sf(15.59e4 / _rp38_rest(x)),
     ),
-    "RP53": Problem(
+    "RP53": averaged(
         [normal(1.5), normal(2.5)],
         lambda x, np: np.sin(5 * x[0] / 2) + 2 - (x[0] ** 2 + 4) * (x[1] - 1) / 20,
         lambda d, x: d.sf(1 + 20 * (np.sin(5 * x[0] / 2) + 2) / (x[0] ** 2 + 4)),
         1,
     ),
-    "RP54": Known([exponential()] * 20, lambda x, np: sum(x) - 8.951, stats.gamma(20).cdf(8.951)),
-    "RP55": Known([uniform(-1, 1)] * 2, _rp55, _rp55_truth()),
-    "RP57": Problem(TWO, _rp57, _rp57_given, 1),
-    "RP60": RP60,
-    "RP63": Known(
-        [normal()] * 100, lambda x, np: 0.1 * sum(v**2 for v in x[1:]) - x[0] - 4.5, _rp63_truth()
+    "RP54": Problem(
+        [exponential()] * 20, lambda x, np: sum(x) - 8.951, lambda p: stats.gamma(20).cdf(8.951)
     ),
-    "RP75": Problem(TWO, lambda x, np: 3 - x[0] * x[1], partial(_product, limit=3.0)),
-    "RP77": Known(
+    "RP55": Problem([uniform(-1, 1)] * 2, _rp55, _rp55_truth),
+    "RP57": averaged(TWO, _rp57, _rp57_given, 1),
+    "RP60": Problem(
+        [log_normal(mean, mean / 10) for mean in (2200, 2100, 2300, 2000)]
+        + [log_normal(1200, 480)],
+        _rp60,
+        _rp60_truth,
+    ),
+    "RP63": Problem(
+        [normal()] * 100, lambda x, np: 0.1 * sum(v**2 for v in x[1:]) - x[0] - 4.5, _rp63_truth
+    ),
+    "RP75": averaged(TWO, lambda x, np: 3 - x[0] * x[1], partial(_product, limit=3.0)),
+    "RP77": Problem(
         [normal(10, 0.5), normal(), normal(4)],
         lambda x, np: np.where(x[2] <= 5, x[0] - x[1] - x[2], x[2] - x[1]),
-        _rp77_truth(),
+        _rp77_truth,
     ),
-    "RP89": Problem(
+    "RP89": averaged(
         TWO,
         lambda x, np: np.minimum(8 - x[0] ** 2 - x[1], 6 - x[0] / 5 - x[1]),
         lambda d, x: d.sf(np.minimum(8 - x[0] ** 2, 6 - x[0] / 5)),
         1,
     ),
-    "RP91": Problem(
+    "RP91": averaged(
         [normal(0.07433, 0.005), normal(0.1, 0.01), normal(13, 60), normal(4751, 48)]
         + [normal(-684, 11)],
         _rp91,
         _rp91_given,
     ),
-    "RP107": Known([normal()] * 10, lambda x, np: 5 * 10**0.5 - sum(x), stats.norm.sf(5)),
-    "RP110": Known(TWO, _rp110, 1 - stats.norm.cdf(4) * stats.norm.cdf(5)),
-    "RP111": Problem(
+    "RP107": Problem(
+        [normal()] * 10, lambda x, np: 5 * 10**0.5 - sum(x), lambda p: stats.norm.sf(5)
+    ),
+    "RP110": Problem(TWO, _rp110, lambda p: 1 - stats.norm.cdf(4) * stats.norm.cdf(5)),
+    "RP111": averaged(
         TWO,
         lambda x, np: 12.5 - np.abs(x[0] * x[1]),
         lambda d, x: 2 * _product(d, x, 12.5),
     ),
-    "axial": Problem(
+    "axial": averaged(
         [log_normal(300, 30), normal(75_000, 5000)],
         lambda x, np: x[0] - x[1] / (np.pi * 100),
         lambda d, x: d.cdf(x[1] / (np.pi * 100)),
     ),
-    "R-S": Known([normal(4), normal(2)], lambda x, np: x[0] - x[1], stats.norm.sf(2**0.5)),
+    "R-S": Problem(
+        [normal(4), normal(2)], lambda x, np: x[0] - x[1], lambda p: stats.norm.sf(2**0.5)
+    ),
 }
 
 
