@@ -56,10 +56,14 @@ def read(path, format, version, kind):
     ValueError says why a file is refused: not ``kind`` (which is of this ``format``), a version
     other than ``version``, or damaged.
     """
+    with _opened(path, kind) as file:
+        return unpacked(file.read(), path, format, version, kind)
+
+
+def _opened(path, kind):
     if os.path.isdir(path):
         raise ValueError(f"load: {path} is not {kind}: it is a folder, as checkpoint= makes")
-    with open(path, "rb") as file:
-        return unpacked(file.read(), path, format, version, kind)
+    return open(path, "rb")
 
 
 def unpacked(data, path, format, version, kind):
@@ -107,7 +111,7 @@ def unpacked(data, path, format, version, kind):
 
 def format_of(path: str | os.PathLike) -> Any:
     """The format of a file of `write`; ValueError where it is none or damaged."""
-    with open(path, "rb") as file:
+    with _opened(path, "a file of jast.save") as file:
         if file.read(2) != b"PK":
             raise ValueError(f"load: {path} is not a file of jast.save")
     try:
