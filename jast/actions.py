@@ -36,7 +36,14 @@ __all__ = [
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Samples:
-    """See `samples`."""
+    """See `samples`.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> float(jast.actions.samples().near(jnp.array(4.0), D.Normal(0.0, 1.0), 0.5))
+        2.0
+    """
 
     places_start = False
     focus = 1.0  # draws of the model are near its mode already
@@ -71,7 +78,14 @@ class Samples:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Quantiles:
-    """See `quantiles`."""
+    """See `quantiles`.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> float(jast.actions.quantiles().place(jnp.array(0.5), D.Normal(1.0, 2.0)))  # the median
+        1.0
+    """
 
     numbers: tuple[Any, ...] = ()
     """The leaves of the proposal."""
@@ -118,7 +132,15 @@ class Quantiles:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UniformBox:
-    """See `uniform`."""
+    """See `uniform`.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> box = jast.actions.uniform(-2.0, 2.0)
+        >>> float(jnp.exp(box.log_prob(jnp.array(1.0), D.Normal(0.0, 1.0))))
+        0.25
+    """
 
     low: Any
     high: Any
@@ -211,7 +233,14 @@ class UniformBox:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Wide:
-    """See `wide`."""
+    """See `wide`.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> float(jast.actions.wide(3.0).of_normal(jnp.array(1.0), D.Normal(0.0, 2.0)))
+        6.0
+    """
 
     width: Any = None
     places_start = True

@@ -49,7 +49,18 @@ KINDS = {
 
 
 class Incident(NamedTuple):
-    """One kind of thing that went wrong, and its first example. NumPy and Python values."""
+    """One kind of thing that went wrong, and its first example. NumPy and Python values.
+
+    Example:
+        >>> import jax, jast
+        >>> from jast import distributions as D
+        >>> broken = lambda x: 1 / 0
+        >>> sim = jast.blackbox.from_python(broken, horizon=2, disturbance=D.Normal(0.0, 1.0))
+        >>> invalid = jast.rollout(jax.random.key(0), sim)
+        >>> incident = jast.incidents.incidents(sim)[0]
+        >>> incident.kind, "ZeroDivisionError" in incident.message, incident.disturbances.shape
+        ('raised', True, (2,))
+    """
 
     kind: str
     """One of `KINDS`"""

@@ -62,7 +62,13 @@ _density = dict(default="raw", metadata=dict(static=True))
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Standard:
-    """See `standard`."""
+    """See `standard`.
+
+    Example:
+        >>> from jast.rewards import Standard
+        >>> float(Standard(event_bonus=50.0)(-1.0, True, 0.0, True))
+        49.0
+    """
 
     event_bonus: Any = 0.0
     density: str = field(**_density)
@@ -78,7 +84,13 @@ class Standard:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Episodic:
-    """See `episodic`."""
+    """See `episodic`.
+
+    Example:
+        >>> from jast.rewards import Episodic
+        >>> float(Episodic(bonus=10.0)(-1.0, False, 2.0, True))  # a miss by 2
+        -3.0
+    """
 
     bonus: Any = 100.0
     density: str = field(**_density)
@@ -101,7 +113,13 @@ class Episodic:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shaped:
-    """See `shaped`."""
+    """See `shaped`.
+
+    Example:
+        >>> from jast.rewards import Shaped
+        >>> float(Shaped(scale=2.0)(-1.0, False, 3.0, False, 0.5))  # it came nearer by 0.5
+        0.0
+    """
 
     scale: Any = 1.0
     event_bonus: Any = 0.0
@@ -122,6 +140,11 @@ class Shaped:
 class LogLikelihood:
     """The log density alone: likelihood where failures are all that is ranked, and a reward that
     costs nothing where only the course of an episode is wanted.
+
+    Example:
+        >>> from jast.rewards import LogLikelihood
+        >>> LogLikelihood()(-4.5, False, 3.0, True)
+        -4.5
     """
 
     density: str = field(**_density)
@@ -135,7 +158,14 @@ class LogLikelihood:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Lexicographic:
-    """See `lexicographic`."""
+    """See `lexicographic`.
+
+    Example:
+        >>> import jast
+        >>> reward = jast.rewards.lexicographic()
+        >>> reward.scaled, reward.once  # a search sets the scales
+        (False, True)
+    """
 
     near: Any = None
     rare: Any = None

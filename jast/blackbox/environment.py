@@ -13,7 +13,14 @@ __all__ = ["Moment", "gymnasium_system"]
 
 
 class Moment(NamedTuple):
-    """What an environment showed last."""
+    """What an environment showed last.
+
+    Example:
+        >>> from jast.blackbox import Moment
+        >>> distance = lambda now: max(200.0 + now.total, 0.0)  # fails once it has lost 200
+        >>> distance(Moment([0.1, 0.2], -1.0, -50.0, False, False, {}, None))
+        150.0
+    """
 
     observation: Any
     reward: float

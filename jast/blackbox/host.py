@@ -21,7 +21,18 @@ REMEMBERED = 1 << 16
 
 
 class Calls(NamedTuple):
-    """What a black box has done so far. Python numbers."""
+    """What a black box has done so far. Python numbers.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> run = lambda x: (bool(x.sum() > 5.0), float(max(5.0 - x.sum(), 0.0)))
+        >>> sim = jast.blackbox.from_python(run, horizon=10, disturbance=D.Normal(0.0, 1.0))
+        >>> before = jast.blackbox.calls(sim).transitions
+        >>> episode = jast.replay(sim, jnp.ones(10))
+        >>> jast.blackbox.calls(sim).transitions - before
+        10
+    """
 
     calls: int
     """Host calls, each for a batch"""

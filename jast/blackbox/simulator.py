@@ -36,7 +36,17 @@ NAME = "from_python"
 
 
 class Record(NamedTuple):
-    """State of an episodic black box."""
+    """State of an episodic black box.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> run = lambda x: (bool(x.sum() > 5.0), float(max(5.0 - x.sum(), 0.0)))
+        >>> sim = jast.blackbox.from_python(run, horizon=10, disturbance=D.Normal(0.0, 1.0))
+        >>> state = sim.step(sim.init(()), jnp.array(2.0))
+        >>> int(state.t), state.disturbances[:2].tolist()
+        (1, [2.0, 0.0])
+    """
 
     begun: Any
     """bool, True: a state of zeros is none, and is not run"""
@@ -48,7 +58,27 @@ class Record(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """State of a black box that is looked at after every disturbance."""
+    """State of a black box that is looked at after every disturbance.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import distributions as D
+        >>> class Tank:
+        ...     def initialize(self):
+        ...         self.level = 5.0
+        ...
+        ...     def transition(self, x):
+        ...         self.level += float(x)
+        ...
+        ...     def miss_distance(self):
+        ...         return max(self.level, 0.0)
+        ...
+        ...     def is_event(self):
+        ...         return self.level <= 0.0
+        >>> sim = jast.blackbox.from_python(Tank, horizon=10, disturbance=D.Normal(0.0, 1.0))
+        >>> float(jast.replay(sim, jnp.array([-2.0, 1.0])).states.distance[1])  # after one step
+        3.0
+    """
 
     begun: Any
     t: Any

@@ -246,6 +246,14 @@ def _run(method: str, *, key: chex.PRNGKey, objective: Objective, **given: Any) 
 class Search:
     """A cross-entropy method between two batches, for an objective that is evaluated outside; see
     `start`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> search = ce.start(jax.random.key(0), ce.normal(jnp.zeros(2), 9.0), iterations=1)
+        >>> x = ce.ask(search)
+        >>> search.done, ce.tell(search, x, (x**2).sum(1)).done
+        (False, True)
     """
 
     state: loop.State

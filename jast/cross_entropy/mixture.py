@@ -31,6 +31,14 @@ __all__ = [
 class Mixture(NamedTuple):
     """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is
     positive definite.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> means, covariances = jnp.array([[-1.0], [1.0]]), jnp.ones((2, 1, 1))
+        >>> both = ce.Mixture(jnp.array([0.5, 0.5]), means, covariances)  # two bells on a line
+        >>> both.means.shape
+        (2, 1)
     """
 
     weights: Any

@@ -18,6 +18,14 @@ __all__ = ["CEResult", "History", "Scores", "scores"]
 class History(NamedTuple):
     """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand
     together, in order.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> found = ce.ce_method(jax.random.key(0), ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> best = found.history.best_value
+        >>> best.shape, bool((best[1:] <= best[:-1]).all())  # after each iteration
+        ((10,), True)
     """
 
     x: Any
@@ -39,7 +47,15 @@ class History(NamedTuple):
 
 @results.result("best_value", batches=True)
 class CEResult(NamedTuple):
-    """The outcome. With a leading axis everywhere after `jax.vmap`."""
+    """The outcome. With a leading axis everywhere after `jax.vmap`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> found = ce.ce_method(jax.random.key(0), ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> found.best_x.shape, bool(found.best_value < 0.1), found.episodes
+        ((2,), True, 100)
+    """
 
     proposal: Any
     """The last one, a `Gaussian` or a `Mixture`"""
@@ -99,6 +115,14 @@ def _point(x):
 class Scores(NamedTuple):
     """Of several runs, the means over them; distances are Euclidean, from the best point to the
     optimum.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jast import cross_entropy as ce
+        >>> run = lambda key: ce.ce_method(key, ce.paraboloid, ce.normal(jnp.ones(2), 4.0))
+        >>> told = ce.scores(jax.vmap(run)(jax.random.split(jax.random.key(0), 5)), jnp.zeros(2))
+        >>> bool((told.rms_distance >= told.mean_distance).all())
+        True
     """
 
     best_value: Any

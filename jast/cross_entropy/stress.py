@@ -38,7 +38,16 @@ __all__ = ["Stress", "over"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Stress:
-    """The search for failures of a system as a minimisation; see `over`. A pytree."""
+    """The search for failures of a system as a minimisation; see `over`. A pytree.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import cross_entropy as ce
+        >>> stress = ce.over(jast.simulators.landing(b=0.3))
+        >>> z = jnp.zeros_like(stress.proposal.mean)  # an undisturbed episode
+        >>> bool(stress.episode(z).failure), float(stress.objective(z)) > 0
+        (False, True)
+    """
 
     sim: Any
     reward: Any

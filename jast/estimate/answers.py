@@ -29,6 +29,13 @@ POINTS = 64
 class Exceedance(NamedTuple):
     """The probability that an episode comes as near to a failure as a threshold of the miss
     distance, [k] each, NumPy. NaN where it is not known.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> curve = jast.estimate.exceedance(counted, [0.0, 1.0])
+        >>> bool((curve.low < curve.probability).all() and (curve.probability < curve.high).all())
+        True
     """
 
     thresholds: Any
@@ -52,6 +59,14 @@ class Exceedance(NamedTuple):
 class FailureTimes(NamedTuple):
     """When failures happen, in steps, [T + 1] each, NumPy: from 0, at the start, to the last step
     at which one was seen.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> times = jast.estimate.failure_times(counted)
+        >>> low, median, high = (times.quantiles[q][0] for q in (0.05, 0.5, 0.95))
+        >>> low <= median <= high, round(float(times.given_failure.sum()), 6)
+        (True, 1.0)
     """
 
     probability: Any

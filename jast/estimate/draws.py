@@ -24,6 +24,12 @@ class Draws(NamedTuple):
     """Failing episodes of the draws that an estimate is the mean of, and those others that came
     nearest to a failure: [m], NumPy. Of more failures than fit, one in ``every`` is kept and counts
     so often; of the others those up to the miss distance ``reach``.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> counted.draws.counted, int(counted.draws.failure.sum()) == counted.failing
+        (True, True)
     """
 
     log_weight: Any

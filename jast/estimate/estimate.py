@@ -24,6 +24,12 @@ class Estimate(NamedTuple):
 
     Good diagnostics are necessary, not sufficient: a proposal that never reaches a failure mode
     gives weights that look perfect.
+
+    Example:
+        >>> import jax, jast
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> counted.mean == counted.failing / counted.samples, counted.reliable
+        (True, True)
     """
 
     method: str

@@ -46,7 +46,16 @@ OF = ("state", "start", "episode")
 
 @results.shown()
 class Event(NamedTuple):
-    """An event among the failures. Python numbers."""
+    """An event among the failures. Python numbers.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> counted = jast.estimate.monte_carlo(jax.random.key(0), sim, 1000)
+        >>> above = jast.estimate.events(sim, counted, {"above": lambda s: s > 0})["above"]
+        >>> above.given_interval[0] < above.given_failure < above.given_interval[1]
+        True
+    """
 
     probability: float
     """That an episode fails and the event happens in it"""
@@ -69,7 +78,17 @@ class Event(NamedTuple):
 
 @results.shown()
 class GivenStart(NamedTuple):
-    """A failure given where the episode starts. Python numbers."""
+    """A failure given where the episode starts. Python numbers.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.pendulum()
+        >>> counted = jast.estimate.monte_carlo(key, sim, 3000)
+        >>> near = {"tilted": lambda s: abs(s[0]) > 0.1}
+        >>> found = jast.estimate.given_start(key, sim, counted, near, draws=1000)["tilted"]
+        >>> found.start_interval[0] < found.start < found.start_interval[1]
+        True
+    """
 
     probability: float
     """Of a failure, given a start in the set"""

@@ -41,7 +41,16 @@ PER_SAMPLE = 10
 
 @results.result("ess")
 class FailureSamples(NamedTuple):
-    """Failures drawn from p(x | failure)."""
+    """Failures drawn from p(x | failure).
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing()
+        >>> proposal = jast.estimate.failure_proposal(key, sim, samples=200).policy
+        >>> drawn = jast.estimate.failure_samples(key, sim, proposal, 50)
+        >>> drawn.failures.disturbances.shape, 1 <= drawn.distinct <= 50
+        ((50, 10), True)
+    """
 
     failures: Episode
     """A batch, leading axis [n]; without states (`jast.replay` gives them)"""

@@ -55,7 +55,16 @@ PROBES = 256
 
 @results.shown()
 class Traces(NamedTuple):
-    """Simulated episodes of a proposal, one a row of the leading axis [n]."""
+    """Simulated episodes of a proposal, one a row of the leading axis [n].
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> model = jast.Policy(sim.start, lambda state, t: sim.disturbance(state))
+        >>> traces = jast.estimate.log_weights(jax.random.key(0), sim, model, 100)
+        >>> traces.failure.shape, bool((traces.length <= 30).all())
+        ((100,), True)
+    """
 
     log_weight: Any
     """log p - log q to the end of the episode, also of those that do not fail"""

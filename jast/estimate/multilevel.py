@@ -37,6 +37,15 @@ __all__ = ["FailureProposal", "failure_proposal"]
 class FailureProposal(NamedTuple):
     """A proposal and how it was found. K iterations; with a leading axis everywhere after
     `jax.vmap`.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.landing()
+        >>> found = jast.estimate.failure_proposal(key, sim, samples=200)
+        >>> float(found.levels[-1])  # the last elites fail
+        0.0
+        >>> jast.rollout(key, sim, found.policy).disturbances.shape
+        (10,)
     """
 
     policy: Any

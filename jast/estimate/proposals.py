@@ -42,6 +42,14 @@ MIXING = ("step", "trace")
 class Proposal:
     """A mixture of K policies, one of which is drawn for a whole trace: q(trace) = sum of
     exp(log_weights[k]) q_k(trace). A pytree.
+
+    Example:
+        >>> import jast
+        >>> from jast import distributions as D
+        >>> sim = jast.simulators.walk1d()
+        >>> push = jast.Policy(sim.start, lambda state, t: D.Normal(1.0, 1.0))
+        >>> jast.estimate.policy_proposal(sim, push).covers  # its density is nowhere 0
+        True
     """
 
     log_weights: Any

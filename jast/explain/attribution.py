@@ -27,7 +27,16 @@ POINTS, LINES = 128, 10
 
 @results.shown()
 class Attribution(NamedTuple):
-    """By how much each disturbance has lowered the miss distance."""
+    """By how much each disturbance has lowered the miss distance.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.5).at[3].set(5.0))
+        >>> found = jast.explain.attribution(sim, failure, permutations=10)
+        >>> found.parts[0][0]  # the greatest is that of step 4
+        4
+    """
 
     values: Any
     """Like the disturbances [horizon, ...]: above 0 what led towards the failure. In units of the

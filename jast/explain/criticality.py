@@ -26,7 +26,16 @@ LANES, CERTAIN = 512, 0.95
 
 @results.result("evaluations")
 class Criticality(NamedTuple):
-    """The probability of failing from each state of an episode, [length + 1] rows."""
+    """The probability of failing from each state of an episode, [length + 1] rows.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(6, 2.0))
+        >>> found = jast.explain.criticality(jax.random.key(0), sim, failure, draws=100)
+        >>> 0 < found.last_below_half < found.point_of_no_return <= 5
+        True
+    """
 
     probability: np.ndarray
     """Of failing later on, disturbed as the model says; row t is of the state after t steps."""

@@ -24,7 +24,16 @@ SWEEPS, LINES = 3, 12
 
 @results.shown()
 class Minimal(NamedTuple):
-    """What a failure needs."""
+    """What a failure needs.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> failure = jast.replay(sim, jnp.full(30, 0.01).at[3].set(12.0))
+        >>> found = jast.explain.minimal(sim, failure, orders=2)
+        >>> [part[0] for part in found.parts], bool(found.episode.failure)  # step 4 alone
+        ([4], True)
+    """
 
     needed: Any
     """bool, like the disturbances [horizon, ...]: those that are not at their mode."""

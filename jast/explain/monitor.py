@@ -32,7 +32,16 @@ ROWS, BINS, REPEATS = 200_000, 256, 400
 
 @results.result("evaluations")
 class Monitor(NamedTuple):
-    """A classifier of observations, and how it does on episodes that it has not seen."""
+    """A classifier of observations, and how it does on episodes that it has not seen.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> watch = jast.explain.monitor(sim, found, model="logistic", episodes=100)
+        >>> 0.0 <= watch.threshold <= 1.0, min(watch.held_out) > 0
+        (True, True)
+    """
 
     model: Any
     """The scikit-learn classifier."""

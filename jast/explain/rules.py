@@ -31,7 +31,16 @@ OF = "disturbances", "states", "both"
 
 @results.result("evaluations")
 class Rules(NamedTuple):
-    """Rules for failures, and how they do on episodes that they were not made from."""
+    """Rules for failures, and how they do on episodes that they were not made from.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d(form="one-sided")
+        >>> found = jast.search.gradient(jax.random.key(0), sim, starts=4, refine=0)
+        >>> told = jast.explain.rules(sim, found, episodes=100)
+        >>> told.classes, told.recall["fails"] > 0.5
+        (('does not fail', 'fails'), True)
+    """
 
     rules: tuple[Any, ...]
     """`Rule` of each way to a failure, by label and then those first that tell the most."""

@@ -30,7 +30,16 @@ FEW = 100
 
 @results.shown()
 class Sensitivity(NamedTuple):
-    """Derivatives of the log probability of failure."""
+    """Derivatives of the log probability of failure.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.landing(b=0.5)
+        >>> estimate = jast.estimate.failure_probability(jax.random.key(0), sim, 6000)
+        >>> rows = jast.explain.sensitivity(sim, estimate, samples=2000).rows
+        >>> all(low < slope < high for name, value, slope, error, (low, high) in rows)
+        True
+    """
 
     rows: tuple[Any, ...]
     """(name, value, derivative of log P, standard error, (low, high)) of each parameter. Times the

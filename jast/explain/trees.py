@@ -18,7 +18,14 @@ FOLDS = 3
 
 @results.shown()
 class Rule(NamedTuple):
-    """One way through the tree."""
+    """One way through the tree.
+
+    Example:
+        >>> from jast.explain import Rule
+        >>> height = ("height at step 5", "number", float("-inf"), 2.0)
+        >>> print(Rule("fails", (height,), 0.9, (0.8, 1.0), 0.5, (0.4, 0.6)))
+        height at step 5 <= 2 -> fails
+    """
 
     label: str
     """What it says of an episode: "fails", or the kind of failure."""

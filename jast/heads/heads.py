@@ -33,6 +33,12 @@ __all__ = [
 class Moments(NamedTuple):
     """Running mean and deviation of n numbers; with ``count`` 0 they leave what they normalise as
     it is.
+
+    Example:
+        >>> import numpy as np, jast
+        >>> speeds = jast.heads.Moments(np.float32(100), np.array([5.0]), np.array([2.0]))
+        >>> float(speeds.normalise(np.array([9.0]))[0])
+        2.0
     """
 
     count: Any

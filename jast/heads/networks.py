@@ -29,6 +29,13 @@ ACTIVATIONS = {
 class Head(NamedTuple):
     """A network: ``apply(params, x)`` of one input x [n] float32. Any pair of the kind will do, of
     any framework.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> linear = jast.heads.Head({"w": jnp.ones(2)}, lambda params, x: params["w"] @ x)
+        >>> heads = jast.heads.Heads(value=linear)  # a network of one's own
+        >>> float(heads.value.apply(heads.value.params, jnp.array([1.0, 2.0])))
+        3.0
     """
 
     params: Any

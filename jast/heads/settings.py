@@ -10,7 +10,14 @@ __all__ = ["MODES", "HeadSettings", "checked", "settings"]
 
 
 class HeadSettings(NamedTuple):
-    """Settings of heads. A pair is (rollout-policy head, value head)."""
+    """Settings of heads. A pair is (rollout-policy head, value head).
+
+    Example:
+        >>> import jast
+        >>> chosen = jast.heads.settings(hidden=(16,), steps=(20, 20))
+        >>> chosen.hidden, chosen._replace(bins=8).bins
+        ((16,), 8)
+    """
 
     round: Any
     """Trees that grow between two trainings; None: a fifth of all, at most 128."""

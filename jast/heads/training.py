@@ -26,7 +26,18 @@ class Learner(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """What one round of training came to."""
+    """What one round of training came to.
+
+    Example:
+        >>> import jax, jast
+        >>> few = jast.heads.settings(round=2, hidden=(8,), steps=(5, 5), bins=4)
+        >>> found = jast.search.forest(
+        ...     jax.random.key(0), jast.simulators.walk1d(), trees=4, prunes=1, simulations=50,
+        ...     heads="rollout", actions=jast.actions.wide(2.0), head_settings=few, refine=0,
+        ... )
+        >>> [lesson["policy"].steps for lesson in found.lessons]  # of two rounds
+        [5, 5]
+    """
 
     loss: float
     """Mean over the last tenth of the steps."""

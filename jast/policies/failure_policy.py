@@ -24,7 +24,16 @@ __all__ = ["FailurePolicy", "History"]
 
 @results.shown()
 class History(NamedTuple):
-    """The training, a row for each stretch of it: [rows] each."""
+    """The training, a row for each stretch of it: [rows] each.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, updates=1)
+        >>> policy = jast.policies.sac(jax.random.key(0), sim, **small)
+        >>> int(policy.history.episodes[-1]) == int(policy.episodes)
+        True
+    """
 
     episodes: Any
     """Simulated so far, those of the look around before the learning included."""
@@ -103,6 +112,15 @@ class FailurePolicy(Policy):
     policy's value; ``start()`` is the start tilted by the critics. Both have samples and densities,
     above 0 wherever the model's are, so `jast.rollout` plays it and importance sampling may draw
     from it.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> small = dict(episodes=32, lanes=4, hidden=(8,), batch=16, updates=1)
+        >>> policy = jast.policies.sac(jax.random.key(0), sim, **small)
+        >>> log_prob = policy.disturbance(sim.init(()), 0).log_prob(1.0)
+        >>> bool(log_prob > -float("inf")), int(policy.episodes) >= 32
+        (True, True)
     """
 
     learned: Learned = None

@@ -24,7 +24,16 @@ __all__ = ["Mode", "Modes", "modes"]
 
 @results.shown()
 class Mode(NamedTuple):
-    """One way to fail."""
+    """One way to fail.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(key, sim, episodes=500, refine=0).failures
+        >>> ways = jast.search.modes(sim, jast.search.refine(key, sim, found, budget=2000).failures)
+        >>> bool(ways[0].failure.failure), 0 < ways[0].share < 1
+        (True, True)
+    """
 
     failure: Episode
     """Its likeliest failure, an `jast.Episode`; its ``reward`` is log p relative to the mode of the
@@ -39,6 +48,14 @@ class Mode(NamedTuple):
 class Modes(tuple):
     """A tuple of `Mode`, the likeliest first; prints as a table. ``evaluations``: episodes that it
     took to tell them apart.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(key, sim, episodes=500, refine=0).failures
+        >>> ways = jast.search.modes(sim, jast.search.refine(key, sim, found, budget=2000).failures)
+        >>> sum(way.members for way in ways) > 1, ways.evaluations > 0
+        (True, True)
     """
 
     evaluations = 0

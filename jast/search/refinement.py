@@ -44,7 +44,16 @@ LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2
 
 @results.result("episodes")
 class Refined(NamedTuple):
-    """Failures, pulled to where they are likeliest."""
+    """Failures, pulled to where they are likeliest.
+
+    Example:
+        >>> import jax, jast
+        >>> key, sim = jax.random.key(0), jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(key, sim, episodes=500, refine=0).failures
+        >>> refined = jast.search.refine(key, sim, found, budget=2000)
+        >>> bool((refined.gain >= 0).all()), len(refined.origin) == len(refined.failures)
+        (True, True)
+    """
 
     failures: Failures
     """By falling log p relative to the mode, which is their reward; all replay."""

@@ -19,7 +19,15 @@ __all__ = ["History", "SearchResult", "Trials", "table"]
 
 @results.shown()
 class History(NamedTuple):
-    """How the search went, at C moments of it."""
+    """How the search went, at C moments of it.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> int(found.history.failing[-1]) == round(500 * found.failing_share)
+        True
+    """
 
     simulations: Any
     """[C] int: episodes simulated by each tree so far."""
@@ -62,6 +70,13 @@ class Trials(NamedTuple):
 class SearchResult(NamedTuple):
     """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap`
     all are traced arrays and ``failures`` is None.
+
+    Example:
+        >>> import jax, jast
+        >>> sim = jast.simulators.walk1d()
+        >>> found = jast.search.monte_carlo(jax.random.key(0), sim, episodes=500, refine=0)
+        >>> found.episodes, found.invalid, bool(found.best.failure)
+        (500, 0, True)
     """
 
     best: Episode

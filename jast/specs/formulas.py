@@ -36,7 +36,15 @@ _static = dict(metadata=dict(static=True))
 
 
 class Formula:
-    """What all formulas have in common."""
+    """What all formulas have in common.
+
+    Example:
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> high = specs.predicate(lambda s: s - 1.0, "s > 1")
+        >>> print(specs.always(low & high))
+        always ((s < 5) & (s > 1))
+    """
 
     def __and__(self, other: "Formula") -> "Formula":
         return _joined("&", self, other)

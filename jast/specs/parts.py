@@ -14,7 +14,17 @@ __all__ = ["Part", "Parts", "parts"]
 
 
 class Part(NamedTuple):
-    """A sub-formula, at the moment at which the whole formula's robustness depends on it."""
+    """A sub-formula, at the moment at which the whole formula's robustness depends on it.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> found = specs.parts(specs.always(low), jnp.array([1.0, 6.0, 2.0]), 1.0)
+        >>> part = found.rows[1]  # s < 5, inside of always
+        >>> part.time, part.value, part.held
+        (1.0, -1.0, False)
+    """
 
     formula: Formula
     depth: int
@@ -33,7 +43,16 @@ class Part(NamedTuple):
 
 @results.shown()
 class Parts(NamedTuple):
-    """What `parts` found: prints as a table, a long formula on several lines."""
+    """What `parts` found: prints as a table, a long formula on several lines.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> found = specs.parts(specs.always(low), jnp.array([1.0, 6.0, 2.0]), 1.0)
+        >>> [str(part.formula) for part in found.rows if part.decides]
+        ['always (s < 5)', 's < 5']
+    """
 
     rows: tuple[Part, ...]
     """The formula itself first, each formula before its parts."""

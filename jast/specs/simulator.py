@@ -21,7 +21,17 @@ __all__ = ["Monitored", "goes_on", "trace_of", "under"]
 
 
 class Monitored(NamedTuple):
-    """State of a system under a formula."""
+    """State of a system under a formula.
+
+    Example:
+        >>> import jax.numpy as jnp, jast
+        >>> from jast import specs
+        >>> low = specs.predicate(lambda s: 5.0 - s, "s < 5")
+        >>> sim = specs.under(jast.simulators.walk1d(), specs.always(low))
+        >>> states = jast.replay(sim, jnp.ones(30)).states
+        >>> states.state[:3].tolist(), float(states.robustness[2])
+        ([0.0, 1.0, 2.0], 3.0)
+    """
 
     state: Any
     """The system's own."""

@@ -23,7 +23,14 @@ __all__ = ["Report", "Tried"]
 
 @results.shown()
 class Tried(NamedTuple):
-    """One piece of the work."""
+    """One piece of the work.
+
+    Example:
+        >>> from jast.stress_testing import Tried
+        >>> tried = [Tried("nominal", 10000, 1, -24.3), Tried("gradients", 9720, 63, -10.8)]
+        >>> max(tried, key=lambda part: part.best).name
+        'gradients'
+    """
 
     name: str
     evaluations: int
@@ -35,7 +42,14 @@ class Tried(NamedTuple):
 
 @results.result("episodes")
 class Report(NamedTuple):
-    """The outcome of `jast.stress`."""
+    """The outcome of `jast.stress`.
+
+    Example:
+        >>> import jax, jast
+        >>> report = jast.stress(jax.random.key(0), jast.simulators.walk1d(), 2000)
+        >>> report.episodes == sum(report.spent.values()), len(report.modes) > 0
+        (True, True)
+    """
 
     nominal: Nominal
     """The system as it is: undisturbed, and under plain draws."""

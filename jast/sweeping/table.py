@@ -33,7 +33,18 @@ class Answer(NamedTuple):
 
 
 class Crossing(NamedTuple):
-    """Where the probability of failure crosses ``level``."""
+    """Where the probability of failure crosses ``level``.
+
+    Example:
+        >>> import jax, jast
+        >>> make = lambda threshold: jast.simulators.walk1d(threshold=threshold)
+        >>> table = jast.sweep(
+        ...     jax.random.key(0), make, {"threshold": [8.0, 12.0]}, jast.nominal, episodes=500
+        ... )
+        >>> crossing = table.crossing(0.1)
+        >>> crossing.interval[0] < crossing.value < crossing.interval[1]
+        True
+    """
 
     name: str
     """Of the setting"""
@@ -55,6 +66,15 @@ class Sweep(NamedTuple):
     """A table: what a function said of each of N systems. Row i is ``function(key_i,
     simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``; where ``settings["follow"]``
     holds, with ``near``, the result of the last row before it that has one.
+
+    Example:
+        >>> import jax, jast
+        >>> make = lambda threshold: jast.simulators.walk1d(threshold=threshold)
+        >>> table = jast.sweep(
+        ...     jax.random.key(0), make, {"threshold": [8.0, 12.0]}, jast.nominal, episodes=500
+        ... )
+        >>> table.values, table.probability.shape, bool(table.reliable.all())
+        ({'threshold': (8.0, 12.0)}, (2,), True)
     """
 
     values: dict[str, tuple[Any, ...]]

@@ -14,7 +14,15 @@ __all__ = ["Seen", "Selector", "Step"]
 
 
 class Seen(NamedTuple):
-    """What the system under test has been asked so far."""
+    """What the system under test has been asked so far.
+
+    Example:
+        >>> import numpy as np
+        >>> from jast.weakness import Seen
+        >>> seen = Seen(np.array([2, 0]), np.array([1, -1, 3]), np.array([1, 2, 2]))
+        >>> seen.tried.tolist(), seen.failed.tolist()
+        ([True, False, True], [False, False, True])
+    """
 
     order: Any
     """[calls] int: the inputs it was run on, in order"""
@@ -35,7 +43,15 @@ class Seen(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What one iteration of a selector comes to."""
+    """What one iteration of a selector comes to.
+
+    Example:
+        >>> import numpy as np
+        >>> from jast.weakness import Step
+        >>> done = Step({}, np.array([0.9, 0.1, 0.5]), np.array([0]), 0.6)
+        >>> int(done.scores.argmax())  # the most suspect input
+        0
+    """
 
     memory: dict[str, Any]
     """Arrays by name: what the next iteration needs of this one"""

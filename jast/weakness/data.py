@@ -29,7 +29,14 @@ LARGEST, MOST = 1e30, 65_536  # number among the inputs; classes
 
 
 class Data(NamedTuple):
-    """A labelled validation set, on the host."""
+    """A labelled validation set, on the host.
+
+    Example:
+        >>> import numpy as np
+        >>> from jast.weakness import Data
+        >>> Data(np.zeros((3, 8, 8)), np.array([0, 1, 1]), 2).image
+        True
+    """
 
     inputs: Any
     """[n, ...]: n inputs of one shape, as the user's ``predict`` takes them"""

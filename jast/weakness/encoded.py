@@ -25,7 +25,18 @@ __all__ = ["Encoded", "encoded"]
 
 @results.shown()
 class Encoded(NamedTuple):
-    """The autoencoder and the adversary of a result (`encoded`); n inputs, codes of h numbers."""
+    """The autoencoder and the adversary of a result (`encoded`); n inputs, codes of h numbers.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> small = jast.weakness.thesis(iterations=1, sample=50, hidden=(8,), encoder_epochs=1)
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(jax.random.key(0), wrong, inputs, labels, selector=small)
+        >>> networks = jast.weakness.encoded(found, inputs, labels)
+        >>> networks.decode(networks.codes[:3]).shape
+        (3, 8, 8)
+    """
 
     codes: Any
     """[n, h]: E(x) of each input"""

@@ -20,7 +20,14 @@ __all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
 
 @results.shown()
 class Roc(NamedTuple):
-    """A receiver operating characteristic, from (0, 0) to (1, 1)."""
+    """A receiver operating characteristic, from (0, 0) to (1, 1).
+
+    Example:
+        >>> import numpy as np, jast
+        >>> curve = jast.weakness.roc(np.array([0.9, 0.2, 0.4]), np.array([True, False, True]))
+        >>> curve.area
+        1.0
+    """
 
     false_positive: Any
     """[m]: share of the inputs that pass whose score is at least the threshold"""
@@ -37,7 +44,19 @@ class Roc(NamedTuple):
 
 @results.shown()
 class Judgement(NamedTuple):
-    """How good the scores of each iteration are on the whole data set; R iterations."""
+    """How good the scores of each iteration are on the whole data set; R iterations.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> told = jast.weakness.judge(found, wrong(inputs) != labels, top=20)
+        >>> bool((told.precision <= 1.0).all())
+        True
+    """
 
     auc: Any
     """[R]: area under the ROC curve; NaN where all inputs fail or none"""

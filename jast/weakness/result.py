@@ -17,7 +17,18 @@ ROUGH = " (a guide only: where it was measured, between a seventh and six times 
 
 @results.shown()
 class History(NamedTuple):
-    """R iterations, each of a batch of calls and what was learned from it."""
+    """R iterations, each of a batch of calls and what was learned from it.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> int(found.history.calls[-1]), int(found.history.found[-1]) == found.failing
+        (50, True)
+    """
 
     calls: Any
     """[R] int: calls after each iteration"""
@@ -43,7 +54,22 @@ class History(NamedTuple):
 
 @results.shown()
 class State(NamedTuple):
-    """All that `validate` needs to go on; for `save` and `load`."""
+    """All that `validate` needs to go on; for `save` and `load`.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> more = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=80, selector="random",
+        ...     state=found.state,
+        ... )
+        >>> more.calls
+        80
+    """
 
     selector: str
     """The selector's name and settings, as JSON"""
@@ -66,7 +92,20 @@ class State(NamedTuple):
 
 @results.result("calls")
 class Result(NamedTuple):
-    """The outcome of a validation of n inputs. NumPy arrays."""
+    """The outcome of a validation of n inputs. NumPy arrays.
+
+    Example:
+        >>> import jax, jast
+        >>> inputs, labels = (a[:200] for a in jast.weakness.digits())
+        >>> wrong = lambda x: (x.sum((1, 2)) > 20).astype(int)  # a poor classifier
+        >>> found = jast.weakness.validate(
+        ...     jax.random.key(0), wrong, inputs, labels, budget=50, selector="random"
+        ... )
+        >>> found.calls, bool((found.predicted[found.failures] != labels[found.failures]).all())
+        (50, True)
+        >>> len(found.ranked)  # inputs that were not run
+        150
+    """
 
     failures: Any
     """[found] int: the inputs that the system gets wrong, in the order found"""

@@ -39,7 +39,15 @@ SECANTS = 3
 
 
 class Cars(NamedTuple):
-    """The cars at a moment. Gaps, not positions, as these are large."""
+    """The cars at a moment. Gaps, not positions, as these are large.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast.simulators.arch import Cars
+        >>> cars = Cars(jnp.full(4, 10.0), jnp.zeros(5), jnp.zeros(4, jnp.int32), jnp.array(0.0))
+        >>> cars.y.tolist()
+        [0.0, 10.0, 20.0, 30.0, 40.0]
+    """
 
     gaps: Any
     """[4] m: y2 - y1, .., y5 - y4"""

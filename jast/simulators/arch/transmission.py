@@ -114,7 +114,16 @@ DOWN = _even(
 
 
 class Transmission(NamedTuple):
-    """The car at a moment."""
+    """The car at a moment.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast.simulators.arch import Transmission
+        >>> zero = jnp.zeros((), jnp.int32)
+        >>> car = Transmission(jnp.array(1000.0), jnp.array(500.0), zero + 1, zero, zero, zero)
+        >>> round(float(car.speed))  # mph
+        36
+    """
 
     rpm: Any
     """Engine speed"""
