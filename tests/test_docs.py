@@ -1,16 +1,19 @@
 """The documentation: it builds without a warning, and what it shows runs."""
 
 import ast
+import importlib
 import inspect
 import operator
 import os
 import re
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from doors import DOORS
 
 import jast
 
@@ -47,6 +50,16 @@ def test_it_builds_without_a_warning(tmp_path):
     pytest.importorskip("myst_nb", reason="needs the extra `docs`")
     python("-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", ".", str(tmp_path), cwd=ROOT)
     assert (tmp_path / "docs/index.html").exists()
+    listed = zlib.decompress((tmp_path / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
+    pages = {line.split()[0]: line.split()[3] for line in listed.splitlines()}
+    for door in DOORS:
+        room = importlib.import_module(door)
+        for name in room.__all__:
+            value = getattr(room, name)
+            ours = getattr(value, "__module__", None) or "jast"  # a constant has none
+            if not inspect.ismodule(value) and ours.startswith("jast"):
+                ways = (f"{door}.{name}", f"jast.{name}")  # `jast.stress`, `jast.sweep`
+                assert any(pages.get(way, "").startswith("docs/api/") for way in ways), ways
 
 
 def test_code_that_needs_other_machines_names_what_exists():
