@@ -1,6 +1,6 @@
 """Falsification of the ARCH-COMP benchmarks with few simulations: ``python -m benchmarks.arch
 [--json] [--quick | --smoke] [--cases ...] [--methods ...] [--seeds N] [--budget N]
-[--probability [CASE]]``.
+[--probability [CASE]] [--flights]``.
 
 For each requirement and method: seeds that falsified it within the budget (300; CC4 and AT 1500),
 and the mean and median number of simulations of these. A method is ``method(key, sim, budget)`` and
@@ -21,11 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks import arch_probability, peers
+from benchmarks import arch_flights, arch_probability, peers
 from benchmarks.cma_es import Stop
 from benchmarks.sizes import options, size
 from jast import limit_state
-from jast.simulators.arch import automatic_transmission, chasing_cars
+from jast.simulators.arch import (
+    automatic_transmission,
+    chasing_cars,
+    ground_collision_avoidance,
+)
 
 __all__ = ["METHODS", "run"]
 
@@ -34,6 +38,8 @@ CASES = {"CC1": 300, "CC2": 300, "CC3": 300, "CC4": 1500, "CC5": 300, "CCx": 300
     name: 1500
     for name in ("AT1", "AT2", "AT51", "AT52", "AT53", "AT54", "AT6a", "AT6b", "AT6c", "AT6abc")
 }
+CASES |= {"F16": 300}
+SYSTEMS = {"CC": chasing_cars, "AT": automatic_transmission, "F1": ground_collision_avoidance}
 PUBLISHED = {
     "CC1": "FalCAuN 229 (10/10)",
     "CC2": "FalCAuN 76 (10/10)",
@@ -46,12 +52,13 @@ PUBLISHED = {
     "AT6b": "FalCAuN 600 (10/10; the year after 0/10)",
     "AT6c": "FalCAuN 898 (10/10)",
     "AT6abc": "FalCAuN 1232 (10/10)",
+    "F16": "MoonLight with TuRBO 21 (10/10), from 2338 ft and with other gains",
 }
 
 
 def system(name):
     """The simulator of a requirement."""
-    return chasing_cars(name) if name.startswith("CC") else automatic_transmission(name)
+    return SYSTEMS[name[:2]](name)
 
 
 def falsify(key, sim, budget):
@@ -176,7 +183,15 @@ def main(argv=None):
         help="instead: how probable it is that uniform inputs break one (default: CCx), by"
         " estimates of 20,000 episodes (or --budget) and crude Monte Carlo of 1,000,000",
     )
+    parser.add_argument(
+        "--flights", action="store_true", help="instead: how low F-16s come, by altitude"
+    )
     args = parser.parse_args(argv)
+    if args.flights:
+        found = arch_flights.rows(size(args, 20_000, 2_000, 20))
+        said = json.dumps(dict(settings=dict(jast=jast.__version__), rows=found))
+        print(said if args.json else arch_flights.table(found))
+        return
     if args.probability:
         budget = args.budget or size(args, 20_000, 5_000, 500)
         crude = size(args, 1_000_000, 20_000, 500)

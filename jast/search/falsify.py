@@ -197,7 +197,7 @@ def _signal(
     if rng.uniform() < CROSSED and length > 1:
         at = rng.integers(1, length)
         rows[at:] = pool.rows[rng.integers(m)][at:]
-    for _ in range(1 + rng.poisson(0.7)):
+    for _ in range(1 + rng.poisson(0.7) if k else 0):
         begin = rng.integers(length)
         end = begin + 1 + int(length / 3 * rng.uniform() ** 2)
         columns = [rng.integers(k)] if rng.uniform() < 0.6 else range(k)
@@ -210,7 +210,7 @@ def _signal(
             else:  # held
                 part = rng.uniform() if kind < 0.8 else rng.integers(2)
             rows[begin:end, c] = part
-    if k0 and rng.uniform() < 0.5:
+    if k0 and (k == 0 or rng.uniform() < 0.5):
         first = np.clip(first + STEP * rng.normal(size=k0), 0, 1)
     return rows, first
 

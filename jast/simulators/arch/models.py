@@ -16,7 +16,7 @@ from jast._checks import whole
 from jast.distributions import Independent, Uniform
 from jast.simulator import Simulator
 from jast.simulators.arch import cars, transmission
-from jast.simulators.arch.specifications import SPECIFICATIONS
+from jast.simulators.arch.specifications import named
 from jast.specs import Formula, under
 from jast.specs.robustness import reach
 
@@ -198,15 +198,7 @@ def _driven(
         raise ValueError(
             f"{function}: segments must divide {total}, the samples of a run, received {segments}"
         )
-    formula = requirement
-    if not isinstance(formula, Formula):
-        names = [name for name in SPECIFICATIONS if name.startswith(prefix)]
-        if formula not in names:
-            raise ValueError(
-                f"{function}: requirement must be a formula or one of {names}, received"
-                f" {requirement!r}"
-            )
-        formula = SPECIFICATIONS[formula]
+    formula = named(function, prefix, requirement)
     each = total // segments
     needed = min(reach(formula, model.DT), total)
     functions, samples = _functions(model, each, math.ceil(needed / each))
@@ -249,16 +241,18 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         init=init,
         step=step,
         disturbance=disturbance,
-        evaluate=_nothing,
+        evaluate=nothing,
         is_terminal=is_terminal,
         observe=observe,
     )
-    return functions, Partial(_samples)
+    return functions, Partial(samples_of)
 
 
-def _samples(state: Driving) -> Any:
+def samples_of(state: Driving) -> Any:
+    """Those during the step that led to a state, for `jast.specs.under`."""
     return state.samples
 
 
-def _nothing(state: Driving) -> tuple[Any, Any]:
+def nothing(state: Driving) -> tuple[Any, Any]:
+    """``evaluate`` of a system whose requirement judges it."""
     return jnp.zeros((), bool), jnp.zeros(())

@@ -3,7 +3,8 @@
 CC4's inner window differs between tools: 5 s in FalStar and the report of 2024 ("CC4"), 20 s in
 stgem and FReaK ("CC4-20", which asks for 115 s of 100: windows are clipped at the end). CC3 has the
 inequality of the category's reports. AT1 to AT6c as in the reports of 2019 to 2024; AT6abc is all
-three of AT6. The robustness of "in gear i" is half a gear where it holds.
+three of AT6. The robustness of "in gear i" is half a gear where it holds. F16: the altitude stays
+above the ground, in feet.
 """
 
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 
 from jast.specs import Formula, always, eventually, implies, predicate
 
-__all__ = ["SPECIFICATIONS"]
+__all__ = ["SPECIFICATIONS", "named"]
 
 
 def _wider(i: int, metres: float) -> Formula:
@@ -76,6 +77,19 @@ SPECIFICATIONS: Mapping[str, Formula] = MappingProxyType(
         "AT6b": _at6(50, 8),
         "AT6c": _at6(65, 20),
         "AT6abc": _at6(35, 4) & _at6(50, 8) & _at6(65, 20),
+        "F16": always(predicate(lambda s: s.altitude, "altitude > 0"), 0, 15),
     }
 )
 """Name -> formula of the trace of its model, at seconds."""
+
+
+def named(function: str, prefix: str, requirement: str | Formula) -> Formula:
+    """The formula of a name in `SPECIFICATIONS` that begins with ``prefix``; a formula as it is."""
+    if isinstance(requirement, Formula):
+        return requirement
+    names = [name for name in SPECIFICATIONS if name.startswith(prefix)]
+    if requirement not in names:
+        raise ValueError(
+            f"{function}: requirement must be a formula or one of {names}, received {requirement!r}"
+        )
+    return SPECIFICATIONS[requirement]

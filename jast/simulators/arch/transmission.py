@@ -34,6 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast.simulators.arch._table import along
+
 __all__ = ["DT", "DURATION", "INPUTS", "Transmission", "drive", "observe", "start"]
 
 DT = 0.02
@@ -176,7 +178,7 @@ def observe(car: Transmission) -> tuple[Any, ...]:
 def _shifted(car: Transmission, throttle: Any) -> Transmission:
     """The car after the logic looked, where it is time to."""
     level = throttle / 5
-    up, down = _along(UP, level)[car.gear - 1], _along(DOWN, level)[car.gear - 1]
+    up, down = along(UP, level)[car.gear - 1], along(DOWN, level)[car.gear - 1]
     v, waited = car.speed, car.waited + 1
     fires = (waited >= WAIT) & jnp.where(car.wish > 0, v >= up, v <= down) & (car.wish != 0)
     dropped = jnp.where(car.wish > 0, v < up, v > down)
@@ -195,14 +197,14 @@ def _shifted(car: Transmission, throttle: Any) -> Transmission:
 def _moved(car: Transmission, u: jax.Array) -> Transmission:
     """The car `DT` later, in its gear, at throttle and brake ``u``."""
     dtype = car.rpm.dtype
-    torques = _along(TORQUE, u[0] / 10)
+    torques = along(TORQUE, u[0] / 10)
     ratio = jnp.asarray(GEARS, dtype)[car.gear - 1]
 
     def slopes(rpm: Any, wheel: Any) -> tuple[Any, Any]:
         rpm, v = jnp.clip(rpm, IDLE, MOST), MPH * wheel
-        capacity, gain = _along(CONVERTER, 100 * FINAL * ratio * wheel / rpm)
+        capacity, gain = along(CONVERTER, 100 * FINAL * ratio * wheel / rpm)
         impeller = (rpm / capacity) ** 2
-        rise = (_along(torques, rpm / 400 - 2) - impeller) / ENGINE
+        rise = (along(torques, rpm / 400 - 2) - impeller) / ENGINE
         stuck = ((rpm <= IDLE) & (rise < 0)) | ((rpm >= MOST) & (rise > 0))
         load = (FRICTION + DRAG * v**2 + u[1]) * jnp.sign(v)
         return jnp.where(stuck, 0, rise), (FINAL * ratio * impeller * gain - load) / VEHICLE
@@ -221,11 +223,3 @@ def _moved(car: Transmission, u: jax.Array) -> Transmission:
 
     rpm, wheel = lax.fori_loop(0, STEPS, step, (car.rpm, car.wheel))
     return car._replace(rpm=rpm, wheel=wheel)
-
-
-def _along(table: Any, place: Any) -> Any:
-    """The rows of a table at ``place``, counted in rows: straight between two, and beyond."""
-    table = jnp.asarray(table, place.dtype)
-    low = jnp.clip(jnp.floor(place), 0, len(table) - 2)
-    row = low.astype(jnp.int32)
-    return table[row] + (place - low) * (table[row + 1] - table[row])
