@@ -1,7 +1,8 @@
 """What the driver of units costs, what a second worker gains, and whether killed calls go on to the
 same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--costs] [--kills N]``.
 
-``overhead``: CPU time of a call to that with a plain loop over the same units in its place.
+``overhead``: CPU time of a call to that with a plain loop over the same units in its place, both
+in one thread.
 ``checkpoint``: CPU time with a checkpoint to that without. Runs of the two alternate; medians.
 ``workers``: wall time with one process to that with two, of an executor of spawned processes, on
 the ferry (S0) and on a black box that waits for 5 ms. ``kills``: calls killed at random moments
@@ -55,7 +56,9 @@ def calls(episodes, trees, budget):
         "monte_carlo": lambda **how: jast.search.monte_carlo(
             KEY, ferry(), episodes=episodes, refine=0, **how
         ),
-        "forest": lambda **how: jast.search.forest(KEY, ferry(), trees=trees, refine=0, **how),
+        "forest": lambda **how: jast.search.forest(
+            KEY, ferry(), trees=trees, refine=0, threads=1, lanes=trees // 4, **how
+        ),
         "failure_probability": lambda **how: jast.estimate.failure_probability(
             KEY, landing(), budget, **how
         ),

@@ -145,9 +145,9 @@ def forest(
             states are then kept at every node.
         threads: how many run trees. Default: one for each processor. Like ``lanes``, it changes no
             result.
-        lanes: trees that a thread runs side by side. They are the unit of a checkpoint or an
-            executor, with which the default is 64 to 128: smaller units lose less and make one wait
-            less, but cost more each.
+        lanes: trees that a thread runs side by side, at most 128 by default. They are the unit of
+            a checkpoint or an executor, whose default is 64 to 128: smaller units lose less and
+            make one wait less, but cost more each.
         available: bytes that the trees in flight may take. Default: what is free.
         progress: whether to show a progress bar.
         callback: called as ``callback(done, total, None)`` now and then, with the simulations of

@@ -39,7 +39,7 @@ MEMOIZE = ("auto", "node", "root", "none")
 PUBLISHED = ("code", "text", "paper", "thesis")
 """Modes that maximise the reward of before by default, over draws of the model."""
 LEAST = 64
-"""Trees of a group with a checkpoint or an executor, at least: fewer in lockstep cost more each."""
+"""Trees of a group with an executor, at least: fewer in lockstep cost more each."""
 BOUNDED = 1.0
 """``exploration`` for `jast.rewards.lexicographic`, whose range is (-1, 1]."""
 CHUNK, HOST_CHUNK = 500, 10  # simulations of a tree between two looks at the keyboard
@@ -130,7 +130,7 @@ def grow_trees(
             f"{method}: keep_trees needs states at every node, received memoize={memoize!r}"
         )
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
-    if lanes is None and (checkpoint, executor) != (None, None):
+    if lanes is None and executor is not None:
         lanes = min(LANES, -(-job.at_once // max(job.at_once // LEAST, 1)))
     if devices is not None:
         threads = len(ways.devices)
