@@ -79,7 +79,7 @@ def guarded(s, i, last):
         f"guard: {asked:.2%} of the probability where the proposal is thin, {thin:.2%} by its own"
         " batches"
     )
-    found = [f for f in found if len(f[1]) and f[0] > 2 * (thin + LOST)]
+    found = [f for f in found if len(f[1]) and _lost(s, *f, thin)]
     if i == 0 and len(s.seeds):
         found += _forgotten(s)
     if not found:
@@ -95,6 +95,16 @@ def guarded(s, i, last):
     for share, points, used in found:
         s.add(s.fitted(points, used), min(max(share / (1 + share), 0.15), 0.85))
     return False
+
+
+def _lost(s, share, points, used, thin):
+    """Whether the ``share`` of the probability that a population found at the ``points`` is missing.
+    Where the batches have met such points, they know it better: it is ``thin`` at most.
+    """
+    each = [log_ratio(b.q, points, used) + math.log(len(b.z)) for b in s.batches]
+    # how many draws of all batches would lie there, were all of the share like this point
+    expected = share * np.exp(np.logaddexp.reduce(each) + s.log_mean)
+    return share > 2 * (thin + LOST) or share * np.mean(expected < 1) > 2 * LOST
 
 
 def _share(share):
