@@ -98,7 +98,7 @@ def guarded(s, i, last):
 
 
 def _lost(s, share, points, used, thin):
-    """Whether the ``share`` of the probability that a population found at the ``points`` is missing.
+    """Whether the ``share`` of the probability that a population found at ``points`` is missing.
     Where the batches have met such points, they know it better: it is ``thin`` at most.
     """
     each = [log_ratio(b.q, points, used) + math.log(len(b.z)) for b in s.batches]
