@@ -224,8 +224,8 @@ class UniformBox:
             array = jnp.asarray(end)
         except (TypeError, ValueError):
             raise ValueError(
-                f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or what"
-                f" the disturbance is, {like}"
+                f"actions.uniform: {side} is {jax.tree.structure(end)}, expected an array or the"
+                f" structure of a disturbance, {like}"
             ) from None
         return jax.tree.map(lambda _: array, x)
 

@@ -62,7 +62,7 @@ def read(path, format, version, kind):
 
 def _opened(path, kind):
     if os.path.isdir(path):
-        raise ValueError(f"load: {path} is not {kind}: it is a folder, as checkpoint= makes")
+        raise ValueError(f"load: {path} is not {kind} but a folder, such as checkpoint= makes")
     return open(path, "rb")
 
 
@@ -87,14 +87,14 @@ def unpacked(data, path, format, version, kind):
         raise ValueError(f"load: {path} is not {kind}")
     if header.get("version") != version:
         raise ValueError(
-            f"load: {path} has version {header.get('version')!r}; this jast reads version"
-            f" {version}: use the jast that wrote it, {header.get('package')}"
+            f"load: {path} has version {header.get('version')!r}, and this jast reads version"
+            f" {version}: use the jast that wrote the file, {header.get('package')}"
         )
     dtypes = header.get("dtypes", {})
     if set(dtypes) != set(arrays):
         raise ValueError(
-            f"load: {path} is damaged: the arrays {sorted(set(dtypes) ^ set(arrays))} are missing"
-            " or too many"
+            f"load: {path} is damaged: its list of arrays and the arrays themselves differ in"
+            f" {sorted(set(dtypes) ^ set(arrays))}"
         )
     arrays = {
         name: (

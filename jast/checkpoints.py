@@ -24,7 +24,7 @@ __all__ = ["PARTS", "Store", "stored"]
 
 ABOUT, STATE, VERSION = "jast checkpoint", "jast checkpoint state", 1
 PARTS = "parts.log"
-REFUSED = "give another folder, or remove this one to begin anew"
+REFUSED = "give another folder, or remove this one to start again"
 
 
 class Store:
@@ -140,14 +140,16 @@ def _agree(function: str, folder: Path, about: dict[str, str]) -> None:
         others = [p.name for p in folder.iterdir() if p.name != "lock"]
         if others:
             raise ValueError(
-                f"{function}: checkpoint {folder} is a folder with other files in it, such as"
-                f" {sorted(others)[0]}: {REFUSED.partition(',')[0]}"
+                f"{function}: checkpoint {folder} holds other files, such as {sorted(others)[0]}:"
+                f" {REFUSED.partition(',')[0]}"
             )
         with _writing(function, folder):
             return archive.write(path, ABOUT, VERSION, dict(about=about), {})
     header, _ = archive.read(path, ABOUT, VERSION, "a checkpoint")
     if unlike := differences(header["about"], about):
-        raise ValueError(f"{function}: checkpoint {folder} is of another call: {unlike}; {REFUSED}")
+        raise ValueError(
+            f"{function}: checkpoint {folder} belongs to another call: {unlike}; {REFUSED}"
+        )
 
 
 @contextlib.contextmanager

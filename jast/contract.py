@@ -77,7 +77,9 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     try:
         found = jax.device_get(_probe(sim, actions))
     except jax.errors.JaxRuntimeError as e:  # a host callback that raised
-        raise ValueError(f"check: the first steps raised {_first_line(e)}") from e
+        raise ValueError(
+            f"check: while the first steps ran, a function of the simulator raised {_first_line(e)}"
+        ) from e
     _densities(found)
     _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
@@ -120,6 +122,7 @@ def _trace(sim, actions, observed):
     start = _call("start", sim.start)
     x0 = _draw("start", start)
     state = _arrays("init", _call("init", sim.init, x0))
+    hint = _whole(state)
     dist = _call("disturbance", sim.disturbance, state)
     x = _draw("disturbance", dist)
     pair = _call("evaluate", sim.evaluate, state)
@@ -129,7 +132,7 @@ def _trace(sim, actions, observed):
             f" {_kind(pair)}"
         )
     _scalar("evaluate: event", pair[0], bool)
-    _scalar("evaluate: distance", pair[1], float)
+    _scalar("evaluate: distance", pair[1], float, hint)
     for told in pair[2:]:
         _scalar("evaluate: log p", told, float)
     _scalar("is_terminal", _call("is_terminal", sim.is_terminal, state), bool)
@@ -146,7 +149,7 @@ def _trace(sim, actions, observed):
                 f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}; pass"
                 " observe=, a function state -> float vector of those that matter"
             )
-    _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state)
+    _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state, hint)
     if actions is not None:
         name = _name(actions)
         if not callable(getattr(actions, "draw", None)):
@@ -188,7 +191,7 @@ def _several(dist):
     """What to do where a distribution should be and several are."""
     if not isinstance(dist, dict | list | tuple):
         return ""
-    return "; several that are independent are one as jast.distributions.Joint(them)"
+    return "; combine several independent ones with jast.distributions.Joint"
 
 
 def _arrays(name, tree):
@@ -207,7 +210,7 @@ def _arrays(name, tree):
     return jax.tree_util.tree_map_with_path(array, tree)
 
 
-def _scalar(what, value, kind):
+def _scalar(what, value, kind, hint=""):
     if not isinstance(value, ARRAYS):
         raise ValueError(f"{what}: received {_kind(value)}, expected a {kind.__name__} scalar")
     shape, dtype = jnp.shape(value), jnp.result_type(value)
@@ -215,11 +218,20 @@ def _scalar(what, value, kind):
         raise ValueError(f"{what} has shape {shape}, expected (): a {kind.__name__} scalar")
     if not (dtype == jnp.bool_ if kind is bool else jnp.issubdtype(dtype, jnp.floating)):
         raise ValueError(
-            f"{what} has dtype {dtype}, expected {'bool' if kind is bool else 'a float'}"
+            f"{what} has dtype {dtype}, expected {'bool' if kind is bool else 'a float'}{hint}"
         )
 
 
-def _same(what, new, old):
+def _whole(state):
+    """A hint where a state of `init` holds whole numbers: often these are floats, written as 0."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.integer):
+            at = f" in leaf {_path(path)}" if path else ""
+            return f"; init returns whole numbers{at}: where floats are meant, write 0.0 for 0"
+    return ""
+
+
+def _same(what, new, old, hint=""):
     """ValueError unless ``new`` has the tree structure, shapes and dtypes of ``old``."""
     if jax.tree.structure(new) != jax.tree.structure(old):
         raise ValueError(
@@ -233,7 +245,10 @@ def _same(what, new, old):
             ("dtype", jnp.result_type(a), jnp.result_type(b)),
         ):
             if x != y:
-                raise ValueError(f"{what} leaf {_path(path)} has {part} {x}, expected {y}")
+                raise ValueError(
+                    f"{what} leaf {_path(path)} has {part} {x}, expected {y}"
+                    f"{hint if part == 'dtype' else ''}"
+                )
 
 
 def _box(box, x):
@@ -400,8 +415,8 @@ def _twice(name, function, *args):
     ):
         if np.asarray(a).tobytes() != np.asarray(b).tobytes():
             raise ValueError(
-                f"{name}: leaf {_path(path)} differs between two runs on the same input; randomness"
-                " belongs into disturbance or start"
+                f"{name}: leaf {_path(path)} differs between two runs on the same input;"
+                " randomness belongs in disturbance or start"
             )
     return first
 

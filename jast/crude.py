@@ -170,8 +170,8 @@ def nominal(
         settings["interrupted"] = short
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
-            "the system fails undisturbed: its likeliest disturbances already lead to a failure, so"
-            " a search for failures has nothing to find out",
+            "the system fails undisturbed: its likeliest disturbances already lead to a failure,"
+            " so a search for failures can find nothing new",
             stacklevel=2,
         )
     if invalid:

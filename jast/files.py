@@ -176,13 +176,14 @@ def _result(path: Any, header: dict, arrays: dict[str, np.ndarray], sim: Any, he
             return None
         if what != "kind":
             raise ValueError(
-                f"load: {path} holds {what!r}, unknown here: use the jast that wrote it"
+                f"load: {path} holds {what!r}, which this jast does not know: use the jast that"
+                " wrote the file"
             )
         format, version, name, names, own = about
         if format not in KINDS or version != KINDS[format].version:
             raise ValueError(
-                f"load: {path} holds {format!r} of version {version}, unknown here: use the jast"
-                f" that wrote it, {header.get('package')}"
+                f"load: {path} holds {format!r} of version {version}, which this jast does not"
+                f" know: use the jast that wrote the file, {header.get('package')}"
             )
         these = {k: arrays[f"{name}/{k}"] for k in names}
         return _whole(path, format, own, these, sim, heads)

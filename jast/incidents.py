@@ -24,26 +24,27 @@ GROUPS = 100
 KINDS = {
     "raised": "run the system on the example's disturbances to see it again",
     "timed out": (
-        "raise time_limit if the system is only slow; else the example's disturbances make it hang"
+        "increase time_limit if the system is only slow; otherwise the example's disturbances"
+        " make it hang"
     ),
     "died": (
-        "the process of the system ended: run it on the example's disturbances outside of this"
-        " process"
+        "the process of the system ended: run the system on the example's disturbances in a"
+        " process of its own"
     ),
     "wrong answer": "return (event, distance): a bool and one number",
     "NaN": (
-        "return a finite number for every input; an episode without one is no failure and has"
-        " reward -inf"
+        "return a finite number for every input; an episode without one does not count as a"
+        " failure and has reward -inf"
     ),
     "not deterministic": (
-        "seed every random number generator at the start of a run, or make what it draws a"
+        "seed every random number generator at the start of a run, or make its draws part of the"
         " disturbance"
     ),
     "unit left out": (
-        "a part of the work failed three times in the processes of the executor, and what it would"
-        " have added is missing; mend what it says, and make the same call again"
+        "a part of the work failed three times in the processes of the executor, and its results"
+        " are missing; fix the error it names, then make the same call again"
     ),
-    "other": "mend those listed first: their examples say how",
+    "other": "fix those listed first: their examples show how",
 }
 """The kinds of incidents, and what to do."""
 
@@ -97,7 +98,7 @@ class Log:
             if group not in self._groups and len(self._groups) >= GROUPS:
                 group = (
                     "other",
-                    f"more than {GROUPS} different messages; the last one: {kind}: {message}"[:200],
+                    f"more than {GROUPS} different messages; the latest: {kind}: {message}"[:200],
                 )
                 old = next((g for g in self._groups if g[0] == "other"), None)
                 if old is not None:

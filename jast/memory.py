@@ -53,7 +53,7 @@ def require(function: str, needed: int, what: str, advice: str) -> None:
     free = available()
     if free is not None and needed > 0.8 * free:
         raise ValueError(
-            f"{function}: {what} take at least {readable(needed)}, {readable(free)} are free;"
+            f"{function}: {what} need at least {readable(needed)}, and {readable(free)} are free;"
             f" {advice}"
         )
 

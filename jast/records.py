@@ -146,7 +146,10 @@ def _array(value: Any, arrays: dict[str, np.ndarray], at: str) -> dict[str, str]
 
 def _record(path: str, name: str) -> type:
     if name not in RECORDS:
-        raise ValueError(f"load: {path} holds a {name}, unknown here: use the jast that wrote it")
+        raise ValueError(
+            f"load: {path} holds a {name}, which this jast does not know: use the jast that wrote"
+            " the file"
+        )
     module, _, attribute = RECORDS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)
 

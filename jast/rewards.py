@@ -184,8 +184,8 @@ class Lexicographic:
     ) -> jax.Array:
         if not self.scaled:
             raise ValueError(
-                "rewards.lexicographic: near and rare are set by a search; here it needs both, as"
-                " lexicographic(near=1.0, rare=10.0)"
+                "rewards.lexicographic: only a search sets near and rare by itself; here give"
+                " both, such as lexicographic(near=1.0, rare=10.0)"
             )
         near, rare, likely = (_like(v, log_p) for v in (self.near, self.rare, self.likely))
         cost, miss = (likely - log_p) / rare, jnp.maximum(distance, 0)

@@ -43,9 +43,10 @@ def rounded(sim: Simulator) -> str | None:
     if not least or not moved > SHARE * spread:
         return None
     return (
-        f"the state is too coarse: a disturbance moves a number of it by {min(least):.2g} units of"
-        f" its last place, and rounding moves the miss distance by {moved / spread:.0%} of what the"
-        " disturbances do; take offsets out of the state, or float64"
+        "the state is too coarse: a disturbance changes one of its numbers by only"
+        f" {min(least):.2g} units in the last place, and rounding changes the miss distance by"
+        f" {moved / spread:.0%} as much as the disturbances do; take large offsets out of the"
+        " state, or use float64"
     )
 
 

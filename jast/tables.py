@@ -135,7 +135,7 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
     except (json.JSONDecodeError, KeyError, TypeError) as wrong:
         raise ValueError(
             f"from_json: path must be a file from the page of a report, received {str(path)!r},"
-            f" which is none: {wrong!r}"
+            f" which is not one: {wrong!r}"
         ) from None
     about, wholes = outline(sim), []
     for name, like, part in zip(("x0", "x"), (about.x0, about.x), parts, strict=True):
@@ -143,8 +143,8 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
         names = [place(at) for at, _ in pairs]
         if set(names) != set(part):
             raise ValueError(
-                f"from_json: sim must be the simulator of the failure, of {name} {sorted(part)},"
-                f" received one of {sorted(names)}"
+                f"from_json: sim must be the simulator of the failure, whose {name} has the fields"
+                f" {sorted(part)}, received one with {sorted(names)}"
             )
         arrays = (np.array(part[name]["values"], part[name]["dtype"]) for name in names)
         wholes.append(treedef.unflatten(list(arrays)))

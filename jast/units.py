@@ -161,7 +161,7 @@ def note(what: str, ran: Ran, done: int, total: int) -> str | None:
     said = "" if ran.ended is None else f"after {done} of {total} {what}{ran.ended}"
     if ran.left_out:
         units = ", ".join(map(str, ran.left_out[:5])) + ", ..." * (len(ran.left_out) > 5)
-        lost = f"units {units} are left out, as they failed again and again"
+        lost = f"units {units} are left out, since every attempt failed"
         said = f"{said}; {lost}" if said else f"{done} of {total} {what}: {lost}"
     return said or None
 
@@ -216,15 +216,15 @@ class _Desk:
     def give_up(self) -> None:
         """RuntimeError: what fails everywhere is no matter of luck."""
         raise RuntimeError(
-            f"{self._watch.name}: units fail in the executor, {TRIES} times each; the last one:"
-            f" {_words(self._error)}"
+            f"{self._watch.name}: every unit of work failed in the executor, {TRIES} times each;"
+            f" the last error: {_words(self._error)}"
         ) from self._error
 
     def _take(self, answer: Answer) -> None:
         number, result, error, incidents = answer
         if isinstance(error, Differs):
             raise ValueError(
-                f"{self._watch.name}: a process of the executor has other versions, with which"
+                f"{self._watch.name}: a process of the executor runs other versions, so its"
                 f" results would differ: {error}"
             )
         if error is not None:

@@ -245,7 +245,7 @@ def test_shares_cover():
 def test_what_holds_no_draws_says_so(key, found):
     e = subset_simulation(key, plane(), 100, replicates=3)
     for call in (exceedance, failure_times, lambda e: distance_quantile(e, 0.1)):
-        with pytest.raises(ValueError, match="must hold weighted draws.*subset"):
+        with pytest.raises(ValueError, match="must have kept its weighted draws.*subset"):
             call(e)
     sim = plane()
     with pytest.raises(ValueError, match="events: sim must be the simulator"):

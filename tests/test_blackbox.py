@@ -212,7 +212,7 @@ def test_what_goes_wrong_is_counted_with_an_example():
     assert (
         str(found["NaN"])
         == "1 x NaN: distance is nan; return a finite number for every input; an episode without"
-        " one is no failure and has reward -inf"
+        " one does not count as a failure and has reward -inf"
     )
     before = incidents(sim)
     ends(sim, [[1, 2]])
@@ -452,7 +452,7 @@ class Waits(blackboxes.Walk):
         (
             blackboxes.walk,
             {"start": lambda: NORMAL},
-            r"function of \(disturbances, x0\), as start is random, received walk\(disturbances\)",
+            r"function of \(disturbances, x0\), since start is random, received walk",
         ),
         (blackboxes.walk, {"episodic": False}, "episodic=False needs a class"),
         (blackboxes.walk, {"episodic": 1}, "episodic must be True, False or None"),
@@ -482,9 +482,9 @@ def test_bad_input_is_named(system, settings, message):
 
 def test_bad_programs_and_environments_are_named():
     for command, message in (
-        ("no-such-program -x", "'no-such-program' is not found"),
+        ("no-such-program -x", "'no-such-program' was not found"),
         ([], "must name a program"),
-        (__file__, "is not found or is none"),
+        (__file__, "was not found or is not executable"),
     ):
         with pytest.raises(ValueError, match=message):
             blackbox.program(command)

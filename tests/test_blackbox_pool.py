@@ -118,7 +118,9 @@ def test_check_looks_on_the_way_in_a_worker():
     settings = dict(horizon=8, episodic=True, workers=1)
     said = []
     for each in (settings, settings | dict(workers=0, time_limit=None)):
-        with pytest.warns(UserWarning, match="is True on the way and False at the end") as warned:
+        with pytest.warns(
+            UserWarning, match="is True during the episode and False at its end"
+        ) as warned:
             jast.check(box(blackboxes.Leaves, **each))
         said.append([str(w.message) for w in warned])
     assert said[0] == said[1]

@@ -247,7 +247,7 @@ def test_leads_on_from_known_failures(key):
     assert not len(cem(key, sim, **few).failures)
     around = cem(key, sim, **few, failures=known)
     assert len(around.failures) > 10 and around.settings["samples"] == 50
-    with pytest.raises(ValueError, match=r"cem: failures need actions quantiles\(\) or wide\(\)"):
+    with pytest.raises(ValueError, match=r"cem: actions must be quantiles\(\) or wide\(\)"):
         cem(key, sim, **few | dict(actions=actions.samples()), failures=known)
     with pytest.raises(ValueError, match="cem: failures must be an archive .* received list"):
         cem(key, sim, **few, failures=[known.best])

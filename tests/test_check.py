@@ -127,7 +127,7 @@ SHAPES = {  # found by tracing
     ),
     "disturbance is a dict": (
         dict(disturbance=lambda s: {"gust": D.Normal(0.0, 1.0)}),
-        r"disturbance: expected a distribution .*received dict.*; .* jast.distributions.Joint\(",
+        r"disturbance: expected a distribution .*received dict.*; .* with jast.distributions.Joint",
     ),
     "observe is a scalar": (
         dict(observe=lambda s: s),
@@ -153,6 +153,18 @@ SHAPES = {  # found by tracing
     "step changes the dtype": (
         dict(step=lambda s, x: (s + x).astype(jnp.float16)),
         r"step: state leaf .* has dtype float16, expected float",
+    ),
+    "init forgets the point": (
+        dict(
+            init=lambda x0: dict(at=0),
+            step=lambda s, x: dict(at=x),
+            evaluate=lambda s: (False, 0.0),
+        ),
+        r"step: state leaf \['at'\] has dtype float.*; init returns whole numbers in leaf \['at'\]",
+    ),
+    "distance of whole numbers": (
+        dict(init=lambda x0: jnp.array(3), evaluate=lambda s: (s < 1, s - 1)),
+        r"evaluate: distance has dtype int.*, expected a float; init returns whole numbers",
     ),
     "step changes the structure": (
         dict(step=lambda s, x: (s, x)),

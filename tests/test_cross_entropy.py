@@ -468,7 +468,9 @@ def test_the_call_that_the_thesis_prints(key, x64):
 
 
 BAD = {
-    "elites must be at most the samples of an iteration, 10, received 11": dict(elites=11),
+    "elites must be at most the number of samples in an iteration, 10, received 11": dict(
+        elites=11
+    ),
     "elites must be a whole number of at least 1, received 0": dict(elites=0),
     "schedule: samples must be a whole number of at least 1, received 0": dict(samples=0),
     "mode must be one of ['default', 'thesis'], received 'paper'": dict(mode="paper"),
@@ -484,7 +486,7 @@ BAD = {
     "evaluated must be a share from 0 to 0.5, received 0.7": dict(evaluated=0.7),
     "memory must be a whole number of at least 1, received 0": dict(memory=0),
     "best must be a whole number of at least 0, received -1": dict(best=-1),
-    'selection must be "elites", "dimension", or a share above 0, at most 1, received 2': dict(
+    'selection must be "elites", "dimension", or a share above 0 and at most 1, received 2': dict(
         selection=2
     ),
     "alpha must be a number above 0, received 0": dict(alpha=0),
@@ -553,14 +555,14 @@ def test_bad_proposals_and_objectives_are_named(key):
     }.items():
         raises(message, bowl, ce.Mixture(*mixture), method=ce.ce_mixture)
     raises(
-        "ce_mixture: components must be at most the elites, 5",
+        "ce_mixture: components must be at most the number of elites, 5",
         bowl,
         START,
         method=ce.ce_mixture,
         components=6,
     )
     raises(
-        "ce_method: no setting warp",
+        "ce_method: expected settings among .* received warp",
         bowl,
         START,
         warp="rank",
@@ -595,7 +597,7 @@ def test_bad_answers_are_named(key):
             ce.tell(search, x, words)
     search = ce.tell(search, x, np.zeros(4))
     for call in (lambda: ce.ask(search), lambda: ce.tell(search, x, np.zeros(4))):
-        with pytest.raises(ValueError, match="the search is done, all 4 evaluations are spent"):
+        with pytest.raises(ValueError, match="the search is over: all 4 evaluations are spent"):
             call()
 
 

@@ -92,7 +92,7 @@ def test_the_reward_of_an_episode_is_that_of_its_log_p_and_distance(key):
         (lambda: actions.wide(0), "wide: width must be above 0, received 0"),
         (
             lambda: jast.rollout(jax.random.key(0), walk(), reward=rewards.lexicographic()),
-            "near and rare are set by a search; here it needs both",
+            "only a search sets near and rare by itself; here give both",
         ),
     ],
 )

@@ -280,7 +280,10 @@ def test_thin_modes():
         found = estimate("x", summed(log_w, log_shares=shares))
         np.testing.assert_allclose(np.sort(found.modes), [0.1, 0.9], atol=0.01)
         assert (
-            any("a mode of" in w and "effective sample size of" in w for w in found.warnings)
+            any(
+                "a failure mode with" in w and "effective sample size of" in w
+                for w in found.warnings
+            )
             != reliable
             and found.reliable == reliable
         )

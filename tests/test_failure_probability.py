@@ -728,7 +728,7 @@ def test_samples_of_an_estimate(key, two):
 @pytest.mark.long
 def test_samples_without_a_failure(key, proposal):
     with pytest.raises(
-        ValueError, match="failure_samples: source gave no failure in 5000 episodes"
+        ValueError, match="failure_samples: source must be .* no failure in 5000 episodes"
     ):
         failure_samples(key, landing(50.0), proposal, 500)
 

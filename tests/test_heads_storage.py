@@ -366,8 +366,8 @@ def test_load_refuses_an_unknown_activation(tmp_path, monkeypatch):
     with pytest.raises(
         ValueError,
         match=(
-            "has the activation 'mish', unknown here: use the jast that wrote it,"
-            f" {jast.__version__}"
+            "has the activation 'mish', which this jast does not know: use the jast that"
+            f" wrote the file, {jast.__version__}"
         ),
     ):
         jast.heads.load(tmp_path / "h")
@@ -391,8 +391,8 @@ def test_load_refuses_other_files_and_versions(tmp_path, monkeypatch):
         with pytest.raises(
             ValueError,
             match=(
-                f"has version {version}; this jast reads version 1: use the jast that wrote it,"
-                f" {jast.__version__}"
+                f"has version {version}, and this jast reads version 1: use the jast that"
+                f" wrote the file, {jast.__version__}"
             ),
         ):
             jast.heads.load(path)

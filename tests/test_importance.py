@@ -559,11 +559,11 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         ),
         (
             lambda: importance(jax.random.key(0), WALK, recorded(jnp.ones(10))),
-            "importance: a policy that plays one value has no density",
+            "importance: proposal must have a density, received a policy that plays one value",
         ),
         (
             lambda: log_weights(jax.random.key(0), WALK, recorded(jnp.ones(10)), 5),
-            "log_weights: a policy that plays one value has no density",
+            "log_weights: proposal must have a density, received a policy that plays one value",
         ),
         (
             lambda: importance(jax.random.key(0), SIM, STEER, 1),

@@ -113,12 +113,12 @@ def test_what_indices_refuse(key):
         (lambda: explain.indices(key, sim, 3.0), "indices: estimate must be a jast.estimate"),
         (lambda: explain.indices(key, sim, good, draws=-1), "indices: draws"),
         (lambda: explain.indices(key, sim, good, level=2), "indices: level"),
-        (lambda: explain.indices(key, hyperplane(4.0, 5), good), "indices: sim must be .* of 4"),
+        (lambda: explain.indices(key, hyperplane(4.0, 5), good), "indices: sim must be .* with 4"),
         (lambda: explain.indices(key, dice(), good), "indices: disturbance: .*no quantile"),
         (lambda: explain.indices(key, sim, plain), "indices: estimate must have drawn normal"),
         (
             lambda: explain.indices(key, sim, good._replace(draws=None)),
-            "indices: estimate must hold weighted draws",
+            "indices: estimate must have kept its weighted draws",
         ),
     ]
     for call, words in cases:

@@ -99,7 +99,7 @@ CALLS = {
 @pytest.mark.parametrize("name", CALLS)
 def test_what_does_not_fit_says_so_before_it_starts(name, monkeypatch, key):
     monkeypatch.setattr(memory, "available", lambda: 50_000)
-    with pytest.raises(ValueError, match=rf"{name}: .* take at least .*B, 50 kB are free; use"):
+    with pytest.raises(ValueError, match=rf"{name}: .* need at least .*B, and 50 kB are free; use"):
         CALLS[name](key)
 
 

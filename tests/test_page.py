@@ -83,7 +83,9 @@ def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):
 def test_what_is_no_failure_of_the_system_is_refused(page, tmp_path):
     path = tmp_path / "failure-1.json"
     path.write_text(Page(page).data["modes"][0]["exact"])
-    with pytest.raises(ValueError, match="from_json: sim must be the simulator of the failure, of"):
+    with pytest.raises(
+        ValueError, match="from_json: sim must be the simulator of the failure, whose"
+    ):
         jast.failures.from_json(path, jast.simulators.walk1d())
     for words in ("3", "{}", "no json"):
         path.write_text(words)
@@ -156,7 +158,7 @@ def test_a_report_from_a_file_has_a_page(tmp_path):
     assert "has no states" in words and "states" not in Page(words).data["modes"][0]
     bare.html(tmp_path / "given.html", SIM)
     assert "states" in Page((tmp_path / "given.html").read_text()).data["modes"][0]
-    with pytest.raises(ValueError, match="Report.html: sim must be the simulator where draw"):
+    with pytest.raises(ValueError, match="Report.html: draw needs the simulator"):
         bare.html(tmp_path / "no.html", draw=str)
     with pytest.raises(ValueError, match="Report.html: explanations must be at most 2"):
         bare.html(tmp_path / "no.html", explanations=["a"] * 3)

@@ -120,7 +120,7 @@ def test_no_failure_is_an_upper_bound():
         ((), "estimates must be an Estimate or a dict"),
         (({},), "received none"),
         (({"a": 1e-9},), "received ['float']"),
-        ((made()._replace(mean=0.0),), "above the least double"),
+        ((made()._replace(mean=0.0),), "above the smallest float64"),
         ((made(), 0.0), "truth must be above 0"),
         ((made(), 1.5), "truth must be above 0"),
     ],
@@ -294,7 +294,7 @@ def test_exceedance_of_estimates_and_what_it_refuses():
     for wrong in ({}, 3.0, {"a": "b"}):
         with pytest.raises(ValueError, match="plot.exceedance: curves must be an Exceedance"):
             plot.exceedance(wrong)
-    with pytest.raises(ValueError, match="curves must hold a probability"):
+    with pytest.raises(ValueError, match="curves must hold at least one probability"):
         plot.exceedance(curve([0.0], [np.nan]))
-    with pytest.raises(ValueError, match="exceedance: estimate must hold weighted draws"):
+    with pytest.raises(ValueError, match="exceedance: estimate must have kept its weighted draws"):
         plot.exceedance(made())

@@ -294,7 +294,7 @@ def test_what_is_not_finite_is_counted_and_never_learned_from():
     "setting, value, words",
     [
         ("episodes", 0, "episodes must be a whole number of at least 1, received 0"),
-        ("episodes", 30, "episodes must be at least 4 a lane, 32, received 30"),
+        ("episodes", 30, "episodes must be at least 4 for each lane, 32, received 30"),
         ("lanes", 1.5, "lanes must be a whole number of at least 1, received 1.5"),
         ("batch", -1, "batch must be a whole number"),
         ("epochs", 0, "epochs must be a whole number of at least 1, received 0"),

@@ -105,7 +105,7 @@ def test_cells_of_the_users_own_and_numbers_that_are_not_finite():
 @pytest.mark.parametrize(
     "settings, said",
     [
-        (dict(episodes=2), "episodes must be at least 4 a lane"),
+        (dict(episodes=2), "episodes must be at least 4 for each lane"),
         (dict(cells=(3, 4)), "cells must be a whole number or 1 of them"),
         (dict(cells=0), "cells must be a whole number of at least 1"),
         (dict(values=1), "values must be a whole number of at least 2"),

@@ -37,7 +37,7 @@ def test_floats_that_are_fine_enough_are_not_mentioned(offset):
 
 def test_an_offset_is_too_coarse():
     """4.6e6 in float32 has units of a half."""
-    assert "state is too coarse: a disturbance moves a number" in rounded(walk(4.6e6))
+    assert "state is too coarse: a disturbance changes one" in rounded(walk(4.6e6))
 
 
 def test_what_decides_nothing_may_be_coarse():

@@ -210,9 +210,11 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
 
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
-    with pytest.raises(ValueError, match="sac: checkpoint .* is of another call: rates.polyak is"):
+    with pytest.raises(
+        ValueError, match="sac: checkpoint .* belongs to another call: rates.polyak was"
+    ):
         sac(jax.random.key(3), WALK, **TINY, polyak=0.5, checkpoint=path)
-    with pytest.raises(ValueError, match="sac: checkpoint .* is of another call: key is"):
+    with pytest.raises(ValueError, match="sac: checkpoint .* belongs to another call: key was"):
         sac(jax.random.key(4), WALK, **TINY, checkpoint=path)
 
 
@@ -306,7 +308,7 @@ def test_the_temperature_follows_the_entropy():
     "setting, value, words",
     [
         ("episodes", 0, "episodes must be a whole number of at least 1, received 0"),
-        ("episodes", 30, "episodes must be at least 4 a lane, 32, received 30"),
+        ("episodes", 30, "episodes must be at least 4 for each lane, 32, received 30"),
         ("lanes", 1.5, "lanes must be a whole number of at least 1, received 1.5"),
         ("batch", -1, "batch must be a whole number"),
         ("buffer", "big", "buffer must be a whole number"),

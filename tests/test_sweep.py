@@ -185,7 +185,7 @@ def test_results_of_any_kind_have_a_row(key):
     assert head.split() == ["limit", "name", "best", "log", "p", "fails", "episodes"]
     assert first.split()[:2] == ["1", "a"] and first.split()[-2:] == ["yes", "256"]
     assert "3" in str(jast.sweep(key, make, {"limit": [1.0]}, lambda key, sim: 3))
-    with pytest.raises(ValueError, match="plot.sweep: table must hold a probability"):
+    with pytest.raises(ValueError, match="plot.sweep: table must hold at least one probability"):
         table.plot()
 
 
@@ -237,7 +237,7 @@ def test_a_crossing_is_covered_as_often_as_the_rows_are():
 def test_where_there_is_no_crossing_the_error_says_why():
     table = table_of([0.0, 1.0, 2.0], [100, 10, 0])
     with pytest.raises(
-        ValueError, match="no crossing of 1e-06: for gain from 0 to 1 .* 0.01 and 0"
+        ValueError, match="does not cross 1e-06: for gain from 0 to 1 .* 0.01 and 0"
     ):
         table.crossing()
     with pytest.raises(ValueError, match="level must be a number between 0 and 1, received 1"):
@@ -245,7 +245,7 @@ def test_where_there_is_no_crossing_the_error_says_why():
     with pytest.raises(ValueError, match="two rows with a reliable probability, received 1 of 2"):
         table_of([0.0, 1.0], [100, 0]).crossing(0.05)
     many = table_of([0.0, 1.0, 2.0, 3.0], [900, 10, 900, 10])
-    with pytest.raises(ValueError, match="0.1 is crossed at several values of gain: 0.4"):
+    with pytest.raises(ValueError, match="crosses 0.1 at several values of gain: 0.4"):
         many.crossing(0.1)
     # within the noise of the rows it is one crossing
     one = table_of([0.0, 1.0, 2.0, 3.0], [200, 101, 99, 20]).crossing(0.1)
@@ -272,11 +272,11 @@ BAD = {
     "values must be a dict of name -> values, .*received {}": dict(values={}),
     "limit must be a sequence of values, received 'text'": dict(values={"limit": "text"}),
     "limit must be a sequence of values, received 3": dict(values={"limit": 3}),
-    r"as many for each setting, 1 or more: {'limit': 2, 'other': 1}": dict(
+    r"equally many for each setting, at least 1, received {'limit': 2, 'other': 1}": dict(
         values={"limit": [1, 2], "other": [1]}
     ),
-    r"as many for each setting, 1 or more: {'limit': 0}": dict(values={"limit": []}),
-    "one for each of 2 values, received 1": dict(simulators=[make(1.0)]),
+    r"equally many for each setting, at least 1, received {'limit': 0}": dict(values={"limit": []}),
+    "must be 2, one for each value, received 1": dict(simulators=[make(1.0)]),
     "one for each value, received Simulator": dict(simulators=make(1.0)),
     "one for each value, received int": dict(simulators=3),
     "function must be callable, received 3": dict(function=3),
@@ -456,7 +456,7 @@ class Dying:
 def test_a_row_whose_process_dies_has_an_error(key):
     table = crude(key, executor=Dying())
     assert [e is None for e in table.errors] == [True, False, True, True]
-    assert "failed again and again" in table.errors[1]
+    assert "failed in every attempt" in table.errors[1]
 
 
 def test_follow_skips_rows_that_raise(key):

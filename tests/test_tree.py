@@ -437,7 +437,7 @@ def test_states_that_do_not_fit_at_nodes_are_kept_at_roots():
         for memoize in ("node", "root")
     )
     assert node > 5 * root
-    with pytest.warns(UserWarning, match='kept at roots: memoize="root"'):
+    with pytest.warns(UserWarning, match='kept at the roots alone: memoize="root"'):
         result = forest(jax.random.key(0), sim, **size, **TOLD, available=2 * 2 * root)
     assert result.settings["memoize"] == "root" and result.episodes == 720
     result = forest(jax.random.key(0), sim, **size, **TOLD, available=2 * 2 * node)

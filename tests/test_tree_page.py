@@ -105,7 +105,7 @@ def test_refusals(found, tmp_path):
             draw(found._replace(trees=None), *more)
         with pytest.raises(ValueError, match=rf"plot.{name}: tree must be in 0 .. 1, received 2"):
             draw(found, *more, tree=2)
-    with pytest.raises(ValueError, match="mcts: keep_trees needs states at every node.*'none'"):
+    with pytest.raises(ValueError, match="mcts: memoize must be .* keep_trees=True.*'none'"):
         jast.search.mcts(jax.random.key(0), walk(), keep_trees=True, memoize="none")
 
 

@@ -335,7 +335,9 @@ def test_a_unit_that_goes_on_failing_is_left_out_and_told():
 
 
 def test_where_all_units_fail_the_call_says_why():
-    with pytest.raises(RuntimeError, match="squares: units fail in the executor, 3 times.*Zero"):
+    with pytest.raises(
+        RuntimeError, match="squares: every unit of work failed in the executor, 3 times.*Zero"
+    ):
         squares(executor=Flaky(9))
     with pytest.raises(ZeroDivisionError):  # in this process, at once
         squares(function=fails)
@@ -383,8 +385,11 @@ def test_bad_places_are_named(name, key, tmp_path):
         (dict(devices=jax.devices(), executor=Flaky(0)), "devices must be None where"),
         (dict(checkpoint=3), "checkpoint must be the path of a folder, received 3"),
         (dict(checkpoint=tmp_path / "file"), "checkpoint must be a folder, received the file"),
-        (dict(checkpoint=tmp_path / "full"), ".* other files in it, such as thesis.tex"),
-        (dict(checkpoint=tmp_path / "other"), f".* another call: function is '.*' there, '{name}'"),
+        (dict(checkpoint=tmp_path / "full"), ".* holds other files, such as thesis.tex"),
+        (
+            dict(checkpoint=tmp_path / "other"),
+            f".* another call: function was '.*', and is '{name}'",
+        ),
     ]:
         with pytest.raises(ValueError, match=f"{name}: {match}"):
             call(key, **how)
@@ -400,7 +405,7 @@ def test_a_checkpoint_of_another_key_or_in_use_is_refused(key, tmp_path):
             call(key, checkpoint=tmp_path)
 
     call(key, checkpoint=tmp_path, callback=again)
-    with pytest.raises(ValueError, match="another call: key is .* there, .* here; give another"):
+    with pytest.raises(ValueError, match="another call: key was .*, and is .* now; give another"):
         call(jax.random.fold_in(key, 1), checkpoint=tmp_path)
 
 
@@ -460,7 +465,7 @@ def test_a_fingerprint_tells_functions_and_numbers_apart():
 
     same = fingerprint(sim=walk1d(), f=made(2.0)), fingerprint(sim=walk1d(), f=made(2.0))
     assert differences(*same) == ""
-    assert "f.gain is 2.0 there, 3.0 here" == differences(
+    assert "f.gain was 2.0, and is 3.0 now" == differences(
         same[0], fingerprint(sim=walk1d(), f=made(3.0))
     )
     assert "code" in differences(fingerprint(f=lambda x: x + 1), fingerprint(f=lambda x: x - 1))

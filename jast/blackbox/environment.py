@@ -157,8 +157,8 @@ def gymnasium_system(
             raise ValueError(f"gymnasium_system: {name} must be a function, received {value!r}")
     if agent is not None and apply is None:
         raise ValueError(
-            "gymnasium_system: an agent needs apply, (action, disturbance) -> action: else no"
-            " disturbance reaches the environment"
+            "gymnasium_system: an agent needs apply=, a function (action, disturbance) -> action;"
+            " without it no disturbance reaches the environment"
         )
     return _System(make, agent, apply, _terminated if event is None else event, distance, int(seed))
 

@@ -146,7 +146,7 @@ class Host:
             wrong[i] = True
             self.log.add(
                 "NaN",
-                f"distance is {reply.distance[i]:g}, beyond {np.dtype(dtype).name}",
+                f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}",
                 example(i),
             )
         event, terminal = reply.event & ~wrong, reply.terminal | wrong

@@ -28,10 +28,10 @@ def compare(host: Host, sim: Simulator) -> None:
     lost = host.lost(*map(jax.tree.leaves, drawn))
     if lost:
         warnings.warn(
-            f"from_python: in {lost} of {EPISODES} episodes is_event() is True on the way and False"
-            " at the end; with episodic=True they count as no failure. Leave episodic out where"
-            " is_event says whether the system fails now: each state is judged then. All is well"
-            " where it means something only at the end",
+            f"from_python: in {lost} of {EPISODES} episodes is_event() is True during the episode"
+            " and False at its end; with episodic=True these do not count as failures. If"
+            " is_event says whether the system fails now, leave episodic out: every state is"
+            " judged then. If it means something only at the end, all is well",
             stacklevel=3,
         )
 

@@ -94,8 +94,8 @@ def program(command: str | Sequence[str], *, folder: PathLike | None = None) -> 
     near = folder is not None and os.path.dirname(parts[0])
     if shutil.which(os.path.join(folder, parts[0]) if near else parts[0]) is None:
         raise ValueError(
-            f"program: command must name an executable program, and {parts[0]!r} is not found or is"
-            " none"
+            f"program: command must name an executable program, and {parts[0]!r} was not found or"
+            " is not executable"
         )
     return Program(parts, None if folder is None else os.fspath(folder))
 

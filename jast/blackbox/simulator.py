@@ -429,7 +429,7 @@ def _shape(disturbance, blank, like):
         try:
             found = jax.eval_shape(value)
         except Exception as error:
-            hint = "" if given else "; give like=, a value of it"
+            hint = "" if given else "; give like=, an example of a disturbance"
             tried = f"on a state with disturbances {_text(blank(like).disturbances)}{hint}"
             raise ValueError(
                 f"{NAME}: disturbance: {type(error).__name__}: {error} ({tried})"
@@ -438,8 +438,8 @@ def _shape(disturbance, blank, like):
             return like
         like = found
     raise ValueError(
-        f"{NAME}: disturbance returns values of other shapes for each shape of the state's"
-        f" disturbances, the last {_text(like)}; give like="
+        f"{NAME}: the shape of what disturbance returns changes with the shape of the state's"
+        f" disturbances, the last was {_text(like)}; give like=, an example of a disturbance"
     )
 
 
@@ -518,9 +518,9 @@ def _is_run(system, random, episodic):
         return False
     if not takes(system, 1 + random):
         expected = (
-            "(disturbances, x0), as start is random"
+            "(disturbances, x0), since start is random"
             if random
-            else "(disturbances), as there is one start"
+            else "(disturbances), since no start distribution was given"
         )
         raise ValueError(
             f"{NAME}: system must be a function of {expected}, received"

@@ -144,8 +144,8 @@ class Runner:
                     f" {type(thing).__name__} lacks {', '.join(missing)}"
                 )
             if not takes(thing.initialize, int(self.spec.random)):
-                one = "x0, as start is random"
-                none = "no argument, as there is one start"
+                one = "x0, since start is random"
+                none = "no argument, since no start distribution was given"
                 return f"initialize must take {one if self.spec.random else none}"
             if not takes(thing.transition, 1):
                 return "transition must take one argument, a disturbance"
@@ -157,7 +157,7 @@ class Runner:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            return f"the first object: {_said(error)[1]}"
+            return f"the first object could not be made: {_said(error)[1]}"
         return size
 
     def __call__(self, t, x0, xs, lanes=None):

@@ -400,7 +400,7 @@ def _count(caller, search):
     """How many points the next batch has."""
     if search.done:
         raise ValueError(
-            f"{caller}: the search is done, all {sum(search.plan.counts)} evaluations are spent"
+            f"{caller}: the search is over: all {sum(search.plan.counts)} evaluations are spent"
         )
     return search.plan.counts[int(search.state.k)]
 

@@ -76,7 +76,7 @@ class CEResult(NamedTuple):
         value = np.asarray(self.best_value)
         n = np.asarray(self.history.value).shape[-1]
         bad = int(np.sum(self.invalid))
-        note = f"\n{bad} evaluations gave NaN or infinity and count as no elite" if bad else ""
+        note = f"\n{bad} evaluations gave NaN or infinity; they are never elites" if bad else ""
         if value.ndim == 0:
             done = ~np.isnan(self.history.x).any(axis=1)  # of a search that is not at its end
             evaluations = np.cumsum(np.bincount(self.history.iteration[done]))
@@ -94,7 +94,7 @@ class CEResult(NamedTuple):
         found = value[np.isfinite(value)]
         if found.size < value.size:
             note += (
-                f"\n{value.size - found.size} runs have no finite value, and are left out of the"
+                f"\n{value.size - found.size} runs found no finite value and are left out of the"
                 " mean"
             )
         mean = f"{found.mean() if found.size else np.inf:.6g}" + (

@@ -72,7 +72,8 @@ def settled(
         )
     if unknown := sorted(set(given) - set(MODES[method][mode])):
         raise ValueError(
-            f"{method}: no setting {', '.join(unknown)}; there are {sorted(MODES[method][mode])}"
+            f"{method}: expected settings among {sorted(MODES[method][mode])}, received"
+            f" {', '.join(unknown)}"
         )
     chosen = {
         name: value if given.get(name) is None else given[name]
@@ -86,8 +87,8 @@ def settled(
     elites = whole(method, "elites", elites, 1)
     if elites > max(sizes):
         raise ValueError(
-            f"{method}: elites must be at most the samples of an iteration, {max(sizes)}, received"
-            f" {elites}"
+            f"{method}: elites must be at most the number of samples in an iteration,"
+            f" {max(sizes)}, received {elites}"
         )
     kept = [min(elites, n) for n in sizes]
     if ratchet:
@@ -197,8 +198,7 @@ def checked(method, objective, d, dtype):
         or jnp.issubdtype(out.dtype, jnp.complexfloating)
     ):
         raise ValueError(
-            f"{method}: objective must return one real number for x of shape ({d},), it returns"
-            f" {out}"
+            f"{method}: objective must return one real number for x of shape ({d},), received {out}"
         )
     return objective
 
@@ -214,7 +214,7 @@ def _selection(method, given, each, kept, d):
         return [min(e / each, 1.0 if given == "elites" else 1 / d) for e in kept]
     if isinstance(given, bool) or not isinstance(given, Real) or not 0 < given <= 1:
         raise ValueError(
-            f'{method}: selection must be "elites", "dimension", or a share above 0, at most 1,'
+            f'{method}: selection must be "elites", "dimension", or a share above 0 and at most 1,'
             f" received {given!r}"
         )
     return [given] * len(kept)
@@ -227,7 +227,7 @@ def _mixture(method, proposal, elites, components, asked):
         k = len(proposal.weights)
         if asked not in (None, k):
             raise ValueError(
-                f"{method}: components must be those of the proposal, {k}, received {asked!r}"
+                f"{method}: components must be as many as in the proposal, {k}, received {asked!r}"
             )
     else:
         g = as_gaussian(proposal)
@@ -244,7 +244,7 @@ def _mixture(method, proposal, elites, components, asked):
         )
     if k > elites:
         raise ValueError(
-            f"{method}: components must be at most the elites, {elites}, as each begins at one,"
-            f" received {k}"
+            f"{method}: components must be at most the number of elites, {elites}, since each"
+            f" starts at one of them, received {k}"
         )
     return proposal

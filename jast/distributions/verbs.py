@@ -79,7 +79,7 @@ def mode(d: DistributionLike) -> chex.ArrayTree:
         return quantile(d, half)
     except ValueError:
         raise ValueError(
-            f"{type(d).__name__} has neither a mode nor a median: the undisturbed system is not"
+            f"{type(d).__name__} has neither a mode nor a median, so the undisturbed system is not"
             " defined"
         ) from None
 

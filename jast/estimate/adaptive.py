@@ -51,7 +51,7 @@ SEEN, LOST = 100, 2.0
 """Failures of the model from which plain draws tell a probability; what may be lost, as a multiple
 of what was found, from which the proposal is given up.
 """
-ASTRAY = "no proposal was found that draws failures by their weights"
+ASTRAY = "no proposal was found that draws failures in proportion to their probability"
 TILTS, POOR = 0.2, 0.05
 """Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
 below which they are.
@@ -297,8 +297,8 @@ def _of_the_search(s, level):
     none = np.zeros(rows)
     seen = Traces(log_weights, none[:, None], failing, none.astype(bool), none.astype(int))
     against = (
-        f"interrupted after {s.spent} of {s.budget} evaluations: this is of episodes that have"
-        " chosen the proposal"
+        f"interrupted after {s.spent} of {s.budget} evaluations: the estimate uses the same"
+        " episodes that chose the proposal"
     )
     return estimate(
         NAME,
@@ -410,7 +410,7 @@ def adaptive_cross_entropy(
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
     result = importance(key, sim, found.policy, budget - int(found.episodes), level=level)
     against = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
-    words = "one Gaussian covers one failure mode; nothing has looked for others"
+    words = "one Gaussian covers one failure mode, and no others were looked for"
     return result._replace(
         method=name,
         episodes=budget,

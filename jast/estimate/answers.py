@@ -212,7 +212,7 @@ def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureT
     draws, level = asked(name, estimate, level)
     log_w, at = (a[draws.failure] for a in (draws.log_weight, draws.length))
     if not len(at):
-        raise ValueError(f"{name}: estimate must hold a failure, received one without")
+        raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
     m, n = of_weights(log_w, draws.samples), draws.samples
     w, whole = shares(log_w, draws.counted)
     first, second, count = np.bincount(at, w), np.bincount(at, w**2), np.bincount(at)
@@ -251,9 +251,10 @@ def asked(name, estimate, level):
     level = estimate.level if level is None else checked_level(name, level)
     if not isinstance(estimate.draws, Draws) or not estimate.draws.samples:
         raise ValueError(
-            f"{name}: estimate must hold weighted draws, as those of importance sampling and of"
-            f" plain draws do, received one of {estimate.method} without: populations (subset"
-            " simulation), a surrogate (budgets below 5000) and an interrupted search keep none"
+            f"{name}: estimate must have kept its weighted draws, received one by"
+            f" {estimate.method} without draws: importance sampling and plain draws keep them;"
+            " subset simulation, a surrogate (budgets below 5000) and an interrupted search do"
+            " not"
         )
     return estimate.draws, level
 

@@ -91,7 +91,7 @@ def thin_modes(shares, sizes):
     if len(shares) < 2:
         return []
     return [
-        f"a mode of {v:.1%} of the estimate has an effective sample size of {n:.3g}"
+        f"a failure mode with {v:.1%} of the estimate has an effective sample size of only {n:.3g}"
         for v, n in zip(shares, sizes, strict=True)
         if v > MATTERS and n < FEW
     ]
@@ -103,16 +103,16 @@ def reasons(failures, ess, k_hat, max_share):
     if ess < ESS:
         found.append(f"effective sample size {ess:.3g}, below {ESS}")
     if np.isnan(k_hat):
-        found.append(f"{failures} failures are too few to look at the tail of the weights")
+        found.append(f"{failures} failures are too few to judge the tail of the weights")
     elif k_hat > K_HAT:
         found.append(
-            f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the greatest weights have no variance to"
-            " speak of"
+            f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the weights have so heavy a tail that their"
+            " standard error cannot be trusted"
         )
     if max_share > SHARE:
         found.append(f"one episode carries {max_share:.0%} of the estimate, above {SHARE:.0%}")
     if ess < PER_FAILURE * failures:
         found.append(
-            f"effective sample size {ess:.3g} of {failures} failures, below {PER_FAILURE:.0%}"
+            f"effective sample size {ess:.3g} is below {PER_FAILURE:.0%} of the {failures} failures"
         )
     return found

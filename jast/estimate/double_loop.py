@@ -91,7 +91,7 @@ def double_loop(
     proposal = as_proposal("double_loop", sim, proposal)
     if len(proposal.log_weights) > 1:
         raise ValueError(
-            "double_loop: proposal must have one component, as its traces share their start,"
+            "double_loop: proposal must have one component, since its traces share their start,"
             f" received {len(proposal.log_weights)}"
         )
     settings = asked("double_loop", key, starts=starts, samples=samples, level=level)

@@ -203,7 +203,7 @@ def given_start(
         event, m = _event(estimate, kept, log_w, v, level), count[k]
         reasons = list(event.warnings)
         if m < diagnostics.ESS:
-            reasons.append(f"{m} of {n} starts are in the set: too few")
+            reasons.append(f"only {m} of {n} starts are in the set")
         p, ends = np.nan, (0.0, 1.0)
         if m and event.failing:
             of_both = of_weights(log_w[v], kept.samples)
@@ -230,7 +230,7 @@ def _event(estimate, draws, log_w, happened, level):
     if not k:
         # above by what is not excluded among the failures
         high = given[1][1] * float(np.exp(of_weights(log_w, n).log_mean))
-        reasons.append("no failure shows it")
+        reasons.append("the event happened in no failure")
         return Event(0.0, (0.0, high), *given, 0.0, 0, False, tuple(reasons), level)
     m = of_weights(log_w[happened], n)
     if not draws.counted:
@@ -255,12 +255,12 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
     """Name -> [m] bool, in which of the failing draws each event happened."""
     rows, length = draws.row[draws.failure], draws.length[draws.failure]
     if not len(rows):
-        raise ValueError(f"{name}: estimate must hold a failure, received one without")
+        raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
     if isinstance(draws.source, Latent):
         if (received := draws.source.means.shape[1]) != dimension(sim):
             raise ValueError(
-                f"{name}: sim must be the simulator of the estimate, of {received} numbers,"
-                f" received one of {dimension(sim)}"
+                f"{name}: sim must be the simulator of the estimate, with {received} random"
+                f" numbers in an episode, received one with {dimension(sim)}"
             )
     if draws.source == "policy":
         if estimate.method != "monte_carlo" and proposal is None:

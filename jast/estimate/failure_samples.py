@@ -128,7 +128,8 @@ def failure_samples(
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
         raise ValueError(
-            f"{name}: source must hold a proposal, received one of {source.method} without one"
+            f"{name}: source must hold a proposal, received an estimate by {source.method} without"
+            " one"
         )
     require_episodes(name, sim, PER_SAMPLE * samples)
     about = dict(sim=sim, source=q, samples=samples, moves=moves)
@@ -142,16 +143,16 @@ def _sampled(name, key, sim, q, samples, moves):
     if isinstance(q, latent.Latent):
         if (received := q.means.shape[1]) != latent.dimension(sim):
             raise ValueError(
-                f"{name}: source must be of this simulator, of {latent.dimension(sim)} numbers,"
-                f" received one of {received}"
+                f"{name}: source must be of this simulator, with {latent.dimension(sim)} random"
+                f" numbers in an episode, received one with {received}"
             )
         z, o, log_w = redrawn(for_draws, sim, q, n)
         failure = o.failure
     elif isinstance(q, Tilts):
         if (received := q.frame.centre.shape[0]) != (expected := shape(sim).seen):
             raise ValueError(
-                f"{name}: source must be of this simulator, of whose states {expected} numbers are"
-                f" seen, received one of {received}"
+                f"{name}: source must be of this simulator, whose states show {expected} numbers,"
+                f" received one of a simulator that shows {received}"
             )
         z, o, log_w = redrawn(for_draws, sim, q, n)
         failure = o.failure
@@ -162,8 +163,8 @@ def _sampled(name, key, sim, q, samples, moves):
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
         raise ValueError(
-            f"{name}: source gave no failure in {n} episodes: expected a proposal under which"
-            " failures are frequent"
+            f"{name}: source must be a proposal under which failures are frequent, received one"
+            f" with no failure in {n} episodes"
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
     people, chain = settled(key, sim, z[rows], moves)

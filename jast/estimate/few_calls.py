@@ -137,7 +137,7 @@ def _estimate(s, rounds, level):
         found.append(f"interrupted after {s.spent} of {s.budget} calls")
     relative = error / mean if mean > 0 else math.inf
     if not mean > 0:
-        found.append("the system contradicts the surrogate: the estimate is not above 0")
+        found.append("the system contradicts the surrogate: the corrected estimate is not above 0")
     elif relative > ERROR:
         found.append(f"relative standard error {relative:.0%}")
     if mean > 0 and np.abs(c).max() / n > CHANGE * mean:
@@ -145,10 +145,10 @@ def _estimate(s, rounds, level):
     if w[invalid].sum() / n > INVALID * max(mean, 0.0):
         found.append(
             f"{int(s.invalid.sum())} episodes are invalid (a number that is not finite): if they"
-            " failed, the estimate would be another one"
+            " failed, the estimate would change"
         )
     if s.failing.sum() < FEW:
-        found.append(f"{int(s.failing.sum())} failures are too few")
+        found.append(f"{int(s.failing.sum())} failures are too few to trust the estimate")
     v = w * failing
     ess = float(v.sum() ** 2 / (v**2).sum()) if v.any() else 0.0
     log_mean = math.log(mean) if mean > 0 else math.nan

@@ -58,7 +58,7 @@ def guarded(s, i, last):
         )
         if p is None or not p.complete:
             s.note(f"guard ({name}): ended by the budget", p.evaluations if p else 0)
-            s.reasons.append("the budget did not last to look for lost failure modes")
+            s.reasons.append("the budget ran out before the search for lost failure modes was over")
             break
         share = math.exp(min(p.log_mean - s.log_mean, 50)) if p.reached else 0.0
         rows = _bare(s, p.points, p.used)
@@ -84,12 +84,15 @@ def guarded(s, i, last):
         found += _forgotten(s)
     if not found:
         if thin > THIN and effective(log_w[rows]) < MET:
-            s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
+            s.reasons.append(
+                f"{thin:.0%} of the probability found lies where the proposal hardly draws"
+            )
         return True
     if i == last or s.spent + 2 * s.batch > MOST * s.budget:
         s.lost = asked
         s.reasons.append(
-            f"failures that the proposal hardly draws may carry {_share(asked)} what it found"
+            f"failures that the proposal hardly draws may have {_share(asked)} the probability"
+            " that it found"
         )
         return True
     for share, points, used in found:

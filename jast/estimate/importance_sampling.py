@@ -351,8 +351,8 @@ def _uncovered(key, sim, proposal):
     missing = int((~seen.invalid & ~(seen.log_weight < np.inf)).sum())
     return (
         [
-            f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: what"
-            " it cannot draw is missing"
+            f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes:"
+            " failures that it cannot draw are missing from the estimate"
         ]
         if missing
         else []

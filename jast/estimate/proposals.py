@@ -112,7 +112,7 @@ def trace_proposal(
     if not all(is_traced(a) or np.isfinite(a).all() for a in jax.tree.leaves((start, steps))):
         raise ValueError(
             "trace_proposal: episodes must hold finite disturbances that the model can draw,"
-            " received others"
+            " received some that are not finite or outside its support"
         )
     k = len(jax.tree.leaves(steps)[0])
     if mixing == "trace":
@@ -229,8 +229,8 @@ def as_proposal(function, sim, proposal):
 
     if ask(sim, plays_one_value):
         raise ValueError(
-            f"{function}: a policy that plays one value has no density; make a proposal of it with"
-            " trace_proposal or policy_proposal"
+            f"{function}: proposal must have a density, received a policy that plays one value;"
+            " make a proposal of it with trace_proposal or policy_proposal"
         )
     return proposal
 

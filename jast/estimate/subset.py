@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["subset_simulation"]
 
-LOST = "a mode that few members of a population reach is lost at times, and nothing shows it"
+LOST = "a failure mode that few members of a population reach can be lost without a sign"
 REPLICATES, FEWEST, LEAST = 5, 3, 100
 
 

@@ -118,7 +118,7 @@ def _lost(s, t, takes):
     room = int(min(GUARD * s.budget, (s.budget - s.spent) / 2))
     size = min(s.size, int(room / (least / math.log(QUANTILE) + LAST + 4)) // 50 * 50)
     if not size:
-        s.reasons.append("the budget did not last to look for lost failure modes")
+        s.reasons.append("the budget ran out before the search for lost failure modes was over")
         return False
     covered = _covered(s)
     q, threshold = t.tilts(t.q), -t.log_mean - covered
@@ -130,9 +130,11 @@ def _lost(s, t, takes):
         p.evaluations,
     )
     if not p.complete:
-        s.reasons.append("the budget did not last to look for lost failure modes")
+        s.reasons.append("the budget ran out before the search for lost failure modes was over")
     if thin > THIN:
-        s.reasons.append(f"{thin:.0%} of what was found lies where the proposal hardly draws")
+        s.reasons.append(
+            f"{thin:.0%} of the probability found lies where the proposal hardly draws"
+        )
     if share <= 3 * (thin + LOST):
         return False
     most = int(min(GUARD * s.budget, REST * (s.budget - s.spent)))
@@ -141,7 +143,8 @@ def _lost(s, t, takes):
         if share < WRONG / math.sqrt(t.promised * (s.budget - s.spent)):
             return False
         s.reasons.append(
-            f"failures that the proposal hardly draws may carry {share:.0%} of what it found"
+            f"failures that the proposal hardly draws may have {share:.0%} of the probability that"
+            " it found"
         )
         return False
     o, _, trace = of_the_model(s.sim, q, p.points.astype(s.dtype))

@@ -119,7 +119,9 @@ def attribution(
     g = given(name, sim, episode)
     quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
-        raise ValueError(f"{name}: the undisturbed system has no finite miss distance ({quiet})")
+        raise ValueError(
+            f"{name}: sim must have a finite miss distance when it is undisturbed, received {quiet}"
+        )
     total = float(quiet - g.outcome.distance[0])
     values, error, cost = METHODS[method](g, float(quiet), key, permutations)
     x0, shaped = like_disturbances(g.sim, values)
@@ -165,7 +167,10 @@ def _gradient(g: Given, quiet: float, key: jax.Array, permutations: int):
     shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
     outside = shares[~g.judge(shares[:, None] * g.v).failure]
     if not len(outside):
-        raise ValueError("attribution: the system fails all the way from the mode to the episode")
+        raise ValueError(
+            'attribution: method="gradient" needs a point outside of the failures on the line'
+            ' from the mode to the episode, and there is none; expected method="shapley" here'
+        )
     slopes = _gradients(g, outside.max() * g.v[None])[0]
     return -slopes * np.sign(g.v), np.zeros(len(g.v)), 4
 
@@ -181,7 +186,7 @@ def _gradients(g: Given, points: np.ndarray) -> np.ndarray:
     slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.judge.dtype)), np.float64)
     if not np.isfinite(slopes).all() or not slopes.any():
         raise ValueError(
-            "attribution: the miss distance has no finite gradient that leads anywhere; expected"
+            "attribution: the miss distance has no finite gradient, or one of 0; expected"
             ' method="shapley", which needs none'
         )
     return slopes
@@ -195,6 +200,7 @@ def _slopes(sim: Simulator, points: jax.Array) -> jax.Array:
 def _finite(distance: np.ndarray) -> np.ndarray:
     if not np.isfinite(distance).all():
         raise ValueError(
-            "attribution: an episode with some of the disturbances has no finite miss distance"
+            "attribution: the miss distance is not finite where only some of the disturbances"
+            " act; expected a finite one"
         )
     return distance.astype(np.float64)

@@ -46,14 +46,14 @@ def simulated(
     v = variants(key, sim, s, episodes)
     if len(v.label) < 2 * DISTINCT:
         raise ValueError(
-            f"{function}: failures must fail when they are played again, received those of which"
-            f" {len(v.label)} of {episodes} variants do"
+            f"{function}: failures must be such that small changes of them still fail, received"
+            f" ones of which {len(v.label)} of {episodes} changed episodes fail"
         )
     near = len(v.near_group) if most is None else min(most, len(v.near_group))
     if near < 2 * DISTINCT:
         raise ValueError(
-            f"{function}: others: {near} of the variants of the failures do not fail, expected"
-            f" {2 * DISTINCT} or more: nearly everything fails"
+            f"{function}: others: expected {2 * DISTINCT} or more changed failures that no longer"
+            f" fail, received {near}: nearly everything fails"
         )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b[:near]]), v.failures, v.near)
     kind = np.concatenate([1 + v.label, np.zeros(near, int)])
@@ -83,8 +83,8 @@ def told(
         few = min((int(np.sum(kind[-1] == k)) for k in np.unique(each)), default=0)
         if few < least:
             raise ValueError(
-                f"{function}: {argument} must be {least} distinct episodes or more of each kind,"
-                f" received {few}; without others {function} simulates more"
+                f"{function}: {argument} must hold at least {least} distinct episodes of each"
+                f" kind, received {few}; leave others out and {function} simulates more"
             )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b]), *parts)
     owner = np.concatenate(kind)

@@ -96,7 +96,11 @@ class Indices(NamedTuple):
     evaluations: int
 
     def __str__(self) -> str:
-        lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
+        lines = (
+            []
+            if self.reliable
+            else ["UNRELIABLE: the estimate is unreliable, or there are too few failures"]
+        )
         lines.append(
             f"{'number':<20} {'step':>4} {'mean':>7} {'first order':>12} {'total':>7}"
             f"   {self.level:.0%} intervals"
@@ -164,17 +168,17 @@ def indices(
     latent.check(name, sim)
     if isinstance(kept.source, str) and kept.source != "model":
         raise ValueError(
-            f"{name}: estimate must have drawn normal numbers, received one of {estimate.method} by"
-            f" a {kept.source}"
+            f"{name}: estimate must have drawn normal numbers, received one by {estimate.method}"
+            f" that drew from a {kept.source}"
         )
     if not kept.failure.any():
-        raise ValueError(f"{name}: estimate must hold a failure, received one without")
+        raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
     if isinstance(kept.source, latent.Latent):
         of, d = kept.source.means.shape[1], latent.dimension(sim)
         if of != d:
             raise ValueError(
-                f"{name}: sim must be the simulator of the estimate, of {of} numbers, received one"
-                f" of {d}"
+                f"{name}: sim must be the simulator of the estimate, with {of} random numbers in"
+                f" an episode, received one with {d}"
             )
     rng = generator(key)
     z, log_w, length, spent = failing(sim, kept, KEPT)

@@ -199,9 +199,8 @@ def monitor(
     i, t = learned.T
     if soon[i, t].all() or not soon[i, t].any():
         raise ValueError(
-            f"{name}: within must leave moments that are not followed by a failure, and some that"
-            f" are; received {within} where failures have {e.length[owner == FAILING].mean():.3g}"
-            " steps"
+            f"{name}: within must separate moments soon before a failure from others, received"
+            f" {within} steps where failures last {e.length[owner == FAILING].mean():.3g} steps"
         )
     fitted = MODELS[model](name).fit(seen[i, t], soon[i, t])
     score = np.full(live.shape, -np.inf)
@@ -264,8 +263,8 @@ def _episodes(name, key, sim, failures, others, episodes):
     n = len(plain.length)
     if n < LEAST:
         raise ValueError(
-            f"{name}: others: {n} of {episodes} ordinary episodes do not fail, expected {LEAST} or"
-            " more"
+            f"{name}: others: expected at least {LEAST} of {episodes} ordinary episodes that do"
+            f" not fail, received {n}"
         )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b]), cases.episodes, plain)
     kind = np.concatenate([np.where(cases.kind > 0, FAILING, NEAR), np.full(n, ORDINARY)])

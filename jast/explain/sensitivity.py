@@ -52,7 +52,11 @@ class Sensitivity(NamedTuple):
     evaluations: int
 
     def __str__(self) -> str:
-        lines = [] if self.reliable else ["UNRELIABLE: so is the estimate, or too few failures"]
+        lines = (
+            []
+            if self.reliable
+            else ["UNRELIABLE: the estimate is unreliable, or there are too few failures"]
+        )
         lines.append(
             f"{'parameter':<28} {'value':>10} {'d log P':>11} {'elasticity':>11}"
             f"   {self.level:.0%} interval of d log P"
@@ -112,14 +116,14 @@ def sensitivity(
     q = getattr(estimate, "proposal", None)
     if not fits(sim, q):
         raise ValueError(
-            f"{name}: estimate must be one of failure_probability with a proposal for this"
+            f"{name}: estimate must be one by failure_probability that holds a proposal for this"
             f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
         )
     called, values = _parameters(sim)
     if not called:
         raise ValueError(
-            f"{name}: no parameter is bound in the disturbance or the start; expected a"
-            " jax.tree_util.Partial(disturbance, parameter), received functions without any"
+            f"{name}: sim: disturbance or start must be a jax.tree_util.Partial(function,"
+            " parameter), received functions without parameters"
         )
     logs, scores = [], []
     for i in range(-(-samples // LANES)):
@@ -132,7 +136,10 @@ def sensitivity(
             logs.append(np.asarray(log_w, np.float64)[rows])
             scores.append(each[: len(rows)])
     if not logs:
-        raise ValueError(f"{name}: none of {samples} draws of the estimate's proposal fails")
+        raise ValueError(
+            f"{name}: estimate: none of {samples} draws of its proposal fails; expected one that"
+            " draws failures"
+        )
     log_w, s = np.concatenate(logs), np.concatenate(scores)
     w = np.exp(log_w - log_w.max())
     w /= w.sum()

@@ -84,7 +84,7 @@ def seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> 
     if isinstance(given, Estimate):
         raise ValueError(
             f"{function}: failures must be episodes, or an estimate for sim that drew normal"
-            f" numbers and met failures; received one of {given.method} that did not"
+            f" numbers and saw failures, received one by {given.method} that did not"
         )
     of_mode = isinstance(given, Modes) and len(given) > 1
     e = gathered(function, "failures", sim, given[:MOST] if of_mode else given)

@@ -44,8 +44,8 @@ def enrol(key, sim, actions, heads, settings):
         jnp.all(jnp.isfinite(start_seen))
     ):
         raise ValueError(
-            f"observe: expected finite numbers for heads, received {np.asarray(start_seen)} at the"
-            " start"
+            "observe: must return finite numbers where heads learn from them, received"
+            f" {np.asarray(start_seen)} at the start"
         )
     if isinstance(heads, str):
         keys = jax.random.split(key)
@@ -100,8 +100,8 @@ def filled(heads, n, d):
     inputs = Moments.empty(n + d) if heads.inputs is None else heads.inputs
     if inputs.mean.shape != (n + d,):
         raise ValueError(
-            f"heads: expected those of {n} observed numbers and a disturbance of {d}, received"
-            f" heads of {inputs.mean.shape[0]} in all"
+            f"forest: heads must take {n + d} numbers ({n} observed, {d} of the disturbance),"
+            f" received heads that take {inputs.mean.shape[0]}"
         )
     return Heads(
         heads.policy,

@@ -222,8 +222,8 @@ def _head(path, name, header, leaves, given):
         )
     elif network["activation"] not in ACTIVATIONS:
         raise ValueError(
-            f"load: {path} has the activation {network['activation']!r}, unknown here: use the jast"
-            f" that wrote it, {header.get('package')}"
+            f"load: {path} has the activation {network['activation']!r}, which this jast does not"
+            f" know: use the jast that wrote the file, {header.get('package')}"
         )
     like, apply = _made(network) if given is None else given
     other = "its network" if given is None else "heads"

@@ -61,8 +61,8 @@ def write_report(
     """
     if draw is not None and sim is None:
         raise ValueError(
-            "Report.html: sim must be the simulator where draw is given, as a report from a file"
-            " has none: html(path, sim, draw=draw)"
+            "Report.html: draw needs the simulator, which a report from a file does not hold:"
+            " expected html(path, sim, draw=draw)"
         )
     failures = _shown(report)
     if len(explanations) > len(failures):

@@ -52,7 +52,7 @@ def exceedance(
         )
     named = {k: curve_of(c) if isinstance(c, Estimate) else c for k, c in named.items()}
     if not all(np.isfinite(c.probability).any() for c in named.values()):
-        raise ValueError(f"{caller}: curves must hold a probability, received NaN alone")
+        raise ValueError(f"{caller}: curves must hold at least one probability, received only NaN")
     with style.axes(ax, (6.8, 3.8)) as ax:
         ax.axvline(0.0, color=style.INK, linewidth=1.0, linestyle=(0, (1, 1.5)), label="failure")
         for i, (name, c) in enumerate(named.items()):

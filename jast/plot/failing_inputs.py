@@ -85,8 +85,8 @@ def first_failures(
     said, true = np.asarray(result.predicted)[failures], labels[failures]
     if (same := int(np.sum(said == true))) > 0:
         raise ValueError(
-            f"plot.{caller}: labels must be those of the result, received some by which {same} of"
-            f" its {len(failures)} failures are none"
+            f"plot.{caller}: labels must be those of the result, received labels that agree with"
+            f" its answer in {same} of its {len(failures)} failures"
         )
     words = _words(caller, names, max([*said, *true], default=-1))
     tiles = failures[:count]

@@ -123,8 +123,8 @@ def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np
         names = chosen(caller, value, played, 1)
         if len(names) > 1:
             raise ValueError(
-                f"plot.{caller}: value must be one of {names}, received {value!r}, which is all of"
-                " them"
+                f"plot.{caller}: value must name one number of {names}, received {value!r}, which"
+                " names them all"
             )
         out = played.columns[names[0]]
     else:

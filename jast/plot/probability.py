@@ -54,7 +54,7 @@ def probability(
         )
     if any(e.mean == 0 for e in found):
         raise ValueError(
-            f"plot.{caller}: estimates must be above the least double, received log10"
+            f"plot.{caller}: estimates must be above the smallest float64, received log10"
             f" {min(e.log10_mean for e in found if e.mean == 0):.4g}"
         )
     if truth is not None and not 0 < truth <= 1:

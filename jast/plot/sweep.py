@@ -59,7 +59,7 @@ def sweep(
     x, p, reliable = x[order], table.probability[order], table.reliable[order]
     low, high = table.interval[order].T
     if not np.isfinite(high).any():
-        raise ValueError(f"{caller}: table must hold a probability, received NaN alone")
+        raise ValueError(f"{caller}: table must hold at least one probability, received only NaN")
     seen, blue = p > 0, style.BLUE
     with style.axes(ax, (6.8, 3.8)) as ax:
         good = seen & reliable

@@ -164,7 +164,9 @@ class FailurePolicy(Policy):
                 " ".join(f"{getattr(h, name)[i].item():{form}}" for name, form in formats.items())
             )
         if h.invalid[-1]:
-            table.append(f"{h.invalid[-1]} transitions were not finite and not learned from")
+            table.append(
+                f"{h.invalid[-1]} transitions were not finite and were left out of the training"
+            )
         if self.learned.tilt != ():
             text = lambda a: np.array2string(np.asarray(a), precision=2, suppress_small=True)
             parts = (

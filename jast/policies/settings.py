@@ -37,7 +37,8 @@ def plan(function: str, episodes: int, horizon: int, lanes: int, piece: int = 1)
     """
     if episodes < 4 * lanes:
         raise ValueError(
-            f"{function}: episodes must be at least 4 a lane, {4 * lanes}, received {episodes}"
+            f"{function}: episodes must be at least 4 for each lane, {4 * lanes}, received"
+            f" {episodes}"
         )
     steps = -(-episodes * horizon // lanes)
     nominal, around = (max(horizon, int(share * steps)) for share in (NOMINAL, AROUND))

@@ -123,8 +123,8 @@ def whole(
     n, n0 = sizes(sim, "load")
     if header["tilted"] != bool(n0):
         raise ValueError(
-            f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} start,"
-            f" expected {'one' if n0 else 'none'}"
+            f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} learned"
+            f" start, expected {'one' if n0 else 'none'}"
         )
     (m,) = outline(sim).observation
     hidden, components = tuple(header["hidden"]), header["components"]

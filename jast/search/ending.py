@@ -71,8 +71,8 @@ def planned(
             )
         if share and lacking:
             raise ValueError(
-                f"{function}: refine must be 0 where a disturbance has no quantile function, as"
-                f" {lacking}, received {refine!r}"
+                f"{function}: refine must be 0, since {lacking} has no quantile function, received"
+                f" {refine!r}"
             )
     return None if settings is None else settings | dict(refine=share)
 

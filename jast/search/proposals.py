@@ -68,13 +68,15 @@ def around(sim, actions, failures, settings):
     ``()`` where there is none. ``settings``: None inside of a transformation of JAX.
     """
     if settings is None:
-        raise ValueError("cem: failures: cannot be given inside of jax.jit and jax.vmap")
+        raise ValueError("cem: failures must be None inside of jax.jit and jax.vmap")
     if not isinstance(failures, Failures):
         kind = type(failures).__name__
         raise ValueError(f"cem: failures must be an archive (result.failures), received {kind}")
     if not isinstance(actions, choices.Wide | choices.Quantiles):
         kind = type(actions).__name__
-        raise ValueError(f"cem: failures need actions quantiles() or wide(), received {kind}")
+        raise ValueError(
+            f"cem: actions must be quantiles() or wide() where failures are given, received {kind}"
+        )
     if not len(failures):
         return ()
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], failures.best._replace(states=None))

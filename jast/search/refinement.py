@@ -74,7 +74,7 @@ class Refined(NamedTuple):
     def __str__(self) -> str:
         n = len(self.failures)
         if not n:
-            return f"refine: no failure to pull, {self.episodes} evaluations"
+            return f"refine: there was no failure to refine; {self.episodes} evaluations"
         lines = [f"refine: {n} failure{'s' * (n > 1)}, {self.episodes} evaluations"]
         lines.append(f"{'rank':>4} {'log p rel.':>11} {'gained':>9} {'lately':>9} {'residual':>9}")
         for i in range(min(n, 10)):

@@ -227,7 +227,7 @@ def _refined(refined):
     asked = refined.settings
     text = f"refined: {refined.episodes:,} evaluations"
     if not len(refined.failures):
-        return text + ", nothing came of it"
+        return text + ", no failure came of it"
     density = "log p relative to the mode" if asked["density"] == "mode" else "log p"
     best = float(refined.failures.best.reward)
     return f"{text}, {density} {asked['likeliest']:.2f} -> {best:.2f}"

@@ -57,7 +57,8 @@ class Formula:
 
     def __bool__(self) -> bool:
         raise ValueError(
-            f"specs: {self} is a formula: combine formulas by &, | and ~, not by words"
+            f"specs: {self} is a formula: combine formulas by the operators &, | and ~, not by the"
+            " words and, or and not"
         )
 
     def __repr__(self) -> str:

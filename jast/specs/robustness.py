@@ -189,9 +189,9 @@ def fits(function: str, formula: Formula, length: int, dt: float) -> None:
                 )
             if latest + first > end:
                 raise ValueError(
-                    f"{function}: {f}: asked at {latest * dt:g} s, the window begins after the"
-                    f" trace's end, {end * dt:g} s; end the window around it at"
-                    f" {(end - first) * dt:g} s or before"
+                    f"{function}: {f}: the formula around it asks for it up to {latest * dt:g} s,"
+                    f" where its window begins after the trace's end, {end * dt:g} s; let the"
+                    f" outer window end at {(end - first) * dt:g} s or before"
                 )
             whole = end if last is None else min(latest + last, end)
             if isinstance(f, Until):
@@ -284,5 +284,10 @@ def _refuse_nan(function: str, formula: Formula, trace: Any, dt: float) -> None:
     for p, m in zip(predicates(formula), given, strict=True):
         if np.isnan(m).any():
             when = float(np.flatnonzero(np.isnan(m))[0] * dt)
-            raise ValueError(f"{function}: {p}: the predicate returned NaN at {when:g} s")
-    raise ValueError(f"{function}: {formula}: infinite margins of both signs make NaN")
+            raise ValueError(
+                f"{function}: {p}: the predicate must return a number, received NaN at {when:g} s"
+            )
+    raise ValueError(
+        f"{function}: {formula}: predicates must return finite numbers, received infinite ones of"
+        " both signs, which give NaN"
+    )

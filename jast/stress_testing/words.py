@@ -135,7 +135,7 @@ def verdict(r: Any) -> list[tuple[str, str]]:
 def advice(r: Any) -> str:
     """What a user would do next."""
     if r.nominal.undisturbed is not None and bool(r.nominal.undisturbed.failure):
-        return "next: mend the system, which fails without any disturbance"
+        return "next: repair the system, which fails without any disturbance"
     if not len(r.failures):
         return "next: a larger budget; a miss distance that falls on the way to a failure"
     words = ["next: jast.replay(sim, report.failures[0]) for its states"]

@@ -88,7 +88,7 @@ def elsewhere(rows: Rows, executor: Executor, store: Store | None, watch: Watch)
     fold = lambda done, i, outcome: {**done, i: _opened(outcome, rows.made[i])}
     ways = units.Ways(executor, None, store, ROW, _is_kept)
     ran = units.run(Task(_unit, rows, lambda: 0), len(rows.made), fold, {}, watch, ways)
-    lost = "left out, as its process failed again and again"
+    lost = "left out, since its process failed in every attempt"
     found = [ran.state.get(i, (None, RuntimeError(lost))) for i in range(ran.done)]
     cut = next((i for i, (result, _) in enumerate(found, 1) if _ended_early(result)), len(found))
     return Found(found[:cut], ran.ended or "")

@@ -108,7 +108,10 @@ def sweep(
     if follow is None:
         follow = function is failure_probability and executor is None
     if follow and executor is not None:
-        raise ValueError("sweep: follow must be False with an executor, whose rows do not wait")
+        raise ValueError(
+            "sweep: follow must be False with an executor, since its rows do not wait for each"
+            " other"
+        )
     n = len(settings_of)
     made = batch(_checked(simulators, n), settings_of)
     keys = [jax.random.fold_in(key, i) for i in range(n)]
@@ -155,7 +158,9 @@ def _rows(values):
         columns[name] = tuple(v.item() if _scalar(v) else v for v in given)
     sizes = {name: len(column) for name, column in columns.items()}
     if len(set(sizes.values())) > 1 or not all(sizes.values()):
-        raise ValueError(f"sweep: values must be as many for each setting, 1 or more: {sizes}")
+        raise ValueError(
+            f"sweep: values must be equally many for each setting, at least 1, received {sizes}"
+        )
     return columns, [dict(zip(columns, row)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -173,7 +178,7 @@ def _checked(simulators, n):
         )
     if len(simulators) != n:
         raise ValueError(
-            f"sweep: simulators must be one for each of {n} values, received {len(simulators)}"
+            f"sweep: simulators must be {n}, one for each value, received {len(simulators)}"
         )
     return simulators
 

@@ -140,16 +140,16 @@ class Sweep(NamedTuple):
         rows = np.flatnonzero(used)[np.argsort(x[used], kind="stable")]
         if len(rows) < 2:
             raise ValueError(
-                f"crossing: needs two rows with a reliable probability, received {len(rows)} of"
-                f" {len(x)}; unreliable=True takes the others"
+                "crossing: expected at least two rows with a reliable probability, received"
+                f" {len(rows)} of {len(x)}; unreliable=True also uses the others"
             )
         with np.errstate(divide="ignore"):
             x, *logs = x[rows], *(np.log(a[rows]) - math.log(level) for a in (p, low, high))
         at = _zeros(x, logs[0])
         if not at:
             raise ValueError(
-                f"crossing: no crossing of {level:g}: for {name} from {x[0]:.6g} to {x[-1]:.6g}"
-                f" the probability lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
+                f"crossing: the probability does not cross {level:g}: for {name} from {x[0]:.6g}"
+                f" to {x[-1]:.6g} it lies between {p[rows].min():.3g} and {p[rows].max():.3g}"
             )
         ends = [*_zeros(x, logs[1]), *_zeros(x, logs[2])]
         left = max((e for e in ends if e <= at[0]), default=-math.inf)
@@ -157,7 +157,7 @@ class Sweep(NamedTuple):
         if at[-1] > right:
             places = ", ".join(f"{v:.6g}" for v in at)
             raise ValueError(
-                f"crossing: {level:g} is crossed at several values of {name}: {places}"
+                f"crossing: the probability crosses {level:g} at several values of {name}: {places}"
             )
         return Crossing(name, (at[0] + at[-1]) / 2, (left, right), level)
 

@@ -127,7 +127,8 @@ def grow_trees(
         return joined(sim, job.problem.reward, job.pilot, found, top)
     if keep_trees and memoize in ("root", "none"):
         raise ValueError(
-            f"{method}: keep_trees needs states at every node, received memoize={memoize!r}"
+            f'{method}: memoize must be "node" or "auto" with keep_trees=True, which needs states'
+            f" at every node, received {memoize!r}"
         )
     wanted = job.plan._replace(record=bool(record), branches=bool(keep_trees))
     if lanes is None and executor is not None:
@@ -220,8 +221,8 @@ def enlist(
     school = enrol(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
     if chosen["follow"] and school.value is not None:
         raise ValueError(
-            f"{job.method}: follow must be False with a value head, which judges a child by an"
-            f" action of its own, received True (mode={chosen['mode']!r})"
+            f"{job.method}: follow must be False with a value head, since that judges each child"
+            f" by an action drawn for it, received True (mode={chosen['mode']!r})"
         )
     problem = job.problem._replace(guide=guide(school.heads, head_settings))
     learns = head_settings.train
@@ -229,13 +230,13 @@ def enlist(
     recount = learns and head_settings.counted == "tree"
     if job.settings is None and isinstance(heads, str):
         raise ValueError(
-            f"{job.method}: heads learn between rounds of trees, which jax.jit and jax.vmap cannot"
-            " hold: pass jast.heads.Heads that were trained"
+            f"{job.method}: heads are trained between rounds of trees, which cannot be done inside"
+            " of jax.jit and jax.vmap: pass trained jast.heads.Heads"
         )
     if edges and memoize in ("root", "none"):
         raise ValueError(
-            f"{job.method}: heads that learn from all edges (head_settings.edges) need states at"
-            f" every node, received memoize={memoize!r}"
+            f'{job.method}: memoize must be "node" or "auto" where heads learn from all edges'
+            f" (head_settings.edges), which needs states at every node, received {memoize!r}"
         )
     usual = max(1, min(job.trees // 5, LANES))
     return job._replace(

@@ -249,8 +249,8 @@ def make(problem, axes, keys, simulations, memoize="node", pages=None, record=Fa
     pages = pages_of(problem, simulations) if pages is None else pages
     if lanes > most_lanes(pages):
         raise ValueError(
-            f"search: at most {most_lanes(pages)} trees of {simulations} simulations fit into one"
-            f" program's 32-bit places, received {lanes}"
+            f"search: expected at most {most_lanes(pages)} trees of {simulations} simulations side"
+            f" by side, so that 32 bits can number their nodes, received {lanes}"
         )
 
     def origin(problem, key):

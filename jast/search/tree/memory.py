@@ -74,8 +74,8 @@ def fit(
         )
     if auto and plan.memoize == "root":
         warnings.warn(
-            f"{method}: states at every node do not fit into memory, so they are kept at roots:"
-            ' memoize="root"',
+            f"{method}: states at every node do not fit into memory, so they are kept at the roots"
+            ' alone: memoize="root"',
             stacklevel=4,
         )
     return plan, threads, max(1, min(lanes, within))

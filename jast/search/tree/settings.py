@@ -47,8 +47,8 @@ def settled(
     pair = isinstance(widening, tuple | list) and len(widening) == 2
     if not pair or not (is_traced(*widening) or (widening[0] > 0 and 0 <= widening[1] <= 1)):
         raise ValueError(
-            f"{method}: widening must be a pair (k, alpha), k > 0 and 0 <= alpha <= 1, received"
-            f" {widening!r}"
+            f"{method}: widening must be a pair (k, alpha) with k > 0 and 0 <= alpha <= 1,"
+            f" received {widening!r}"
         )
     if focus is not None and not is_traced(focus) and not focus > 0:
         raise ValueError(f"{method}: focus must be above 0, received {focus!r}")
