@@ -37,7 +37,7 @@ def differences(there: dict[str, str], here: dict[str, str]) -> str:
     names = [*here, *(n for n in there if n not in here)]
     unlike = [n for n in names if there.get(n) != here.get(n)]
     said = [
-        f"{n} was {there.get(n, 'nothing')}, and is {here.get(n, 'nothing')} now" for n in unlike
+        f"{n} is {there.get(n, 'nothing')} there, {here.get(n, 'nothing')} here" for n in unlike
     ]
     more = [f"and {len(said) - TOLD} more differences"] if len(said) > TOLD else []
     return "; ".join(said[:TOLD] + more)

@@ -160,8 +160,8 @@ def test_check_says_what_is_wrong_with_the_ends_of_a_box():
     with pytest.raises(
         ValueError,
         match=(
-            r"actions.uniform: low is PyTreeDef\({'a': \*}\), expected an array or the structure of a"
-            r" disturbance, PyTreeDef\({'a'"
+            r"actions.uniform: low is PyTreeDef\({'a': \*}\), expected an array or the structure"
+            r" of a disturbance, PyTreeDef\({'a'"
         ),
     ):
         jast.check(sim, actions.uniform({"a": -1.0}, 2.0))

@@ -211,10 +211,10 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
     with pytest.raises(
-        ValueError, match="sac: checkpoint .* belongs to another call: rates.polyak was"
+        ValueError, match="sac: checkpoint .* belongs to another call: rates.polyak is"
     ):
         sac(jax.random.key(3), WALK, **TINY, polyak=0.5, checkpoint=path)
-    with pytest.raises(ValueError, match="sac: checkpoint .* belongs to another call: key was"):
+    with pytest.raises(ValueError, match="sac: checkpoint .* belongs to another call: key is"):
         sac(jax.random.key(4), WALK, **TINY, checkpoint=path)
 
 
@@ -244,7 +244,9 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
     save(path, learned)
     with pytest.raises(ValueError, match="does not fit sim: its horizon is 2, expected 6"):
         load(path, WALK)
-    with pytest.raises(ValueError, match="does not fit sim: it holds a start, expected none"):
+    with pytest.raises(
+        ValueError, match="does not fit sim: it holds a learned start, expected none"
+    ):
         load(path, walk(horizon=2))
     two = jast.Simulator(
         lambda x0: jnp.stack([x0, x0]),

@@ -388,7 +388,7 @@ def test_bad_places_are_named(name, key, tmp_path):
         (dict(checkpoint=tmp_path / "full"), ".* holds other files, such as thesis.tex"),
         (
             dict(checkpoint=tmp_path / "other"),
-            f".* another call: function was '.*', and is '{name}'",
+            f".* another call: function is '.*' there, '{name}'",
         ),
     ]:
         with pytest.raises(ValueError, match=f"{name}: {match}"):
@@ -405,7 +405,7 @@ def test_a_checkpoint_of_another_key_or_in_use_is_refused(key, tmp_path):
             call(key, checkpoint=tmp_path)
 
     call(key, checkpoint=tmp_path, callback=again)
-    with pytest.raises(ValueError, match="another call: key was .*, and is .* now; give another"):
+    with pytest.raises(ValueError, match="another call: key is .* there, .* here; give another"):
         call(jax.random.fold_in(key, 1), checkpoint=tmp_path)
 
 
@@ -465,7 +465,7 @@ def test_a_fingerprint_tells_functions_and_numbers_apart():
 
     same = fingerprint(sim=walk1d(), f=made(2.0)), fingerprint(sim=walk1d(), f=made(2.0))
     assert differences(*same) == ""
-    assert "f.gain was 2.0, and is 3.0 now" == differences(
+    assert "f.gain is 2.0 there, 3.0 here" == differences(
         same[0], fingerprint(sim=walk1d(), f=made(3.0))
     )
     assert "code" in differences(fingerprint(f=lambda x: x + 1), fingerprint(f=lambda x: x - 1))
