@@ -373,7 +373,9 @@ def test_load_refuses_other_files_and_versions(tmp_path, archive, monkeypatch):
             kind = files.KINDS["jast failures"]._replace(version=version)
             patch.setitem(files.KINDS, "jast failures", kind)
             F.save(path, archive)
-        with pytest.raises(ValueError, match=f"has version {version}; this jast reads version 1"):
+        with pytest.raises(
+            ValueError, match=f"has version {version}, and this jast reads version 1"
+        ):
             F.load(path)
 
 

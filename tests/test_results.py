@@ -372,13 +372,13 @@ def test_bad_files_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="not a file of jast.save"):
         jast.load(path)
     archive.write(path, "jast result", 2, {}, {})
-    with pytest.raises(ValueError, match="has version 2; this jast reads version 1"):
+    with pytest.raises(ValueError, match="has version 2, and this jast reads version 1"):
         jast.load(path)
     archive.write(path, "jast sac checkpoint", 1, {}, {})
     with pytest.raises(ValueError, match="its format is 'jast sac checkpoint'"):
         jast.load(path)
     archive.write(path, "jast result", 1, {"result": {"record": ["Unknown", {}]}}, {})
-    with pytest.raises(ValueError, match="holds a Unknown, unknown here"):
+    with pytest.raises(ValueError, match="holds a Unknown, which this jast does not know"):
         jast.load(path)
     with pytest.raises(FileNotFoundError):
         jast.load(tmp_path / "none")
