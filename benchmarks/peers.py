@@ -123,7 +123,9 @@ def expected_improvement(seed, objective, mean, sd, budget, first=10, n_random=1
     acquisition = ExpectedImprovement(xi=0.0)
 
     def search(evaluate):
-        z = list(rng.standard_normal((first, len(mean))))
+        z = rng.standard_normal((first, len(mean)))
+        # it asks for a point of the box: in 40 dimensions ten draws may all lie outside of it
+        z = list(z if (np.abs(z) <= 2).all(axis=1).any() else np.clip(z, -2, 2))
         value = [evaluate(mean + sd * point) for point in z]
         while True:
             y = np.array(value)

@@ -131,11 +131,23 @@ def test_a_start_of_the_users_and_its_probability(key):
     [
         (lambda: avoidance("AT1"), "ground_collision_avoidance: requirement"),
         (lambda: avoidance(altitude=0.0), "ground_collision_avoidance: altitude"),
-        (lambda: fly(0.8, np.nan, 0.0), "fly: roll, pitch and yaw must be finite"),
-        (lambda: fly(0.8, -1.2, np.zeros(2)), "fly: roll, pitch and yaw must be finite"),
+        (lambda: fly(0.8, np.nan, 0.0), "fly: pitch must be a number of rad"),
+        (lambda: fly("left", -1.2, 0.0), "fly: roll must be a number of rad"),
         (lambda: fly(0.8, -1.2, 0.0, altitude=-1.0), "fly: altitude"),
     ],
 )
 def test_errors(call, said):
     with pytest.raises(ValueError, match=said):
         call()
+
+
+def test_equal_settings_compile_once():
+    @jax.jit
+    def traced(sim):
+        calls.append(0)
+        return sim.init(jnp.zeros(3))
+
+    calls = []
+    for altitude in (2262.0, 2262.0, 4040):
+        traced(avoidance(altitude=altitude))
+    assert len(calls) == 1

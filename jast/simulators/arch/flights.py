@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import Partial
 
+from jast._checks import number
 from jast.distributions import Independent, Uniform
 from jast.simulator import Simulator, ravel
 from jast.simulators._parameter import positive
@@ -94,8 +94,7 @@ def fly(
         (`Flight` [451, ...], 1/30): samples from 0 s on, and the seconds between them.
 
     Raises:
-        ValueError: for an attitude that is not three finite numbers and an altitude that is not
-            positive.
+        ValueError: for angles that are not finite numbers and an altitude that is not positive.
 
     Example:
         >>> import jast
@@ -104,10 +103,9 @@ def fly(
         True
     """
     (altitude,) = positive("fly", altitude=altitude)
-    given = roll, pitch, yaw
-    if not all(np.shape(a) == () and np.isfinite(a) for a in given):
-        raise ValueError(f"fly: roll, pitch and yaw must be finite numbers, received {given}")
-    begin = gcas.start(jnp.array(given, jnp.zeros(()).dtype), altitude)
+    given = dict(roll=roll, pitch=pitch, yaw=yaw)
+    attitude = [number("fly", name, a, math.isfinite, "of rad") for name, a in given.items()]
+    begin = gcas.start(jnp.array(attitude, jnp.zeros(()).dtype), altitude)
     after = _flown(begin)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, after), gcas.DT
 

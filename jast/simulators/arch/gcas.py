@@ -21,7 +21,7 @@ and 30 degrees. **The gains of the inner loops are our own design**
 (`jast.simulators.arch.f16_design`), as the published ones are under the GPL. So figures compare
 with published ones in kind alone, and starts that are hard to survive are lower: from 2338 ft, as
 in the category of 2024, no flight of this model comes below 47 ft, where 1.3 % of all starts fail
-with the published gains, by up to 34 ft. From 2262 ft 1.3 % fail here, by up to 28 ft.
+with the published gains, by up to 34 ft. From 2262 ft 1.2 % fail here, by up to 28 ft.
 
 Published, from 2338 ft: MoonLight with TuRBO 10 of 10 within 300 simulations, mean 21, median 19
 (ARCH-COMP 2024).
