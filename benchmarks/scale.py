@@ -50,7 +50,7 @@ def waits(disturbances):
 
 
 def calls(episodes, trees, budget):
-    """Calls by name, with keywords as to how they run; by default 100,000, 200 and 100,000."""
+    """Calls by name, with keywords as to how they run; at full size 1,000,000, 200 and 100,000."""
     return {
         "nominal": lambda **how: jast.nominal(KEY, ferry(), episodes, **how),
         "monte_carlo": lambda **how: jast.search.monte_carlo(
@@ -265,9 +265,9 @@ def many_kills(n):
 
 
 def report(args):
-    sizes = size(args, (100_000, 200, 100_000), (100_000, 16, 20_000), (2000, 8, 5000))
+    sizes = size(args, (1_000_000, 200, 100_000), (100_000, 16, 20_000), (2000, 8, 5000))
     names = size(args, None, None, ["nominal"])
-    found = costs(sizes, names or calls(*sizes), size(args, 15, 3, 1))
+    found = costs(sizes, names or calls(*sizes), size(args, 9, 3, 1))
     if args.costs:
         return found
     if not args.smoke:
