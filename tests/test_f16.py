@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jast
+from benchmarks import arch_flights
 from jast.distributions import Independent, Normal
 from jast.simulators.arch import SPECIFICATIONS, f16, f16_design, fly, gcas
 from jast.simulators.arch import ground_collision_avoidance as avoidance
@@ -114,6 +115,15 @@ def test_falsify_needs_no_disturbances():
     assert found.first_failure is not None
     x0 = np.asarray(found.best.x0)
     assert found.best.failure and np.all((x0 > WORST[0] - 0.2) | (x0 < 0))
+
+
+@pytest.mark.long
+def test_the_least_altitudes_of_the_box():
+    found = arch_flights.rows(200)
+    for r in found.values():
+        assert r["corner"]["roll"] == 1 and r["corner"]["pitch"] == 0
+        assert r["yaw"] < 0.01 and r["halved"] < 1
+    assert found["2338"]["share"] == 0 and found["2262"]["least"] < 0
 
 
 @pytest.mark.long
