@@ -34,6 +34,14 @@ OBSERVED = 64
 """The most numbers that ``observe`` may return."""
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LANES, STEPS, DRAWS = 32, 8, 64
+HINTS = {
+    "TracerBoolConversionError": (
+        " An if, and, or, not, min or max on a value of the state or the disturbance does not work:"
+        " write jnp.where(condition, this, that)"
+    ),
+    "TracerArrayConversionError": " Use jax.numpy in place of numpy",
+    "ConcretizationTypeError": " Use jax.numpy in place of float, int and math",
+}
 ACTIONS = {
     Samples: "actions.samples",
     Quantiles: "actions.quantiles",
@@ -165,7 +173,12 @@ def _call(name, function, *args):
     try:
         return function(*args)
     except Exception as e:
-        raise ValueError(f"{name}: raised {type(e).__name__}: {_first_line(e)}") from e
+        from jast.blackbox.worker import line_of
+
+        kind = type(e).__name__
+        raise ValueError(
+            f"{name}: raised {kind}{line_of(e)}: {_first_line(e)}{HINTS.get(kind, '')}"
+        ) from e
 
 
 def _draw(name, dist):

@@ -553,7 +553,7 @@ def test_a_distance_beyond_the_precision_is_no_number():
     state = sim.step(sim.init(()), jnp.ones(()))
     assert not state.event and state.terminal and np.isnan(state.distance)
     (only,) = incidents(sim)
-    assert (only.kind, only.message) == ("NaN", "distance is 1e+300, beyond float32")
+    assert (only.kind, only.message) == ("NaN", "distance is 1e+300, too large for float32")
     assert only.disturbances.tolist() == [1]
 
 

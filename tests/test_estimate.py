@@ -238,7 +238,10 @@ def test_pareto_k_at_its_ends():
         ((1000, 99.0, 0.3, 0.01), ["effective sample size 99, below 100"]),
         ((1000, 500.0, 0.71, 0.01), ["Pareto k-hat 0.71, above 0.7"]),
         ((1000, 500.0, 0.3, 0.06), ["one episode carries 6% of the estimate"]),
-        ((100_000, 500.0, 0.3, 0.01), ["effective sample size 500 of 100000 failures, below 1%"]),
+        (
+            (100_000, 500.0, 0.3, 0.01),
+            ["effective sample size 500 is below 1% of the 100000 failures"],
+        ),
         (
             (4, 3.0, np.nan, 0.4),
             [

@@ -49,7 +49,9 @@ def test_explanations_are_told_drawn_and_marked(page):
     first, second = Page(page).data["modes"]
     assert first["risk"] == [0.1, 0.2, 0.4, 1.0] and first["interval"][1] == [1.0] * 4
     assert first["needed"] == {EVIL: [3]} and "risk" not in second and "needed" not in second
-    assert "1 of 3 disturbance is needed" in page and "it stays at 0.95 or more from step 3" in page
+    assert (
+        "1 of 3 disturbances is needed" in page and "it stays at 0.95 or more from step 3" in page
+    )
 
 
 def test_traces_have_the_fields_and_numbers_of_the_system(page):

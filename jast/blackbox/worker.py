@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Runner", "Spec"]
+__all__ = ["Runner", "Spec", "line_of"]
 
 METHODS = ("initialize", "transition", "miss_distance", "is_event")
 KEPT = 8192
@@ -410,16 +410,22 @@ def _said(error):
         return "wrong answer", str(error)
     if isinstance(error, NotANumber):
         return "NaN", str(error)
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
+    text = " ".join(str(error).split())[:200]
+    return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{line_of(error)}"
+
+
+def line_of(error):
+    """ " (system.py:12)": the last line of the system's own code that ``error`` went through."""
+    here = os.path.dirname(os.path.dirname(__file__))
+    frames = traceback.extract_tb(error.__traceback__)
+    frames = [f for f in frames if not f.filename.startswith(here)]
     libraries = os.path.dirname(os.__file__), "<frozen"
     own = [
         f
         for f in frames
         if "site-packages" not in f.filename and not f.filename.startswith(libraries)
     ] or frames
-    where = f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
-    text = " ".join(str(error).split())[:200]
-    return "raised", f"raised {type(error).__name__}{f': {text}' if text else ''}{where}"
+    return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
 
 
 def install(system, spec):

@@ -51,8 +51,10 @@ class Minimal(NamedTuple):
 
     def __str__(self) -> str:
         steps = sorted({step for step, *_ in self.parts})
-        what = "disturbance is" if len(self.parts) == 1 else "disturbances are"
-        lines = [f"{len(self.parts)} of {self.numbers} {what} needed: {_in_words(steps)}"]
+        are = "is" if len(self.parts) == 1 else "are"
+        lines = [
+            f"{len(self.parts)} of {self.numbers} disturbances {are} needed: {_in_words(steps)}"
+        ]
         lines += [
             f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} from the mode"
             for step, name, value, z in self.parts[:LINES]
