@@ -87,6 +87,27 @@ def close_figures():
 
 
 @pytest.fixture
+def traced():
+    """The names of the functions that JAX traces from here on: a list that grows. A function that
+    is called inside of another is not heard.
+    """
+    names = []
+
+    def heard(event, _, fun_name="", **about):
+        if event == "/jax/core/compile/jaxpr_trace_duration":
+            names.append(fun_name)
+
+    def new(x):
+        return x + 1
+
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    jax.jit(new)(1.0)
+    assert names == ["new"]
+    yield names
+    jax.monitoring.unregister_event_duration_listener(heard)
+
+
+@pytest.fixture
 def equal():
     """Asserts that two pytrees are the same to the bit, NaN included."""
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import jast
 from jast import distributions as D
+from jast.episode import _rollout, play_back
 from jast.simulators import fms, fms_misses, fms_path
 from jast.simulators.fms import FIXES, KLAX, KSFO, MEANS, SIGMAS, FmsState, database, events, system
 
@@ -380,8 +381,9 @@ def test_contract(database, key):
     )
 
 
-def test_settings_are_traced(key):
-    before = [jast.rollout(key, fms()), system._evaluate._cache_size()]
+def test_settings_are_traced(key, traced):
+    jast.rollout(key, fms())
+    traced.clear()
     for sim in (
         fms(0.1, 15, 300),
         fms(fixed=True),
@@ -390,7 +392,7 @@ def test_settings_are_traced(key):
     ):
         jast.rollout(key, sim)
         assert jax.tree.structure(sim) == jax.tree.structure(fms())
-    assert system._evaluate._cache_size() == before[1]
+    assert not {_rollout.__name__, play_back.__name__} & set(traced)
 
 
 @pytest.mark.parametrize(
