@@ -1,6 +1,7 @@
 """The documentation: it builds without a warning, and what it shows runs."""
 
 import ast
+import functools
 import importlib
 import inspect
 import operator
@@ -62,12 +63,36 @@ def test_it_builds_without_a_warning(tmp_path):
                 assert any(pages.get(way, "").startswith("docs/api/") for way in ways), ways
 
 
-def test_code_that_needs_other_machines_names_what_exists():
-    """That of docs/scale.md is not run: it is Python, and its calls and their settings exist."""
-    page = (ROOT / "docs/scale.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.S)
-    assert blocks
-    for block in blocks:
+FEWER = {
+    "trees=2000": "trees=2, prunes=1, simulations=50",
+    "10_000_000": "1000",
+    "Executor(4": "Executor(1",
+}
+
+
+def scale():
+    """The code of docs/scale.md: that of one machine, and that of a cluster."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/scale.md").read_text(), re.S)
+    here = [block for block in blocks if "dask" not in block]
+    assert len(here) == 3
+    return here, [block for block in blocks if "dask" in block]
+
+
+@pytest.mark.long
+def test_the_code_for_long_work_on_one_machine_runs(tmp_path):
+    """As on the page, with fewer episodes, trees and processes."""
+    start = "import jax, jast\nkey, sim = jax.random.key(0), jast.simulators.walk1d()\n"
+    for i, block in enumerate(scale()[0]):
+        less = functools.reduce(lambda text, few: text.replace(*few), FEWER.items(), block)
+        assert less != block
+        (tmp_path / f"page{i}.py").write_text(start + less)
+        python(f"page{i}.py", cwd=tmp_path)
+    assert (tmp_path / "run.jast").is_dir()
+
+
+def test_code_that_needs_a_cluster_names_what_exists():
+    """It is not run: it is Python, and its calls and their settings exist."""
+    for block in scale()[1]:
         for call in (n for n in ast.walk(ast.parse(block)) if isinstance(n, ast.Call)):
             name = ast.unparse(call.func)
             if name.startswith("jast."):
