@@ -1,8 +1,9 @@
-"""A checkpoint: a folder that holds the finished parts of a long call, so that the same call goes
-on where it was ended, whatever ended it.
+"""A checkpoint: a folder that holds the finished parts of a long call, so that the same call
+continues where it was ended.
 
 Parts are records of a `jast.ledger`; the state of a chain of steps, each of which replaces the
-last, is a file of `jast.archive`. Both are whole or not there, with checksums, without pickle.
+last, is a file of `jast.archive`. Both have checksums, so each is complete or is not there. Neither
+uses pickle.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
-"""A file of records that only grows. A record is whole or not there, whatever ended the process
-that wrote it: each has checksums, and what is left of the last one is cut off.
+"""A file of records that only grows. Each record has checksums: whatever ended
+the process that wrote it, a record is complete or is not there. An incomplete last one is cut off.
 
-To make a file costs ten times as much as to add a record. So the parts of a checkpoint, of which
-there may be a hundred thousand, are records of one file.
+Making a file costs ten times as much as adding a record. A checkpoint may have a hundred thousand
+parts, so they are records of one file.
 """
 
 import hashlib

@@ -214,7 +214,7 @@ class _Desk:
         return sorted((i, r) for i, r in self.ready.items() if i >= done and r is not None)
 
     def give_up(self) -> None:
-        """RuntimeError: what fails everywhere is no matter of luck."""
+        """RuntimeError: a unit that fails in every process does not fail by chance."""
         raise RuntimeError(
             f"{self._watch.name}: every unit of work failed in the executor, {TRIES} times each;"
             f" the last error: {_words(self._error)}"

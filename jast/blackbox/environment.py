@@ -13,7 +13,7 @@ __all__ = ["Moment", "gymnasium_system"]
 
 
 class Moment(NamedTuple):
-    """What an environment showed last.
+    """What an environment returned last.
 
     Example:
         >>> from jast.blackbox import Moment
@@ -31,7 +31,7 @@ class Moment(NamedTuple):
     truncated: bool
     info: dict[str, Any]
     env: Any
-    """The environment itself, for what it does not show"""
+    """The environment itself, for what it does not return"""
 
 
 class _System(NamedTuple):

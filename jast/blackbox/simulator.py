@@ -49,7 +49,7 @@ class Record(NamedTuple):
     """
 
     begun: Any
-    """bool, True: a state of zeros is none, and is not run"""
+    """bool: True in every state of an episode; the system is not run on a state of zeros"""
     t: Any
     """int32: disturbances so far"""
     x0: Any

@@ -48,11 +48,12 @@ class Exceedance(NamedTuple):
     ess: Any
     """[k] effective sample size of the draws within a threshold"""
     reliable: Any
-    """[k] bool: the estimate is, and the weights within this threshold speak for a number"""
+    """[k] bool: whether the estimate is, and the draws within this threshold are enough for a
+    number"""
     level: float
     method: str
     unseen: float | None = None
-    """As of the estimate"""
+    """That of the estimate"""
 
 
 @results.shown()
@@ -83,7 +84,7 @@ class FailureTimes(NamedTuple):
     ess: Any
     """[T + 1] effective sample size of the failures at this step"""
     reliable: bool
-    """The estimate is, and the times have more than a few effective failures"""
+    """Whether the estimate is, and there are enough effective failures for the times"""
     level: float
     method: str
 

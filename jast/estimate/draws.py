@@ -21,9 +21,9 @@ KEPT = 2**17
 
 @results.shown()
 class Draws(NamedTuple):
-    """Failing episodes of the draws that an estimate is the mean of, and those others that came
-    nearest to a failure: [m], NumPy. Of more failures than fit, one in ``every`` is kept and counts
-    so often; of the others those up to the miss distance ``reach``.
+    """The failing episodes among the draws of an estimate, and the others that came nearest to a
+    failure: [m] each, NumPy. Of more failures than fit, one in ``every`` is kept, and counts
+    ``every`` times; of the other episodes, those with a miss distance of at most ``reach``.
 
     Example:
         >>> import jax, jast

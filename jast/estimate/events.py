@@ -70,7 +70,7 @@ class Event(NamedTuple):
     failing: int
     """How many these are"""
     reliable: bool
-    """The estimate is, and the weights of these failures speak for a number"""
+    """Whether the estimate is, and these failures are enough for a number"""
     warnings: tuple[Any, ...]
     """Why not"""
     level: float

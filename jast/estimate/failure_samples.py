@@ -57,7 +57,8 @@ class FailureSamples(NamedTuple):
     ess: float
     """Effective number of the weighted failures that they were resampled from"""
     distinct: int
-    """How many different ones the resampling took; the Markov chain parted the copies"""
+    """How many different failures the resampling took; the Markov chain then moves the copies
+    apart"""
     accepted: float
     """Share of the last Markov moves that was accepted"""
     evaluations: int

@@ -67,8 +67,8 @@ class FailureProposal(NamedTuple):
     invalid: Any
     """int: those in which the simulator returned a number that is not finite"""
     reached: Any
-    """bool: all of the last elites fail, and for two effective episodes or more; else the proposal
-    is fitted to near misses as well
+    """bool: whether all of the last elites fail, and are worth two effective episodes or more;
+    otherwise the proposal is fitted to near misses too
     """
 
     @results.Former

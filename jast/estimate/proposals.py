@@ -57,8 +57,8 @@ class Proposal:
     policies: Policy
     """Stacked: a leading axis [K] on every leaf"""
     covers: bool = field(default=False, metadata=dict(static=True))
-    """Known to have a density above 0 wherever the model has one, as it holds a share of the model;
-    static.
+    """Whether its density is known to be above 0 wherever the model's is, because it holds a share
+    of the model; static.
     """
 
 

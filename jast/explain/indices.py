@@ -86,13 +86,13 @@ class Indices(NamedTuple):
     rows: tuple[Any, ...]
     """An `Index` for each number, x0 first, then step by step"""
     probability: float
-    """Of failure: what a first-order index is about where a number decides nothing alone is a small
+    """Of failure. The first-order index of a number that decides nothing by itself is a small
     multiple of it"""
     level: float
     ess: float
     """Effective number of failures behind the means and the first-order indices"""
     reliable: bool
-    """The estimate is, and there are 100 effective failures or more"""
+    """Whether the estimate is, and there are 100 effective failures or more"""
     evaluations: int
 
     def __str__(self) -> str:

@@ -48,7 +48,7 @@ class Sensitivity(NamedTuple):
     ess: float
     """Effective number of failures behind them."""
     reliable: bool
-    """The estimate is, and there are 100 effective failures or more."""
+    """Whether the estimate is, and there are 100 effective failures or more."""
     evaluations: int
 
     def __str__(self) -> str:

@@ -46,7 +46,7 @@ class Moments(NamedTuple):
     mean: Any
     """[n] float32."""
     deviation: Any
-    """[n] float32: 0 where nothing varies, which then is as good as 1."""
+    """[n] float32: 0 where nothing varies; 1 is used in its place."""
 
     @classmethod
     def empty(cls, *shape: Sequence[int]) -> Moments:

@@ -54,7 +54,7 @@ class HeadSettings(NamedTuple):
     edges: str
     """That the value head learns from: "roots" or "all"."""
     untrained_alone: bool
-    """Leave a value head without a policy head as it was made."""
+    """Whether a value head without a policy head stays untrained."""
     from_start: bool
     """Whether heads that were never trained guide the first round."""
     power: float

@@ -20,7 +20,7 @@ from jast.watch import Watch, terminable
 __all__ = ["learn", "look"]
 
 REACH, WIDEN, FAR = 8.0, 3.0, 30.0
-"""How far away from the model, in deviations, the episodes of the look around are in all their
+"""How far away from the model, in deviations, the episodes of the exploration are in all their
 latents together: as far as a failure of probability 1e-15; how wide the starts are; both more where
 the miss distance is more of its deviations away from 0, and then as wide as this at the most (a
 third of it).

@@ -36,7 +36,7 @@ class History(NamedTuple):
     """
 
     episodes: Any
-    """Simulated so far, those of the look around before the learning included."""
+    """Simulated so far, including those of the exploration before the learning."""
     steps: Any
     """Steps of the simulator so far."""
     mean_return: Any
@@ -52,7 +52,7 @@ class History(NamedTuple):
     scale: Any
     """lambda."""
     invalid: Any
-    """Transitions so far in which a number was not finite: none was learned from."""
+    """Transitions so far in which a number was not finite: they are left out of the training."""
 
 
 FAILING_SHARE = History._fields.index("failing_share")

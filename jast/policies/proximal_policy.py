@@ -34,9 +34,9 @@ __all__ = ["ppo"]
 LONGEST = 128
 """Steps of a lane between updates, at most, where nobody says."""
 ITERATIONS, LANES = 150, (8, 64)
-"""Lanes, where nobody says: such that the policy changes so often, within these bounds."""
+"""Of the lanes, where nobody says: as many as let the policy change this often; their bounds."""
 LOOKED_AT = 100_000
-"""Transitions of the look around whose moments are taken."""
+"""Transitions of the exploration whose moments are taken."""
 
 
 def ppo(
@@ -69,7 +69,7 @@ def ppo(
     It learns only from the episodes of the policy as it is, and keeps none of them: an episode
     costs less to learn from than with `sac`, and teaches less (docs/figures.md). The latents,
     the reward of a step (Lipkis and Agogino eq. 21, less ``alpha`` times the log density of what
-    was drawn), the look around before the learning, and what becomes of numbers that are not finite
+    was drawn), the exploration before the learning, and what becomes of numbers that are not finite
     are those of `sac`. So are random starts: drawn ``widen`` times as wide as p(x0), and handed out
     as a mixture fitted to p(x0) exp(V(s0) - lambda d(s0)).
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["q_learning"]
 
 LOOKED_AT = 100_000
-"""Transitions of the look around that the ranges are taken of."""
+"""Transitions of the exploration that the ranges are taken of."""
 
 
 def q_learning(
@@ -77,7 +77,7 @@ def q_learning(
         cell: function of what is observed, [m] float32, and of the step, int32, to the number of
             its cell, from 0 to ``cells`` - 1; beyond that, the nearest. None: the grid.
         ranges: of the grid, [m, 2], the least and the greatest of each number observed; what is
-            beyond belongs to the last cell. "auto": what the look around before the learning saw.
+            beyond belongs to the last cell. "auto": what the exploration before the learning saw.
         values: of each latent, at least 2, evenly from -``reach`` to ``reach``; the table has
             ``values`` to the power of the latents columns.
         reach: in standard deviations, above 0.

@@ -13,7 +13,7 @@ __all__ = ["Plan", "auto", "number", "plan", "positive", "shaped", "widening", "
 
 STRETCHES = 20
 NOMINAL, AROUND = 0.03, 0.05
-"""Shares of the steps: of the model itself and of the look around, before the learning."""
+"""Shares of the steps: of the model itself and of the exploration, before the learning."""
 
 
 class Plan(NamedTuple):

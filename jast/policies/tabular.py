@@ -122,7 +122,7 @@ def _row(cell, horizon, table, inputs):
 
 
 def spread(training: E.Training, ranges: np.ndarray | None) -> E.Training:
-    """``training`` after the look around: its grid has the ``ranges`` [m, 2], or those that were
+    """``training`` after the exploration: its grid has the ``ranges`` [m, 2], or those that were
     seen, and what is seen is no longer normalised.
     """
     seen = training.buffer.seen[: int(training.stored)]

@@ -28,15 +28,16 @@ class Part(NamedTuple):
 
     formula: Formula
     depth: int
-    """How many formulas it is inside of."""
+    """How many formulas contain it."""
     time: float
     """Seconds; NaN where nothing was decided within the trace."""
     value: float
     """Its robustness then."""
     held: bool
-    """It is not below 0."""
+    """Whether ``value`` is at least 0."""
     decides: bool
-    """Its robustness is that of the whole formula, or minus it (below ``~``, ``implies``)."""
+    """Whether its robustness is that of the whole formula, or minus that (below ``~``,
+    ``implies``)."""
     values: np.ndarray
     """[T] its robustness at each moment, windows clipped at the trace's end."""
 

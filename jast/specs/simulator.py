@@ -40,8 +40,8 @@ class Monitored(NamedTuple):
     memory: Any
     """`jast.specs.monitor.Memory` of each window."""
     robustness: Any
-    """The greatest that the trace's robustness can still come to; at the trace's end, the
-    robustness. Infinite where all is open yet.
+    """The greatest robustness that the trace can still reach; at its end, its robustness. Infinite
+    while nothing is decided.
     """
     goes_on: Any
     """bool: the trace goes on. False at the horizon, and where ``is_terminal`` ended it."""

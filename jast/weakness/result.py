@@ -39,7 +39,8 @@ class History(NamedTuple):
     there were none
     """
     recall: Any
-    """[R]: failures found, as a share of these and ``expected``: as rough as that is"""
+    """[R]: failures found, as a share of these and ``expected``, and so no better than that
+    guess"""
     auc: Any
     """[R]: area under the ROC curve of the iteration's scores on the inputs run so far, which were
     chosen (`judge`: on all); NaN where all failed or none
