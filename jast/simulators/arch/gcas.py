@@ -66,7 +66,14 @@ LATERAL = np.array([[27.9123, -3.2968, -16.1738, -17.9932, -9.7869],
 
 
 class Flight(NamedTuple):
-    """The aircraft and its autopilot at a moment."""
+    """The aircraft and its autopilot at a moment.
+
+    Example:
+        >>> import jast
+        >>> trace, dt = jast.simulators.arch.fly(0.8, -1.2, -0.8, altitude=4040.0)
+        >>> int(trace.mode[0]), float(trace.altitude[0])  # Wait, at the start
+        (0, 4040.0)
+    """
 
     aircraft: F16
     errors: Any
