@@ -1,5 +1,6 @@
 """What the driver of units costs, what a second worker gains, and whether killed calls go on to the
-same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--costs] [--kills N]``.
+same result: ``python -m benchmarks.scale [--json] [--quick | --smoke] [--costs] [--kills N]
+[--calls NAME ...]``.
 
 ``overhead``: CPU time of a call to that with a plain loop over the same units in its place, both
 in one thread.
@@ -9,7 +10,7 @@ the ferry (S0) and on a black box that waits for 5 ms. ``kills``: calls killed a
 (SIGKILL) and made again: how many gave the result of the uninterrupted call to the bit, and how
 many units that had ended were not on disk.
 
-``--costs``: only the first two. ``--kills N``: only kills, N in all, and also of the chains, whose
+``--costs``: only the first two. ``--kills N``: only kills, N in all, also of the chains, whose
 steps depend on one another: a forest with heads, a training, a validation.
 """
 
@@ -225,7 +226,7 @@ def killed(name, sizes, moment, folder, programs):
         process.kill()
     if process.wait() == 0:
         return None
-    units = [name for name in parts(checkpoint) if name.startswith("unit")]
+    units = [name for name in parts(checkpoint) if not name.startswith("answer")]
     return ended.stat().st_size, len(units)
 
 
@@ -253,10 +254,10 @@ def kills(name, sizes, runs):
     return dict(runs=runs, killed=met, equal=equal, most_units_lost=lost)
 
 
-def many_kills(n):
-    """`kills` of all calls, ``n`` in all; tells of each as it ends, as this takes long."""
+def many_kills(n, names):
+    """`kills` of these calls, ``n`` in all; tells of each as it ends, as this takes long."""
     sizes, found = (300_000, 16, 20_000), {}
-    names = [*calls(*sizes), *chains()]
+    names = names or [*calls(*sizes), *chains()]
     for i, name in enumerate(names):
         if runs := n // len(names) + (i < n % len(names)):
             found[name] = kills(name, sizes, runs)
@@ -318,8 +319,9 @@ def main(argv=None):
     options(parser, "less of everything: two kills of two calls")
     parser.add_argument("--costs", action="store_true", help="only the driver and a checkpoint")
     parser.add_argument("--kills", type=int, metavar="N", help="only kills, N in all")
+    parser.add_argument("--calls", nargs="+", metavar="NAME", help="of these calls; default: all")
     args = parser.parse_args(argv)
-    found = report(args) if args.kills is None else dict(kills=many_kills(args.kills))
+    found = report(args) if args.kills is None else dict(kills=many_kills(args.kills, args.calls))
     print(json.dumps(found, indent=1) if args.json else tables(found))
 
 
