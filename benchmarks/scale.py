@@ -326,4 +326,6 @@ def main(argv=None):
 
 
 if __name__ == "__main__":
-    main()
+    from benchmarks import scale  # a checkpoint knows functions by the module's own name
+
+    scale.main()
