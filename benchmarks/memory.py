@@ -33,7 +33,9 @@ LONG = {
     ),
     "forest": (
         "simulations of each of 10,000 trees",
-        lambda n: jast.search.forest(KEY, ferry(), trees=10_000, simulations=n, refine=0),
+        lambda n: jast.search.forest(
+            KEY, ferry(), trees=10_000, prunes=18, simulations=n // 18, refine=0
+        ),
     ),
 }
 """Name -> (what grows, the call)"""
