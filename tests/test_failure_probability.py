@@ -347,6 +347,20 @@ def test_the_guard_is_content_where_nothing_was_lost(down, shares, key):
     assert guard.guarded(s, 1, 2) and not s.reasons
 
 
+def test_a_share_counts_as_lost_where_no_batch_could_have_drawn(key):
+    """The batch of 20,000 is of the upper mode alone. It meets that one, so what it saw there,
+    .02, speaks against a population's .04; of the lower mode it knows nothing, however much it saw
+    elsewhere. Below twice what is tolerated nothing is lost, above twice what was seen it is.
+    """
+    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
+    at = lambda mean: (np.full((3, 4), mean), np.full(3, 4, np.int32))
+    up, down = at(2.0), at(-2.0)
+    assert not guard._lost(s, 0.04, *up, 0.02)
+    assert guard._lost(s, 0.04, *down, 0.02)
+    assert not guard._lost(s, 2 * guard.LOST, *down, 0.02)
+    assert guard._lost(s, 0.06, *up, 0.02)
+
+
 def test_subset_simulation(key):
     """The estimate is within 4 of the standard errors that its ten replicates have, of at most 30
     %; each population is counted.
