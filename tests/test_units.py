@@ -203,7 +203,12 @@ def test_what_is_done_is_not_done_again(key, tmp_path, monkeypatch, same):
 def test_signals_end_a_call_with_what_is_done(key, ended_by):
     episodes = 200 * EPISODES  # many units, as those that run beside the interrupted one are kept
     end = lambda *_: os.kill(os.getpid(), ended_by)
-    found = jast.nominal(key, walk1d(), episodes, callback=end)
+    # a shell that starts the tests in the background has them ignore Ctrl-C
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        found = jast.nominal(key, walk1d(), episodes, callback=end)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert 0 < found.episodes < episodes and found.settings["interrupted"].startswith("after ")
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
