@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jast.cross_entropy import gaussian, mixture
@@ -205,6 +205,7 @@ def test_iterations_add_up(dtype):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), double=st.booleans(), least=st.sampled_from([0.0, 3.0]))
+@example(seed=5138, double=False, least=0.0)
 def test_a_weight_is_a_number_of_rows(seed, double, least):
     rng = np.random.default_rng(seed)
     x, w = data(seed, 30), rng.integers(0, 4, 30)
@@ -221,10 +222,12 @@ def test_a_weight_is_a_number_of_rows(seed, double, least):
             (jnp.asarray(x, dtype), jnp.asarray(w, dtype)),
             (jnp.asarray(padded, dtype), jnp.asarray(ones)),
         )
-        got, expected = EM(m, *rows, 5, 0.0, least), EM(m, *all_rows, 5, 0.0, least)
+        # where a component collapses, float32's rounding grows from one iteration to the next
+        times = 5 if double else 1
+        got, expected = EM(m, *rows, times, 0.0, least), EM(m, *all_rows, times, 0.0, least)
         for a, b in zip(got, expected, strict=True):
             np.testing.assert_allclose(
-                a, b, rtol=1e-8 if double else 2e-3, atol=1e-8 if double else 2e-3
+                a, b, rtol=1e-8 if double else 1e-4, atol=1e-8 if double else 1e-4
             )
         assert float(SCORE(got, *rows)) == pytest.approx(
             float(SCORE(got, *all_rows)), rel=1e-8 if double else 1e-4
