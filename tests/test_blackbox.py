@@ -2,6 +2,7 @@
 in which a system can go wrong.
 """
 
+import os
 import re
 import sys
 
@@ -570,3 +571,13 @@ def test_the_memory_of_outcomes_is_bounded(monkeypatch):
     ends(sim, [[3, 0], [9, 0]])
     (only,) = incidents(sim)
     assert only.count == 2 and only.message.endswith("gave two distances")
+
+
+def test_a_folder_beside_the_package_is_the_users_own():
+    """Its path begins with the package's, as that of jast_models beside jast does."""
+    path = f"{os.path.dirname(jast.__file__)}_models/system.py"
+    code = compile("\n\ndef step():\n    return 1 / 0\n", path, "exec")
+    exec(code, names := {})
+    with pytest.raises(ZeroDivisionError) as raised:
+        names["step"]()
+    assert worker.line_of(raised.value) == " (system.py:4)"

@@ -416,7 +416,7 @@ def _said(error):
 
 def line_of(error):
     """ " (system.py:12)": the last line of the system's own code that ``error`` went through."""
-    here = os.path.dirname(os.path.dirname(__file__))
+    here = os.path.join(os.path.dirname(os.path.dirname(__file__)), "")
     frames = traceback.extract_tb(error.__traceback__)
     frames = [f for f in frames if not f.filename.startswith(here)]
     libraries = os.path.dirname(os.__file__), "<frozen"
