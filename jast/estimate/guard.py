@@ -104,10 +104,12 @@ def _lost(s, share, points, used, thin):
     """Whether the ``share`` of the probability that a population found at ``points`` is missing.
     Where the batches have met such points, they know it better: it is ``thin`` at most.
     """
+    if not 2 * LOST < share <= 2 * (thin + LOST):
+        return share > 2 * LOST
     each = [log_ratio(b.q, points, used) + math.log(len(b.z)) for b in s.batches]
     # how many draws of all batches would lie there, were all of the share like this point
     expected = share * np.exp(np.logaddexp.reduce(each) + s.log_mean)
-    return share > 2 * (thin + LOST) or share * np.mean(expected < 1) > 2 * LOST
+    return share * np.mean(expected < 1) > 2 * LOST
 
 
 def _share(share):
