@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -15,7 +14,7 @@ from jast.distributions import Independent, Uniform
 from jast.simulator import Simulator, ravel
 from jast.simulators._parameter import positive
 from jast.simulators.arch import gcas
-from jast.simulators.arch.models import Driving, nothing, samples_of
+from jast.simulators.arch.models import Driving, begun, ends, nothing, samples_of
 from jast.simulators.arch.specifications import named
 from jast.specs import Formula, under
 from jast.specs.robustness import reach
@@ -75,7 +74,7 @@ def ground_collision_avoidance(
         evaluate=nothing,
         horizon=STEPS,
         start=_start if start is None else lambda: start,
-        is_terminal=_ends(needed),
+        is_terminal=ends(needed),
         observe=_observe,
     )
     return under(sim, formula, gcas.DT, samples=Partial(samples_of))
@@ -121,9 +120,7 @@ def _start() -> Any:
 
 
 def _init(altitude: Any, x0: Any) -> Driving:
-    begin = gcas.start(x0, altitude)
-    samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (EACH, *a.shape)), begin)
-    return Driving(begin, samples, jnp.zeros((), jnp.int32))
+    return begun(gcas.start(x0, altitude), EACH)
 
 
 def _step(state: Driving, x: Any) -> Driving:
@@ -134,12 +131,6 @@ def _undisturbed(state: Driving) -> Any:
     """A disturbance of no numbers, x [0]."""
     none = jnp.zeros(0, state.now.errors.dtype)
     return Independent(Uniform(none, none + 1), 1)
-
-
-@cache
-def _ends(needed: int) -> Any:
-    """``is_terminal`` after ``needed`` steps; the same object for the same number."""
-    return lambda state: state.step >= needed
 
 
 def _observe(state: Driving) -> Any:

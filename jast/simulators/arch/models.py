@@ -214,9 +214,7 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
     """
 
     def init(x0: Any) -> Driving:
-        start = model.start()
-        samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), start)
-        return Driving(start, samples, jnp.zeros((), jnp.int32))
+        return begun(model.start(), each)
 
     def ranges() -> list[Any]:
         dtype = jnp.zeros(()).dtype
@@ -229,9 +227,6 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         inputs = jnp.broadcast_to(jnp.clip(x, *ranges()).astype(jnp.zeros(()).dtype), (each, 2))
         return Driving(*model.drive(state.now, inputs), state.step + 1)
 
-    def is_terminal(state: Driving) -> Any:
-        return state.step >= needed
-
     def observe(state: Driving) -> Any:
         dtype = jnp.zeros(()).dtype
         parts = *model.observe(state.now), state.step[None]
@@ -242,10 +237,22 @@ def _functions(model: ModuleType, each: int, needed: int) -> tuple[dict[str, Any
         step=step,
         disturbance=disturbance,
         evaluate=nothing,
-        is_terminal=is_terminal,
+        is_terminal=ends(needed),
         observe=observe,
     )
     return functions, Partial(samples_of)
+
+
+def begun(now: Any, each: int) -> Driving:
+    """The state at 0 s, of a system whose steps are ``each`` samples."""
+    samples = jax.tree.map(lambda a: jnp.broadcast_to(a, (each, *a.shape)), now)
+    return Driving(now, samples, jnp.zeros((), jnp.int32))
+
+
+@cache
+def ends(needed: int) -> Any:
+    """``is_terminal`` after ``needed`` steps; the same object for the same number."""
+    return lambda state: state.step >= needed
 
 
 def samples_of(state: Driving) -> Any:
