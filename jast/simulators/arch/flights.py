@@ -103,7 +103,9 @@ def fly(
     """
     (altitude,) = positive("fly", altitude=altitude)
     given = dict(roll=roll, pitch=pitch, yaw=yaw)
-    attitude = [number("fly", name, a, math.isfinite, "of rad") for name, a in given.items()]
+    attitude = [
+        number("fly", name, a, math.isfinite, "of rad that is finite") for name, a in given.items()
+    ]
     begin = gcas.start(jnp.array(attitude, jnp.zeros(()).dtype), altitude)
     after = _flown(begin)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, after), gcas.DT
