@@ -18,7 +18,16 @@ from benchmarks.stress_systems import latch
 from jast import distributions as D
 from jast.distributions.parts import parts
 from jast.estimate import failure_probability, failure_samples
-from jast.estimate.markov_tilts import assembled, log_weight, numbers, played, shape, stacked
+from jast.estimate.markov_tilts import (
+    assembled,
+    log_weight,
+    numbers,
+    of_the_model,
+    played,
+    shape,
+    stacked,
+)
+from jast.estimate.recorded_tilts import recorded
 from jast.estimate.tilt_fit import as_tilts, fit, frame_of, ratios, steps_of
 from jast.estimate.tilt_search import TiltSeeker
 from jast.simulators import autoregression, ruin
@@ -112,6 +121,48 @@ def test_parts_of_a_mixture(key):
     at = jnp.asarray(x[:: n // 20], jnp.zeros(()).dtype)
     gaps = np.searchsorted(x, at) / n - np.asarray(jax.vmap(lambda v: D.cdf(d, v))(at))
     assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
+
+
+def test_parts_and_back(key):
+    """A value gives the numbers and categories that give the value again."""
+    mixture = D.MixtureSameFamily(
+        D.Categorical(probs=jnp.asarray([0.9, 0.1])),
+        D.Normal(jnp.zeros((2, 2)), jnp.asarray([[1.0, 50.0]] * 2)),
+    )
+    unlike = D.where(jnp.asarray(False), D.Bernoulli(probs=0.3), D.Categorical(jnp.zeros(3)))
+    mixture = D.Independent(mixture, 1)
+
+    @jax.jit
+    @jax.vmap
+    def there_and_back(key):
+        d = D.Joint({"all": joint(), "m": mixture, "u": unlike, "e": D.Exponential(2.0)})
+        p, x = parts(d), D.sample(d, key)
+        z, i = p.inverse(x)
+        return x, p.value(z, i), i[-1]
+
+    x, again, component = there_and_back(jax.random.split(key, 200))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), x, again)
+    # from 4 on the wide component is the likelier one
+    np.testing.assert_array_equal(component[np.abs(x["m"]) > 4.5], 1)
+    np.testing.assert_array_equal(component[np.abs(x["m"]) < 3], 0)
+
+
+def test_recorded_episodes_play_again(mixed, key):
+    """Their categories to the bit, rare ones too; numbers, ends and distances up to rounding."""
+    e = jax.vmap(jast.rollout, (0, None))(jax.random.split(key, 300), mixed)
+    z = recorded(mixed, e._replace(states=None))
+    q = TiltSeeker(key, mixed, 1)
+    o, log_q, trace = of_the_model(mixed, q.tilts(q.mixture), z)
+    np.testing.assert_array_equal(o.length, e.length)
+    np.testing.assert_array_equal(o.failure, e.failure)
+    np.testing.assert_allclose(o.distance, e.distance, atol=1e-5)
+    np.testing.assert_allclose(log_q, 0, atol=1e-5)
+    live = np.arange(mixed.horizon)[:, None] < o.length
+    assert e.failure.any() and (np.asarray(o.length) < mixed.horizon).any()
+    for j, name in enumerate(("coin", "kind")):
+        np.testing.assert_array_equal(
+            trace.choices[:, :, j][live], np.asarray(e.disturbances[name]).T[live]
+        )
 
 
 @pytest.mark.parametrize("gates", [1, 3])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jast.distributions.base import is_distribution
 from jast.distributions.kinds import Where
-from jast.distributions.verbs import event_like, from_normal
+from jast.distributions.verbs import event_like, from_normal, to_normal
 from jast.pytrees import count
 
 __all__ = ["Parts", "parts"]
@@ -25,6 +25,8 @@ class Parts(NamedTuple):
     """Log probabilities [B, C] of each batch of choices"""
     value: Callable[[jax.Array, tuple[jax.Array, ...]], Any]
     """(z [normals], (category [B], ...)) -> the value"""
+    inverse: Callable[[Any], tuple[jax.Array, tuple[jax.Array, ...]]]
+    """The value -> (z, categories) that give it: of a mixture those of the likeliest component"""
     owners: tuple[int, ...] = ()
     """[normals] which of all choices, in their order, a number belongs to; -1: none"""
 
@@ -51,7 +53,13 @@ def parts(d: Any) -> Parts:
 def _numbers(d: Any) -> Parts:
     like = event_like(d)
     n = count(like)
-    return Parts(n, (), lambda z, _: from_normal(d, _shaped(z, like)), (-1,) * n)
+    return Parts(
+        n,
+        (),
+        lambda z, _: from_normal(d, _shaped(z, like)),
+        lambda x: (_row(jax.tree.leaves(to_normal(d, x))), ()),
+        (-1,) * n,
+    )
 
 
 def _shaped(z: jax.Array, like: Any) -> Any:
@@ -64,6 +72,11 @@ def _shaped(z: jax.Array, like: Any) -> Any:
     return treedef.unflatten(out)
 
 
+def _row(arrays: Any) -> jax.Array:
+    """The numbers of ``arrays``, of which there may be none, as one row."""
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(a) for a in arrays)])
+
+
 def _choice(d: Any) -> Parts:
     like = event_like(d)
     logits = d.logits
@@ -72,7 +85,12 @@ def _choice(d: Any) -> Parts:
     else:
         logits = jax.nn.log_softmax(logits, axis=-1)
     log_p = logits.reshape(-1, logits.shape[-1])
-    return Parts(0, (log_p,), lambda _, i: i[0].reshape(like.shape).astype(like.dtype))
+    return Parts(
+        0,
+        (log_p,),
+        lambda _, i: i[0].reshape(like.shape).astype(like.dtype),
+        lambda x: (_row(()), (jnp.ravel(x).astype(jnp.int32),)),
+    )
 
 
 def _joint(d: Any) -> Parts:
@@ -86,12 +104,16 @@ def _joint(d: Any) -> Parts:
             at, of = at + p.normals, of + len(p.choices)
         return treedef.unflatten(values)
 
+    def inverse(x: Any) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        found = [p.inverse(v) for p, v in zip(each, treedef.flatten_up_to(x), strict=True)]
+        return _row(z for z, _ in found), tuple(i for _, choices in found for i in choices)
+
     choices = tuple(log_p for p in each for log_p in p.choices)
     owners, before = [], 0
     for p in each:
         owners += [o if o < 0 else o + before for o in p.owners]
         before += sum(len(c) for c in p.choices)
-    return Parts(sum(p.normals for p in each), choices, value, tuple(owners))
+    return Parts(sum(p.normals for p in each), choices, value, inverse, tuple(owners))
 
 
 def _either(d: Where) -> Parts:
@@ -101,7 +123,13 @@ def _either(d: Where) -> Parts:
     if not alike:  # by the normal numbers that both have behind them
         return _numbers(d)
     choices = tuple(jnp.where(d.pred, p, q) for p, q in zip(a.choices, b.choices, strict=True))
-    return Parts(a.normals, choices, lambda z, i: d.select(a.value(z, i), b.value(z, i)), a.owners)
+    return Parts(
+        a.normals,
+        choices,
+        lambda z, i: d.select(a.value(z, i), b.value(z, i)),
+        lambda x: d.select(a.inverse(x), b.inverse(x)),
+        a.owners,
+    )
 
 
 def _mixture(d: Any) -> Parts:
@@ -116,4 +144,12 @@ def _mixture(d: Any) -> Parts:
         each, k = from_normal(components, own), i[0].reshape(*like.shape, 1)
         return jnp.take_along_axis(each, k, axis=-1)[..., 0]
 
-    return Parts(count(like), (log_p,), value, tuple(range(count(like))))
+    def inverse(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        own = jnp.broadcast_to(x[..., None], components.batch_shape)
+        each = components.log_prob(own) + log_p.reshape(components.batch_shape)
+        # off the support of a component its density may be NaN
+        k = jnp.argmax(jnp.where(jnp.isnan(each), -jnp.inf, each), axis=-1).astype(jnp.int32)
+        z = jnp.take_along_axis(to_normal(components, own), k[..., None], axis=-1)
+        return jnp.ravel(z), (jnp.ravel(k),)
+
+    return Parts(count(like), (log_p,), value, inverse, tuple(range(count(like))))

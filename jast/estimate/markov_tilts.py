@@ -191,13 +191,20 @@ def chosen(log_q: jax.Array, v: jax.Array) -> jax.Array:
     rare ones lie near 0, where floats are fine.
     """
     p = jnp.exp(log_q)
+    below = starts(p)
+    fits = (p > 0) & (v[:, None] >= below)
+    return jnp.argmax(jnp.where(fits, below, -1), axis=1).astype(jnp.int32)
+
+
+def starts(p: jax.Array) -> jax.Array:
+    """Where the intervals [B, C] of uniform numbers begin that `chosen` gives to categories of the
+    probabilities ``p`` [B, C].
+    """
     c = jnp.arange(p.shape[1], dtype=jnp.int32)
     before = (p[:, None, :] < p[:, :, None]) | (
         (p[:, None, :] == p[:, :, None]) & (c[None, None] < c[None, :, None])
     )
-    below = jnp.sum(jnp.where(before, p[:, None, :], 0), axis=2)
-    fits = (p > 0) & (v[:, None] >= below)
-    return jnp.argmax(jnp.where(fits, below, -1), axis=1).astype(jnp.int32)
+    return jnp.sum(jnp.where(before, p[:, None, :], 0), axis=2)
 
 
 def tilted_log(log_p: jax.Array, shifts: jax.Array, floors: jax.Array) -> jax.Array:
