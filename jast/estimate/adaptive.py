@@ -17,7 +17,7 @@ from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.checkpoints import stored
 from jast.contract import contract
-from jast.estimate import diagnostics, few_calls, sums, tilt_estimate
+from jast.estimate import diagnostics, few_calls, sums, tilt_estimate, tilt_guard
 from jast.estimate.batches import balanced, drawn, of_chunk, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate, of_counts
@@ -119,6 +119,8 @@ def failure_probability(
         budget: episodes to simulate, at least 50.
         failures: known ones (an archive, `jast.failures`), which join what the explorers find, so
             that no mode among them is lost. They lead to a proposal and never enter the estimate.
+            Tilts take in two modes that they hardly draw; where others are left, the estimate is
+            UNRELIABLE.
         near: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
             fitted to two or three batches, takes the place of the search where it serves; the guard
             and the last draws stay. One without a proposal that fits changes nothing.
@@ -168,6 +170,7 @@ def failure_probability(
         else:
             ways, watched = ways._replace(store=store), (progress, callback)
             s = Seeker(key, sim, budget, known, similar)
+            s.recorded = None if failures is None else failures.episodes
             found = _sought(key, s, gradients, level, watched, ways)
     return found._replace(settings=settings)
 
@@ -180,7 +183,7 @@ def _sought(key, s, gradients, level, watched, ways):
         s.coarse.append(coarse)
     try:
         t = tilt_estimate.first(s)
-        if t is None or not t.serves(tilt_estimate.SERVES):
+        if t is None or not t.serves(tilt_estimate.SERVES) or not _enough(s, t):
             t = _beside_gaussians(s, t, gradients)
         return _with_the_rest(key, s, t, level, watched, ways)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
@@ -216,8 +219,8 @@ def _with_the_rest(key, s, t, level, watched, ways):
     """The `Estimate` of what is left of the budget, by the proposal that was found: that of the
     `TiltSeeker` ``t`` where there is one.
     """
-    if t is not None and t.promised * (s.budget - s.spent) > diagnostics.ESS:
-        tilt_estimate.guarded(s, t)
+    if t is not None and _enough(s, t):
+        tilt_guard.guarded(s, t)
         n = s.budget - s.spent
         share, watch = _of_the_model(t.promised * n), Watch(NAME, n, "episode", *watched)
         return tilt_estimate.estimated(key, s, t, share, level, watch, ways)
@@ -259,6 +262,11 @@ def _with_the_rest(key, s, t, level, watched, ways):
         **about,
     )
     return found._replace(draws=drawn_by(found.draws, key, lanes, q))
+
+
+def _enough(s, t):
+    """Whether what is left of the budget tells the probability by the `TiltSeeker` ``t``."""
+    return t.promised * (s.budget - s.spent) > diagnostics.ESS
 
 
 def _about(s):

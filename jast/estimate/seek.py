@@ -71,6 +71,7 @@ class Seeker:
         self.anchors = np.zeros((0, self.dimension))
         # what came with the call: failures, and the proposal of a similar system
         self.known = self.anchors if known is None else known
+        self.recorded = None  # the episodes of these failures, for tilts
         self.near = near
         self.seeds = self.anchors  # failures of many places, whatever their probability
         self.spent, self.reasons, self.history = 0, [], []

@@ -29,7 +29,8 @@ from jast.limit_state import normal_numbers
 
 __all__ = ["TiltSeeker", "from_near", "only", "seek_tilts"]
 
-COMPONENTS = (3, 5)
+COMPONENTS = (3, 5, 9)
+"""How many a mixture is made up to, so that programs are compiled once."""
 ELITE, MODEL, WIDE, HALF = 0.1, 0.1, 0.2, 0.75
 REFITS, NEAR, KEPT = 8, 1, 1200
 ENOUGH = 0.2
@@ -62,11 +63,13 @@ class TiltSeeker:
         self.batches, self.history, self.spent = [], [], 0
         self.promised, self.log_mean, self.q = 0.0, None, None
         self.near = False  # the mixture is that of a similar system
+        self.widest = COMPONENTS[1]  # components, beyond which no tilt is added
+        self.given = None  # failures that came with the call
         self.ratios = {}  # of the mixture of a batch on the episodes of another
 
     def tilts(self, mixture: tuple) -> Tilts:
         tilts, weights, frame = mixture
-        size = COMPONENTS[len(tilts) > COMPONENTS[0]]
+        size = next(c for c in COMPONENTS if c >= len(tilts))
         return as_tilts(tilts, weights, frame, size, self.dtype)
 
     def draw(self) -> Drawn:
@@ -156,6 +159,13 @@ class TiltSeeker:
         r = r.reshape(len(r), -1, 2).sum(axis=2)
         return r / r.sum(axis=1, keepdims=True)
 
+    def start(self, trace: Trace, length: np.ndarray, most: int) -> None:
+        """Begin the search anew from failures, for at most ``most`` episodes in all."""
+        self.mixture = mixture_of(self, Drawn(None, trace, None, length, None, 0), 0.0 * length)
+        if self.spent + self.batch <= most and ((b := self.draw()).score == -np.inf).any():
+            self.take(b)
+            self.refit(most, REFITS)
+
     def widen(self, trace: Trace, length: np.ndarray, share: float, most: int) -> None:
         """Take in failures that the mixture hardly draws, which carry ``share`` of what it found,
         as a tilt of their own.
@@ -166,8 +176,11 @@ class TiltSeeker:
             trace=joined([used.trace, trace]), length=np.concatenate([used.length, length])
         )
         log_w = np.concatenate([w, np.full(n, math.log(share / n))])
-        of = np.repeat(np.eye(2), [len(w), n], axis=0)
-        if len(self.mixture[0]) <= 3:
+        if len(self.mixture[0]) < self.widest:
+            before = self.groups(used)
+            before = np.ones((len(w), 1)) if before is None else before
+            own = np.repeat([[0.0], [1.0]], [len(w), n], axis=0)
+            of = np.concatenate([np.pad(before, ((0, n), (0, 0))), own], axis=1)
             self.mixture = mixture_of(self, both, log_w, of)
         self.refit(most, 3)
 
