@@ -23,7 +23,9 @@ from jast.estimate import (
     adaptive_cross_entropy,
     failure_probability,
     failure_samples,
+    first_proposal,
     guard,
+    next_proposal,
     seek,
     subset_simulation,
     trace_proposal,
@@ -242,7 +244,7 @@ def test_interrupts_keep_whole_chunks(two):
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, jax.errors.JaxRuntimeError])
 def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
-    fit, fits = seek._fit, []
+    fit, fits = seek.refitted, []
 
     def interrupted(s):
         fits.append(s.spent)
@@ -250,7 +252,7 @@ def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
             raise raised("INTERNAL: CpuCallback error: KeyboardInterrupt: ")
         return fit(s)
 
-    monkeypatch.setattr(seek, "_fit", interrupted)
+    monkeypatch.setattr(seek, "refitted", interrupted)
     found = failure_probability(jax.random.key(5), planes(4.0, 4.5), BUDGET)
     [why] = [w for w in found.warnings if "interrupted" in w]
     assert why.startswith(f"interrupted after {fits[1]} of {BUDGET} evaluations")
@@ -752,7 +754,7 @@ def test_samples_without_a_failure(key, proposal):
 def test_the_shares_of_a_defended_proposal_are_those_of_a_mixture(rare, values):
     """Its wide copies and, unless failures are rare, a share of the model, which sum to 1."""
     g = Gaussians(np.ones(1), np.zeros((1, 2)), np.array([values]), np.eye(2)[None])
-    parts = seek._defended(g, 0.0, rare)
+    parts = next_proposal.defended(g, 0.0, rare)
     assert np.isclose(sum(share for share, _ in parts), 1.0)
     assert len(parts) == 1 + (min(values) < 1) + (not rare)
 
@@ -862,6 +864,6 @@ def test_mirror_images_of_failures(key):
     for down, lifts in ((4.4, [1.1]), (8.0, [])):
         s = seek.Seeker(key, planes(4.0, down), BUDGET)
         s.anchors = np.full((1, 4), 2.001)
-        points, evaluations = seek._mirrored(s)
-        assert evaluations == len(seek.LIFTS) and len(points) == len(lifts)
+        points, evaluations = first_proposal._mirrored(s)
+        assert evaluations == len(first_proposal.LIFTS) and len(points) == len(lifts)
         assert np.allclose(points, [-lift * s.anchors[0] for lift in lifts] or points)

@@ -13,9 +13,10 @@ from jast._jax import quick
 from jast.boundary import EPISODES, STEPS, descents
 from jast.counter import generator
 from jast.journal import answered
-from jast.limit_state import dimension, normal_numbers
+from jast.limit_state import dimension, normal_numbers, unit
+from jast.products import product
 
-__all__ = ["design_points", "distinct"]
+__all__ = ["descended", "design_points", "distinct", "explained"]
 
 APART = 0.5
 """Points nearer to one another than so much of their norm are one."""
@@ -29,7 +30,8 @@ class DesignPoints(NamedTuple):
     """On the host."""
 
     points: np.ndarray
-    """[m, D] distinct failing points next to the boundary, by rising norm"""
+    """[m, D] failing points next to the boundary, distinct and by rising norm if not said
+    otherwise"""
     evaluations: int
 
 
@@ -37,12 +39,19 @@ def design_points(key, sim, starts=MOST, limit=16):
     """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
     where the miss distance has no useful gradient.
     """
-    z = np.zeros((-(-starts // MOST) * MOST, dimension(sim)), normal_numbers(sim))
-    z[:starts] = generator(key).standard_normal((starts, z.shape[1]))
-    found = answered(partial(_in_blocks, sim), z, np.int32(starts))
-    points, failing = (a[:starts] for a in found)
+    z = generator(key).standard_normal((starts, dimension(sim)))
+    found = descended(sim, z)
+    return found._replace(points=distinct(found.points, limit))
+
+
+def descended(sim, starts):
+    """The `DesignPoints` that at most `MOST` ``starts`` [n, D] lead to, in no order."""
+    n = len(starts)
+    z = np.zeros((MOST, dimension(sim)), normal_numbers(sim))
+    z[:n] = starts
+    points, failing = (a[:n] for a in answered(partial(_in_blocks, sim), z, np.int32(n)))
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
-    return DesignPoints(distinct(points, limit), starts * (STEPS * GRADIENT + EPISODES))
+    return DesignPoints(points, n * (STEPS * GRADIENT + EPISODES))
 
 
 @quick
@@ -70,3 +79,12 @@ def distinct(points, limit):
         ):
             kept.append(z)
     return np.array(kept).reshape(-1, points.shape[-1])
+
+
+def explained(points, known, slack=1e-3):
+    """Which of the failures ``points`` [n, D] lie beyond the plane that stands square on one of the
+    design points ``known`` [m, D], or before it by ``slack`` of its distance: bool [n]. The others
+    fail by something else.
+    """
+    size = np.linalg.norm(known, axis=1)
+    return (product(points, unit(known).T) >= (1 - slack) * size).any(axis=1)

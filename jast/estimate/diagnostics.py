@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["pareto_k", "reasons"]
 
-K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW = 0.7, 100, 0.05, 0.01, 0.02, 30
+K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW, PART = 0.7, 100, 0.05, 0.01, 0.02, 30, 0.5
 
 
 def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
@@ -86,14 +86,16 @@ def by_mode(sums, groups):
     )
 
 
-def thin_modes(shares, sizes):
-    """Texts for the modes that matter and that few effective episodes speak for."""
+def thin_modes(shares, sizes, error):
+    """Texts for the modes that few effective episodes speak for and that matter: also to the
+    relative ``error`` of the whole.
+    """
     if len(shares) < 2:
         return []
     return [
         f"a failure mode with {v:.1%} of the estimate has an effective sample size of only {n:.3g}"
         for v, n in zip(shares, sizes, strict=True)
-        if v > MATTERS and n < FEW
+        if v > MATTERS and n < FEW and v**2 > n * (PART * error) ** 2
     ]
 
 

@@ -216,7 +216,7 @@ def estimate(
         groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
         modes, sizes = diagnostics.by_mode(sums, groups)
         mode_intervals = _of_modes(log_mean, modes, sizes, n, level)
-        found += diagnostics.thin_modes(modes, sizes)
+        found += diagnostics.thin_modes(modes, sizes, relative)
     mean = math.exp(log_mean) if seen else math.nan
     if seen and mean > 1 + 4 * mean * relative:
         found.append(f"the estimate is {mean:.4g}, above 1: a density does not fit its samples")

@@ -24,8 +24,10 @@ MOST, FULL = 4000, 30
 """Points that are looked at; dimensions above which a mixture is fitted in a few of them."""
 NOTHING = 1e-6
 """Of a variance: rounding."""
-SIZE = 40
-"""Components of a `Latent`, unused ones included."""
+SIZE, MEMORY = (40, 256), 2**24
+"""Components of a `Latent`: the least and the greatest number that is their limit, and numbers of
+all their covariances that it holds between these.
+"""
 
 
 class Gaussians(NamedTuple):
@@ -126,26 +128,16 @@ def _fit(rng, points, weights, count, known=None, limit=16, anchors=None):
 
 
 def as_latent(parts, dtype):
-    """The `Latent` of [(share, Gaussians), ...]: its ``SIZE`` greatest components, padded with ones
-    of weight 0, so that programs are compiled once.
-    """
+    """The `Latent` of [(share, Gaussians), ...], of its greatest components."""
     weights = np.concatenate([share * g.weights for share, g in parts])
-    kept = np.argsort(-weights, kind="stable")[:SIZE]
+    kept = _greatest(weights, parts[0][1].means.shape[1])
     weights, (means, values, vectors) = (
         weights[kept],
         (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3)),
     )
     factors = np.linalg.cholesky(np.einsum("kij,kj,klj->kil", vectors, values, vectors))
-    k, d = means.shape
-    pad = lambda a, fill: np.concatenate([a, np.broadcast_to(fill, (SIZE - k, *a.shape[1:]))])
-    with np.errstate(divide="ignore"):
-        log_weights = np.log(pad(weights / weights.sum(), 0.0))
-    arrays = (
-        log_weights,
-        pad(means, 0.0),
-        pad(factors, np.eye(d)),
-        pad(np.tril(np.linalg.inv(factors)), np.eye(d)),
-    )
+    log_weights = np.log(weights / weights.sum())
+    arrays = log_weights, means, factors, np.tril(np.linalg.inv(factors))
     return Latent(*(np.asarray(a, dtype) for a in arrays))
 
 
@@ -156,13 +148,17 @@ def together(a, b, share):
     weights = np.concatenate(
         [np.exp(np.asarray(q.log_weights, np.float64)) * s for q, s in ((a, 1 - share), (b, share))]
     )
-    kept = np.argsort(-weights, kind="stable")[:SIZE]
-    with np.errstate(divide="ignore"):
-        log_weights = np.log(weights[kept] / weights[kept].sum())
+    kept = _greatest(weights, a.means.shape[1])
     return Latent(
-        np.asarray(log_weights, a.means.dtype),
+        np.asarray(np.log(weights[kept] / weights[kept].sum()), a.means.dtype),
         *(np.concatenate(each)[kept] for each in zip(a[1:], b[1:], strict=True)),
     )
+
+
+def _greatest(weights, d):
+    """Which of the ``weights`` of components of ``d`` numbers a `Latent` has."""
+    kept = np.argsort(-weights, kind="stable")[: np.clip(MEMORY // d**2, *SIZE)]
+    return kept[weights[kept] > 0]
 
 
 def effective(log_weights):
@@ -264,6 +260,18 @@ def unit(centres):
     )
 
 
+def to_anchors(mean, count, anchors):
+    """The ``mean`` [D] of ``count`` points, shrunk to the next of ``anchors`` [m, D]: what it
+    differs from there may be noise alone (James and Stein 1961).
+    """
+    d = len(mean)
+    if anchors is None or not len(anchors) or d <= 2:
+        return mean
+    gaps = mean - anchors
+    gap = gaps[np.argmin((gaps**2).sum(axis=1))]
+    return mean - gap * min((d - 2) / (count * (gap**2).sum() + 1e-12), 1)
+
+
 def _maximise(z, r, count, anchors):
     total = r.sum(axis=0)
     kept = total * count > 2
@@ -272,15 +280,7 @@ def _maximise(z, r, count, anchors):
     parts = []
     for i in np.flatnonzero(kept):
         mean = np.einsum("n,nd->d", r[:, i], z) / total[i]
-        if anchors is not None and len(anchors):
-            # what a mean differs from its design point may be noise alone (James and Stein 1961)
-            gaps = mean - anchors
-            gap = gaps[np.argmin((gaps**2).sum(axis=1))]
-            mean = (
-                mean - gap * min((z.shape[1] - 2) / (count * total[i] * (gap**2).sum() + 1e-12), 1)
-                if z.shape[1] > 2
-                else mean
-            )
+        mean = to_anchors(mean, count * total[i], anchors)
         e = z - mean
         values, vectors = np.linalg.eigh(gram(e, r[:, i]) / total[i])
         parts.append((total[i], mean, np.maximum(shrunk(values, count * total[i]), 1e-4), vectors))

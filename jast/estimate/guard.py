@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
+from jast.estimate.design_points import explained
 from jast.estimate.gaussians import as_latent, effective, unit
 from jast.estimate.populations import LAST, QUANTILE, explore, settled
 
@@ -24,7 +25,7 @@ ratio there.
 """
 MOST = 0.85
 """Of the budget, where the search ends."""
-LEAST, MOVES, FEW = 50, 10, 40
+LEAST, MOVES, FEW, MANY, SLACK = 50, 10, 40, 16, 0.15
 """Points of a population, which come in as many; moves of the failures that wide noise led to; one
 of as many of them, or one, may lie where the proposal does not cover it.
 """
@@ -134,7 +135,11 @@ def _forgotten(s):
     s.note(
         f"guard (cooled): {rows.mean():.0%} of {len(rows)} failures not covered", chain.evaluations
     )
-    return [(0.0, z[rows], used[rows])] if rows.sum() > max(len(rows) // FEW, 1) else []
+    centres = s.centres()
+    if len(centres) > MANY:  # each mode may have a few of them
+        rows &= ~explained(z, centres, SLACK)
+    some = 0 if len(centres) > MANY else max(len(rows) // FEW, 1)
+    return [(0.0, z[rows], used[rows])] if rows.sum() > some else []
 
 
 def _unit(s):

@@ -15,15 +15,17 @@ import numpy as np
 from jast.counter import generator
 from jast.estimate import markov_tilts
 from jast.estimate.batches import log_ratio
+from jast.estimate.design_points import explained
 from jast.estimate.markov_tilts import Tilts, of_the_model, shape
 from jast.judge import judged
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import WIDTHS, proposed
 
-__all__ = ["cool", "explore", "settled"]
+__all__ = ["cool", "edges", "explore", "settled"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 FAILING, COLD, COOLING, DRAWS = 0.1, 0.25, 60, 4
+RESTING, TRIES, HALVES = (0.5, 0.25), 4, 6
 
 
 class Explored(NamedTuple):
@@ -82,23 +84,32 @@ class Chain:
     def move(self, people, rows, level, width, times):
         """``people[rows]`` after Markov moves that keep N(0, width^2 I) given score <= level."""
         for _ in range(times):
-            before = Population(*(a[rows] for a in people))
+            before = only(people, rows)
             new = _judge(
                 self.sim, proposed(before.z, self.noise(), self.scale, float(width)), self.covered
             )
             good = new.score <= level
             self.count(new)
-            people = Population(
-                *(
-                    np.where(good.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-                    for a, b in zip(new, before, strict=True)
-                )
-            )
+            people = _either(good, new, before)
             self.accepted = float(good.mean())
             self.scale = float(
                 np.clip(self.scale * math.exp(self.accepted - ACCEPTANCE), 0.02, 1.0)
             )
             rows = np.arange(self.size)
+        return people
+
+    def rest(self, people, times):
+        """Failures ``people`` with as many of their numbers at 0 as they need not: some are tried
+        together, ``times`` over.
+        """
+        none = True
+        for i in range(times):
+            some = self.rng.random(people.z.shape) < RESTING[i % len(RESTING)]
+            new = self.judge(np.where(some, 0, people.z).astype(self.dtype))
+            good = new.score == -math.inf
+            people, none = _either(good, new, people), none and not good.any()
+            if none and i + 1 == TRIES:  # they need them all
+                break
         return people
 
     def count(self, people):
@@ -163,31 +174,54 @@ def explore(key, sim, size, *, covered=None, least=-math.inf, most=10**9):
         levels.append(level)
 
 
-def cool(key, sim, chains, *, covered=None):
-    """Failing points of small norm, one a chain, found without a miss distance that could mislead:
-    `Explored`.
-
-    Under wider noise N(0, s^2 I) failures are frequent: the first width that makes a share of
-    ``FAILING`` fail (nothing is found where none does). ``chains`` of these failures go on, each by
-    Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no chain
-    replaces another one, no failure mode is lost on the way, however little of the probability it
-    has. ``covered`` as in `explore`.
+def widened(key, sim, n, *, covered=None):
+    """Failures under wider noise N(0, s^2 I), at the first width s of `WIDTHS` at which a share of
+    ``FAILING`` of some ``n`` draws fails, or at the last: (`Population` [m] of them, s, the
+    `Chain`). ``covered`` as in `explore`.
     """
-    chain = Chain(key, sim, chains, covered)
+    chain = Chain(key, sim, -(-n // DRAWS), covered)
     for width in WIDTHS:
         drawn = [chain.draw(width) for _ in range(DRAWS)]
         people = Population(*map(np.concatenate, zip(*drawn, strict=True)))
-        failing = np.flatnonzero(np.asarray(people.score) == -np.inf)
-        if len(failing) >= FAILING * DRAWS * chains or (width == WIDTHS[-1] and len(failing)):
-            break
-    else:
+        failing = np.flatnonzero(people.score == -np.inf)
+        if len(failing) >= FAILING * len(people.z) or width == WIDTHS[-1]:
+            return only(people, failing), width, chain
+
+
+def edges(key, sim, n):
+    """The last safe and the first failing points, [m, D] each, on the ways from 0 to the failures
+    that `widened` comes to, by halves; and evaluations.
+    """
+    people, _, chain = widened(key, sim, n)
+    outside, inside = np.zeros_like(people.z), people.z
+    for _ in range(HALVES if len(inside) else 0):
+        half = ((outside + inside) / 2).astype(inside.dtype)
+        fails = judged(sim, half).failure[:, None]
+        outside, inside = np.where(fails, outside, half), np.where(fails, half, inside)
+    return outside, inside, chain.evaluations + HALVES * len(inside)
+
+
+def cool(key, sim, chains, *, covered=None, known=None, rests=0):
+    """Failing points of small norm, one a chain, found without a miss distance that could mislead:
+    `Explored`.
+
+    Under wider noise N(0, s^2 I) failures are frequent (`widened`). ``chains`` of these failures go
+    on, each by Markov moves that keep N(0, s^2 I) given failure, while s falls to ``COLD``. As no
+    chain replaces another one, no failure mode is lost on the way, however little of the
+    probability it has. ``known`` [m, D]: design points, from failures that these do not explain
+    chains start first. ``rests``: tries at the end to do without some of the numbers. ``covered``
+    as in `explore`.
+    """
+    people, width, chain = widened(key, sim, DRAWS * chains, covered=covered)
+    if not len(people.z):
         return chain.end(None, -math.inf, (width,))
-    rows = failing[np.arange(chains) % len(failing)]
-    people = Population(*(a[rows] for a in people))
+    if known is not None and len(known):
+        people = only(people, np.argsort(explained(people.z, known), kind="stable"))
+    people = only(people, np.arange(chains) % len(people.z))
     widths = np.geomspace(width, COLD, COOLING)
     for width in widths:
         people = chain.move(people, np.arange(chains), -math.inf, width, 1)
-    return chain.end(people, math.nan, widths)
+    return chain.end(chain.rest(people, rests), math.nan, widths)
 
 
 def settled(key, sim, points, moves, *, covered=None):
@@ -197,6 +231,17 @@ def settled(key, sim, points, moves, *, covered=None):
     chain, rows = Chain(key, sim, len(points), covered), np.arange(len(points))
     people = chain.judge(np.asarray(points, chain.dtype))
     return chain.move(people, rows, -math.inf, 1.0, moves), chain
+
+
+def _either(good, new, before):
+    """The population ``new`` where ``good`` [n], else ``before``."""
+    at = lambda a: good.reshape(-1, *(1,) * (a.ndim - 1))
+    return Population(*(np.where(at(a), a, b) for a, b in zip(new, before, strict=True)))
+
+
+def only(people, rows):
+    """The `Population` of ``rows``."""
+    return Population(*(a[rows] for a in people))
 
 
 def _next(score, last):
