@@ -14,7 +14,8 @@ from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, l
 
 __all__ = ["Estimate", "estimate", "of_counts"]
 
-INVALID = 0.01
+INVALID, COUNTED = 0.01, 10
+"""Part of an estimate that invalid episodes may add; failures from which a count is believed."""
 
 
 @results.result("samples")
@@ -257,6 +258,7 @@ def of_counts(
     found = [
         *reasons,
         *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",)),
+        *((f"{k} failures are too few: only the interval is known",) if 0 < k < COUNTED else ()),
     ]
     found += _if_invalid_failed(sums._replace(first=float(k), invalid_first=float(sums.invalid)))
     relative = math.sqrt((1 - mean) / k) if k else math.nan

@@ -13,18 +13,18 @@ from jast.judge import judged
 
 __all__ = ["explored"]
 
-STARTS, TRIED, WIDER = (4, 48), 12, 4
-"""Descents of a round; those that are tried before others; draws of wider noise for each of
-them.
+STARTS, TRIED, WIDER = (4, 48), 12, (4, 12)
+"""Descents of a round; those that are tried before others; draws of wider noise for each of them,
+in a first round and in others.
 """
 ENOUGH, COOLED, RESTS = 36, 0.2, 18
 """Failures that wide noise is cooled to at the least, the share of the budget at which that and
 descents end, and tries to do without some of their numbers.
 """
-ALONE, MET, ENDLESS, SLOW = 0.03, 3, 0.5, 0.7
+ALONE, MET, ENDLESS, SLOW, NEW = 0.03, 3, 0.5, 0.85, 0.25
 """The part of what is found that is met once, or that nothing known explains, at which enough was
-found, or so many of it; the part above which there is no end of it; and what is left of it after a
-round that gained too little.
+found, or so many of it; the part above which there is no end of it; what is left of it after a
+round that gained too little; and the part of a round's descents that come to new points.
 """
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
@@ -75,28 +75,29 @@ def explored(s, gradients):
 def _descended(s):
     """Distinct design points [m, D] by gradients, and evaluations: from draws of the model, then
     from the edges of failures under wider noise that those found do not explain, for as long as
-    fewer and fewer are left.
+    these lead to others and fewer and fewer are left.
     """
-    n, left = int(np.clip(s.budget // 2000, *STARTS)), 2.0
+    n, wider, left = int(np.clip(s.budget // 2000, *STARTS)), WIDER[0], 2.0
     points, evaluations = np.zeros((0, s.dimension)), 0
 
     def go(starts):
         nonlocal points, evaluations
-        found = descended(s.sim, starts)
+        before, found = len(points), descended(s.sim, starts)
         points = distinct(np.concatenate([points, found.points]), s.points)
         evaluations += found.evaluations
-        return len(points) > 0
+        return len(points) - before
 
     if go(s.rng.standard_normal((min(n, TRIED), s.dimension))) and n > TRIED:
         go(s.rng.standard_normal((n - TRIED, s.dimension)))
     while len(points) and evaluations < COOLED * s.budget:
-        safe, fails, paid = edges(s.next_key(), s.sim, WIDER * n)
+        safe, fails, paid = edges(s.next_key(), s.sim, wider * n)
         evaluations += paid
         rest = ~explained(fails, points)
         if not len(rest) or not ALONE < rest.mean() < SLOW * left:
             break
-        left = rest.mean()
-        go(safe[rest][:n])
+        left, wider = rest.mean(), WIDER[1]
+        if go(safe[rest][:n]) < NEW * min(rest.sum(), n):
+            break
     return points, evaluations
 
 
