@@ -3,6 +3,8 @@ gradients, wide noise that is cooled, mirror images of what these find, and a po
 down the levels of the miss distance.
 """
 
+import math
+
 import numpy as np
 
 from jast.estimate.design_points import descended, distinct, explained
@@ -77,7 +79,7 @@ def _descended(s):
     from the edges of failures under wider noise that those found do not explain, for as long as
     these lead to others and fewer and fewer are left.
     """
-    n, wider, left = int(np.clip(s.budget // 2000, *STARTS)), WIDER[0], 2.0
+    n, few, left = int(np.clip(s.budget // 2000, *STARTS)), True, math.inf
     points, evaluations = np.zeros((0, s.dimension)), 0
 
     def go(starts):
@@ -90,12 +92,12 @@ def _descended(s):
     if go(s.rng.standard_normal((min(n, TRIED), s.dimension))) and n > TRIED:
         go(s.rng.standard_normal((n - TRIED, s.dimension)))
     while len(points) and evaluations < COOLED * s.budget:
-        safe, fails, paid = edges(s.next_key(), s.sim, wider * n)
+        safe, fails, paid = edges(s.next_key(), s.sim, WIDER[not few] * n)
         evaluations += paid
         rest = ~explained(fails, points)
         if not len(rest) or not ALONE < rest.mean() < SLOW * left:
             break
-        left, wider = rest.mean(), WIDER[1]
+        left, few = math.inf if few else rest.mean(), False
         if go(safe[rest][:n]) < NEW * min(rest.sum(), n):
             break
     return points, evaluations

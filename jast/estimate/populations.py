@@ -99,14 +99,14 @@ class Chain:
         return people
 
     def rest(self, people, times):
-        """Failures ``people`` with as many of their numbers at 0 as they need not: some are tried
-        together, ``times`` over.
+        """Failures ``people`` without the numbers that they do not need, which come to 0: some are
+        tried together, ``times`` over, as delta debugging does (Zeller and Hildebrandt 2002).
         """
         none = True
         for i in range(times):
             some = self.rng.random(people.z.shape) < RESTING[i % len(RESTING)]
             new = self.judge(np.where(some, 0, people.z).astype(self.dtype))
-            good = new.score == -math.inf
+            good = (new.score == -math.inf) & (new.z != people.z).any(axis=1)
             people, none = _either(good, new, people), none and not good.any()
             if none and i + 1 == TRIES:  # they need them all
                 break
