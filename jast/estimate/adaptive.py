@@ -119,8 +119,8 @@ def failure_probability(
         budget: episodes to simulate, at least 50.
         failures: known ones (an archive, `jast.failures`), which join what the explorers find, so
             that no mode among them is lost. They lead to a proposal and never enter the estimate.
-            Tilts take in two modes that they hardly draw; where others are left, the estimate is
-            UNRELIABLE.
+            Tilts take in two modes that they hardly draw; where others are left, or these could not
+            be learned, the estimate is UNRELIABLE.
         near: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
             fitted to two or three batches, takes the place of the search where it serves; the guard
             and the last draws stay. One without a proposal that fits changes nothing.
@@ -224,7 +224,8 @@ def _with_the_rest(key, s, t, level, watched, ways):
         n = s.budget - s.spent
         share, watch = _of_the_model(t.promised * n), Watch(NAME, n, "episode", *watched)
         return tilt_estimate.estimated(key, s, t, share, level, watch, ways)
-    sim, n = s.sim, s.budget - s.spent
+    # a search of many parts may have spent all
+    sim, n = s.sim, max(s.budget - s.spent, s.batch)
     lanes = s.batch
     about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
     astray, log_p = _astray(s, n), _about(s)

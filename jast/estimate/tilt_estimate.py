@@ -12,7 +12,7 @@ from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, log_weight, numbers, played
-from jast.estimate.tilt_guard import REST, charged, given, started
+from jast.estimate.tilt_guard import REST, charged, given, joined
 from jast.estimate.tilt_search import TiltSeeker, from_near, seek_tilts
 from jast.units import Ways
 from jast.watch import Watch
@@ -21,8 +21,8 @@ __all__ = ["estimated", "first"]
 
 LONG, LARGE = 30, 2e7
 """Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
-SHARE = 0.35
-"""Of the budget for their search."""
+SHARE, MORE = 0.35, 1.5
+"""Of the budget for their search; how much longer it may be where failures came with the call."""
 GATES = 3
 """Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
 SERVES = 0.02
@@ -54,10 +54,10 @@ def _sought(s, t, most):
     t.batch = int(
         min(max(s.budget // 50, min(s.budget // 20, 2000)), LARGE / (a_step * s.sim.horizon) + 100)
     )
-    t.given = given(s, t)
+    t.given, end = given(s, t), s.spent + int(MORE * most)
     charged(s, t, lambda: seek_tilts(t, int(most)))
-    if t.given is not None and not (t.batches or t.near):
-        started(s, t)
+    if t.given is not None:
+        joined(s, t, end)
     return t
 
 

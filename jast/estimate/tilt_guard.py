@@ -17,7 +17,7 @@ from jast.estimate.populations import LAST, QUANTILE, cool, explore, settled
 from jast.estimate.recorded_tilts import recorded
 from jast.estimate.tilt_search import TiltSeeker, only
 
-__all__ = ["REST", "charged", "given", "guarded", "started"]
+__all__ = ["REST", "charged", "given", "guarded", "joined"]
 
 COVERED, MET, GUARD, WRONG = 50.0, 20, 0.15, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
@@ -28,10 +28,10 @@ REST = 0.3
 CHAINS, FEW = (8, 24), 3
 """Failures that wide noise leads to; of those that the tilts hardly draw, as many as are taken in.
 """
-GIVEN, PLACES, SETTLING, LEFT = 0.05, 2, 25, 0.3
+GIVEN, PLACES, SETTLING = 0.05, 2, 25
 """Of the failures that came with the call: how many are looked at, of the budget; how many places
 get a tilt of their own; Markov moves, after which a failure of great norm lies among those of its
-mode; the share of the budget that is left to what comes after.
+mode.
 """
 
 
@@ -74,13 +74,33 @@ def _around(s, t, z):
     return _failures(s, q, people.z)
 
 
-def started(s: Any, t: TiltSeeker) -> None:
-    """Begin the search anew from the likeliest of the failures that came with the call, where it
-    met none.
+def joined(s: Any, t: TiltSeeker, end: int) -> None:
+    """Take the failures that came with the call into what the search found, until the `Seeker`
+    ``s`` has spent ``end``; where it met none, begin it anew from the likeliest of them.
     """
-    found = _around(s, t, np.repeat(distinct(t.given.z, 1), CHAINS[0], axis=0))
-    most = t.spent + int(GUARD * s.budget)
-    charged(s, t, lambda: t.start(found.trace, found.length, most))
+    if not (t.batches or t.near):
+        found = _around(s, t, np.repeat(distinct(t.given.z, 1), CHAINS[0], axis=0))
+        most = t.spent + min(int(GUARD * s.budget), end - s.spent)
+        charged(s, t, lambda: t.start(found.trace, found.length, most))
+    if t.batches and (rows := _bare(s, t, t.given)).any():
+        t.given = _around(s, t, distinct(t.given.z[rows], _chains(s)))
+        _one_by_one(s, t, end)
+
+
+def _one_by_one(s, t, end):
+    """Take in the failures given that the tilts hardly draw, however few: one at a time and what is
+    around it, as a tilt of its own.
+    """
+    done = []
+    for _ in range(PLACES):
+        rows = np.setdiff1d(np.flatnonzero(_bare(s, t, t.given)), done)
+        if not len(rows) or end - s.spent < t.batch:
+            return
+        s.note(f"failures given: {len(rows)} of {len(t.given.z)} not covered")
+        lead = _around(s, t, np.repeat(t.given.z[rows[:1]], CHAINS[0], axis=0))
+        done.append(rows[0])
+        t.widest += 2
+        _taken(s, t, lead.trace, lead.length, 1.0, min(_room(s), end - s.spent))
 
 
 def charged(s: Any, t: TiltSeeker, search: Callable[[], None]) -> None:
@@ -96,36 +116,18 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     cover. What is found is taken in, and else becomes a reason against the estimate.
     """
     s.reasons = []  # others are about the Gaussians
-    if t.given is not None:
-        _named(s, t)
     _elsewhere(s, t)
     if _lost(s, t, True):
         _lost(s, t, False)
-
-
-def _named(s, t):
-    """Take in the failures that came with the call and that the tilts hardly draw, however few: one
-    at a time and what is around it, as a tilt of its own.
-    """
-    bare = lambda found: np.flatnonzero(t.log_ratio(t.q, found) < -t.log_mean - _covered(s))
-    if not len(rows := bare(t.given)):
-        return
-    found = _around(s, t, distinct(t.given.z[rows], _chains(s)))
-    done = []
-    for _ in range(PLACES):
-        most = min(_room(s), s.budget - s.spent - int(LEFT * s.budget))
-        rows = np.setdiff1d(bare(found), done)
-        if not len(rows) or most < t.batch:
-            break
-        s.note(f"guard (given): {len(rows)} of {len(found.z)} failures not covered")
-        lead = _around(s, t, np.repeat(found.z[rows[:1]], CHAINS[0], axis=0))
-        done.append(rows[0])
-        t.widest += 2
-        _taken(s, t, lead.trace, lead.length, 1.0, most)
-    if len(rows := bare(found)) and (missed := int(_unmet(s, t, found)[rows].sum())):
+    if t.given is not None and (missed := (_bare(s, t, t.given) & _unmet(s, t, t.given)).sum()):
         s.reasons.append(
-            f"{missed} of {len(found.z)} failures given lie where the proposal hardly draws"
+            f"{missed} of {len(t.given.z)} failures given lie where the proposal hardly draws"
         )
+
+
+def _bare(s, t, found):
+    """Which failures [n] the proposal hardly draws."""
+    return t.log_ratio(t.q, found) < -t.log_mean - _covered(s)
 
 
 def _unmet(s, t, found):
