@@ -121,7 +121,7 @@ def guarded(s: Any, t: TiltSeeker) -> None:
         _lost(s, t, False)
     if t.given is not None and (missed := (_bare(s, t, t.given) & _unmet(s, t, t.given)).sum()):
         s.reasons.append(
-            f"{missed} of {len(t.given.z)} failures given lie where the proposal hardly draws"
+            f"the proposal hardly draws near {missed} of {len(t.given.z)} failures given"
         )
 
 
