@@ -2,6 +2,7 @@
 from many starts (`jast.boundary`).
 """
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -16,12 +17,14 @@ from jast.journal import answered
 from jast.limit_state import dimension, normal_numbers, unit
 from jast.products import product
 
-__all__ = ["descended", "design_points", "distinct", "explained"]
+__all__ = ["descended", "design_points", "distinct", "explained", "likely"]
 
 APART = 0.5
 """Points nearer to one another than so much of their norm are one."""
 MOST, BLOCK = 48, 12
 """Descents of a call, those that run side by side."""
+LITTLE = math.log(1e-3)
+"""The log of a part of the probability that does not matter."""
 GRADIENT = 3
 """Evaluations that a value with its gradient is counted as."""
 
@@ -88,3 +91,9 @@ def explained(points, known, slack=1e-3):
     """
     size = np.linalg.norm(known, axis=1)
     return (product(points, unit(known).T) >= (1 - slack) * size).any(axis=1)
+
+
+def likely(points):
+    """Which of the design points ``points`` [n, D] may matter beside the nearest: bool [n]."""
+    square = (points**2).sum(axis=1)
+    return square <= square.min(initial=np.inf) - 2 * LITTLE

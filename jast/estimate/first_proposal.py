@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from jast.estimate.design_points import descended, distinct, explained
+from jast.estimate.design_points import descended, distinct, explained, likely
 from jast.estimate.gaussians import nearest, unit
 from jast.estimate.next_proposal import failing
 from jast.estimate.populations import cool, edges, explore
@@ -19,9 +19,10 @@ STARTS, TRIED, WIDER = (4, 48), 12, (4, 12)
 """Descents of a round; those that are tried before others; draws of wider noise for each of them,
 in a first round and in others.
 """
-ENOUGH, COOLED, RESTS = 36, 0.2, 18
+ENOUGH, COOLED, LATE, RESTS = 36, 0.2, 0.3, 18
 """Failures that wide noise is cooled to at the least, the share of the budget at which that and
-descents end, and tries to do without some of their numbers.
+descents end, that of all before it at which no more than these are looked for, and tries to do
+without some of their numbers.
 """
 ALONE, MET, ENDLESS, SLOW, NEW = 0.03, 3, 0.5, 0.85, 0.25
 """The part of what is found that is met once, or that nothing known explains, at which enough was
@@ -84,10 +85,10 @@ def _descended(s):
 
     def go(starts):
         nonlocal points, evaluations
-        before, found = len(points), descended(s.sim, starts)
+        before, found = likely(points).sum(), descended(s.sim, starts)
         points = distinct(np.concatenate([points, found.points]), s.points)
         evaluations += found.evaluations
-        return len(points) - before
+        return likely(points).sum() - before
 
     if go(s.rng.standard_normal((min(n, TRIED), s.dimension))) and n > TRIED:
         go(s.rng.standard_normal((n - TRIED, s.dimension)))
@@ -119,8 +120,10 @@ def _cooled(s):
         if not found:
             break
         owner = nearest(known, distinct(known, len(known)))
-        alone = (np.bincount(owner) == 1)[owner[given:]].mean()
-        if alone <= max(ALONE, MET / found) or (alone > ENDLESS and found >= ENOUGH):
+        count = likely(known)[given:] | (found < ENOUGH)
+        alone = (np.bincount(owner) == 1)[owner[given:]][count].sum() / max(count.sum(), 1)
+        late = found >= ENOUGH and (alone > ENDLESS or s.spent + evaluations > LATE * s.budget)
+        if late or alone <= max(ALONE, MET / found):
             break
     return known[given:], evaluations
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from jast.estimate.batches import balanced, log_ratio
-from jast.estimate.design_points import explained
+from jast.estimate.design_points import explained, likely
 from jast.estimate.gaussians import as_latent, effective, unit
 from jast.estimate.populations import LAST, QUANTILE, explore, settled
 
@@ -135,10 +135,9 @@ def _forgotten(s):
     s.note(
         f"guard (cooled): {rows.mean():.0%} of {len(rows)} failures not covered", chain.evaluations
     )
-    centres = s.centres()
-    if len(centres) > MANY:  # each mode may have a few of them
-        rows &= ~explained(z, centres, SLACK)
-    some = 0 if len(centres) > MANY else max(len(rows) // FEW, 1)
+    centres, some = s.centres(), max(len(rows) // FEW, 1)
+    if likely(centres).sum() > MANY:  # each mode may have a few of them
+        rows, some = rows & ~explained(z, centres, SLACK), 0
     return [(0.0, z[rows], used[rows])] if rows.sum() > some else []
 
 
