@@ -15,7 +15,7 @@ from jast.estimate.batches import Batch
 from jast.estimate.design_points import explained
 from jast.estimate.diagnostics import thin_modes
 from jast.estimate.first_proposal import explored
-from jast.estimate.gaussians import Gaussians, as_latent, to_anchors, unit
+from jast.estimate.gaussians import _greatest, held, to_anchors
 from jast.estimate.next_proposal import _sparse
 from jast.estimate.populations import Chain, cool, edges
 from jast.estimate.seek import Seeker
@@ -112,19 +112,16 @@ def test_a_mean_is_shrunk_to_its_design_point_by_what_may_be_noise():
     np.testing.assert_array_equal(to_anchors(mean[:2], 2.0, anchors[:, :2]), mean[:2])
 
 
-def test_a_proposal_holds_as_many_components_as_memory_allows():
-    """256 in few dimensions, 40 in many; the greatest stay."""
-    for d, held in ((2, 256), (400, 104), (1000, 40)):
-        k = 300
-        g = unit(np.zeros((1, d)))
-        vectors = np.broadcast_to(np.eye(d), (k, d, d))
-        many = Gaussians(np.arange(1.0, k + 1), np.zeros((k, d)), np.ones((k, d)), vectors)
-        few = many._replace(**{f: getattr(many, f)[-held - 1 :] for f in many._fields})
-        q = as_latent([(1.0, few if d > 100 else many), (0.0, g)], np.float32)
-        assert len(q.means) == held
-        np.testing.assert_allclose(np.exp(q.log_weights).sum(), 1, rtol=1e-5)
-        least = k / (k - held + 1)
-        np.testing.assert_allclose(np.exp(q.log_weights[0] - q.log_weights[-1]), least, 1e-4)
+def test_a_proposal_holds_as_many_components_as_memory_allows(key):
+    """256 in few dimensions, 40 in many, the greatest of them; and no more directions than it has
+    two components for, beside the model.
+    """
+    rising = np.arange(300.0)
+    for d, most, directions in ((2, 256, 125), (300, 186, 92), (400, 104, 51), (1000, 40, 19)):
+        assert held(d) == most
+        np.testing.assert_array_equal(_greatest(rising, d), np.arange(299, 299 - most, -1))
+        assert Seeker(key, limit_state(_sum, d), 100_000).points == directions
+    assert _greatest(np.array([0.0, 2.0, 0.0]), 2).tolist() == [1]
 
 
 def test_a_sparse_proposal_differs_from_the_model_in_the_numbers_that_matter(key):

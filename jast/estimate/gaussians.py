@@ -155,9 +155,14 @@ def together(a, b, share):
     )
 
 
+def held(d):
+    """How many components of ``d`` numbers a `Latent` has at most."""
+    return int(np.clip(MEMORY // d**2, *SIZE))
+
+
 def _greatest(weights, d):
     """Which of the ``weights`` of components of ``d`` numbers a `Latent` has."""
-    kept = np.argsort(-weights, kind="stable")[: np.clip(MEMORY // d**2, *SIZE)]
+    kept = np.argsort(-weights, kind="stable")[: held(d)]
     return kept[weights[kept] > 0]
 
 

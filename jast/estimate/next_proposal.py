@@ -63,7 +63,7 @@ def refitted(s):
         choices["modes"] = _by_owner(s, points, log_w, owner)
     if len(centres) > MANY:
         choices["sparse"] = _sparse(s, points, log_w, centres)
-    if owner.any():
+    if "modes" not in choices or owner.any():
         choices["one"] = _by_owner(s, points, log_w, np.zeros_like(owner))
     # failures in all directions: no number of Gaussians elsewhere covers a sphere in many
     # dimensions

@@ -16,7 +16,7 @@ from jast.counter import generator
 from jast.estimate.batches import Batch, drawn, numbers
 from jast.estimate.design_points import distinct
 from jast.estimate.first_proposal import explored
-from jast.estimate.gaussians import as_latent, effective, fit, together, unit
+from jast.estimate.gaussians import as_latent, effective, fit, held, together, unit
 from jast.estimate.guard import guarded
 from jast.estimate.next_proposal import RARE, defended, refitted, weighed
 from jast.incidents import hosted
@@ -50,7 +50,8 @@ class Seeker:
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.size, self.batch = max(budget // 100, 100), budget // 25
         self.chains = int(np.clip(budget // 800, *CHAINS))
-        self.points = max(self.chains, POINTS)  # directions that it can hold
+        # directions that it can hold, each by two components, beside the model
+        self.points = max(min(self.chains, (held(self.dimension) - 1) // 2), POINTS)
         self.rng = generator(self.next_key())
         self.q, self.log_mean, self.rare = None, None, True
         self.batches, self.populations = [], []
@@ -152,7 +153,7 @@ def _from_near(s):
         _refine(s, NEAR)
         if _own(s) > SERVES * s.batch:
             return True
-    s.q, s.anchors = None, s.known
+    s.q, s.anchors = None, s.anchors[:0]
     return False
 
 
