@@ -2,6 +2,7 @@
 is made of, and failures as they would happen.
 """
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -361,6 +362,30 @@ def test_a_share_counts_as_lost_where_no_batch_could_have_drawn(key):
     assert guard._lost(s, 0.04, *down, 0.02)
     assert not guard._lost(s, 2 * guard.LOST, *down, 0.02)
     assert guard._lost(s, 0.06, *up, 0.02)
+
+
+@pytest.mark.parametrize("mean, against", [(2.0, 0), (-2.0, 1)])
+def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
+    mean, against, key, monkeypatch
+):
+    """A population that tells of nine tenths of the probability, in a place that the batch has
+    drawn thousands of points of, is wrong about the share: a population of few independent points
+    often is. Where the batch has no point it is a reason.
+    """
+    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
+    points, used = np.full((50, 4), mean), np.full(50, 4)
+    p = SimpleNamespace(
+        complete=True,
+        reached=True,
+        log_mean=s.log_mean + np.log(0.9),
+        points=points,
+        used=used,
+        evaluations=0,
+    )
+    monkeypatch.setattr(guard, "explore", lambda *a, **k: p)
+    monkeypatch.setattr(guard, "_bare", lambda s, points, used: np.full(len(points), True))
+    assert guard.guarded(s, 2, 2)
+    assert len(s.reasons) == against
 
 
 def test_subset_simulation(key):

@@ -52,9 +52,9 @@ SEEN, LOST = 100, 2.0
 of what was found, from which the proposal is given up.
 """
 ASTRAY = "no proposal was found that draws failures in proportion to their probability"
-TILTS, POOR = 0.2, 0.05
+TILTS, POOR, PLENTY = 0.2, 0.05, 1000
 """Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
-below which they are.
+below which they are, and of all that are left at which they are not.
 """
 EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
@@ -208,7 +208,7 @@ def _beside_gaussians(s, t, gradients):
 
     seek(s, gradients, instead)
     n, [t], known = s.budget - s.spent, tried, s.log_mean is not None
-    poor = _astray(s, n) or _promised(s, 1) < POOR
+    poor = _astray(s, n) or (_promised(s, 1) < POOR and _promised(s, n) < PLENTY)
     if t is None and poor and n > TILTS * s.budget and not (known and _plain_is_better(s)):
         t = tilt_estimate.after(s)
     gaussian = 0.0 if not known or max(s.lost, s.asked) > LOST else _promised(s, 1)

@@ -83,13 +83,15 @@ def guarded(s, i, last):
     found = [f for f in found if len(f[1]) and _lost(s, *f, thin)]
     if i == 0 and len(s.seeds):
         found += _forgotten(s)
+    if end := i == last or s.spent + 2 * s.batch > MOST * s.budget:
+        found = [f for f in found if f[0] == 0 or _unmet(s, *f) > 2 * LOST]
     if not found:
         if thin > THIN and effective(log_w[rows]) < MET:
             s.reasons.append(
                 f"{thin:.0%} of the probability found lies where the proposal hardly draws"
             )
         return True
-    if i == last or s.spent + 2 * s.batch > MOST * s.budget:
+    if end:
         s.lost = asked
         s.reasons.append(
             f"failures that the proposal hardly draws may have {_share(asked)} the probability"
@@ -103,14 +105,20 @@ def guarded(s, i, last):
 
 def _lost(s, share, points, used, thin):
     """Whether the ``share`` of the probability that a population found at ``points`` is missing.
-    Where the batches have met such points, they know it better: it is ``thin`` at most.
+    Where the batches have met such points, they know it better: it is about ``thin``.
     """
     if not 2 * LOST < share <= 2 * (thin + LOST):
         return share > 2 * LOST
+    return _unmet(s, share, points, used) > 2 * LOST
+
+
+def _unmet(s, share, points, used):
+    """What part of the probability, of the ``share`` at ``points``, no draw of any batch has met:
+    by chance, were all of the share like each of the points (Poisson's law).
+    """
     each = [log_ratio(b.q, points, used) + math.log(len(b.z)) for b in s.batches]
-    # how many draws of all batches would lie there, were all of the share like this point
     expected = share * np.exp(np.logaddexp.reduce(each) + s.log_mean)
-    return share * np.mean(expected < 1) > 2 * LOST
+    return share * np.exp(-expected).mean()
 
 
 def _share(share):

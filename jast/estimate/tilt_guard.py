@@ -118,6 +118,7 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     s.reasons = []  # others are about the Gaussians
     _elsewhere(s, t)
     if _lost(s, t, True):
+        s.reasons = []  # what is still wrong is said again
         _lost(s, t, False)
     if t.given is not None and (missed := (_bare(s, t, t.given) & _unmet(s, t, t.given)).sum()):
         s.reasons.append(
