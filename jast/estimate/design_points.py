@@ -75,13 +75,13 @@ def _in_blocks(sim, starts, n):
 def distinct(points, limit):
     """At most ``limit`` of ``points`` [n, D], of least norm and apart from one another: [m, D]."""
     points = points[np.argsort((points**2).sum(axis=1), kind="stable")]
-    kept = []
-    for z in points:
-        if len(kept) < limit and all(
-            np.linalg.norm(z - other) > APART * np.linalg.norm(other) for other in kept
-        ):
-            kept.append(z)
-    return np.array(kept).reshape(-1, points.shape[-1])
+    kept = points[:0]
+    while len(points) and len(kept) < limit:
+        nearest = points[0]
+        kept = np.concatenate([kept, nearest[None]])
+        gaps = np.linalg.norm(points - nearest, axis=1)
+        points = points[gaps > APART * np.linalg.norm(nearest)]
+    return kept
 
 
 def explained(points, known, slack=1e-3):

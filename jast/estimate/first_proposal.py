@@ -20,14 +20,16 @@ STARTS, TRIED, WIDER = (4, 48), 12, (4, 12)
 in a first round and in others.
 """
 ENOUGH, COOLED, LATE, RESTS = 36, 0.2, 0.3, 18
-"""Failures that wide noise is cooled to at the least, the share of the budget at which that and
-descents end, that of all before it at which no more than these are looked for, and tries to do
-without some of their numbers.
+"""Failures that wide noise is cooled to at the least; the share of the budget at which cooling
+ends, and at which descents do; the share that is spent in all, above which cooling looks for no
+more than that least number; and how often a failure is tried without some of its numbers.
 """
 ALONE, MET, ENDLESS, SLOW, NEW = 0.03, 3, 0.5, 0.85, 0.25
-"""The part of what is found that is met once, or that nothing known explains, at which enough was
-found, or so many of it; the part above which there is no end of it; what is left of it after a
-round that gained too little; and the part of a round's descents that come to new points.
+"""When the search for more directions ends. `ALONE`: where at most this part of the failures lies
+in a direction of its own, or is explained by nothing known; or `MET` of them. `ENDLESS`: where more
+than this part is alone even so, as more chains would not change it. `SLOW`: where a round of
+descents leaves more than this part unexplained of what was before it. `NEW`: where less than this
+part of its descents come to new points.
 """
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
@@ -80,7 +82,7 @@ def _descended(s):
     from the edges of failures under wider noise that those found do not explain, for as long as
     these lead to others and fewer and fewer are left.
     """
-    n, few, left = int(np.clip(s.budget // 2000, *STARTS)), True, math.inf
+    n, first, left = int(np.clip(s.budget // 2000, *STARTS)), True, math.inf
     points, evaluations = np.zeros((0, s.dimension)), 0
 
     def go(starts):
@@ -93,12 +95,12 @@ def _descended(s):
     if go(s.rng.standard_normal((min(n, TRIED), s.dimension))) and n > TRIED:
         go(s.rng.standard_normal((n - TRIED, s.dimension)))
     while len(points) and evaluations < COOLED * s.budget:
-        safe, fails, paid = edges(s.next_key(), s.sim, WIDER[not few] * n)
+        safe, fails, paid = edges(s.next_key(), s.sim, WIDER[0 if first else 1] * n)
         evaluations += paid
         rest = ~explained(fails, points)
         if not len(rest) or not ALONE < rest.mean() < SLOW * left:
             break
-        left, few = math.inf if few else rest.mean(), False
+        left, first = math.inf if first else rest.mean(), False
         if go(safe[rest][:n]) < NEW * min(rest.sum(), n):
             break
     return points, evaluations

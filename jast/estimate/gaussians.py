@@ -13,7 +13,21 @@ import numpy as np
 from jast.limit_state import Latent
 from jast.products import gram, product
 
-__all__ = ["Gaussians", "as_latent", "fit", "log_density", "log_sum", "shrunk", "together", "unit"]
+__all__ = [
+    "Gaussians",
+    "as_latent",
+    "effective",
+    "fit",
+    "held",
+    "log_density",
+    "log_sum",
+    "nearest",
+    "shrunk",
+    "tempered",
+    "to_anchors",
+    "together",
+    "unit",
+]
 
 COMPONENTS = (1, 2, 4, 8, 16)
 ITERATIONS, GAIN = 10, 1e-3
@@ -135,7 +149,8 @@ def as_latent(parts, dtype):
         weights[kept],
         (np.concatenate([g[i] for _, g in parts])[kept] for i in (1, 2, 3)),
     )
-    factors = np.linalg.cholesky(np.einsum("kij,kj,klj->kil", vectors, values, vectors))
+    covariances = (vectors * values[:, None]) @ vectors.transpose(0, 2, 1)
+    factors = np.linalg.cholesky(covariances)
     log_weights = np.log(weights / weights.sum())
     arrays = log_weights, means, factors, np.tril(np.linalg.inv(factors))
     return Latent(*(np.asarray(a, dtype) for a in arrays))

@@ -9,6 +9,7 @@ import numpy as np
 from jast.estimate.batches import balanced, log_ratio
 from jast.estimate.design_points import explained, likely
 from jast.estimate.gaussians import as_latent, effective, unit
+from jast.estimate.next_proposal import MANY
 from jast.estimate.populations import LAST, QUANTILE, explore, settled
 
 LOST = 0.005
@@ -25,9 +26,10 @@ ratio there.
 """
 MOST = 0.85
 """Of the budget, where the search ends."""
-LEAST, MOVES, FEW, MANY, SLACK = 50, 10, 40, 16, 0.15
+LEAST, MOVES, FEW, SLACK = 50, 10, 40, 0.15
 """Points of a population, which come in as many; moves of the failures that wide noise led to; one
-of as many of them, or one, may lie where the proposal does not cover it.
+of as many of them, or one, may lie where the proposal does not cover it; how far before the plane
+of a known design point, as a part of its distance, they count as of that one.
 """
 
 

@@ -18,7 +18,7 @@ from jast.estimate.gaussians import (
     unit,
 )
 
-__all__ = ["defended", "failing", "refitted", "weighed"]
+__all__ = ["MANY", "defended", "failing", "refitted", "weighed"]
 
 WIDE, MODEL = 0.2, 0.1
 """Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
@@ -26,7 +26,7 @@ no weight is without variance; where failures are not rare the model itself.
 """
 RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
 MANY = 16
-"""Directions above which each has too few failures for a covariance."""
+"""Directions above which each has too few failures for a covariance of all numbers."""
 NUMBERS, SPREAD, SEEN = 4, 3.0, 5.0
 """Numbers, at most, that a direction of many is fitted in; failures that the model's variance and,
 in its share, each direction is as good as.
@@ -151,8 +151,8 @@ def _masses(mass, n):
 
 def failing(batches):
     """The failing points [n, D] of ``batches`` and how many numbers each has used [n]."""
-    failing = np.concatenate([b.failure for b in batches])
-    return tuple(np.concatenate([getattr(b, a) for b in batches])[failing] for a in ("z", "used"))
+    rows = np.concatenate([b.failure for b in batches])
+    return tuple(np.concatenate([getattr(b, a) for b in batches])[rows] for a in ("z", "used"))
 
 
 def defended(g, low, rare):

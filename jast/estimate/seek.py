@@ -29,8 +29,9 @@ proposals that stay as they were without gain, which end them too.
 """
 REFITS, GUARDS = 8, 3
 CHAINS, POINTS, HELD = (8, 128), 16, 0.05
-"""Chains of cooled noise; directions that the proposal can hold, where the chains are not more; the
-share of an equal part with which one of them counts.
+"""The least and the greatest number of chains of cooled noise; directions that a proposal can hold
+at the least, where many chains may lead to more; the share, over the number of directions, above
+which a component counts as one of them.
 """
 NEAR, GOOD, SERVES = 2, 0.2, 0.05
 """Of the proposal of a similar system: the batches that it is fitted to; effective draws of a draw
@@ -108,8 +109,8 @@ class Seeker:
 
     def centres(self):
         """The distinct means of the proposal [m, D]."""
-        held = np.asarray(self.q.log_weights) > math.log(HELD / self.points)
-        return distinct(np.asarray(self.q.means, np.float64)[held], self.points)
+        heavy = np.asarray(self.q.log_weights) > math.log(HELD / self.points)
+        return distinct(np.asarray(self.q.means, np.float64)[heavy], self.points)
 
 
 def seek(s, gradients=True, instead=lambda s: False):
