@@ -52,7 +52,7 @@ SEEN, LOST = 100, 2.0
 of what was found, from which the proposal is given up.
 """
 ASTRAY = "no proposal was found that draws failures in proportion to their probability"
-TILTS, POOR, PLENTY = 0.2, 0.05, 1000
+TILTS, POOR, PLENTY = 0.2, 0.05, 500
 """Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
 below which they are, and of all that are left at which they are not.
 """
@@ -82,7 +82,7 @@ def failure_probability(
     An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). Design
     points come from gradients of the miss distance, from noise that is wide first and then cooled,
     from the mirror images of what these found, and from a population of subset simulation where
-    gradients did not help; up to 128 directions are kept, fewer of more than 250 numbers. Mixtures
+    gradients did not help and no ``failures`` came with the call; up to 128 directions are kept, fewer of more than 250 numbers. Mixtures
     of Gaussians are fitted to the weighted failures of a few batches. A guard, a population that is
     kept out of what the proposal covers, looks for lost failure modes; what it finds is taken in,
     or else the estimate is UNRELIABLE. Systems of 30 steps or more, or whose disturbances hold
@@ -201,15 +201,15 @@ def _beside_gaussians(s, t, gradients):
     tried = [t]
 
     def instead(s):
-        if tried[0] is not None or _promised(s, 1) > tilt_estimate.SERVES or _plain_is_better(s):
+        if tried[0] is not None or not _poor(s, tilt_estimate.SERVES) or _plain_is_better(s):
             return False
         tried[0] = tilt_estimate.after(s)
         return tried[0].serves(tilt_estimate.SERVES)
 
     seek(s, gradients, instead)
     n, [t], known = s.budget - s.spent, tried, s.log_mean is not None
-    poor = _astray(s, n) or (_promised(s, 1) < POOR and _promised(s, n) < PLENTY)
-    if t is None and poor and n > TILTS * s.budget and not (known and _plain_is_better(s)):
+    better = known and _plain_is_better(s)
+    if t is None and (_astray(s, n) or _poor(s, POOR)) and n > TILTS * s.budget and not better:
         t = tilt_estimate.after(s)
     gaussian = 0.0 if not known or max(s.lost, s.asked) > LOST else _promised(s, 1)
     return t if t is not None and t.serves(gaussian) else None
@@ -288,6 +288,13 @@ def _promised(s, n):
     """The effective sample size of ``n`` draws of the proposal, by its last batch."""
     b = s.batches[-1]
     return effective(b.log_weight[b.failure]) / len(b.z) * n
+
+
+def _poor(s, share):
+    """Whether draws of the proposal have less than ``share`` effective ones each, and all that are
+    left of the budget less than `PLENTY`.
+    """
+    return _promised(s, 1) < share and _promised(s, s.budget - s.spent) < PLENTY
 
 
 def _of_the_model(promised):

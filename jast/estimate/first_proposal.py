@@ -1,6 +1,7 @@
 """The first proposal of a search: what its explorers come to. Draws of the model, descents by
-gradients, wide noise that is cooled, mirror images of what these find, and a population that goes
-down the levels of the miss distance.
+gradients, wide noise that is cooled, mirror images of what these find, and, where neither gradients
+nor failures that came with the call lead there, a population that goes down the levels of the miss
+distance.
 """
 
 import math
@@ -65,7 +66,7 @@ def explored(s, gradients):
     s.seeds = points[s.rng.permutation(len(points))]
     if len(s.anchors):
         around("their mirror images", *_mirrored(s))
-    if not differentiable:
+    if not (differentiable or len(s.known)):
         population = explore(s.next_key(), s.sim, s.size, most=int(0.4 * s.budget))
         s.note(
             f"subset simulation: {len(population.levels)} levels, log p {population.log_mean:.2f}",
