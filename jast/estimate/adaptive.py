@@ -82,13 +82,14 @@ def failure_probability(
     An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). Design
     points come from gradients of the miss distance, from noise that is wide first and then cooled,
     from the mirror images of what these found, and from a population of subset simulation where
-    gradients did not help and no ``failures`` came with the call; up to 128 directions are kept, fewer of more than 250 numbers. Mixtures
-    of Gaussians are fitted to the weighted failures of a few batches. A guard, a population that is
-    kept out of what the proposal covers, looks for lost failure modes; what it finds is taken in,
-    or else the estimate is UNRELIABLE. Systems of 30 steps or more, or whose disturbances hold
-    choices (Bernoulli, Categorical), are first tried with tilts: each step's own disturbance is
-    tilted by the state and the time, choices by their odds, and the tilts are fitted by
-    cross-entropy. Others are tried with tilts where the Gaussians promise few effective draws.
+    gradients did not help and no ``failures`` came with the call; up to 128 directions are kept,
+    fewer of more than 250 numbers. Mixtures of Gaussians are fitted to the weighted failures of a
+    few batches. A guard, a population that is kept out of what the proposal covers, looks for lost
+    failure modes; what it finds is taken in, or else the estimate is UNRELIABLE. Systems of 30
+    steps or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with
+    tilts: each step's own disturbance is tilted by the state and the time, choices by their odds,
+    and the tilts are fitted by cross-entropy. Others are tried with tilts where the Gaussians
+    promise few effective draws.
 
     What is left of the budget, about half, is drawn from the proposal as it then stands. The
     estimate and its interval come from these episodes alone. A tenth of them or more, up to two
