@@ -313,6 +313,16 @@ def test_the_guard_looks_for_failures_away_from_the_known_modes(key, monkeypatch
     assert (ratios > threshold).tolist() == [False, False, True, True]
 
 
+def test_forgotten_failures_are_a_reason_that_names_no_share(key, monkeypatch):
+    """Nobody knows what they weigh."""
+    s = at_the_guard(key, planes(4.0, FAR), 1.0)
+    s.seeds, s.spent = np.full((1, 4), 2.0), BUDGET * 0.6
+    lost = 0.0, np.full((3, 4), -2.0), np.full(3, 4)
+    monkeypatch.setattr(guard, "_forgotten", lambda s: [lost])
+    assert guard.guarded(s, 0, 0)
+    assert s.reasons == ["the proposal hardly draws some failures that wide noise led to"]
+
+
 def at_the_guard(key, sim, *shares):
     """A `Seeker` with a batch of a proposal: unit Gaussians at the nearest failures of `planes` up
     and down, by these shares.

@@ -98,6 +98,8 @@ def guarded(s, i, last):
         s.reasons.append(
             f"failures that the proposal hardly draws may have {_share(asked)} the probability"
             " that it found"
+            if any(share for share, *_ in found)
+            else "the proposal hardly draws some failures that wide noise led to"
         )
         return True
     for share, points, used in found:
