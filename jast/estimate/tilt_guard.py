@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast.estimate.design_points import distinct
-from jast.estimate.guard import LOST, MOVES, THIN
+from jast.estimate.guard import LOST, THIN
 from jast.estimate.markov_tilts import Trace, of_the_model
 from jast.estimate.populations import LAST, QUANTILE, cool, explore, settled
 from jast.estimate.recorded_tilts import recorded
@@ -29,9 +29,9 @@ CHAINS, FEW = (8, 24), 3
 """Failures that wide noise leads to; of those that the tilts hardly draw, as many as are taken in.
 """
 GIVEN, PLACES, SETTLING = 0.05, 2, 25
-"""Of the failures that came with the call: how many are looked at, of the budget; how many places
-get a tilt of their own; Markov moves, after which a failure of great norm lies among those of its
-mode.
+"""How many of the failures that came with the call are looked at, of the budget; how often failures
+that the tilts hardly draw get a tilt of their own; Markov moves, after which a failure of great
+norm lies among those of its mode.
 """
 
 
@@ -116,10 +116,12 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     cover. What is found is taken in, and else becomes a reason against the estimate.
     """
     s.reasons = []  # others are about the Gaussians
-    _elsewhere(s, t)
+    cold = _elsewhere(s, t)
     if _lost(s, t, True):
         s.reasons = []  # what is still wrong is said again
         _lost(s, t, False)
+    if cold is not None and (_bare(s, t, cold) & _unmet(s, t, cold)).sum() >= FEW:
+        s.reasons.append("the proposal hardly draws some failures that wide noise led to")
     if t.given is not None and (missed := (_bare(s, t, t.given) & _unmet(s, t, t.given)).sum()):
         s.reasons.append(
             f"the proposal hardly draws near {missed} of {len(t.given.z)} failures given"
@@ -139,22 +141,24 @@ def _unmet(s, t, found):
 
 
 def _elsewhere(s, t):
-    """Take in failures that wide noise leads to and the tilts hardly draw: their levels of the miss
-    distance may all have been on the way to one failure mode.
+    """`Given` of failures that wide noise leads to, where there are any. Those that the tilts
+    hardly draw are taken in, twice if need be: the levels of the miss distance may all have been on
+    the way to one failure mode.
     """
     nothing = t.tilts(t.q), math.inf
     cold = cool(s.next_key(), s.sim, _chains(s), covered=nothing)
     if not (n := len(cold.points)):
-        return
-    people, chain = settled(s.next_key(), s.sim, cold.points, MOVES, covered=nothing)
-    o, log_q, trace = of_the_model(s.sim, nothing[0], people.z)
-    bare = (np.asarray(o.score) == -np.inf) & (log_q < -t.log_mean - _covered(s))
-    rows = np.flatnonzero(bare)
-    paid = cold.evaluations + chain.evaluations
-    s.note(f"guard (cooled): {len(rows)} of {n} failures not covered", paid)
-    most = _room(s)
-    if len(rows) >= FEW and most >= t.batch:
-        _taken(s, t, only(trace, rows), np.asarray(o.length)[rows], len(rows) / n, most)
+        return None
+    people, chain = settled(s.next_key(), s.sim, cold.points, SETTLING, covered=nothing)
+    found, paid = _failures(s, nothing[0], people.z), cold.evaluations + chain.evaluations
+    for _ in range(PLACES):
+        rows = np.flatnonzero(_bare(s, t, found))
+        s.note(f"guard (cooled): {len(rows)} of {n} failures not covered", paid)
+        most, paid = _room(s), 0
+        if len(rows) < FEW or most < t.batch:
+            break
+        _taken(s, t, only(found.trace, rows), found.length[rows], len(rows) / n, most)
+    return found
 
 
 def _chains(s):
