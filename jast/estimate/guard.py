@@ -94,11 +94,11 @@ def guarded(s, i, last):
             )
         return True
     if end:
-        s.lost = asked
+        s.lost, worst = asked, max(share for share, *_ in found)
         s.reasons.append(
-            f"failures that the proposal hardly draws may have {_share(asked)} the probability"
+            f"failures that the proposal hardly draws may have {_share(worst)} the probability"
             " that it found"
-            if any(share for share, *_ in found)
+            if worst
             else "the proposal hardly draws some failures that wide noise led to"
         )
         return True
