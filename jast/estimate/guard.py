@@ -24,6 +24,7 @@ CUT = 0.3
 """How far on the way to a known mode the first population may go, as a share of the log density
 ratio there.
 """
+FORGOTTEN = "the proposal hardly draws some failures that wide noise led to"
 MOST = 0.85
 """Of the budget, where the search ends."""
 LEAST, MOVES, FEW, SLACK = 50, 10, 40, 0.15
@@ -99,7 +100,7 @@ def guarded(s, i, last):
             f"failures that the proposal hardly draws may have {_share(worst)} the probability"
             " that it found"
             if worst
-            else "the proposal hardly draws some failures that wide noise led to"
+            else FORGOTTEN
         )
         return True
     for share, points, used in found:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast.estimate.design_points import distinct
-from jast.estimate.guard import LOST, THIN
+from jast.estimate.guard import FORGOTTEN, LOST, THIN
 from jast.estimate.markov_tilts import Trace, of_the_model
 from jast.estimate.populations import LAST, QUANTILE, cool, explore, settled
 from jast.estimate.recorded_tilts import recorded
@@ -120,9 +120,9 @@ def guarded(s: Any, t: TiltSeeker) -> None:
     if _lost(s, t, True):
         s.reasons = []  # what is still wrong is said again
         _lost(s, t, False)
-    if cold is not None and (_bare(s, t, cold) & _unmet(s, t, cold)).sum() >= FEW:
-        s.reasons.append("the proposal hardly draws some failures that wide noise led to")
-    if t.given is not None and (missed := (_bare(s, t, t.given) & _unmet(s, t, t.given)).sum()):
+    if _missed(s, t, cold) >= FEW:
+        s.reasons.append(FORGOTTEN)
+    if missed := _missed(s, t, t.given):
         s.reasons.append(
             f"the proposal hardly draws near {missed} of {len(t.given.z)} failures given"
         )
@@ -138,6 +138,13 @@ def _unmet(s, t, found):
     total = sum(b.size for b in t.batches)
     logs = [t.log_ratio(b.mixture, found) + math.log(b.size / total) for b in t.batches]
     return np.logaddexp.reduce(logs) < -t.log_mean - _covered(s)
+
+
+def _missed(s, t, found):
+    """How many failures, of none where ``found`` is None, neither the proposal nor the batches of
+    the search draw.
+    """
+    return 0 if found is None else (_bare(s, t, found) & _unmet(s, t, found)).sum()
 
 
 def _elsewhere(s, t):
