@@ -208,6 +208,8 @@ def summary(runs):
             (r.mean / truth - 1) / r.relative_error if r.failures_seen else None
             for r, truth in runs
         ],
+        "relative_errors": reported.tolist(),
+        "reliable": reliable.tolist(),
     }
 
 

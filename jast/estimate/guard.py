@@ -27,10 +27,11 @@ ratio there.
 FORGOTTEN = "the proposal hardly draws some failures that wide noise led to"
 MOST = 0.85
 """Of the budget, where the search ends."""
-LEAST, MOVES, FEW, SLACK = 50, 10, 40, 0.15
+LEAST, MOVES, FEW, SLACK, SETTLED = 50, 10, 40, 0.15, 0.06
 """Points of a population, which come in as many; moves of the failures that wide noise led to; one
 of as many of them, or one, may lie where the proposal does not cover it; how far before the plane
-of a known design point, as a part of its distance, they count as of that one.
+of a known design point, as a part of its distance, they count as of that one; what more moves may
+cost where they have not settled, of the budget.
 """
 
 
@@ -142,7 +143,8 @@ def _forgotten(s):
     """Failures near the seeds, drawn from the model given failure, that the proposal does not
     cover; what they weigh is left to the next batches.
     """
-    people, chain = settled(s.next_key(), s.sim, s.seeds, MOVES)
+    most = int(SETTLED * s.budget)
+    people, chain = settled(s.next_key(), s.sim, s.seeds, MOVES, most=most)
     z, used = np.asarray(people.z), np.asarray(people.used)
     rows = _bare(s, z, used) & (np.asarray(people.score) == -np.inf)
     s.note(

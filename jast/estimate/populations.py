@@ -25,6 +25,8 @@ __all__ = ["cool", "edges", "explore", "settled"]
 
 QUANTILE, ACCEPTANCE, LAST = 0.25, 0.4, 5
 FAILING, COLD, COOLING, DRAWS = 0.1, 0.25, 60, 4
+FALLING = 0.95
+"""Of the squares of their norms, what failures have left that fall."""
 RESTING, TRIES, HALVES = (0.5, 0.25), 4, 6
 
 
@@ -224,13 +226,19 @@ def cool(key, sim, chains, *, covered=None, known=None, rests=0):
     return chain.end(chain.rest(people, rests), math.nan, widths)
 
 
-def settled(key, sim, points, moves, *, covered=None):
+def settled(key, sim, points, moves, *, covered=None, most=0):
     """Failures as the model has them: ``points`` [n, D], failures, after so many Markov moves that
-    keep p(x | failure): (`Population`, the `Chain`). ``covered`` as in `explore`.
+    keep p(x | failure): (`Population`, the `Chain`). Where their norms fall, they are still on the
+    way, and as many moves follow, for at most ``most`` evaluations. ``covered`` as in `explore`.
     """
     chain, rows = Chain(key, sim, len(points), covered), np.arange(len(points))
     people = chain.judge(np.asarray(points, chain.dtype))
-    return chain.move(people, rows, -math.inf, 1.0, moves), chain
+    norm = (people.z**2).sum()
+    while True:
+        people = chain.move(people, rows, -math.inf, 1.0, moves)
+        before, norm = norm, (people.z**2).sum()
+        if norm > FALLING * before or chain.evaluations + moves * len(points) > most:
+            return people, chain
 
 
 def _either(good, new, before):

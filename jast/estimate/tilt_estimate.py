@@ -23,8 +23,10 @@ LONG, LARGE = 30, 2e7
 """Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
 SHARE, MORE = 0.35, 1.5
 """Of the budget for their search; how much longer it may be where failures came with the call."""
-GATES = 3
-"""Unit Gaussians that a normal number is drawn from one of, where one does not serve."""
+GATES, GATED, GOOD = 3, 0.15, 0.1
+"""Gaussians that a normal number is drawn from one of, where one does not serve; what the search
+for them costs at most, of the budget; effective draws of a draw with which one does.
+"""
 SERVES = 0.02
 """Effective draws of a draw with which nothing else is tried."""
 
@@ -56,6 +58,8 @@ def _sought(s, t, most):
     )
     t.given, end = given(s, t), s.spent + int(MORE * most)
     charged(s, t, lambda: seek_tilts(t, int(most)))
+    if t.batches and t.gates == 1 and about.normals and t.promised < GOOD:
+        charged(s, t, lambda: t.gated(GATES, t.spent + int(GATED * s.budget)))
     if t.given is not None:
         joined(s, t, end)
     return t

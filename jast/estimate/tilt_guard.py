@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jast.estimate.design_points import distinct
-from jast.estimate.guard import FORGOTTEN, LOST, THIN
+from jast.estimate.guard import FORGOTTEN, LOST, SETTLED, THIN
 from jast.estimate.markov_tilts import Trace, of_the_model
 from jast.estimate.populations import LAST, QUANTILE, cool, explore, settled
 from jast.estimate.recorded_tilts import recorded
@@ -28,11 +28,12 @@ REST = 0.3
 CHAINS, FEW = (8, 24), 3
 """Failures that wide noise leads to; of those that the tilts hardly draw, as many as are taken in.
 """
-GIVEN, PLACES, SETTLING = 0.05, 2, 25
+GIVEN, PLACES = 0.05, 2
 """How many of the failures that came with the call are looked at, of the budget; how often failures
-that the tilts hardly draw get a tilt of their own; Markov moves, after which a failure of great
-norm lies among those of its mode.
+that the tilts hardly draw get a tilt of their own.
 """
+SETTLING = 25
+"""Markov moves, after which a failure of great norm lies among those of its mode, or on the way."""
 
 
 class Given(NamedTuple):
@@ -156,7 +157,9 @@ def _elsewhere(s, t):
     cold = cool(s.next_key(), s.sim, _chains(s), covered=nothing)
     if not (n := len(cold.points)):
         return None
-    people, chain = settled(s.next_key(), s.sim, cold.points, SETTLING, covered=nothing)
+    most = int(SETTLED * s.budget)
+    moved = settled(s.next_key(), s.sim, cold.points, SETTLING, covered=nothing, most=most)
+    people, chain = moved
     found, paid = _failures(s, nothing[0], people.z), cold.evaluations + chain.evaluations
     for _ in range(PLACES):
         rows = np.flatnonzero(_bare(s, t, found))

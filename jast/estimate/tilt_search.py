@@ -15,6 +15,7 @@ from jast.counter import generator
 from jast.estimate.gaussians import effective, tempered
 from jast.estimate.markov_tilts import Tilts, Trace, features, played, shape
 from jast.estimate.tilt_fit import (
+    Tilt,
     as_tilts,
     fit,
     frame_of,
@@ -56,16 +57,24 @@ class TiltSeeker:
     def __init__(self, key: Any, sim: Any, batch: int, gates: int = 1):
         self.sim, self.rng, self.batch = sim, generator(key), batch
         self.about, self.dtype = shape(sim), normal_numbers(sim)
-        frame = unseen(self.about, sim.horizon)
-        zeros = np.zeros((1, self.about.seen))
-        self.model = nothing(self.about, features(frame, zeros, 0.0, np).shape[1], gates)
-        self.mixture = ([self.model], [1.0], frame)
+        self.model = self.untilted(gates)
+        self.mixture = ([self.model], [1.0], unseen(self.about, sim.horizon))
         self.batches, self.history, self.spent = [], [], 0
         self.promised, self.log_mean, self.q = 0.0, None, None
         self.near = False  # the mixture is that of a similar system
         self.widest = COMPONENTS[1]  # components, beyond which no tilt is added
         self.given = None  # failures that came with the call
         self.ratios = {}  # of the mixture of a batch on the episodes of another
+
+    @property
+    def gates(self) -> int:
+        """Gaussians that a normal number is drawn from one of."""
+        return self.model.steps.means.shape[-1]
+
+    def untilted(self, gates: int) -> Tilt:
+        """The model as a tilt, of ``gates`` Gaussians a normal number."""
+        frame, seen = unseen(self.about, self.sim.horizon), np.zeros((1, self.about.seen))
+        return nothing(self.about, features(frame, seen, 0.0, np).shape[1], gates)
 
     def tilts(self, mixture: tuple) -> Tilts:
         tilts, weights, frame = mixture
@@ -147,6 +156,13 @@ class TiltSeeker:
             if stalls and (own > ENOUGH * self.batch or stalls == 3):
                 return
             best = max(own, best)
+
+    def gated(self, gates: int, most: int) -> None:
+        """Go on with ``gates`` Gaussians a normal number, fitted to the failures found."""
+        used = together(self)
+        groups, self.model = self.groups(used), self.untilted(gates)
+        self.mixture = mixture_of(self, used, used.log_weight, groups)
+        self.refit(most, REFITS)
 
     def groups(self, used: Drawn) -> np.ndarray | None:
         """Which part [n, M] of each episode belongs to each group of the mixture's tilts."""
