@@ -36,9 +36,10 @@ DEVIATIONS = (0.4, 1.2)
 TOGETHER = 10.0
 """Of that of a number's own coefficients about those of all, where there are several Gaussians."""
 ITERATIONS, STEP = 25, 4.0
-ROUNDS, BEYOND = 8, 1.5
-"""Of expectation maximisation; the normal numbers that the outer Gaussians start from."""
-ROWS = 60_000
+ROUNDS, NEWTON, BEYOND = 8, 2, 1.5
+"""Of expectation maximisation, Newton's steps in each; the normal numbers that the outer Gaussians start from."""
+ROWS, GATED = 60_000, 20_000
+"""That a fit looks at, at most, and one of several Gaussians."""
 
 
 class Tilt(NamedTuple):
@@ -185,7 +186,7 @@ def _common(rows, w, mine, gates):
     """
     f = rows.x.shape[1]
     none = np.zeros((f, gates)), np.zeros((f, gates)), np.zeros(gates)
-    if gates == 1 or not mine.any():
+    if gates == 1 or mine.size // len(mine) == 1 or not mine.any():
         return none
     n, a = np.nonzero(mine)
     if len(n) > ROWS:
@@ -203,6 +204,9 @@ def _gated(x, z, w, gates, common):
     f = x.shape[1]
     if gates == 1:
         return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g, scales
+    if len(w) > GATED:
+        some, w = _resampled(w, GATED)
+        x, z = x[some], z[some]
     given = means.any()
     ridge = np.full(f, TOGETHER) if given else _ridge(f)
     if given:
@@ -219,6 +223,15 @@ def _gated(x, z, w, gates, common):
         scales[0] = 0.0
         r = _parts(x, z, means, log_g, scales)
     return means, log_g, scales
+
+
+def _resampled(w, n):
+    """Rows [n] in proportion to the weights ``w``, at even spaces of their sum, and their equal
+    weights [n].
+    """
+    total = np.cumsum(w)
+    at = (np.arange(n) + 0.5) / n * total[-1]
+    return np.searchsorted(total, at), np.full(n, total[-1] / n)
 
 
 def _joint(x, z, means, log_g, scales):
@@ -265,7 +278,7 @@ def _logits(x, target, log_p, w, ridge, start=None):
         return w @ each - 0.5 * ridge @ (out**2).sum(axis=1), np.exp(log_q)
 
     now, p = value(out)
-    for _ in range(3 if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)):
+    for _ in range(NEWTON if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)):
         before = now
         for k in others:
             slope = x.T @ (w * (target[:, k] - p[:, k])) - ridge * out[:, k]
