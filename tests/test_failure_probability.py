@@ -31,11 +31,11 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.adaptive import LEAST
+from jast.estimate.adaptive import LEAST, ROUGH, _or_rough
 from jast.estimate.batches import Batch, drawn, log_ratio, numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
-from jast.estimate.populations import cool, explore
+from jast.estimate.populations import cool, explore, settled
 from jast.simulators import landing, limit_state
 
 norm = scipy.stats.norm
@@ -593,6 +593,38 @@ def test_cooling_keeps_every_mode(key):
         and np.median(np.where(along > 0, norms / 4, norms / 5.5)) < 1.2
     )
     assert not cool(key, planes(), 128).reached
+
+
+def test_failures_of_great_norm_move_until_they_have_settled(key):
+    """Of 100 numbers beyond a plane at 3 the squares have the mean 110; of 24 failures theirs has a
+    standard error of 2.9, and the chains stop where a block of moves takes less than a twentieth.
+    """
+    sim = limit_state(lambda x: 3.0 - x[0], 100)
+    noise = jax.random.normal(key, (24, 100))
+    points = (3.0 * noise).at[:, 0].set(4.0 + 3.0 * jnp.abs(noise[:, 0]))
+    left, found = [], []
+    for most in (0, 600, 20_000):
+        people, chain = settled(key, sim, points, 10, most=most)
+        assert (people.z[:, 0] >= 3).all() and chain.evaluations <= max(most, 11 * 24)
+        left.append((people.z**2).sum(axis=1).mean())
+        found.append(chain.evaluations)
+    assert left[0] > left[1] > left[2] and 110 - 12 < left[2] < 110 + 12 + 0.05 * 110
+    assert found[2] < 10_000  # it stops by itself
+    again = settled(key, sim, people.z, 10, most=20_000)[1]
+    assert again.evaluations == 11 * 24  # what has settled moves once
+
+
+def test_a_rough_estimate_says_so(key):
+    """Where nothing else does, the standard error speaks against it; the numbers stay."""
+    counted = jast.estimate.monte_carlo(key, planes(1.0), 2000)
+    assert counted.reliable and counted.relative_error > ROUGH
+    rough = _or_rough(counted)
+    assert not rough.reliable and rough.mean == counted.mean
+    assert rough.warnings[0].startswith(f"relative standard error {counted.relative_error:.2g}")
+    fine = counted._replace(relative_error=ROUGH)
+    assert _or_rough(fine) is fine
+    flagged = counted._replace(reliable=False, warnings=("another reason",))
+    assert _or_rough(flagged) is flagged
 
 
 def test_log_ratios(key):

@@ -29,7 +29,7 @@ from jast.estimate.markov_tilts import (
 )
 from jast.estimate.recorded_tilts import recorded
 from jast.estimate.tilt_fit import as_tilts, fit, frame_of, ratios, steps_of
-from jast.estimate.tilt_search import TiltSeeker
+from jast.estimate.tilt_search import TiltSeeker, seek_tilts
 from jast.simulators import autoregression, ruin
 
 BUDGET = 10_000
@@ -262,11 +262,30 @@ def test_choices(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("horizon", [100, 300])
-def test_long_first_passage(horizon):
-    sim = autoregression(horizon=horizon)
-    found = failure_probability(jax.random.key(0), sim, 30_000)
-    assert good(found, autoregression_probability(0.1, 5.0, horizon)), str(found)
+@pytest.mark.parametrize(
+    "rate, threshold, horizon", [(0.1, 5.0, 100), (0.1, 5.0, 300), (0.4, 5.5, 100)]
+)
+def test_long_first_passage(rate, threshold, horizon):
+    sim = autoregression(rate, threshold, horizon)
+    found = failure_probability(jax.random.key(0), sim, 40_000)
+    assert good(found, autoregression_probability(rate, threshold, horizon)), str(found)
+
+
+def test_several_gaussians_serve_where_one_does_not():
+    """What forgets fast waits, then fails within a few steps: at each step the optimal disturbance
+    is one of two kinds, and a tilt of one Gaussian (of the best moments, too) has .002 to .04
+    effective draws a draw.
+    """
+    sim = autoregression(0.4, 5.5)
+    t = TiltSeeker(jax.random.key(0), sim, 1000)
+    seek_tilts(t, 9000)
+    one, spent = t.promised, t.spent
+    assert t.gates == 1 and one < 0.04
+    t.gated(3, spent + 6000)
+    assert t.gates == 3 and t.promised > 0.04 and spent < t.spent <= spent + 6000
+    truth = autoregression_probability(0.4, 5.5, 100)
+    # by all batches, of some 300 effective draws
+    assert abs(np.exp(t.log_mean) / truth - 1) < 0.25
 
 
 @pytest.mark.parametrize("choice", [False, True])

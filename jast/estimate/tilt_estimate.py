@@ -23,7 +23,7 @@ LONG, LARGE = 30, 2e7
 """Steps from which tilts are tried before Gaussians; numbers of a batch that are held."""
 SHARE, MORE = 0.35, 1.5
 """Of the budget for their search; how much longer it may be where failures came with the call."""
-GATES, GATED, GOOD = 3, 0.15, 0.1
+GATES, GATED, GOOD = 3, 0.25, 0.1
 """Gaussians that a normal number is drawn from one of, where one does not serve; what the search
 for them costs at most, of the budget; effective draws of a draw with which one does.
 """

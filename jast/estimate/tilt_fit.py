@@ -37,7 +37,9 @@ TOGETHER = 10.0
 """Of that of a number's own coefficients about those of all, where there are several Gaussians."""
 ITERATIONS, STEP = 25, 4.0
 ROUNDS, NEWTON, BEYOND = 8, 2, 1.5
-"""Of expectation maximisation, Newton's steps in each; the normal numbers that the outer Gaussians start from."""
+"""Of expectation maximisation, and Newton's steps in each; the normal numbers that the outer
+Gaussians start from.
+"""
 ROWS, GATED = 60_000, 20_000
 """That a fit looks at, at most, and one of several Gaussians."""
 

@@ -19,9 +19,10 @@ from jast.estimate.tilt_search import TiltSeeker, only
 
 __all__ = ["REST", "charged", "given", "guarded", "joined"]
 
-COVERED, MET, GUARD, WRONG = 50.0, 20, 0.15, 1.5
+COVERED, MET, GUARD, TIES, WRONG = 50.0, 20, 0.15, 1.5, 1.5
 """As in `jast.estimate.seek`, or more where so many of the last draws would meet a part of `THIN`;
-what the search for lost failures may cost, of the budget; standard errors that may be lost.
+what the search for lost failures should cost, of the budget; how much more it may where miss
+distances are few and levels fall more slowly; standard errors that may be lost.
 """
 REST = 0.3
 """Of what is left of the budget, what a search after others may cost."""
@@ -194,14 +195,15 @@ def _taken(s, t, trace, length, share, most):
 def _lost(s, t, takes):
     """Whether something was lost and taken in, if it is to be."""
     least = t.log_mean + math.log(LOST)
-    paid = int(min(GUARD * s.budget, (s.budget - s.spent) / 2))
+    paid, left = GUARD * s.budget, (s.budget - s.spent) / 2
+    most, paid = int(min(TIES * paid, left)), int(min(paid, left))
     size = min(s.size, int(paid / (least / math.log(QUANTILE) + LAST + 4)) // 50 * 50)
     if not size:
         s.reasons.append("the budget ran out before the search for lost failure modes was over")
         return False
     covered = _covered(s)
     q, threshold = t.tilts(t.q), -t.log_mean - covered
-    p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=paid)
+    p = explore(s.next_key(), s.sim, size, covered=(q, threshold), least=least, most=most)
     share = math.exp(min(p.log_mean - t.log_mean, 50)) if p.reached else 0.0
     thin = t.thin(covered)
     s.note(
