@@ -91,8 +91,8 @@ def failure_probability(
     steps or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with
     tilts: each step's own disturbance is tilted by the state and the time, choices by their odds,
     and the tilts are fitted by cross-entropy; a normal number comes from one of three Gaussians
-    where a single one serves badly. Others are tried with tilts where the Gaussians
-    promise few effective draws.
+    where a single one serves badly. Others are tried with tilts where the Gaussians promise few
+    effective draws.
 
     What is left of the budget, about half, is drawn from the proposal as it then stands. The
     estimate and its interval come from these episodes alone. A tenth of them or more, up to two

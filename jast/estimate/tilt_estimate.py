@@ -59,7 +59,9 @@ def _sought(s, t, most):
     t.given, end = given(s, t), s.spent + int(MORE * most)
     charged(s, t, lambda: seek_tilts(t, int(most)))
     if t.batches and t.gates == 1 and about.normals and t.promised < GOOD:
+        before = s.spent
         charged(s, t, lambda: t.gated(GATES, t.spent + int(GATED * s.budget)))
+        end += s.spent - before
     if t.given is not None:
         joined(s, t, end)
     return t

@@ -40,7 +40,7 @@ ROUNDS, NEWTON, BEYOND = 8, 2, 1.5
 """Of expectation maximisation, and Newton's steps in each; the normal numbers that the outer
 Gaussians start from.
 """
-ROWS, GATED = 60_000, 20_000
+ROWS, FEWER = 60_000, 20_000
 """That a fit looks at, at most, and one of several Gaussians."""
 
 
@@ -206,8 +206,8 @@ def _gated(x, z, w, gates, common):
     f = x.shape[1]
     if gates == 1:
         return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g, scales
-    if len(w) > GATED:
-        some, w = _resampled(w, GATED)
+    if len(w) > FEWER:
+        some, w = _resampled(w, FEWER)
         x, z = x[some], z[some]
     given = means.any()
     ridge = np.full(f, TOGETHER) if given else _ridge(f)

@@ -155,12 +155,10 @@ def _elsewhere(s, t):
     the way to one failure mode.
     """
     nothing = t.tilts(t.q), math.inf
-    cold = cool(s.next_key(), s.sim, _chains(s), covered=nothing)
-    if not (n := len(cold.points)):
+    cold, most = cool(s.next_key(), s.sim, _chains(s), covered=nothing), int(SETTLED * s.budget)
+    if not (n := len(z := cold.points)):
         return None
-    most = int(SETTLED * s.budget)
-    moved = settled(s.next_key(), s.sim, cold.points, SETTLING, covered=nothing, most=most)
-    people, chain = moved
+    people, chain = settled(s.next_key(), s.sim, z, SETTLING, covered=nothing, most=most)
     found, paid = _failures(s, nothing[0], people.z), cold.evaluations + chain.evaluations
     for _ in range(PLACES):
         rows = np.flatnonzero(_bare(s, t, found))
