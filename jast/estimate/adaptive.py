@@ -56,8 +56,8 @@ TILTS, POOR, PLENTY = 0.2, 0.05, 500
 """Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
 below which they are, and of all that are left at which they are not.
 """
-ROUGH = 0.04
-"""Relative standard error above which 10 % more or less is no surprise."""
+ROUGH = 0.05
+"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
 EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
@@ -101,7 +101,7 @@ def failure_probability(
     where plain Monte Carlo would be more exact, and where the proposal is given up but the model
     fails often enough. Where it does not, the answer is subset simulation's, and UNRELIABLE. So is
     that of a system whose floats are too coarse (`jast.rounding`), and an estimate with a relative
-    standard error above 4 %.
+    standard error above 5 %.
 
     Fewer than 5000 episodes are for systems that cost a second each. A Gaussian process learns the
     limit state from two thirds of them, 240 at most: the miss distance of the safe ones, and where
