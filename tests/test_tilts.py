@@ -263,11 +263,12 @@ def test_choices(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "rate, threshold, horizon", [(0.1, 5.0, 100), (0.1, 5.0, 300), (0.4, 5.5, 100)]
+    "rate, threshold, horizon, budget",
+    [(0.1, 5.0, 100, 30_000), (0.1, 5.0, 300, 30_000), (0.4, 5.5, 100, 40_000)],
 )
-def test_long_first_passage(rate, threshold, horizon):
+def test_long_first_passage(rate, threshold, horizon, budget):
     sim = autoregression(rate, threshold, horizon)
-    found = failure_probability(jax.random.key(0), sim, 40_000)
+    found = failure_probability(jax.random.key(0), sim, budget)
     assert good(found, autoregression_probability(rate, threshold, horizon)), str(found)
 
 

@@ -188,7 +188,7 @@ def _common(rows, w, mine, gates):
     """
     f = rows.x.shape[1]
     none = np.zeros((f, gates)), np.zeros((f, gates)), np.zeros(gates)
-    if gates == 1 or mine.size // len(mine) == 1 or not mine.any():
+    if gates == 1 or mine.shape[1] == 1 or not mine.any():
         return none
     n, a = np.nonzero(mine)
     if len(n) > ROWS:
