@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jast.estimate.batches import resampled
 from jast.estimate.gaussians import log_sum
 from jast.estimate.markov_tilts import (
     Block,
@@ -207,8 +208,8 @@ def _gated(x, z, w, gates, common):
     if gates == 1:
         return _lines(x, z[:, None], w[:, None], _ridge(f)), log_g, scales
     if len(w) > FEWER:
-        some, w = _resampled(w, FEWER)
-        x, z = x[some], z[some]
+        some = resampled(np.log(w), FEWER, 0.5)
+        x, z, w = x[some], z[some], np.full(FEWER, w.sum() / FEWER)
     given = means.any()
     ridge = np.full(f, TOGETHER) if given else _ridge(f)
     if given:
@@ -225,15 +226,6 @@ def _gated(x, z, w, gates, common):
         scales[0] = 0.0
         r = _parts(x, z, means, log_g, scales)
     return means, log_g, scales
-
-
-def _resampled(w, n):
-    """Rows [n] in proportion to the weights ``w``, at even spaces of their sum, and their equal
-    weights [n].
-    """
-    total = np.cumsum(w)
-    at = (np.arange(n) + 0.5) / n * total[-1]
-    return np.searchsorted(total, at), np.full(n, total[-1] / n)
 
 
 def _joint(x, z, means, log_g, scales):
