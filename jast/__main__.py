@@ -26,6 +26,7 @@ from jast.search.result import table
 from jast.simulator import Simulator
 from jast.simulators.drawings import DRAWN
 from jast.stress_testing import stress
+from jast.stress_testing.portfolio import PORTFOLIO
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
@@ -118,9 +119,8 @@ def _parser():
     add(
         "--budget",
         type=_count,
-        default=200_000,
         metavar="N",
-        help="evaluations of stress (default: 200000)",
+        help="evaluations of stress (default: what some eight CPU seconds simulate)",
     )
     add("--trees", type=_count, metavar="N", help="independent searches (default: 200)")
     add(
@@ -206,11 +206,12 @@ def _stress(options, own):
 
 
 def _explained(options, sim, report):
-    """What the page says of the modes: a tenth of the budget on top."""
+    """What the page says of the modes: a tenth of what the search for them took, on top."""
     about = outline(sim)
     if not (report.modes and about.disturbance.quantile and about.start.quantile):
         return ()
-    found = cards(jax.random.key(options.seed), sim, report.modes, options.budget // 10)
+    budget = min(report.settings["budget"], PORTFOLIO) // 10
+    found = cards(jax.random.key(options.seed), sim, report.modes, budget)
     print(f"{found[0][0]}\n")
     return found
 

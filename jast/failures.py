@@ -107,6 +107,8 @@ class Failures:
         """The i-th best `Episode`, unbatched; negative ``i`` counts from the end. IndexError
         outside the archive.
         """
+        if not self.size:
+            raise IndexError(f"there are no failures: no episodes held, received i = {i}")
         if not -self.size <= i < self.size:
             raise IndexError(
                 f"Failures.episode: i must be within the {self.size} episodes held, received {i}"

@@ -146,13 +146,23 @@ def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Points [n, D] of the mixture ``q`` by uniform numbers ``u`` [n], of the components, and
     normal ones ``e`` [n, D]. On the host.
     """
-    edges = np.cumsum(np.exp(np.asarray(q.log_weights)))
-    k = np.minimum(np.searchsorted(edges, u, side="right"), _live(q) - 1)
-    z = np.empty_like(e)
+    k, z = component(q, u), np.empty_like(e)
     for i in np.unique(k):
         rows = k == i
         z[rows] = np.asarray(q.means[i]) + product(e[rows], np.asarray(q.factors[i]).T)
     return z
+
+
+def component(q: Latent, u: np.ndarray) -> np.ndarray:
+    """Which component of ``q`` each of the uniform numbers ``u`` [n] chooses."""
+    edges = np.cumsum(np.exp(np.asarray(q.log_weights)))
+    return np.minimum(np.searchsorted(edges, u, side="right"), _live(q) - 1)
+
+
+def of_the_model(q: Latent) -> np.ndarray:
+    """Which components [K] are the model itself: their draws are plain ones."""
+    unit = (np.asarray(q.factors) == np.eye(q.means.shape[1])).all(axis=(1, 2))
+    return unit & ~np.asarray(q.means).any(axis=1)
 
 
 def log_ratios(q: Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jast
 from jast.estimate import pareto_k
 from jast.estimate.diagnostics import reasons
 from jast.estimate.estimate import estimate, of_counts
@@ -353,6 +354,70 @@ def test_counts():
         and everything.relative_error == 0
         and everything.chernoff == 1
     )
+
+
+@pytest.mark.parametrize(
+    "k, n, level",
+    [(0, 1_000_000, 0.95), (3, 50, 0.9), (7, 7, 0.95), (1, 1, 0.5), (412, 90_000, 0.99)],
+)
+def test_what_plain_draws_guarantee(k, n, level):
+    """Quantiles of beta distributions, whatever the rest of the estimate says."""
+    found = estimate("x", some(), level=level, reasons=("no",), plain=(k, n))
+    tail = (1 - level) / 2
+    low = scipy.stats.beta.ppf(tail, k, n - k + 1) if k else 0.0
+    high = scipy.stats.beta.isf(tail, k + 1, n - k) if k < n else 1.0
+    assert found.plain == (k, n) and found.guaranteed == pytest.approx((low, high), rel=1e-9)
+    words = f"between {low:.3g} and {high:.3g} at {level:.4g}: {k} of {n} plain draws fail"
+    lines = str(found).splitlines()
+    assert lines[0] == "UNRELIABLE: no" and lines[2] == f"probability    {words}"
+    assert lines[3].startswith(f"doubtful       {found.mean:.4g}   {level:.4g} interval [")
+    assert lines[3].endswith("], not to be believed")
+
+
+def test_plain_draws_of_the_sums_join_the_others():
+    whole = traces(np.full(100, -5.0), failure=np.arange(100) < 30)
+    total = add(nothing(100), whole, np.arange(100) % 10 == 0)
+    assert total.plain == (3, 10) and estimate("x", total, plain=(1, 5)).plain == (4, 15)
+    assert add(total, whole).plain == (3, 10)  # of which nothing is known
+    none = estimate("x", some(), reasons=("no",))
+    assert none.plain is None is none.guaranteed and "doubtful" not in str(none)
+    assert f"probability    {none.mean:.4g}   0.95 interval" in str(none)
+
+
+def test_a_reliable_estimate_prints_as_if_there_were_no_plain_draws():
+    assert str(estimate("x", some(), plain=(3, 4000))) == str(estimate("x", some()))
+
+
+@pytest.mark.parametrize("k", [0, 3])
+def test_counts_are_printed_once(k):
+    found = of_counts("monte_carlo", summed(np.zeros(500), failure=np.arange(500) < k))
+    assert found.plain == (k, 500) and found.guaranteed == found.interval
+    text = str(found)
+    assert not found.reliable and "doubtful" not in text and text.count("between ") == 1
+    assert text.count(f"{found.interval[1]:.3g}") == 1 and f"{k} of 500 plain draws" in text
+
+
+def test_a_file_keeps_the_plain_draws(tmp_path):
+    for found in (estimate("x", some(), plain=(2, 99)), estimate("x", some())):
+        jast.save(tmp_path / "e.npz", found)
+        back = jast.load(tmp_path / "e.npz")
+        assert back.plain == found.plain and back.guaranteed == found.guaranteed
+        assert str(back) == str(found)
+
+
+def test_no_probability_above_1():
+    """A mean of weights that is above 1 by chance is 1; far above it, a density is wrong, which the
+    reasons say.
+    """
+    rng = np.random.default_rng(0)
+    log_w = 0.3 * rng.normal(size=4000) - 0.045
+    log_w += 0.001 - np.log(np.exp(log_w).mean())
+    found = estimate("x", summed(log_w))
+    assert found.reliable and (found.mean, found.log_mean) == (1.0, 0.0)
+    assert found.interval[0] < 1 == found.interval[1] and "probability    1   0.95" in str(found)
+    wrong = estimate("x", summed(log_w + 1), plain=(9, 10))
+    assert not wrong.reliable and wrong.mean == 1 and "is 2.721, above 1" in wrong.warnings[0]
+    assert "doubtful       1   0.95 interval" in str(wrong)
 
 
 def test_the_level_is_the_one_that_was_asked_for():

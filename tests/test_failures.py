@@ -196,6 +196,9 @@ def test_access_by_rank(archive):
     same(archive[0], archive.best)
     with pytest.raises(IndexError, match="episodes held"):
         archive.episode(archive.size)
+    for none in (archive[:0], F.empty(FERRY)):
+        with pytest.raises(IndexError, match="there are no failures"):
+            none[0]
 
 
 @given(st.lists(st.integers(0, 39), max_size=30), st.integers(1, 8), st.randoms())

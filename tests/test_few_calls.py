@@ -123,7 +123,7 @@ def test_a_system_that_never_fails_has_an_upper_bound(coarse):
     r = failure_probability(jax.random.key(0), limit_state(lambda x: 3.0 + jnp.sum(x**2), 2), 60)
     n = r.samples
     assert not r.reliable and np.isnan(r.mean) and n == 60 - 36
-    assert r.interval == clopper_pearson(0, n) and r.evaluations == 60
+    assert r.interval == r.guaranteed == clopper_pearson(0, n) and r.evaluations == 60
     assert f"no failure in {n} episodes" in r.warnings[0]
 
 
@@ -140,6 +140,9 @@ def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     known = np.array([[2.2, 2.2], [2.5, 1.9]])
     r = few_calls.few_calls(jax.random.key(0), sim, 50, 0.95, known)
     assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
+    common = few_calls.few_calls(jax.random.key(0), limit_state(lambda x: x[0], 2), 60, 0.95)
+    k, n = common.plain  # every other one of the initial design
+    assert n == pytest.approx(-np.log(0.05) / common.unseen) and 0 < k < n and common.mean <= 1
 
 
 def test_an_error_above_the_mean_leaves_an_upper_end():

@@ -62,6 +62,17 @@ def test_what_must_not_be_believed_says_so_and_why():
     assert " ".join(words).count("or so") == 30
     assert max(map(len, words)) < 130
     plt.close(figure)
+    figure = plot.report(made(probability=doubt._replace(plain=(2, 30_000))), nominal=0)
+    words = said(figure)
+    assert "between 8.07e-06 and 0.000241" in words and "doubtful" in words
+    assert words.index("at 0.95: 2 of 30000 plain draws fail") < words.index("doubtful")
+    assert "1e-05" not in words and "not to be believed" in " ".join(filter(None, words))
+    # nothing hangs over the facts on the right
+    look = figure.canvas.get_renderer()
+    [value] = [t for t in figure.texts if t.get_text().startswith("between ")]
+    [fact] = [t for t in figure.texts if t.get_text() == "undisturbed"]
+    assert value.get_window_extent(look).x1 < fact.get_window_extent(look).x0
+    plt.close(figure)
 
 
 def test_without_its_simulator_a_failure_or_an_estimate():

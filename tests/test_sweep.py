@@ -17,7 +17,7 @@ from jax.tree_util import Partial
 import jast
 from jast.crude import Nominal
 from jast.distributions import Normal
-from jast.estimate import failure_probability
+from jast.estimate import Estimate, failure_probability
 from jast.estimate.markov_tilts import Tilts
 from jast.estimate.tilt_fit import as_tilts, of_tilts
 from jast.intervals import clopper_pearson
@@ -204,6 +204,20 @@ def test_a_setting_may_be_called_as_a_column():
     names = ["gain", "interval", "note", "probability", "interval", "episodes", "note"]
     assert lines[0].split() == names
     assert lines[1].split()[:4] == ["1", "5", "a", "0.1"] and lines[2].endswith("UNRELIABLE")
+
+
+def test_a_flagged_row_shows_what_plain_draws_guarantee_and_the_doubtful_number_behind():
+    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
+    good = Estimate("mine", *numbers, True, (), plain=(0, 1000))
+    bad = good._replace(reliable=False, warnings=("no",), plain=(0, 1_000_000))
+    bare, none = bad._replace(plain=None), (None,) * 3
+    head, *rows = str(Sweep({"gain": (1, 2, 3)}, (good, bad, bare), none, none, {})).splitlines()
+    names = ["gain", "probability", "interval", "episodes", "doubtful", "note"]
+    assert head.split() == names
+    assert rows[0].split() == ["1", "1e-05", "[8e-06,", "2e-05]", "999"]
+    assert rows[1].split("  ")[-1].endswith("UNRELIABLE: no")
+    assert "  0 of 1000000 fail  [0, 3.689e-06]" in rows[1] and "     1e-05  UNREL" in rows[1]
+    assert rows[2].split() == ["3", "1e-05", "[8e-06,", "2e-05]", "999", "UNRELIABLE:", "no"]
 
 
 def test_the_crossing_of_a_straight_line_and_its_interval():

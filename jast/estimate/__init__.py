@@ -23,6 +23,7 @@ from jast.estimate.events import Event, GivenStart, events, given_start
 from jast.estimate.failure_samples import FailureSamples, failure_samples
 from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
+from jast.estimate.population import Sample, population
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
 from jast.estimate.subset import subset_simulation
 from jast.intervals import chernoff, clopper_pearson, delta_bound, jeffreys, normal
@@ -37,6 +38,7 @@ __all__ = [
     "FailureTimes",
     "GivenStart",
     "Proposal",
+    "Sample",
     "Traces",
     "adaptive_cross_entropy",
     "chernoff",
@@ -58,6 +60,7 @@ __all__ = [
     "normal",
     "pareto_k",
     "policy_proposal",
+    "population",
     "subset_simulation",
     "trace_proposal",
 ]

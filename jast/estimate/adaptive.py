@@ -17,13 +17,14 @@ from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.checkpoints import stored
 from jast.contract import contract
-from jast.estimate import diagnostics, few_calls, sums, tilt_estimate, tilt_guard
-from jast.estimate.batches import balanced, drawn, of_chunk, plain_chunk
+from jast.estimate import budgets, diagnostics, few_calls, sums, tilt_estimate, tilt_guard
+from jast.estimate.batches import balanced, drawn, of_chunk, picks, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
+from jast.estimate.population import by_populations
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import fits
 from jast.estimate.seek import Seeker, seek
@@ -67,8 +68,9 @@ greatest share of the last part.
 def failure_probability(
     key: chex.PRNGKey,
     sim: Simulator,
-    budget: int = 100_000,
+    budget: int | None = None,
     *,
+    seconds: float | None = None,
     failures: Failures | None = None,
     near: Estimate | None = None,
     gradients: bool = True,
@@ -79,7 +81,13 @@ def failure_probability(
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Estimate:
-    """The probability that a system fails, by a proposal that this function finds itself.
+    """The probability that a system fails, by the way that suits what an episode costs.
+
+    By default the rate of the system is measured. One that simulates 300,000 episodes in some eight
+    CPU seconds is answered by populations that stay on the device (`population`), and so is every
+    system in JAX with a budget from 300,000 on. ``settings`` names the budget that was used: the
+    same key with that budget gives the same bits. The others, and calls with ``failures`` or
+    ``near``, are answered by a proposal that this function finds itself.
 
     An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). Design
     points come from gradients of the miss distance, from noise that is wide first and then cooled,
@@ -121,7 +129,11 @@ def failure_probability(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        budget: episodes to simulate, at least 50.
+        budget: episodes to simulate, at least 50. Default: what a cheap system simulates in eight
+            CPU seconds, rounded to a power of 2; 100,000 of others.
+        seconds: in place of ``budget``: as many episodes as the system simulates in so many CPU
+            seconds (a black box: seconds), rounded to a power of 2. Compilation and the method's
+            own work come on top.
         failures: known ones (an archive, `jast.failures`), which join what the explorers find, so
             that no mode among them is lost. They lead to a proposal and never enter the estimate.
             Tilts take in two modes that they hardly draw; where others are left, or these could not
@@ -146,8 +158,9 @@ def failure_probability(
         counts each episode, and three for one with its gradient.
 
     Raises:
-        ValueError: for a budget below 50, a level outside (0, 1), disturbances without a quantile
-            function, and where the simulator's functions do not fit together.
+        ValueError: for a budget below 50, a budget together with ``seconds``, ``seconds`` not above
+            0, a level outside (0, 1), disturbances without a quantile function, and where the
+            simulator's functions do not fit together.
 
     Example:
         >>> import jax, jast
@@ -159,9 +172,16 @@ def failure_probability(
     """
     name = NAME
     random_key(name, key)
-    budget = whole(name, "budget", budget, few_calls.LEAST)
+    budgets.given(name, budget, seconds)
+    if budget is not None:
+        budget = whole(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
+    alone = failures is None and near is None
+    if budget is None and not alone and seconds is None:
+        budget = budgets.DEAR
+    if budget is None:
+        budget = budgets.budget_of(name, key, sim, seconds, few_calls.LEAST)
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
     if near is not None and not isinstance(near, Estimate):
@@ -170,7 +190,10 @@ def failure_probability(
     ways = units.ways(name, executor, devices)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     with stored(name, checkpoint, key, **about) as store, kept(store):
-        if budget < LEAST:
+        if alone and budgets.cheap(sim, budget):
+            ways, watched = ways._replace(store=store), (progress, callback)
+            found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
+        elif budget < LEAST:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             ways, watched = ways._replace(store=store), (progress, callback)
@@ -250,7 +273,9 @@ def _with_the_rest(key, s, t, level, watched, ways):
         found = by_levels(key, sim, n, log_p, level, about["reasons"] or [ASTRAY])
         if found is not None:
             return found._replace(
-                episodes=s.spent + found.episodes, history=(*about["history"], *found.history)
+                episodes=s.spent + found.episodes,
+                history=(*about["history"], *found.history),
+                plain=s.plain,
             )
     if s.log_mean is None or (astray and enough) or _plain_is_better(s):
         watch = Watch(NAME, n, "episode", *watched)
@@ -265,7 +290,9 @@ def _with_the_rest(key, s, t, level, watched, ways):
     modes = _by_direction(q)
     member = np.eye(len(q.means))[_owner(modes, len(q.means))]
     watch = Watch(NAME, n, "episode", *watched)
-    total, notes, lost = chunks(_traces, (key, sim, q, member, lanes, n), lanes, watch, ways)
+    model = latent.of_the_model(q)
+    plain = lambda i: model[latent.component(q, picks(key, i, lanes, q.means.dtype))]
+    total, notes, lost = chunks(_traces, (key, sim, q, member, lanes, n), lanes, watch, ways, plain)
     about["reasons"] += lost
     groups = _groups(q, modes, total) if total.first > 0 else []
     found = estimate(
@@ -276,6 +303,7 @@ def _with_the_rest(key, s, t, level, watched, ways):
         groups=groups,
         proposal=s.q,
         control=int(share * total.samples) + s.batch,
+        plain=s.plain,
         **about,
     )
     return found._replace(draws=drawn_by(found.draws, key, lanes, q))
@@ -340,6 +368,7 @@ def _of_the_search(s, level):
         evaluations=s.spent,
         proposal=s.q,
         history=tuple(s.history),
+        plain=s.plain,
     )
 
 

@@ -231,7 +231,7 @@ def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureT
         for sums_ in zip(np.cumsum(first), np.cumsum(second), np.cumsum(count), strict=True)
     ]
     return FailureTimes(
-        np.exp(each.log_mean),
+        np.exp(np.minimum(each.log_mean, 0.0)),
         *np.array(ends).T,
         first / whole.first,
         {q: _time(by, q) for q in (0.05, 0.5, 0.95)},
@@ -274,7 +274,7 @@ class _Within:
         self.top = np.maximum.accumulate(self.log_w) if self.count else self.log_w
 
     def probability(self, i):
-        return math.exp(self.moments.log_mean[i])
+        return math.exp(min(self.moments.log_mean[i], 0.0))  # weights may have a mean above 1
 
     def ties(self, v):
         """The probability within ``v``."""

@@ -84,9 +84,14 @@ def numbers(key, n, d, dtype):
 
 def of_chunk(key, i, n, q):
     """The `numbers` of the first ``n`` draws of chunk ``i`` of an estimate by ``q``."""
-    u, e = generator(key, 2, i), generator(key, 3, i)
     d, dtype = q.means.shape[1], q.means.dtype
-    return u.random(n).astype(dtype), e.standard_normal((n, d)).astype(dtype)
+    e = generator(key, 3, i).standard_normal((n, d)).astype(dtype)
+    return picks(key, i, n, dtype), e
+
+
+def picks(key, i, n, dtype):
+    """The uniform numbers that choose the components of the first ``n`` draws of chunk ``i``."""
+    return generator(key, 2, i).random(n).astype(dtype)
 
 
 def plain_chunk(key, i, n, sim):

@@ -12,7 +12,7 @@ from jast.estimate import diagnostics
 from jast.estimate.sums import skewness
 from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
-__all__ = ["Estimate", "estimate", "of_counts"]
+__all__ = ["Estimate", "doubtful", "estimate", "guarantee", "of_counts"]
 
 INVALID, COUNTED = 0.01, 10
 """Part of an estimate that invalid episodes may add; failures from which a count is believed."""
@@ -20,8 +20,8 @@ INVALID, COUNTED = 0.01, 10
 
 @results.result("samples")
 class Estimate(NamedTuple):
-    """A failure probability. Python numbers and NumPy arrays; ``print`` says UNRELIABLE and why
-    before any number where it must not be believed.
+    """A failure probability. Python numbers and NumPy arrays; where it must not be believed,
+    ``print`` says UNRELIABLE and why before any number, and then first what plain draws guarantee.
 
     Good diagnostics are necessary, not sufficient: a proposal that never reaches a failure mode
     gives weights that look perfect.
@@ -95,6 +95,10 @@ class Estimate(NamedTuple):
     """`jast.estimate.Draws`: the weighted draws, for `jast.estimate.exceedance`, `failure_times`
     and `events`; None where there are none
     """
+    plain: tuple[int, int] | None = None
+    """(failing, episodes) of the model's own draws, which know nothing of a proposal; None where
+    there were none
+    """
 
     @property
     def failures_seen(self) -> int:
@@ -111,17 +115,28 @@ class Estimate(NamedTuple):
         """Decimal logarithm of the estimate."""
         return self.log_mean / math.log(10)
 
+    @property
+    def guaranteed(self) -> tuple[float, float] | None:
+        """Clopper and Pearson's interval of ``plain`` at ``level``: no proposal can make it wrong.
+        None without plain draws.
+        """
+        return None if self.plain is None else clopper_pearson(*self.plain, self.level)
+
     def __str__(self) -> str:
         rows, low, high = [], *self.interval
+        if (known := guarantee(self)) is not None:
+            rows.append(("probability", " ".join(known)))
         if not math.isnan(self.log_mean):
             value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
-            rows.append(
-                ("probability", f"{value}   {self.level:.4g} interval [{low:.4g}, {high:.4g}]")
-            )
+            value += f"   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"
+            if known is None:
+                rows.append(("probability", value))
+            elif doubtful(self):
+                rows.append(("doubtful", f"{value}, not to be believed"))
             rows.append(
                 ("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}")
             )
-        else:
+        elif known is None:
             known = f"below {high:.4g} at {self.level:.4g}" if high < 1 else "nothing is known"
             rows.append(("probability", f"no failure seen: {known}"))
         if self.chernoff is not None:
@@ -140,7 +155,7 @@ class Estimate(NamedTuple):
                 f"{self.failing} of {self.samples} episodes   {self.episodes} evaluations",
             )
         )
-        if self.chernoff is None and self.failing:
+        if self.chernoff is None and self.failing and not math.isnan(self.max_share):
             rows.append(
                 (
                     "weights",
@@ -174,6 +189,23 @@ class Estimate(NamedTuple):
         )
 
 
+def guarantee(p: Estimate) -> tuple[str, str] | None:
+    """In words, the interval that plain draws guarantee, and its level and counts: what to say
+    first of ``p``. None where it is reliable, and without plain draws.
+    """
+    if p.reliable or p.plain is None:
+        return None
+    (k, n), (low, high) = p.plain, p.guaranteed
+    return f"between {low:.3g} and {high:.3g}", f"at {p.level:.4g}: {k} of {n} plain draws fail"
+
+
+def doubtful(p: Estimate) -> bool:
+    """Whether ``p`` has a number of its own to say behind its `guarantee`; plain counts have none
+    but these.
+    """
+    return guarantee(p) is not None and p.chernoff is None and not math.isnan(p.log_mean)
+
+
 def estimate(
     method,
     sums,
@@ -186,12 +218,14 @@ def estimate(
     proposal=None,
     history=None,
     control=0,
+    plain=(0, 0),
 ):
     """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside,
     ``notes`` are remarks.
 
     ``groups``: lists of components that are one failure mode (default: each by itself).
-    ``control``: episodes that were the model's own draws.
+    ``control``: episodes that were the model's own draws. ``plain``: (failing, episodes) of such
+    draws beside those of ``sums``.
     """
     level = checked_level(method, level)
     n, seen = sums.samples, sums.first > 0
@@ -200,6 +234,8 @@ def estimate(
         found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
     found += _if_invalid_failed(sums)
     log_mean = sums.top + math.log(sums.first / n) if seen else math.nan
+    above = math.exp(min(log_mean, 700.0)) if log_mean > 0 else 0.0
+    log_mean = min(log_mean, 0.0)  # a mean of weights exceeds 1 by chance; min keeps a NaN
     # eq. 14 over the square of the mean; n - 1 for an unbiased variance
     relative = (
         math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1))
@@ -219,8 +255,9 @@ def estimate(
         mode_intervals = _of_modes(log_mean, modes, sizes, n, level)
         found += diagnostics.thin_modes(modes, sizes, relative)
     mean = math.exp(log_mean) if seen else math.nan
-    if seen and mean > 1 + 4 * mean * relative:
-        found.append(f"the estimate is {mean:.4g}, above 1: a density does not fit its samples")
+    if above > 1 + 4 * above * relative:
+        found.append(f"the estimate is {above:.4g}, above 1: a density does not fit its samples")
+    k, drawn = (a + b for a, b in zip(sums.plain, plain, strict=True))
     return Estimate(
         method=method,
         log_mean=log_mean,
@@ -245,6 +282,7 @@ def estimate(
         history=history,
         mode_intervals=mode_intervals,
         draws=sums.draws,
+        plain=(k, drawn) if drawn else None,
     )
 
 
@@ -287,6 +325,7 @@ def of_counts(
         history=history,
         mode_intervals=np.array([clopper_pearson(k, n, level)]) if k else None,
         draws=sums.draws,
+        plain=(k, n) if n else None,
     )
 
 

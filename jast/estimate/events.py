@@ -210,7 +210,7 @@ def given_start(
             # of a ratio of two independent means, to first order
             relative = float(np.hypot(of_both.relative, np.sqrt((1 - m / n) / m)))
             log_p = float(of_both.log_mean) - np.log(m / n)
-            p, ends = float(np.exp(log_p)), log_normal(log_p, relative, level)
+            p, ends = min(float(np.exp(log_p)), 1.0), log_normal(log_p, relative, level)
         elif m:
             p, ends = 0.0, (0.0, min(event.interval[1] * n / m, 1.0))
         good = event.reliable and m >= diagnostics.ESS
@@ -237,7 +237,7 @@ def _event(estimate, draws, log_w, happened, level):
         k_hat = diagnostics.pareto_k(log_w[happened], n, k)
         reasons += diagnostics.reasons(k, float(m.ess), k_hat, float(chosen.max() / chosen.sum()))
     ends = interval(m, level, k if draws.counted else None, n)
-    p = float(np.exp(m.log_mean))
+    p = min(float(np.exp(m.log_mean)), 1.0)
     return Event(p, ends, *given, float(m.ess), k, not reasons, tuple(reasons), level)
 
 

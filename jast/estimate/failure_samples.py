@@ -20,6 +20,7 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.markov_tilts import Tilts, shape
+from jast.estimate.population import Sample
 from jast.estimate.populations import settled
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import redrawn
@@ -100,8 +101,9 @@ def failure_samples(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        source: an `Estimate` of `failure_probability`, a `Proposal`, or a `jast.Policy` with
-            densities; ``10 * samples`` episodes are drawn from it.
+        source: an `Estimate` of `failure_probability` or `population`, a `Proposal`, or a
+            `jast.Policy` with densities; ``10 * samples`` episodes are drawn from it. The failures
+            of populations are taken as they are.
         samples: failures to return.
         moves: Markov moves of each.
         checkpoint: a folder that keeps what the system answered. The same call then goes on where
@@ -141,14 +143,18 @@ def failure_samples(
 def _sampled(name, key, sim, q, samples, moves):
     key, for_draws, for_rows = jax.random.split(key, 3)
     n = PER_SAMPLE * samples
-    if isinstance(q, latent.Latent):
-        if (received := q.means.shape[1]) != latent.dimension(sim):
+    if isinstance(q, latent.Latent | Sample):
+        received = (q.means if isinstance(q, latent.Latent) else q.points).shape[1]
+        if received != latent.dimension(sim):
             raise ValueError(
                 f"{name}: source must be of this simulator, with {latent.dimension(sim)} random"
                 f" numbers in an episode, received one with {received}"
             )
-        z, o, log_w = redrawn(for_draws, sim, q, n)
-        failure = o.failure
+        if isinstance(q, Sample):  # they are failures, which nobody has to look for
+            z, log_w, failure, n = q.points, q.log_weight, np.ones(len(q.points), bool), 0
+        else:
+            z, o, log_w = redrawn(for_draws, sim, q, n)
+            failure = o.failure
     elif isinstance(q, Tilts):
         if (received := q.frame.centre.shape[0]) != (expected := shape(sim).seen):
             raise ValueError(

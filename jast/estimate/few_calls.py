@@ -151,6 +151,7 @@ def _estimate(s, rounds, level):
         found.append(f"{int(s.failing.sum())} failures are too few to trust the estimate")
     v = w * failing
     ess = float(v.sum() ** 2 / (v**2).sum()) if v.any() else 0.0
+    mean = min(mean, 1.0)  # by chance above it: the corrections know no bound
     log_mean = math.log(mean) if mean > 0 else math.nan
     return Estimate(
         method=NAME,
@@ -174,6 +175,7 @@ def _estimate(s, rounds, level):
         unseen=unseen,
         proposal=as_latent([(1.0, s.pool.mixture)], s.dtype),
         history=tuple(s.history),
+        plain=(s.plain_failing, s.plain),
     )
 
 

@@ -204,19 +204,20 @@ def even(samples):
     return -(-samples // -(-samples // LANES))
 
 
-def chunks(simulate, shared, lanes, watch, ways=units.HERE):
+def chunks(simulate, shared, lanes, watch, ways=units.HERE, plain=None):
     """(`Sums`, notes, reasons against them) of all episodes of ``watch``, ``lanes`` at a time, as
     units of work.
 
     ``simulate(shared, i, post)``: `Traces` of chunk i, a function of a module; of the last chunk
-    the first rows count.
+    the first rows count. ``plain(i)``: which of its rows are the model's own draws.
     """
     samples = watch.total
 
     def fold(kept, i, rows):
         total, done = kept
         rows = jax.tree.map(lambda a: a[: samples - i * lanes], rows)
-        return sums.add(total, rows), done + len(rows.failure)
+        own = None if plain is None else plain(i)[: len(rows.failure)]
+        return sums.add(total, rows, own), done + len(rows.failure)
 
     task = Task(simulate, shared, lambda: Traces(*Traces._fields))
     size = lambda done: min(done * lanes, samples)

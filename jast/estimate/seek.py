@@ -66,6 +66,7 @@ class Seeker:
         self.lost = 0.0  # a share that the proposal may have lost
         self.asked = 0.0  # what the guard last saw of it, before it was taken in
         self.coarse = []  # what is wrong with the system's floats
+        self.plain = 0, 0  # failing ones and all of its draws of the model
 
     def next_key(self):
         words = self.root.integers(2**32, size=2, dtype=np.uint32)
@@ -162,6 +163,7 @@ def _look(s):
     """A batch of the model itself."""
     b = _drawn(s, s.model())
     s.batches.append(b)
+    s.plain = int(b.failure.sum()), s.batch
     s.note(f"draws of the model: {b.failure.sum()} fail", s.batch)
 
 

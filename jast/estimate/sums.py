@@ -43,6 +43,8 @@ class Sums(NamedTuple):
     keep: int
     draws: Any = None
     """`jast.estimate.draws.Draws` of the traces that have a miss distance"""
+    plain: tuple[int, int] = (0, 0)
+    """(failing, episodes) of those that are known to be the model's own draws"""
 
 
 def nothing(samples):
@@ -73,8 +75,11 @@ def tail_size(samples):
     return int(np.ceil(min(samples / 5, 3 * np.sqrt(samples)))) + 1
 
 
-def add(total, traces):
-    """`Sums` with the `Traces` [n] (NumPy) as well."""
+def add(total, traces, plain=None):
+    """`Sums` with the `Traces` [n] (NumPy) as well; ``plain`` [n]: which of them are the model's
+    own draws, None where that is not known.
+    """
+    plain = np.zeros(len(traces.failure), bool) if plain is None else plain
     log_w = np.asarray(traces.log_weight, np.float64)
     good = np.asarray(traces.failure) & (log_w < np.inf)
     shares = np.exp(np.asarray(traces.shares, np.float64)[good])
@@ -105,6 +110,10 @@ def add(total, traces):
         tail=np.sort(tail)[::-1],
         keep=total.keep,
         draws=draws.add(total.draws, traces),
+        plain=(
+            total.plain[0] + int(np.asarray(traces.failure)[plain].sum()),
+            total.plain[1] + int(plain.sum()),
+        ),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jast.counter import generator
 from jast.estimate import diagnostics
+from jast.estimate.batches import picks
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.importance_sampling import Traces, chunks
@@ -76,7 +77,8 @@ def estimated(
     weights[0] = share
     q = t.tilts((tilts, weights, frame))
     shared = key, s.sim, q, t.batch, t.about, t.dtype
-    total, notes, lost = chunks(_traces, shared, t.batch, watch, ways)
+    plain = lambda i: picks(key, i, t.batch, t.dtype) < np.exp(q.log_weights[0])
+    total, notes, lost = chunks(_traces, shared, t.batch, watch, ways, plain)
     groups = [list(range(1, len(tilts)))] if total.first > 0 else []
     if groups and total.by_component[0] / total.first >= diagnostics.MATTERS:
         groups.append([0])
@@ -93,6 +95,7 @@ def estimated(
         proposal=q,
         history=tuple(s.history),
         control=int(share * total.samples),
+        plain=s.plain,
     )
     return found._replace(draws=drawn_by(found.draws, key, t.batch, q))
 

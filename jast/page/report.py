@@ -142,7 +142,8 @@ def _title(report: Any) -> str:
 def _head(report: Any) -> str:
     """The verdict on one screen."""
     words, mood = headline(report)
-    known = [(name, value) for name, value in verdict(report) if name and name != "probability"]
+    ours = "", "probability", "doubtful"
+    known = [(name, value) for name, value in verdict(report) if name not in ours]
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
         f"</h1></header>\n<main>\n<section id=verdict>{_probability(report.probability)}"
@@ -164,7 +165,7 @@ def _probability(p: Any) -> str:
         badge = f"<div class={look}>{b.badge}<ul>{reasons}</ul></div>"
     return (
         "<div id=probability><h2>Probability of failure</h2>"
-        f"<p class='value{' doubt' * (b.mood == 'bad')}'>{text(b.value)}</p>"
+        f"<p class='value{' doubt' * b.doubt}'>{text(b.value)}</p>"
         f"<p>{text(b.more)}</p>{badge}{rows(b.facts)}</div>"
     )
 

@@ -88,7 +88,8 @@ def report(
     shown = [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
     told = belief(report.probability)
     left = _left(told)
-    known = [(name, words) for name, words in verdict(report) if name not in ("", "probability")]
+    ours = "", "probability", "doubtful"
+    known = [(name, words) for name, words in verdict(report) if name not in ours]
     right = _wrapped([*known, ("evaluations", f"{report.episodes:,}")], 43)
     title = textwrap.wrap(headline(report)[0], 72)
     tried = work(report)
@@ -156,8 +157,9 @@ def _wrapped(rows: list, width: int) -> list[tuple[str, str]]:
 
 def _belief(page: _Page, told: Any, rows: list) -> None:
     page.words(MARGIN, "Probability of failure", weight="bold", fontsize=10.5)
-    doubt = told.mood == "bad"
-    look = dict(color=style.GREY, fontsize=13) if doubt else dict(fontsize=19, weight="bold")
+    look = dict(fontsize=19 if len(told.value) < 16 else 13, weight="bold")
+    if told.doubt:
+        look = dict(color=style.GREY, fontsize=13)
     page.words(MARGIN, told.value, 0.23, **look)
     for i, (name, words) in enumerate(rows):
         down = 0.66 + LINE * i

@@ -13,7 +13,11 @@ from jast import limit_state as latent
 from jast.contract import check
 from jast.crude import nominal
 from jast.episode import rollout
-from jast.estimate import adaptive, few_calls
+from jast.estimate import adaptive, budgets, few_calls
+from jast.estimate.batches import resampled
+from jast.estimate.budgets import CHEAP
+from jast.estimate.descents import SETTINGS, cooled
+from jast.estimate.population import Sample, by_populations
 from jast.estimate.redrawn import redrawn
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
@@ -33,7 +37,7 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback
 
-__all__ = ["stress"]
+__all__ = ["PORTFOLIO", "stress"]
 
 DRAWN = 400
 """Draws of the estimate's proposal, where only it found failures."""
@@ -58,26 +62,37 @@ nothing else to find: the evaluations of `onward` are the estimate's then.
 def stress(
     key: chex.PRNGKey,
     sim: Simulator,
-    budget: int = 200_000,
+    budget: int | None = None,
     *,
+    seconds: float | None = None,
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
 ) -> Report:
     """How does the system fail, how likely, and what is its likeliest failure?
 
-    It checks the simulator, runs it undisturbed and under plain draws, looks for failures with a
-    portfolio of explorers (those whose failures get likelier are given more of the budget), pulls
-    what they found to where log p is greatest (`jast.search.refine`), sorts it into failure modes,
-    and estimates the probability of failure (`jast.estimate.failure_probability`), for which the
-    modes found are where to look; they never enter the estimate itself.
+    It checks the simulator, and runs it undisturbed and under plain draws. By default its rate is
+    then measured. A system that simulates 300,000 episodes in some eight CPU seconds is answered by
+    populations that stay on the device (`jast.estimate.population`): they tell the probability,
+    their failures are cooled to the likeliest near to each, pulled to where log p is greatest
+    (`jast.search.refine`), and sorted into failure modes, each with its share of the probability.
+    The same holds of every system in JAX with a budget from 300,000 on.
+
+    For the others a portfolio of explorers looks for failures (those whose failures get likelier
+    are given more of the budget), and the probability is that of
+    `jast.estimate.failure_probability`, for which the modes found are where to look; they never
+    enter the estimate itself.
 
     Args:
         key: consumed.
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Below 10,417 the probability is a surrogate's (`failure_probability` with few
-            calls), and with more than 20 numbers an episode that of the plain draws alone.
+            least 300. Default: what a cheap system simulates in eight CPU seconds, rounded to a
+            power of 2; 200,000 of others. The report's ``settings`` name the one that was used.
+            Below 10,417 the probability is a surrogate's (`failure_probability` with few calls),
+            and with more than 20 numbers an episode that of the plain draws alone.
+        seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
+            seconds (a black box: seconds), rounded to a power of 2.
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
         callback: called as ``callback(done, total, None)`` after every piece of the work.
@@ -87,7 +102,8 @@ def stress(
         raised before there is anything.
 
     Raises:
-        ValueError: for a budget below 300, and where the simulator's functions do not fit together.
+        ValueError: for a budget below 300, a budget together with ``seconds``, and where the
+            simulator's functions do not fit together.
 
     Example:
         >>> import jax, jast
@@ -97,17 +113,28 @@ def stress(
     """
     name = "stress"
     _checks.random_key(name, key)
-    budget = _checks.whole(name, "budget", budget, LEAST)
+    budgets.given(name, budget, seconds)
+    if budget is not None:
+        budget = _checks.whole(name, "budget", budget, LEAST)
     top = _checks.whole(name, "top", top, 1)
     check(sim)
+    about = outline(sim)
+    quantiles = about.start.quantile and about.disturbance.quantile
+    if budget is None and not quantiles and seconds is None:
+        budget = PORTFOLIO
+    if budget is None:
+        budget = budgets.budget_of(name, key, sim, seconds, LEAST, PORTFOLIO)
     settings = asked(name, key, budget=budget, top=top)
     with Watch(name, budget, "sim", progress, callback) as watch:
         work = _Work(key, sim, budget, top, watch)
         try:
             work.look()
-            work.search()
-            work.refine()
-            work.estimate()
+            if quantiles and budgets.cheap(sim, budget):
+                work.populate()
+            else:
+                work.search()
+                work.refine()
+                work.estimate()
         except KeyboardInterrupt:
             if work.nominal is None:
                 raise
@@ -124,6 +151,13 @@ class Shares(NamedTuple):
     refine: float
 
 
+PORTFOLIO = 200_000
+"""Evaluations by default where populations are not the answer."""
+COOLED = 0.1
+"""Share of the evaluations by which failures of the populations are cooled to the likeliest near to
+each."""
+POLISHED = 100_000
+"""Evaluations for pulling what was cooled to where log p is greatest."""
 LARGE, BY_SURROGATE, NO_ESTIMATE = (
     Shares(0.05, 0.15, 0.14, 0.18),
     Shares(0.05, 0.3, 0, 0.35),
@@ -146,7 +180,8 @@ class _Work:
         large = (1 - sum(LARGE)) * budget >= ESTIMABLE
         self.estimable = self.latent and (large or latent.dimension(sim) <= SMALL)
         shares = (LARGE if large else BY_SURROGATE) if self.estimable else NO_ESTIMATE
-        self.parts = Shares(*(int(share * budget) for share in shares))
+        self.parts = Shares(*(int(share * min(budget, PORTFOLIO)) for share in shares))
+        self.paths = int(PATHS * budget)
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
@@ -173,6 +208,29 @@ class _Work:
             self.pool = merge(self.pool, collect(self.sim, self.reward, one), top=2)
         best = _best(self.pool)
         self.note("nominal", n.episodes, n.failing, best, n.invalid)
+
+    def populate(self):
+        """The probability by populations, and the likeliest failures from theirs."""
+        cooling = int(COOLED * self.budget)
+        rest = self.budget - self.spent - cooling - 2 * POLISHED
+        p = by_populations("stress", self.next_key(), self.sim, max(rest, CHEAP // 2))
+        self.probability = self.beside_nominal(p)
+        self.note("populations", p.episodes, p.failing, invalid=p.invalid)
+        sample = p.proposal
+        if not isinstance(sample, Sample):
+            self.parts = Shares(0, POLISHED, 0, POLISHED)  # nothing leads to failures, or all does
+            if not len(self.pool):
+                self.search()
+            return self.refine()
+        rows = resampled(sample.log_weight, SETTINGS.cooled, 0.5)
+        points, evaluations = cooled(self.next_key(), self.sim, sample.points[rows], cooling)
+        near = np.argsort((points**2).sum(axis=1), kind="stable")
+        haul = of_points(self.sim, points[near])._replace(evaluations=evaluations)
+        self.gather("cooled", haul)
+        self.parts, self.paths = Shares(0, 0, 0, POLISHED), POLISHED // 4
+        self.refine()
+        if self.modes and p.reliable:
+            self.tell_shares(sample)
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
@@ -240,7 +298,7 @@ class _Work:
             known = found if len(found) else self.pool[:1]
             if self.modes:  # none is lost to a second refinement that had no time for it
                 known = merge(known, self.bests(), top=8 * self.top)
-            self.modes = modes(self.sim, known, self.pool, budget=int(PATHS * self.budget))
+            self.modes = modes(self.sim, known, self.pool, budget=self.paths)
             self.note("telling modes apart", self.modes.evaluations)
             chosen = self.bests()
         self.failures = merge(self.bests(), self.failures, top=self.top)
@@ -271,14 +329,14 @@ class _Work:
         if not self.estimable:
             more = adaptive.monte_carlo(self.next_key(), self.sim, max(rest, 100))
             self.note("plain draws", more.episodes, more.failing, invalid=more.invalid)
-            self.probability = more
+            self.probability = self.beside_nominal(more)
             return
         known = self.known if len(self.known) else None
         if not len(self.pool):  # the estimate may find what the search did not
             rest -= self.parts.refine + self.parts.onward
         rest = max(rest - self.counted(), few_calls.LEAST)
         p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
-        self.probability = p
+        self.probability = self.beside_nominal(p)
         self.note("probability", p.episodes, p.failing, invalid=p.invalid)
         if p.proposal is None:
             return
@@ -286,6 +344,11 @@ class _Work:
             self.take(p.proposal)
         if self.modes and p.reliable:
             self.tell_shares(p.proposal)
+
+    def beside_nominal(self, p):
+        """The `Estimate` ``p`` with the nominal draws among its plain ones, which they are too."""
+        k, n = p.plain or (0, 0)
+        return p._replace(plain=(k + self.nominal.failing, n + self.nominal.episodes))
 
     def take(self, q):
         """Failures that the estimate's proposal draws, where the search found none."""
@@ -302,7 +365,8 @@ class _Work:
 
     def tell_shares(self, q):
         """The share of the probability that each mode has, of failures drawn from the proposal."""
-        found, failing, cost = shares(self.next_key(), self.sim, q, self.modes, self.budget)
+        budget = min(self.budget, PORTFOLIO)
+        found, failing, cost = shares(self.next_key(), self.sim, q, self.modes, budget)
         if cost:
             self.note("shares of modes", cost, failing)
         pairs = zip(self.modes, found, strict=True)

@@ -7,6 +7,7 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast.estimate.batches import resampled
+from jast.estimate.population import Sample
 from jast.estimate.redrawn import redrawn
 from jast.search.centred import centred
 from jast.search.failure_modes import Modes
@@ -47,10 +48,14 @@ def shares(
         return np.ones(1), 0, 0
     if not n:
         return np.full(k, np.nan), 0, 0
-    z, o, log_w = redrawn(key, sim, q, n)
-    if not o.failure.any():
-        return np.full(k, np.nan), 0, n
-    rows = resampled(np.where(o.failure, log_w.astype(np.float64), -np.inf), n // PART, 0.5)
+    if isinstance(q, Sample):
+        z, log_w, failing, n = q.points, q.log_weight, len(q.points), 0
+        rows = resampled(log_w, DRAWS[1] // PART, 0.5)
+    else:
+        z, o, log_w = redrawn(key, sim, q, n)
+        if not (failing := int(o.failure.sum())):
+            return np.full(k, np.nan), 0, n
+        rows = resampled(np.where(o.failure, log_w.astype(np.float64), -np.inf), n // PART, 0.5)
     of_modes = centred(sim)
     place = lambda e: (latent.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length))
     bests = [m.failure._replace(states=None) for m in modes]
@@ -62,7 +67,7 @@ def shares(
     exact = assigned(paths, (points[few], ends[few]), known, np.arange(k))
     part = lambda owner: np.bincount(owner, minlength=k) / len(owner)
     found = np.maximum(part(near) + part(exact) - part(near[few]), 0)
-    return found / found.sum(), int(o.failure.sum()), n + len(rows) + paths.spent
+    return found / found.sum(), failing, n + len(rows) + paths.spent
 
 
 def _draws(budget):

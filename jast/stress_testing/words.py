@@ -4,7 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast.estimate.estimate import doubtful, guarantee
+
 __all__ = ["Belief", "advice", "belief", "headline", "mode_facts", "verdict", "work"]
+
+
+BELIEVE = "UNRELIABLE: believe plain draws only"
 
 
 class Belief(NamedTuple):
@@ -20,6 +25,8 @@ class Belief(NamedTuple):
     """Why not to believe it"""
     facts: list
     """(name, words)"""
+    doubt: bool = False
+    """Whether ``value`` itself is what must not be believed"""
 
 
 def headline(r: Any) -> tuple[str, str]:
@@ -59,11 +66,16 @@ def belief(p: Any) -> Belief:
     if p.reliable:
         facts += [("remark", words) for words in p.warnings]
         return Belief(value, more, "reliable: no known reason against it", "good", (), facts)
-    if blank:
+    known = guarantee(p)
+    if blank and (known is None or not p.plain[0]):
         badge, mood = "an upper bound is all that is known", "unknown"
     else:
-        badge, mood = "UNRELIABLE: do not believe it", "bad"
-    return Belief(value, more, badge, mood, tuple(p.warnings), facts)
+        badge = "UNRELIABLE: do not believe it" if known is None else BELIEVE
+        mood = "bad"
+    if doubtful(p):
+        facts.insert(0, ("doubtful", f"{value}, {more}, not to be believed"))
+    value, more = known or (value, more)
+    return Belief(value, more, badge, mood, tuple(p.warnings), facts, known is None and not blank)
 
 
 def mode_facts(r: Any, i: int, failure: Any) -> list[tuple[str, Any]]:
@@ -103,18 +115,7 @@ def verdict(r: Any) -> list[tuple[str, str]]:
         alone = f"{outcome}, distance {float(quiet.distance):.4g}, {int(quiet.length)} steps"
     rows = [("undisturbed", alone)]
     rows.append(("plain draws", f"{r.nominal.failing} of {r.nominal.episodes} fail"))
-    p = r.probability
-    if p is None:
-        rows.append(("probability", "not estimated"))
-    elif np.isnan(p.log_mean):
-        bound = f"below {p.interval[1]:.3g} at {p.level:.0%}"
-        rows.append(("probability", f"no failure in {p.samples} draws of the model: {bound}"))
-    elif not p.reliable:
-        rows.append(("probability", f"UNRELIABLE: {p.warnings[0]}"))
-        rows.append(("", f"{p.mean:.4g}, which must not be believed"))
-    else:
-        low, high = p.interval
-        rows.append(("probability", f"{p.mean:.4g}   {p.level:.0%} [{low:.4g}, {high:.4g}]"))
+    rows += _probability(r.probability)
     if len(r.failures):
         e = r.failures.best
         text = f"log p {float(e.reward):.4f} relative to the mode, {int(e.length)} steps"
@@ -130,6 +131,24 @@ def verdict(r: Any) -> list[tuple[str, str]]:
     if "interrupted" in r.settings:
         rows.append(("interrupted", r.settings["interrupted"]))
     return rows
+
+
+def _probability(p):
+    """The rows of the probability ``p``."""
+    if p is None:
+        return [("probability", "not estimated")]
+    known, blank, (low, high) = guarantee(p), bool(np.isnan(p.log_mean)), p.interval
+    value = f"{p.mean:.4g}   {p.level:.0%} [{low:.4g}, {high:.4g}]"
+    if known is None and blank:
+        bound = f"below {high:.3g} at {p.level:.0%}"
+        return [("probability", f"no failure in {p.samples} draws of the model: {bound}")]
+    if p.reliable:
+        return [("probability", value)]
+    rows = [] if blank else [("probability", f"UNRELIABLE: {p.warnings[0]}")]
+    if known is None:
+        return [*rows, ("", f"{p.mean:.4g}, which must not be believed")]
+    rows.append(("" if rows else "probability", " ".join(known)))
+    return [*rows, *([("doubtful", f"{value}, not to be believed")] if doubtful(p) else [])]
 
 
 def advice(r: Any) -> str:

@@ -14,6 +14,7 @@ from jast import results
 from jast._checks import number
 from jast.crude import Nominal
 from jast.estimate import Estimate
+from jast.estimate.estimate import doubtful, guarantee
 from jast.search import SearchResult
 from jast.stress_testing import Report
 
@@ -214,10 +215,17 @@ def _row(result, error):
     if error is not None:
         return {NOTE: shorten(error, WIDE, placeholder=" ...")}
     cells, a = {}, answer(result)
+    estimate = result.probability if isinstance(result, Report) else result
     if not math.isnan(a.high):
         seen = not math.isnan(a.probability)
         cells["probability"] = f"{a.probability:.4g}" if seen else "not seen"
         cells["interval"] = f"[{a.low:.4g}, {a.high:.4g}]"
+    if isinstance(estimate, Estimate) and guarantee(estimate) is not None:
+        if doubtful(estimate):
+            cells["doubtful"] = cells["probability"]
+        low, high = estimate.guaranteed
+        cells["probability"] = "{} of {} fail".format(*estimate.plain)
+        cells["interval"] = f"[{low:.4g}, {high:.4g}]"
     found = result.failures if isinstance(result, Report) else None
     best = result.best if isinstance(result, SearchResult) else found.best if found else None
     if best is not None:

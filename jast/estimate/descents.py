@@ -1,0 +1,311 @@
+"""Ways of a population to rare failures, each a chain of few calls of one program
+(`jast.estimate.particles`): down the levels of the miss distance, from wide noise to the model's
+own, and on below it, to the likeliest failures.
+
+The first is subset simulation (Au and Beck 2001; with these moves Papaioannou, Betz, Zwirglmaier
+and Straub 2015), the second a sequential Monte Carlo sampler whose temperature is the width of the
+noise (Del Moral, Doucet and Jasra 2006). They share nothing but the program: the first knows
+failures by their distance alone, the second asks of an episode only whether it failed.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast.counter import generator
+from jast.estimate.batches import resampled
+from jast.estimate.particles import begun, blank, counter_key, fresh, moved
+from jast.limit_state import dimension
+from jast.simulator import Simulator
+
+__all__ = ["WAYS", "Descent", "Settings", "by_distance", "by_width", "cooled"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All numbers of the ways down; `python -m benchmarks.populations` prints what each costs."""
+
+    particles: int = 8192
+    """Points of a population."""
+    moves: int = 10
+    """Moves of a point between two levels."""
+    quantile: float = 0.2
+    """Share of the points that a level keeps."""
+    effective: float = 0.5
+    """Share of effective points that a narrower width leaves."""
+    widths: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+    """Of the noise, in which failures are looked for."""
+    failing: float = 0.1
+    """Share of the points that fails at the first width."""
+    least: float = -690.0
+    """Log probability below which a population gives up: that of the least double."""
+    scattered: float = 0.25
+    """Relative variance above which a population from wide noise gives up: it witnesses nothing."""
+    numbers: int = 2**26
+    """Numbers that a population holds at most; of longer episodes it has fewer points."""
+    coldest: float = 0.05
+    """Width to which failures are cooled: the likeliest are then a twentieth of a standard
+    deviation away."""
+    coolings: int = 40
+    """Widths on the way there."""
+    cooled: int = 128
+    """Failures that are cooled: few of them with many moves each get farther than many."""
+
+
+SETTINGS = Settings()
+
+
+class Descent(NamedTuple):
+    """What one population came to. On the host."""
+
+    points: Any
+    """[m, D] failures, nearly as p(z | failure) has them; empty where none was reached"""
+    used: Any
+    """[m] int32: how many of the numbers decided each"""
+    log_mean: Any
+    """Log of the estimate; -inf where no failure was reached"""
+    variance: Any
+    """Of the estimate over its square, by the genealogy of the points"""
+    plain: Any
+    """[3] of the model's own draws: those that fail, that are invalid, and all"""
+    levels: Any
+    """Miss distances of the levels, or widths, in their order"""
+    evaluations: Any
+    invalid: Any
+    size: Any
+    """Points that it has"""
+
+
+class _Population:
+    """A population on its way: the particles, the family of each, and the counts."""
+
+    def __init__(self, key: jax.Array, sim: Simulator, n: int, moves: int, capacity: int):
+        self.sim, self.n, self.moves = sim, n, moves
+        self.rng, self.key, self.calls = generator(key, 1), counter_key(key, 2), 0
+        self.particles, self.steering = blank(sim, capacity), begun()
+        self.evaluations, self.invalid = 0, 0
+        self.log_mean, self.family, self.generations = 0.0, np.arange(n), 1
+        self.plain, self.levels = (0, 0, 0), []
+
+    def next_key(self):
+        self.calls += 1
+        return jax.random.fold_in(self.key, self.calls)
+
+    def draw(self, width):
+        """Begin with independent points of this width; returns which of them fail."""
+        self.particles, invalid = fresh(
+            self.sim, self.particles, self.next_key(), self.n, width=width
+        )
+        self.evaluations, self.invalid = self.evaluations + self.n, self.invalid + invalid
+        failing = self.score() == -np.inf
+        if width == 1:
+            self.plain = int(failing.sum()), invalid, self.n
+        return failing
+
+    def score(self):
+        return np.asarray(self.particles.score)[: self.n]
+
+    def weigh(self, log_w):
+        """The estimate with one more factor, the mean weight; which is all where it is the last."""
+        top = log_w.max()
+        self.log_mean += top + math.log(np.exp(log_w - top).mean())
+
+    def move(self, log_w, level, **width):
+        """Go on from points chosen by weight (systematic resampling)."""
+        rows = resampled(log_w, self.n, self.rng.random())
+        self.family, self.generations = self.family[rows], self.generations + 1
+        self.particles, self.steering, invalid = moved(
+            self.sim,
+            self.particles,
+            self.next_key(),
+            rows,
+            self.steering,
+            moves=self.moves,
+            level=level,
+            **width,
+        )
+        self.evaluations, self.invalid = (
+            self.evaluations + self.moves * self.n,
+            self.invalid + invalid,
+        )
+
+    def variance(self, log_w):
+        """Relative variance of the estimate whose last weights are these: what families of a common
+        ancestor carry (Lee and Whiteley 2018, eq. 5).
+        """
+        w = np.exp(log_w - log_w.max())
+        together = (np.bincount(self.family, w, self.n) ** 2).sum() / w.sum() ** 2
+        return max(1 - (self.n / (self.n - 1)) ** self.generations * (1 - together), 0.0)
+
+    def lost(self):
+        """The `Descent` that reached no failure."""
+        p, d = self.particles, dimension(self.sim)
+        none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32)
+        return self._end(*none, -math.inf, math.nan)
+
+    def arrived(self, log_w):
+        """The `Descent` whose last weights, of failures, are these."""
+        self.weigh(log_w)
+        variance = self.variance(log_w)
+        self.move(log_w, -np.inf)
+        p = jax.device_get(self.particles)
+        return self._end(p.z[: self.n], p.used[: self.n], self.log_mean, variance)
+
+    def _end(self, points, used, log_mean, variance):
+        return Descent(
+            points=points,
+            used=used,
+            log_mean=np.float64(log_mean),
+            variance=np.float64(variance),
+            plain=np.array(self.plain, np.int64),
+            levels=np.array(self.levels, np.float64),
+            evaluations=np.int64(self.evaluations),
+            invalid=np.int64(self.invalid),
+            size=np.int64(self.n),
+        )
+
+
+def size(sim: Simulator, particles: int, settings: Settings = SETTINGS) -> int:
+    """Points of a population of ``sim``: as many as are asked for, if they fit."""
+    return max(min(particles, settings.numbers // max(dimension(sim), 1)) // 128 * 128, 128)
+
+
+def by_distance(
+    key: jax.Array,
+    sim: Simulator,
+    n: int,
+    moves: int,
+    capacity: int,
+    settings: Settings = SETTINGS,
+) -> Descent:
+    """Down the levels of the miss distance: each is the sample quantile of the scores, until
+    failures are as many. ``n`` points in ``capacity`` places, a size of the compiled program.
+    """
+    s = _Population(key, sim, n, moves, capacity)
+    s.draw(1.0)
+    level = math.inf
+    while True:
+        score = s.score()
+        if np.mean(score == -np.inf) >= settings.quantile:
+            return s.arrived(_where(score == -np.inf))
+        level = _next(score, level, settings.quantile)
+        if level is None or s.log_mean < settings.least:
+            return s.lost()
+        log_w = _where(score <= level)
+        if level == -math.inf:
+            return s.arrived(log_w)
+        s.weigh(log_w)
+        s.levels.append(level)
+        s.move(log_w, level)
+
+
+def by_width(
+    key: jax.Array,
+    sim: Simulator,
+    n: int,
+    moves: int,
+    capacity: int,
+    settings: Settings = SETTINGS,
+) -> Descent:
+    """From the least width of the noise at which failures are frequent to the model's own, each
+    step as far as leaves enough effective points; moves among failures only.
+    """
+    s = _Population(key, sim, n, moves, capacity)
+    for width in settings.widths:
+        failing = s.draw(width)
+        if failing.mean() >= settings.failing:
+            break
+    s.levels.append(width)
+    if failing.sum() < 2:
+        return s.lost()
+    log_w = _where(failing)
+    while width > 1:
+        s.weigh(log_w)
+        before = s.levels[-2] if len(s.levels) > 1 else width
+        s.move(log_w, -np.inf, width=width, before=before)
+        square, used = (np.asarray(a, np.float64)[:n] for a in s.particles[3:1:-1])
+        width = _narrower(square, used, width, settings.effective)
+        log_w = _ratio(square, used, s.levels[-1], width)
+        s.levels.append(width)
+        if s.log_mean < settings.least or s.variance(log_w) > settings.scattered:
+            return s.lost()
+    return s.arrived(log_w)
+
+
+def cooled(
+    key: jax.Array,
+    sim: Simulator,
+    points: np.ndarray,
+    evaluations: int,
+    settings: Settings = SETTINGS,
+) -> tuple[np.ndarray, int]:
+    """The failures ``points`` [m, D] cooled to where failures are likeliest near to each, for so
+    many ``evaluations``, nearly, and how many they were: no point replaces another, so no mode is
+    lost, however little of the probability it has.
+    """
+    m, capacity = len(points), size(sim, settings.particles, settings)
+    particles = blank(sim, capacity)
+    z = np.zeros(particles.z.shape, particles.z.dtype)
+    z[:m] = points
+    # all of them fail, and only a failure takes the place of one
+    particles = particles._replace(z=jax.device_put(z))
+    key, steering, rows = counter_key(key, 3), begun(), np.arange(m)
+    moves = max(evaluations // (m * settings.coolings), 2)
+    for i, width in enumerate(np.geomspace(1.0, settings.coldest, settings.coolings)):
+        particles, steering, _ = moved(
+            sim,
+            particles,
+            jax.random.fold_in(key, i),
+            rows,
+            steering,
+            moves=moves,
+            level=-np.inf,
+            width=float(width),
+        )
+    return np.asarray(particles.z)[:m], moves * settings.coolings * m
+
+
+WAYS = {"distance": by_distance, "width": by_width}
+
+
+def _where(chosen):
+    """Log weights of 1 where ``chosen``, else of 0."""
+    return np.where(chosen, 0.0, -np.inf)
+
+
+def _next(score, last, quantile):
+    """The next level: the sample quantile of the scores, below the last one; -inf where only
+    failures are; None where nothing is.
+    """
+    level = np.partition(score, k := math.ceil(quantile * len(score)) - 1)[k]
+    if level < last:
+        return float(level)
+    below = score[score < last]
+    return float(below.max()) if below.size else None
+
+
+def _ratio(square, used, before, width):
+    """log of N(0, width^2 I) over N(0, before^2 I), of points whose ``used`` numbers have these
+    sums of ``square``.
+    """
+    return used * math.log(before / width) - 0.5 * square * (1 / width**2 - 1 / before**2)
+
+
+def _narrower(square, used, width, least):
+    """The least width, from 1 on, whose weights leave a share of ``least`` effective points."""
+
+    def enough(new):
+        w = _ratio(square, used, width, new)
+        w = np.exp(w - w.max())
+        return w.sum() ** 2 >= least * len(w) * (w**2).sum()
+
+    if enough(1.0):
+        return 1.0
+    low, high = 1.0, width
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high

@@ -1,0 +1,180 @@
+"""A population of points of normal numbers that stays on the device: one compiled program draws it,
+moves it, and simulates it, whatever its level and its width.
+
+A move proposes a point that N(0, width^2 I) has as often as the old one, and is taken where the
+episode of the new point is at most at the level. Two moves alternate. The first changes all numbers
+a little (preconditioned Crank-Nicolson: Cotter, Roberts, Stuart and White 2013). The second draws a
+few neighbouring numbers anew, which is a Gibbs move of a random window; in long episodes it mixes
+where small changes of everything do not. `python -m benchmarks.populations` measures both.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jast.counter import COUNTER, generator
+from jast.limit_state import dimension, normal_numbers, outcome
+from jast.simulator import Simulator
+
+__all__ = ["LANES", "Particles", "Steering", "blank", "counter_key", "fresh", "moved"]
+
+LANES = 128
+"""Points that are simulated side by side: their numbers then stay in the caches of a core."""
+ACCEPTANCE = 0.35
+"""Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
+STEERED = 0.02, 1.0
+"""Least and greatest size of a move: 1 is an independent draw, or a window of all numbers."""
+
+
+class Particles(NamedTuple):
+    """Points and what their episodes came to. On the device."""
+
+    z: jax.Array
+    """[n, D]"""
+    score: jax.Array
+    """[n] miss distance; -inf for a failure, inf for an invalid episode"""
+    used: jax.Array
+    """[n] int32: how many of the numbers decided the episode"""
+    square: jax.Array
+    """[n] sum of the squares of these"""
+
+
+class Steering(NamedTuple):
+    """Sizes of the two moves, and what became of them. On the host, [2] each."""
+
+    size: np.ndarray
+    """Of the small change, from 0 to 1; of the window, as a share of all numbers"""
+    accepted: np.ndarray
+    """Share of the last moves that were taken"""
+
+
+def begun() -> Steering:
+    """Before the first move."""
+    return Steering(np.array([0.5, 0.3], np.float32), np.full(2, np.nan, np.float32))
+
+
+def counter_key(key: jax.Array, *numbers: int) -> jax.Array:
+    """A counter key (`jast.counter`) from a user's key, another one for each ``numbers``: normal
+    numbers of Threefry would take most of the time of a cheap system.
+    """
+    words = generator(key, *numbers).integers(0, 2**32, 2, np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=COUNTER)
+
+
+def blank(sim: Simulator, n: int) -> Particles:
+    """``n`` places for points."""
+    dtype = np.dtype(normal_numbers(sim))
+    zeros = np.zeros(n, dtype)
+    return jax.device_put(
+        Particles(
+            z=np.zeros((n, dimension(sim)), dtype),
+            score=zeros + np.inf,
+            used=np.zeros(n, np.int32),
+            square=zeros,
+        )
+    )
+
+
+def fresh(
+    sim: Simulator, particles: Particles, key: jax.Array, n: int, width: float = 1.0
+) -> tuple[Particles, int]:
+    """``n`` new independent points of N(0, width^2 I) in the place of ``particles``, and how many
+    of their episodes are invalid.
+    """
+    rows = np.arange(n, dtype=np.int32)
+    steering = Steering(np.ones(2, np.float32), np.zeros(2, np.float32))
+    after, _, invalid = moved(
+        sim, particles, key, rows, steering, moves=1, level=np.inf, width=width
+    )
+    return after, invalid
+
+
+def moved(
+    sim: Simulator,
+    particles: Particles,
+    key: jax.Array,
+    rows: np.ndarray,
+    steering: Steering,
+    *,
+    moves: int,
+    level: float,
+    width: float = 1.0,
+    before: float | None = None,
+) -> tuple[Particles, Steering, int]:
+    """The points of ``rows`` [m] after so many moves that keep N(0, width^2 I) given a score of at
+    most ``level``, in the first m places; their new sizes; invalid episodes that were met. What
+    stands in the other places means nothing.
+
+    ``before``: the width that the points were drawn with, where it was another one. Numbers that an
+    episode did not use are scaled to the new one, as nothing ties them.
+    """
+    dtype, live = np.dtype(particles.z.dtype), len(rows)
+    places = np.arange(len(particles.z), dtype=np.int32)
+    places[:live] = rows
+    ratio = 1.0 if before is None else width / before
+    counts = np.int32(live), np.int32(moves)
+    numbers = (dtype.type(v) for v in (level, width, ratio))
+    out, size, accepted, invalid = _moved(
+        sim, particles, key, places, steering.size, *counts, *numbers
+    )
+    return out, Steering(np.asarray(size), np.asarray(accepted)), int(invalid)
+
+
+@partial(jax.jit, donate_argnums=1)
+def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
+    n, d = particles.z.shape
+    lanes = min(LANES, n)
+    play = jax.vmap(partial(outcome, sim))
+    number = jnp.arange(d, dtype=jnp.int32)[None]
+
+    def small(z, noise, key, size):
+        return jnp.sqrt(1 - size**2) * z + size * noise
+
+    def window(z, noise, key, size):
+        begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
+        inside = jnp.mod(number - begin, d) < jnp.maximum(size * d, 1)
+        return jnp.where(inside, noise, z)
+
+    def block(i, carry, key, kind, size):
+        particles, accepted, invalid = carry
+        old = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, i * lanes, lanes), particles)
+        for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
+        noise = width * jax.random.normal(for_noise, old.z.shape, old.z.dtype)
+        z = lax.switch(kind, (small, window), old.z, noise, for_window, size.astype(old.z.dtype))
+        o = play(z)
+        score = o.score.astype(old.score.dtype)
+        square = jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1)
+        taken = score <= level
+        new = jax.tree.map(
+            lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
+            Particles(z, score, o.used, square),
+            old,
+        )
+        particles = jax.tree.map(
+            lambda a, b: lax.dynamic_update_slice_in_dim(a, b, i * lanes, 0), particles, new
+        )
+        count = lambda a: jnp.sum(a & (i * lanes + jnp.arange(lanes) < live), dtype=jnp.int32)
+        return particles, accepted + count(taken), invalid + count(o.invalid)
+
+    def move(t, carry):
+        particles, size, accepted, invalid = carry
+        kind = t % 2
+        run = partial(block, key=jax.random.fold_in(key, t), kind=kind, size=size[kind])
+        none = jnp.zeros((), jnp.int32)
+        particles, taken, wrong = lax.fori_loop(
+            0, (live + lanes - 1) // lanes, run, (particles, none, none)
+        )
+        share = taken.astype(size.dtype) / live
+        steered = jnp.clip(size[kind] * jnp.exp(share - ACCEPTANCE), *STEERED)
+        size, accepted = size.at[kind].set(steered), accepted.at[kind].set(share)
+        return particles, size, accepted, invalid + wrong
+
+    particles = jax.tree.map(lambda a: a[rows], particles)
+    unused = number >= particles.used[:, None]
+    particles = particles._replace(z=jnp.where(unused, ratio * particles.z, particles.z))
+    start = particles, size, jnp.zeros_like(size), jnp.zeros((), jnp.int32)
+    return lax.fori_loop(0, moves, move, start)
