@@ -1,0 +1,264 @@
+"""What a CPU second buys: ``python -m benchmarks.time_to_answer [--json] [--quick | --smoke]
+[--systems NAME ...] [--methods NAME ...] [--seeds N]``.
+
+`jast.estimate.failure_probability` and `jast.stress`, both as they come, on systems of known
+probability: the closed loops of `benchmarks.closed_loops` and rows of static problems and
+diffusions. Beside them stand plain draws for the CPU time of the first (what they would come to, by
+the measured rate of `jast.estimate.monte_carlo`) and OpenTURNS's subset simulation where it is
+installed. ``first`` is the first call in this process, with compilation. A silent miss is an
+unflagged answer more than 4 standard errors off, of itself and the truth.
+"""
+
+import argparse
+import json
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from jax.tree_util import Partial  # noqa: E402
+
+import jast  # noqa: E402
+from benchmarks.closed_loops import JUDGED, TUNED, system  # noqa: E402
+from benchmarks.sizes import options, size  # noqa: E402
+from jast.limit_state import dimension  # noqa: E402
+from jast.simulators import limit_state  # noqa: E402
+
+__all__ = ["SYSTEMS", "System"]
+
+
+class System(NamedTuple):
+    """A simulator, the probability that it fails, and that one's relative standard error."""
+
+    simulator: jast.Simulator
+    truth: float
+    error: float = 0.0
+    group: str = "static"
+    g: Callable | None = None
+    """The limit state of a static problem, of points [D] and a namespace"""
+
+
+def leaf(u, np=jnp):
+    """Two circles, each as far from the origin."""
+    return np.minimum(np.sum((u + 3.8) ** 2, -1), np.sum((u - 3.8) ** 2, -1)) - 1
+
+
+def ring(u, np=jnp):
+    """Between two circles about the origin."""
+    r = np.sum(u**2, -1)
+    return np.maximum(16 - r, r - 20.25)
+
+
+def gayton(u, np=jnp):
+    """Gayton's hat."""
+    return 0.5 * (u[..., 0] - 2) ** 2 - 1.5 * (u[..., 1] - 5) ** 3 - 3
+
+
+def piecewise(u, np=jnp):
+    """Breitung's piecewise branches, of which the farther one looks nearer."""
+    a, b = u[..., 0], u[..., 1]
+    first = np.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
+    return np.minimum(first, np.where(b > 2, 0.5 - 0.1 * b, 2.3 - b))
+
+
+def cube(u, np=jnp):
+    """All of six numbers are great."""
+    return np.max(1.8 - u, -1)
+
+
+def plane(beta, u, np=jnp):
+    """A half-space."""
+    return beta - np.sum(u, -1) / u.shape[-1] ** 0.5
+
+
+def slab(u, np=jnp):
+    """Between two parallel paraboloids."""
+    value = u[..., 0] - np.sum(u[..., 1:] ** 2, -1)
+    return np.maximum(3.5 - value, value - 3.52)
+
+
+def toy_step(steps, s, w):
+    """The diffusion of Schorlepp and Grafke (2023), by Euler's method."""
+    x, y = s
+    dt, deep = 1 / steps, 0.5**0.5
+    x_next = x + dt * (-x - x * y) + deep * dt**0.5 * w[0]
+    return jnp.stack([x_next, y + dt * (-4 * y + x**2) + 0.5 * deep * dt**0.5 * w[1]])
+
+
+def _toy(z, steps):
+    gap = lambda s: z - s[0] - 2 * s[1]
+    return system([0.0, 0.0], Partial(toy_step, steps), gap, 2, steps, episodic=True)
+
+
+def well_step(s, w):
+    """A double well."""
+    x, y = s
+    drift = jnp.stack([x - x**3, -2 * y])
+    return s + 0.01 * drift + (0.01 * 0.1) ** 0.5 * w
+
+
+def well_distance(s):
+    """Of the progress from one well to the other, to .95."""
+    bump = lambda x: 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
+    return 0.95 - (0.5 - bump(-1.0) + bump(1.0))
+
+
+def _static(g, d, truth):
+    return System(limit_state(g, d), truth, g=g)
+
+
+SYSTEMS = {
+    **{a.name: System(a.simulator, a.truth, a.error, "tuned loops") for a in TUNED},
+    **{a.name: System(a.simulator, a.truth, a.error, "judged loops") for a in JUDGED},
+    "leaf": _static(leaf, 2, 4.7934155e-6),
+    "ring": _static(ring, 2, 2.9539733e-4),
+    "Gayton": _static(gayton, 2, 2.8745376e-5),
+    "Gayton of 8": _static(gayton, 8, 2.8745376e-5),
+    "piecewise": _static(piecewise, 2, 3.1957884e-5),
+    "cube": _static(cube, 6, 2.1516243e-9),
+    "plane of 100": _static(Partial(plane, 3.5), 100, 2.3262908e-4),
+    "plane of 300": _static(Partial(plane, 3.5), 300, 2.3262908e-4),
+    "slab": _static(slab, 5, 2.2402549e-7),
+    "toy, z 3, 100": System(_toy(3.0, 100), 9.6715e-6, 0.0, "diffusions"),
+    "toy, z 4, 50": System(_toy(4.0, 50), 2.346e-8, 0.0, "diffusions"),
+    "double well": System(
+        system([-1.0, 0.0], well_step, well_distance, 2, 500), 1.342e-3, 0.0, "diffusions"
+    ),
+}
+METHODS = ("failure_probability", "stress", "subset")
+
+
+def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
+    """The `Estimate` of a method (of OpenTURNS (log mean, relative error)), and CPU seconds."""
+    begun, key = time.process_time(), jax.random.key(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if method == "stress":
+            found = jast.stress(key, about.simulator).probability
+        elif method == "failure_probability":
+            found = jast.estimate.failure_probability(key, about.simulator)
+        else:
+            found = _subset(about, seed)
+    return found, time.process_time() - begun
+
+
+def _subset(about, seed):
+    """OpenTURNS's subset simulation with 10,000 points a level, as it comes."""
+    import openturns as ot
+
+    d = dimension(about.simulator)
+    ot.RandomGenerator.SetSeed(seed)
+
+    class Function(ot.OpenTURNSPythonFunction):
+        def __init__(self):
+            super().__init__(d, 1)
+
+        def _exec_sample(self, x):
+            return np.asarray(about.g(np.asarray(x), np=np)).reshape(-1, 1)
+
+    vector = ot.RandomVector(ot.Normal(d))
+    event = ot.ThresholdEvent(
+        ot.CompositeRandomVector(ot.Function(Function()), vector), ot.LessOrEqual(), 0.0
+    )
+    method = ot.SubsetSampling(event)
+    method.setBlockSize(10_000)
+    method.setMaximumOuterSampling(1)
+    method.run()
+    result = method.getResult()
+    p, error = result.getProbabilityEstimate(), result.getCoefficientOfVariation()
+    return (math.log(p) if p > 0 else math.nan), error
+
+
+def row_of(name: str, method: str, seeds: int) -> dict[str, Any]:
+    """Figures of a method on a system over ``seeds`` keys."""
+    about, found, seconds = SYSTEMS[name], [], []
+    for seed in range(seeds):
+        one, spent = answers(method, about, seed)
+        found.append(one)
+        seconds.append(spent)
+    if method == "subset":
+        logs, errors = np.array(found).T
+        reliable, holds, evaluations = np.isfinite(logs), np.zeros(seeds, bool), 0
+    else:
+        logs = np.array([p.log_mean for p in found])
+        errors = np.array([p.relative_error for p in found])
+        reliable = np.array([p.reliable for p in found])
+        holds = np.array([p.interval[0] <= about.truth <= p.interval[1] for p in found])
+        evaluations = int(np.mean([p.evaluations for p in found]))
+    off = logs - math.log(about.truth)
+    z = np.abs(off) / np.hypot(errors, about.error)
+    known = reliable & np.isfinite(off)
+    rms = lambda a: float(np.sqrt(np.mean(a**2))) if a.size else None
+    warm = float(np.mean(seconds[1:])) if seeds > 1 else None
+    return dict(
+        system=name,
+        group=about.group,
+        method=method,
+        truth=about.truth,
+        seeds=seeds,
+        reliable=int(reliable.sum()),
+        rms=rms(np.expm1(off[known])),
+        rms_of_all=rms(np.expm1(off[np.isfinite(off)])),
+        held=int(holds[known].sum()),
+        silent_misses=int((known & (z > 4)).sum()),
+        evaluations=evaluations,
+        first=seconds[0],
+        warm=warm,
+    )
+
+
+def plain_draws(name: str, seconds: float) -> float | None:
+    """The relative standard error of plain draws in so many CPU seconds."""
+    about, n = SYSTEMS[name], 2**15
+    count = lambda seed: jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
+    count(0)
+    begun = time.process_time()
+    count(1)
+    rate = n / (time.process_time() - begun)
+    return math.sqrt((1 - about.truth) / about.truth / (rate * seconds)) if about.truth else None
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, one key")
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
+    parser.add_argument("--seeds", type=int, help="keys (default: 20)")
+    args = parser.parse_args(argv)
+    names = args.systems or size(args, list(SYSTEMS), ["drone", "piecewise"], ["piecewise"])
+    methods = args.methods or size(args, METHODS, METHODS[:2], METHODS[:1])
+    seeds, rows = args.seeds or size(args, 20, 2, 1), []
+    for name in names:
+        for method in methods:
+            if method == "subset" and SYSTEMS[name].g is None:
+                continue
+            row = row_of(name, method, seeds)
+            if method == "failure_probability":
+                row["plain"] = plain_draws(name, row["warm"] or row["first"])
+            rows.append(row)
+            if not args.json:
+                print(_line(row), flush=True)
+    if args.json:
+        print(json.dumps(dict(seeds=seeds, rows=rows)))
+
+
+def _line(r):
+    percent = lambda v: "-" if v is None else f"{100 * v:.1f} %"
+    warm = "-" if r["warm"] is None else f"{r['warm']:.1f}"
+    plain = f"  plain draws {percent(r['plain'])}" if "plain" in r else ""
+    return (
+        f"{r['system']:14s} {r['method']:20s} truth {r['truth']:.3g}  reliable"
+        f" {r['reliable']}/{r['seeds']}  rms {percent(r['rms'])} (all {percent(r['rms_of_all'])})"
+        f"  held {r['held']}/{r['reliable']}  silent misses {r['silent_misses']}"
+        f"  {r['evaluations']} evaluations  CPU s first {r['first']:.1f} warm {warm}{plain}"
+    )
+
+
+if __name__ == "__main__":
+    main()
