@@ -130,14 +130,15 @@ def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
     lanes = min(LANES, n)
     play = jax.vmap(partial(outcome, sim))
     number = jnp.arange(d, dtype=jnp.int32)[None]
+    lane = jnp.arange(lanes, dtype=jnp.int32)
 
     def small(z, noise, key, size):
         return jnp.sqrt(1 - size**2) * z + size * noise
 
     def window(z, noise, key, size):
         begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
-        inside = jnp.mod(number - begin, d) < jnp.maximum(size * d, 1)
-        return jnp.where(inside, noise, z)
+        length = jnp.maximum(jnp.floor(size * d), 1).astype(jnp.int32)
+        return jnp.where(jnp.mod(number - begin, d) < length, noise, z)
 
     def block(i, carry, key, kind, size):
         particles, accepted, invalid = carry
@@ -157,7 +158,7 @@ def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
         particles = jax.tree.map(
             lambda a, b: lax.dynamic_update_slice_in_dim(a, b, i * lanes, 0), particles, new
         )
-        count = lambda a: jnp.sum(a & (i * lanes + jnp.arange(lanes) < live), dtype=jnp.int32)
+        count = lambda a: jnp.sum(a & (i * lanes + lane < live), dtype=jnp.int32)
         return particles, accepted + count(taken), invalid + count(o.invalid)
 
     def move(t, carry):
@@ -168,7 +169,7 @@ def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
         particles, taken, wrong = lax.fori_loop(
             0, (live + lanes - 1) // lanes, run, (particles, none, none)
         )
-        share = taken.astype(size.dtype) / live
+        share = taken.astype(size.dtype) / live.astype(size.dtype)
         steered = jnp.clip(size[kind] * jnp.exp(share - ACCEPTANCE), *STEERED)
         size, accepted = size.at[kind].set(steered), accepted.at[kind].set(share)
         return particles, size, accepted, invalid + wrong

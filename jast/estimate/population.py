@@ -366,10 +366,10 @@ class _Search:
 
     def fill(self, kind, evaluations):
         """Populations of this kind, alike in size, for so many ``evaluations``."""
-        points = evaluations / self.cost(kind)
-        count = max(math.ceil(points / self.n), 1)
+        points, most = evaluations / self.cost(kind), min(2 * self.n, self.capacity)
+        count = max(math.ceil(points / most), 1)
         n = int(points / count) // LANES * LANES
-        if n >= FEWEST and not self.interrupted:
+        if n >= min(FEWEST, self.n) and not self.interrupted:
             self.run(kind, count, n)
 
     def estimate(self, name, kinds, level):

@@ -1,0 +1,340 @@
+"""Populations on the device: their moves keep what they should, their answers are right, and where
+they cannot be sure they say so.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import jast
+from jast import distributions as D
+from jast.estimate import budgets, failure_probability, failure_samples, population
+from jast.estimate import descents as ways
+from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, fresh, moved
+from jast.estimate.population import BLUNT, Sample, answer_of
+from jast.limit_state import outcomes
+from jast.simulators import limit_state, walk1d
+
+N = 1024
+HALF = limit_state(lambda u: 3.0 - jnp.sum(u) / 4**0.5, 4)  # P = Phi(-3)
+SIDES = limit_state(lambda u: 3.0 - jnp.abs(u[0]), 2)  # P = 2 Phi(-3)
+NEVER = limit_state(lambda u: 1.0 + u[0] ** 2, 2)
+BRANCHES = limit_state(  # of Breitung: the farther branch looks nearer; P by its two half-planes
+    lambda x: jnp.minimum(
+        jnp.where(x[0] > 3.5, 4 - x[0], 0.85 - 0.1 * x[0]),
+        jnp.where(x[1] > 2, 0.5 - 0.1 * x[1], 2.3 - x[1]),
+    ),
+    2,
+)
+BRANCHED = 3.1957884e-5
+
+
+def rows(n=N):
+    return np.arange(n)
+
+
+@pytest.mark.parametrize("width", [1.0, 2.5])
+def test_moves_keep_the_normal_distribution(key, width):
+    """30 moves of points of N(0, w^2 I), all of them taken: their numbers still have that
+    distribution (Kolmogorov and Smirnov, at 1e-4), and hardly any is where it was.
+    """
+    particles, _ = fresh(HALF, blank(HALF, N), counter_key(key, 1), N, width=width)
+    before = np.asarray(particles.z)
+    after, _, invalid = moved(
+        HALF, particles, counter_key(key, 2), rows(), begun(), moves=30, level=np.inf, width=width
+    )
+    z = np.asarray(after.z)
+    assert stats.kstest(z[:, 0] / width, "norm").pvalue > 1e-4
+    assert stats.kstest((z**2).sum(axis=1) / width**2, stats.chi2(4).cdf).pvalue > 1e-4
+    assert np.mean(z == before) < 0.01 and invalid == 0
+
+
+def test_moves_keep_a_level_and_say_what_points_come_to(key):
+    """No point leaves the level; score, used numbers and squares are those of its episode."""
+    sim = walk1d()
+    particles, _ = fresh(sim, blank(sim, N), counter_key(key, 1), N)
+    level = float(np.quantile(np.asarray(particles.score), 0.3))
+    inside = np.flatnonzero(np.asarray(particles.score) <= level)
+    after, steering, _ = moved(
+        sim, particles, counter_key(key, 2), np.resize(inside, N), begun(), moves=6, level=level
+    )
+    o = jax.device_get(outcomes(sim, after.z))
+    assert (np.asarray(after.score) <= level).all()
+    assert (steering.accepted > 0.05).all()
+    np.testing.assert_allclose(np.asarray(after.score), o.score, rtol=1e-5)
+    np.testing.assert_array_equal(np.asarray(after.used), o.used)
+    own = np.arange(after.z.shape[1]) < o.used[:, None]
+    np.testing.assert_allclose(
+        np.asarray(after.square), (np.asarray(after.z) ** 2 * own).sum(axis=1), rtol=1e-5
+    )
+
+
+def test_places_beyond_the_points_do_not_matter(key):
+    """The same 256 points in 1024 places, whatever stands in the others."""
+    found = []
+    for value in (0.0, 5.0):
+        p = blank(HALF, N)
+        p = Particles(jnp.full_like(p.z, value).at[:256].set(0.5), *p[1:])
+        after, steering, _ = moved(
+            HALF, p, counter_key(key, 1), rows(256), begun(), moves=4, level=np.inf
+        )
+        found.append((np.asarray(after.z)[:256], steering))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1].accepted, found[1][1].accepted)
+
+
+def test_a_new_width_scales_what_an_episode_did_not_use(key):
+    """With a size of 0 nothing else moves."""
+    sim = walk1d()
+    particles, _ = fresh(sim, blank(sim, N), counter_key(key, 1), N, width=3.0)
+    z, used = np.asarray(particles.z), np.asarray(particles.used)
+    still = Steering(np.zeros(2, np.float32), np.zeros(2, np.float32))
+    after, _, _ = moved(
+        sim, particles, counter_key(key, 2), rows(), still, moves=1, level=np.inf, width=2, before=3
+    )
+    own = np.arange(z.shape[1]) < used[:, None]
+    assert not own.all()
+    np.testing.assert_allclose(np.asarray(after.z), np.where(own, z, z * 2 / 3), rtol=1e-5)
+
+
+def test_the_variance_is_that_of_lee_and_whiteley(key):
+    """By all pairs of points: 1 - (n / (n - 1))^generations times the share of pairs, by weight,
+    without a common ancestor (Lee and Whiteley 2018).
+    """
+    s = ways._Population(key, HALF, 256, 2, 256)
+    rng = np.random.default_rng(0)
+    s.family, s.generations = rng.integers(40, size=256), 4
+    w = rng.random(256)
+    apart = (s.family[:, None] != s.family[None]) * np.outer(w, w) / w.sum() ** 2
+    expected = 1 - (256 / 255) ** 4 * apart.sum()
+    assert s.variance(np.log(w)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_without_resampling_the_variance_is_the_binomial_one(key):
+    """k of n indicators: (1 - k / n) / k, up to n / (n - 1)."""
+    s = ways._Population(key, HALF, 256, 2, 256)
+    log_w = ways._where(np.arange(256) < 64)
+    assert s.variance(log_w) == pytest.approx((1 - 64 / 256) / 64, rel=0.01)
+
+
+def near(runs, truth, most=4.0):
+    """The mean of populations lies within ``most`` of its standard errors of the truth."""
+    a = answer_of(runs)
+    return abs(a.log_mean - np.log(truth)) < most * a.relative < most * BLUNT
+
+
+@pytest.mark.parametrize("way", ["distance", "width"])
+@pytest.mark.parametrize(
+    "sim, truth", [(HALF, stats.norm.sf(3)), (SIDES, 2 * stats.norm.sf(3))], ids=["one", "two"]
+)
+def test_both_ways_tell_closed_forms(key, way, sim, truth):
+    runs = [ways.WAYS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    assert near(runs, truth)
+    fails = outcomes(sim, jnp.asarray(runs[0].points)).failure
+    assert bool(fails.all()) and len(runs[0].points) == N
+
+
+def test_wide_noise_meets_the_branch_that_the_distance_hides(key):
+    runs = [ways.by_width(k, BRANCHES, N, 10, N) for k in jax.random.split(key, 6)]
+    assert near(runs, BRANCHED)
+
+
+def test_episodes_that_end_early_count_only_their_own_numbers(key):
+    """A walk that ends where it fails: 9.578759495e-4, by quadrature."""
+    runs = [ways.by_width(k, walk1d("one-sided"), N, 10, N) for k in jax.random.split(key, 6)]
+    assert near(runs, 9.578759495e-4) and runs[0].used.min() < 10
+
+
+def test_choices_and_distances_of_few_values(key):
+    """At least 18 of 20 coins of 1/2 (P = 211 / 2^20), with the heads that lack as the distance."""
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x.astype(s.dtype),
+        disturbance=lambda s: D.Bernoulli(probs=jnp.full((), 0.5)),
+        evaluate=lambda s: (s >= 18, jnp.maximum(18 - s, 0.0)),
+        horizon=20,
+    )
+    truth = stats.binom.sf(17, 20, 0.5)
+    runs = [ways.by_distance(k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    assert near(runs, truth)
+
+
+def test_a_distance_that_never_changes_leads_nowhere(key):
+    sim = limit_state(lambda u: jnp.where(u[0] > 3.5, -1.0, 1.0), 2)
+    lost = ways.by_distance(key, sim, 256, 4, 256)
+    assert lost.log_mean == -np.inf and len(lost.points) == 0
+    runs = [ways.by_width(k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    assert near(runs, stats.norm.sf(3.5))
+
+
+def test_in_both_precisions(dtype, key):
+    sim = limit_state(lambda u: 3.0 - u[0], 2)
+    runs = [ways.by_distance(k, sim, N, 10, N) for k in jax.random.split(key, 3)]
+    assert near(runs, stats.norm.sf(3)) and runs[0].points.dtype == dtype
+
+
+def test_cooling_comes_to_the_likeliest(key):
+    """The design point of a half-space, |z| = 3: within .05 nats of 4.5."""
+    run = ways.by_distance(key, HALF, N, 10, N)
+    points, spent = ways.cooled(key, HALF, run.points[:128], 60_000)
+    best = 0.5 * (points**2).sum(axis=1).min()
+    assert 4.5 <= best * (1 + 1e-5) < 4.55 and spent <= 60_000
+
+
+@pytest.fixture(scope="module")
+def two():
+    """The answer for two half-planes, P = .0027."""
+    return population(jax.random.key(1), SIDES, 200_000, particles=N)
+
+
+def test_two_ways_agree_and_their_answer_holds(two):
+    truth = 2 * stats.norm.sf(3)
+    assert two.reliable and abs(two.log_mean - np.log(truth)) < 4 * two.relative_error
+    assert "by distance" in two.method and "by width" in two.method
+    assert "standard errors apart" in two.history[-1]
+    assert two.evaluations <= 200_000 and isinstance(two.proposal, Sample)
+    failing, drawn = two.plain
+    assert 0 < failing < drawn <= two.evaluations
+    assert two.guaranteed[0] < truth < two.guaranteed[1]
+
+
+def test_a_sample_holds_both_modes_and_serves_failure_samples(two, key):
+    right = np.mean(two.proposal.points[:, 0] > 0)
+    assert abs(right - 0.5) < 0.2
+    drawn = failure_samples(key, SIDES, two, 100, moves=2)
+    assert bool(drawn.failures.failure.all())
+
+
+def test_an_estimate_with_a_sample_is_saved(two, tmp_path, equal):
+    jast.save(tmp_path / "found.npz", two)
+    again = jast.load(tmp_path / "found.npz")
+    equal(tuple(again.proposal), tuple(two.proposal))
+    assert again.plain == two.plain and str(again) == str(two)
+
+
+def test_the_same_bits_wherever_populations_run(two, tmp_path):
+    """By an executor, on two devices, and from a checkpoint, which runs nothing again."""
+    call = lambda **more: population(jax.random.key(1), SIDES, 200_000, particles=N, **more)
+    with ThreadPoolExecutor(2) as pool:
+        others = [call(executor=pool), call(devices=jax.devices()[:2])]
+    others += [call(checkpoint=tmp_path / "kept"), call(checkpoint=tmp_path / "kept")]
+    assert {o.log_mean for o in others} == {two.log_mean}
+    assert {o.interval for o in others} == {two.interval}
+
+
+def test_what_misleads_the_distance_is_not_missed_silently(key):
+    """Levels of the distance see one branch alone, which has a thousandth of the probability."""
+    found = population(key, BRANCHES, 400_000, particles=N)
+    right = abs(found.log_mean - np.log(BRANCHED)) < 4 * found.relative_error
+    assert right or not found.reliable
+
+
+def test_no_failure_leaves_what_plain_draws_guarantee(key):
+    found = population(key, NEVER, 100_000, particles=256)
+    assert np.isnan(found.mean) and not found.reliable and found.interval[0] == 0
+    assert found.interval[1] == pytest.approx(stats.beta.ppf(0.975, 1, found.plain[1]), rel=1e-3)
+    assert str(found).index("between 0 and") < str(found).index("failures")
+
+
+@pytest.mark.parametrize("beta", [-9.0, 0.0, 1.5])
+def test_frequent_failures_are_counted(key, beta):
+    found = population(key, limit_state(lambda u: beta - u[0], 2), 60_000, particles=N)
+    truth = stats.norm.sf(beta)
+    assert found.reliable and "plain draws" in found.method and found.evaluations == 60_000
+    assert found.interval[0] <= truth <= found.interval[1] and found.mean <= 1
+
+
+def test_invalid_episodes_are_told_and_never_failures(key):
+    """NaN where the second number is above 1: a sixth of all, which might all fail."""
+    sim = limit_state(lambda u: jnp.where(u[1] > 1, jnp.nan, 3.2 - u[0]), 2)
+    found = population(key, sim, 200_000, particles=N)
+    truth = stats.norm.sf(3.2) * stats.norm.cdf(1)
+    assert found.invalid > 0 and not found.reliable
+    assert any("invalid" in w for w in found.warnings)
+    assert (found.proposal.points[:, 1] <= 1).all()
+    assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
+
+
+def test_an_interruption_keeps_the_populations_that_are_done(key):
+    calls = []
+
+    def stop(done, total, result):
+        calls.append(done)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    found = population(key, SIDES, 400_000, particles=N, callback=stop)
+    assert not found.reliable and any("interrupted" in w for w in found.warnings)
+    assert found.mean > 0 and found.evaluations < 400_000
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda k: population(k, SIDES, 10), "population: budget"),
+        (lambda k: population(k, SIDES, particles=5), "population: particles"),
+        (lambda k: population(k, SIDES, level=1.0), "population: level"),
+        (lambda k: population(k, "x"), "sim must be a jast.Simulator"),
+        (lambda k: failure_probability(k, SIDES, 1000, seconds=1.0), "give budget or seconds"),
+        (lambda k: failure_probability(k, SIDES, seconds=0), "seconds must be"),
+        (lambda k: jast.stress(k, SIDES, seconds=float("nan")), "stress: seconds must be"),
+        (lambda k: jast.stress(k, SIDES, 1000, seconds=1), "stress: give budget or seconds"),
+    ],
+)
+def test_bad_arguments_are_named(key, call, words):
+    with pytest.raises(ValueError, match=words):
+        call(key)
+
+
+def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, monkeypatch):
+    """A rate of 50,000 a second asks for 2^19 evaluations; the same call with these has the same
+    bits.
+    """
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
+    found = failure_probability(key, SIDES)
+    assert found.settings["budget"] == 2**19 and "populations" in found.method
+    again = failure_probability(key, SIDES, 2**19)
+    assert again.log_mean == found.log_mean and again.interval == found.interval
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 100.0)
+    assert budgets.budget_of("f", key, SIDES, None, 50) == budgets.DEAR
+    assert budgets.budget_of("f", key, SIDES, 20.0, 50) == 2048
+
+
+def test_seconds_of_a_black_box_are_of_the_clock(key):
+    slow = jast.blackbox.from_python(
+        lambda x: (bool(abs(x[0]) > 3), 1.0), horizon=1, disturbance=D.Normal(0.0, 1.0)
+    )
+    budget = budgets.budget_of("f", key, slow, 0.01, 50)
+    assert budget >= 50 and not budgets.cheap(slow, 10**7)
+
+
+def test_stress_by_populations_tells_both_modes(key):
+    """Two half-planes: e^-4.5 each, half of the probability each."""
+    report = jast.stress(key, SIDES, 500_000)
+    p, truth = report.probability, 2 * stats.norm.sf(3)
+    assert p.reliable and abs(p.log_mean - np.log(truth)) < 4 * p.relative_error
+    assert float(report.failures.best.reward) == pytest.approx(-4.5, abs=0.01)
+    assert len(report.modes) == 2 and sum(m.share for m in report.modes) == pytest.approx(1)
+    assert all(abs(m.share - 0.5) < 0.15 for m in report.modes)
+    assert report.episodes <= 1.1 * 500_000
+
+
+def test_a_second_key_compiles_nothing(key):
+    heard = []
+
+    def listen(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            heard.append(event)
+
+    one, other = jax.random.split(key)
+    population(one, SIDES, 60_000, particles=N)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        population(other, SIDES, 60_000, particles=N)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not heard
