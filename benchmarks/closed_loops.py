@@ -437,7 +437,7 @@ def main(argv: list[str] | None = None) -> None:
         begun = time.process_time()
         p, error = truth_of(loop, draws, cells)
         both = math.hypot(error * p, loop.error * loop.truth)
-        apart = abs(p - loop.truth) / both if 0 < both < math.inf else math.nan
+        apart = abs(p - loop.truth) / both if 0 < both < math.inf else 0.0
         row = dict(name=loop.name, numbers=loop.numbers, truth=loop.truth, error=loop.error)
         row |= dict(recomputed=p, apart=apart, cpu_seconds=time.process_time() - begun)
         rows.append(row)
@@ -448,7 +448,7 @@ def main(argv: list[str] | None = None) -> None:
                 flush=True,
             )
     if args.json:
-        print(json.dumps(dict(loops=rows), allow_nan=True))
+        print(json.dumps(dict(loops=rows)))
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "arch": ["--smoke"],
     "blackbox": ["--smoke"],
     "bridge": ["--smoke"],
+    "closed_loops": ["--smoke"],
     "colav": ["--smoke"],
     "cross_entropy": ["--smoke"],
     "explain": ["--smoke"],
@@ -33,6 +34,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "memory": ["--smoke"],
     "nasa": ["--smoke"],
     "peers": "--seeds 1 --cases branin --peers random_search differential_evolution".split(),
+    "populations": ["--smoke"],
     "probability": ["--smoke"],
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
@@ -40,6 +42,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "stress": ["--smoke"],
     "sweep": ["--smoke"],
     "table1_seeds": ["--smoke"],
+    "time_to_answer": ["--smoke"],
     "weakness": ["--smoke"],
 }
 QUICK = {

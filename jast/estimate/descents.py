@@ -32,6 +32,8 @@ class Settings:
     """Points of a population."""
     moves: int = 10
     """Moves of a point between two levels."""
+    kinds: int = 2
+    """Of moves: small ones of all numbers, and new ones of a few; 1 leaves out the latter."""
     quantile: float = 0.2
     """Share of the points that a level keeps."""
     effective: float = 0.5
@@ -82,8 +84,8 @@ class Descent(NamedTuple):
 class _Population:
     """A population on its way: the particles, the family of each, and the counts."""
 
-    def __init__(self, key: jax.Array, sim: Simulator, n: int, moves: int, capacity: int):
-        self.sim, self.n, self.moves = sim, n, moves
+    def __init__(self, key, sim, n, moves, capacity, settings=SETTINGS):
+        self.sim, self.n, self.moves, self.kinds = sim, n, moves, settings.kinds
         self.rng, self.key, self.calls = generator(key, 1), counter_key(key, 2), 0
         self.particles, self.steering = blank(sim, capacity), begun()
         self.evaluations, self.invalid = 0, 0
@@ -125,6 +127,7 @@ class _Population:
             self.steering,
             moves=self.moves,
             level=level,
+            kinds=self.kinds,
             **width,
         )
         self.evaluations, self.invalid = (
@@ -184,7 +187,7 @@ def by_distance(
     """Down the levels of the miss distance: each is the sample quantile of the scores, until
     failures are as many. ``n`` points in ``capacity`` places, a size of the compiled program.
     """
-    s = _Population(key, sim, n, moves, capacity)
+    s = _Population(key, sim, n, moves, capacity, settings)
     s.draw(1.0)
     level = math.inf
     while True:
@@ -213,7 +216,7 @@ def by_width(
     """From the least width of the noise at which failures are frequent to the model's own, each
     step as far as leaves enough effective points; moves among failures only.
     """
-    s = _Population(key, sim, n, moves, capacity)
+    s = _Population(key, sim, n, moves, capacity, settings)
     for width in settings.widths:
         failing = s.draw(width)
         if failing.mean() >= settings.failing:

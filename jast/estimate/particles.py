@@ -104,19 +104,21 @@ def moved(
     level: float,
     width: float = 1.0,
     before: float | None = None,
+    kinds: int = 2,
 ) -> tuple[Particles, Steering, int]:
     """The points of ``rows`` [m] after so many moves that keep N(0, width^2 I) given a score of at
     most ``level``, in the first m places; their new sizes; invalid episodes that were met. What
     stands in the other places means nothing.
 
     ``before``: the width that the points were drawn with, where it was another one. Numbers that an
-    episode did not use are scaled to the new one, as nothing ties them.
+    episode did not use are scaled to the new one, as nothing ties them. ``kinds``: 1 leaves out
+    the windows.
     """
     dtype, live = np.dtype(particles.z.dtype), len(rows)
     places = np.arange(len(particles.z), dtype=np.int32)
     places[:live] = rows
     ratio = 1.0 if before is None else width / before
-    counts = np.int32(live), np.int32(moves)
+    counts = np.int32(live), np.int32(moves), np.int32(kinds)
     numbers = (dtype.type(v) for v in (level, width, ratio))
     out, size, accepted, invalid = _moved(
         sim, particles, key, places, steering.size, *counts, *numbers
@@ -125,7 +127,7 @@ def moved(
 
 
 @partial(jax.jit, donate_argnums=1)
-def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
+def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
     n, d = particles.z.shape
     lanes = min(LANES, n)
     play = jax.vmap(partial(outcome, sim))
@@ -163,7 +165,7 @@ def _moved(sim, particles, key, rows, size, live, moves, level, width, ratio):
 
     def move(t, carry):
         particles, size, accepted, invalid = carry
-        kind = t % 2
+        kind = t % kinds
         run = partial(block, key=jax.random.fold_in(key, t), kind=kind, size=size[kind])
         none = jnp.zeros((), jnp.int32)
         particles, taken, wrong = lax.fori_loop(

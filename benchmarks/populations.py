@@ -1,0 +1,94 @@
+"""What each number of a population is worth: ``python -m benchmarks.populations [--json]
+[--quick | --smoke] [--systems NAME ...]``.
+
+The figure is the relative variance of one population's estimate over keys, times its evaluations:
+what a reader pays for a given error. It stands for the settings as they are, and with one of them
+changed, on systems that settings may be chosen on. Beside it stands what the genealogies say. A
+figure over n keys has a relative standard error of about sqrt(2 / n).
+"""
+
+import argparse
+import json
+import os
+from dataclasses import replace
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+from benchmarks.sizes import options, size  # noqa: E402
+from benchmarks.time_to_answer import SYSTEMS  # noqa: E402
+from jast.estimate.descents import SETTINGS, WAYS  # noqa: E402
+
+__all__ = ["CHANGES", "work"]
+
+CHANGES = {
+    "as they are": {},
+    "small moves": dict(kinds=1),
+    "5 moves": dict(moves=5),
+    "20 moves": dict(moves=20),
+    "quantile .1": dict(quantile=0.1),
+    "quantile .5": dict(quantile=0.5),
+    "effective .3": dict(effective=0.3),
+    "effective .8": dict(effective=0.8),
+}
+CASES = (
+    ("toy, z 3, 100", "distance"),
+    ("crossing", "distance"),
+    ("Gayton of 8", "width"),
+    ("piecewise", "width"),
+    ("breaker", "width"),
+)
+
+
+def work(name: str, way: str, keys: int, particles: int, changes: dict[str, Any]) -> dict[str, Any]:
+    """The figure of a system and a way down with these settings, and the mean over the truth."""
+    settings, about = replace(SETTINGS, **changes), SYSTEMS[name]
+    runs = [
+        WAYS[way](key, about.simulator, particles, settings.moves, particles, settings)
+        for key in jax.random.split(jax.random.key(0), keys)
+    ]
+    p = np.exp([float(r.log_mean) for r in runs])
+    evaluations = float(np.mean([r.evaluations for r in runs]))
+    spread = float(p.var(ddof=1) / p.mean() ** 2) if keys > 1 and p.mean() > 0 else None
+    told = float(np.nanmean([r.variance for r in runs])) if p.any() else None
+    return dict(
+        work=None if spread is None else spread * evaluations,
+        told=None if told is None else told * evaluations,
+        of_truth=float(p.mean() / about.truth),
+        evaluations=evaluations,
+    )
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = options(argparse.ArgumentParser(description=__doc__), "8 keys of 1024 points")
+    parser.add_argument("--systems", nargs="+", help="default: all")
+    args = parser.parse_args(argv)
+    keys, particles = size(args, (40, 2048), (8, 1024), (2, 128))
+    rows = []
+    for name, way in size(args, CASES, CASES[2:4], CASES[3:4]):
+        if args.systems and name not in args.systems:
+            continue
+        for words, changes in CHANGES.items():
+            if ("quantile" in changes and way == "width") or (
+                "effective" in changes and way == "distance"
+            ):
+                continue
+            row = dict(system=name, way=way, settings=words)
+            rows.append(row | work(name, way, keys, particles, changes))
+            if not args.json:
+                r = rows[-1]
+                print(
+                    f"{name:14s} by {way:8s} {words:12s} variance x evaluations"
+                    f" {r['work'] or 0:8.0f}  by genealogy {r['told'] or 0:8.0f}"
+                    f"  mean / truth {r['of_truth']:.3f}",
+                    flush=True,
+                )
+    if args.json:
+        print(json.dumps(dict(keys=keys, particles=particles, rows=rows)))
+
+
+if __name__ == "__main__":
+    main()
