@@ -291,17 +291,17 @@ def test_bad_arguments_are_named(key, call, words):
 
 
 def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, monkeypatch):
-    """A rate of 50,000 a second asks for 2^19 evaluations; the same call with these has the same
+    """A rate of 50,000 a second asks for 3 2^17 evaluations; the same call with these has the same
     bits.
     """
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 5e4)
     found = failure_probability(key, SIDES)
-    assert found.settings["budget"] == 2**19 and "populations" in found.method
-    again = failure_probability(key, SIDES, 2**19)
+    assert found.settings["budget"] == 3 * 2**17 and "populations" in found.method
+    again = failure_probability(key, SIDES, 3 * 2**17)
     assert again.log_mean == found.log_mean and again.interval == found.interval
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 100.0)
     assert budgets.budget_of("f", key, SIDES, None, 50) == budgets.DEAR
-    assert budgets.budget_of("f", key, SIDES, 20.0, 50) == 2048
+    assert budgets.budget_of("f", key, SIDES, 20.0, 50) == 1536
 
 
 def test_seconds_of_a_black_box_are_of_the_clock(key):

@@ -24,7 +24,7 @@ from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
-from jast.estimate.population import by_populations
+from jast.estimate.population import Sample, by_populations
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import fits
 from jast.estimate.seek import Seeker, seek
@@ -129,11 +129,11 @@ def failure_probability(
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        budget: episodes to simulate, at least 50. Default: what a cheap system simulates in eight
-            CPU seconds, rounded to a power of 2; 100,000 of others.
+        budget: episodes to simulate, at least 50. Default: what a cheap system simulates in some
+            eight CPU seconds, at most 33,554,432; 100,000 of others.
         seconds: in place of ``budget``: as many episodes as the system simulates in so many CPU
-            seconds (a black box: seconds), rounded to a power of 2. Compilation and the method's
-            own work come on top.
+            seconds (a black box: seconds), rounded down to 2^k or 3 2^k. Compilation and the
+            method's own work come on top.
         failures: known ones (an archive, `jast.failures`), which join what the explorers find, so
             that no mode among them is lost. They lead to a proposal and never enter the estimate.
             Tilts take in two modes that they hardly draw; where others are left, or these could not
@@ -177,16 +177,17 @@ def failure_probability(
         budget = whole(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
-    alone = failures is None and near is None
-    if budget is None and not alone and seconds is None:
-        budget = budgets.DEAR
-    if budget is None:
-        budget = budgets.budget_of(name, key, sim, seconds, few_calls.LEAST)
-    settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
-    known = None if failures is None else latent.normal_of(sim, failures.episodes)
     if near is not None and not isinstance(near, Estimate):
         raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
     similar = near.proposal if near is not None and fits(sim, near.proposal) else None
+    similar = None if isinstance(similar, Sample) else similar  # which draws nothing
+    alone = failures is None and similar is None
+    if budget is None:
+        guided = not alone and seconds is None
+        of_time = lambda: budgets.budget_of(name, key, sim, seconds, few_calls.LEAST)
+        budget = budgets.DEAR if guided else of_time()
+    settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
+    known = None if failures is None else latent.normal_of(sim, failures.episodes)
     ways = units.ways(name, executor, devices)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     with stored(name, checkpoint, key, **about) as store, kept(store):

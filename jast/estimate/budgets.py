@@ -40,7 +40,7 @@ def budget_of(
     """Evaluations for the ``seconds`` of a call (None: as many as a cheap system simulates in
     `SECONDS`, ``dear`` of others), at least ``least``.
 
-    They are a power of 2, so that two calls on one machine mostly agree.
+    They are 2^k or 3 2^k, so that two calls on one machine mostly agree.
 
     Raises:
         ValueError: for ``seconds`` that are not a number above 0.
@@ -66,7 +66,8 @@ def given(name: str, budget: Any, seconds: Any) -> None:
 
 
 def _rounded(evaluations: float) -> int:
-    return 2 ** max(round(math.log2(max(evaluations, 1))), 0)
+    power = 2 ** int(math.log2(max(evaluations, 2)))
+    return power * 3 // 2 if evaluations >= 1.5 * power else power
 
 
 def _rate_on_host(key: jax.Array, sim: Simulator) -> float:

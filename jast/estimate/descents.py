@@ -67,6 +67,8 @@ class Descent(NamedTuple):
     """[m, D] failures, nearly as p(z | failure) has them; empty where none was reached"""
     used: Any
     """[m] int32: how many of the numbers decided each"""
+    distance: Any
+    """[m] miss distances"""
     log_mean: Any
     """Log of the estimate; -inf where no failure was reached"""
     variance: Any
@@ -146,7 +148,7 @@ class _Population:
     def lost(self):
         """The `Descent` that reached no failure."""
         p, d = self.particles, dimension(self.sim)
-        none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32)
+        none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32), np.zeros(0, p.z.dtype)
         return self._end(*none, -math.inf, math.nan)
 
     def arrived(self, log_w):
@@ -155,12 +157,14 @@ class _Population:
         variance = self.variance(log_w)
         self.move(log_w, -np.inf)
         p = jax.device_get(self.particles)
-        return self._end(p.z[: self.n], p.used[: self.n], self.log_mean, variance)
+        own = (a[: self.n] for a in (p.z, p.used, p.distance))
+        return self._end(*own, self.log_mean, variance)
 
-    def _end(self, points, used, log_mean, variance):
+    def _end(self, points, used, distance, log_mean, variance):
         return Descent(
             points=points,
             used=used,
+            distance=distance,
             log_mean=np.float64(log_mean),
             variance=np.float64(variance),
             plain=np.array(self.plain, np.int64),

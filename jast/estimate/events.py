@@ -24,9 +24,9 @@ from jast.estimate.answers import asked
 from jast.estimate.draws import interval, key_of, of_weights, share, shares
 from jast.estimate.importance_sampling import component
 from jast.estimate.proposals import as_proposal
-from jast.estimate.redrawn import points
+from jast.estimate.redrawn import numbers_of, points
 from jast.intervals import clopper_pearson, log_normal
-from jast.limit_state import Latent, dimension, policy_of
+from jast.limit_state import dimension, policy_of
 from jast.policy import nominal_policy
 from jast.pytrees import clear, select, strong
 
@@ -256,12 +256,11 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
     rows, length = draws.row[draws.failure], draws.length[draws.failure]
     if not len(rows):
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if isinstance(draws.source, Latent):
-        if (received := draws.source.means.shape[1]) != dimension(sim):
-            raise ValueError(
-                f"{name}: sim must be the simulator of the estimate, with {received} random"
-                f" numbers in an episode, received one with {dimension(sim)}"
-            )
+    if (received := numbers_of(draws.source)) not in (None, dimension(sim)):
+        raise ValueError(
+            f"{name}: sim must be the simulator of the estimate, with {received} random"
+            f" numbers in an episode, received one with {dimension(sim)}"
+        )
     if draws.source == "policy":
         if estimate.method != "monte_carlo" and proposal is None:
             raise ValueError(f"{name}: proposal must be the one that the estimate was made with")

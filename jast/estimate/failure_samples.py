@@ -23,7 +23,7 @@ from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.population import Sample
 from jast.estimate.populations import settled
 from jast.estimate.proposals import as_proposal
-from jast.estimate.redrawn import redrawn
+from jast.estimate.redrawn import numbers_of, redrawn
 from jast.journal import answered, kept
 from jast.memory import require_episodes
 
@@ -143,8 +143,7 @@ def failure_samples(
 def _sampled(name, key, sim, q, samples, moves):
     key, for_draws, for_rows = jax.random.split(key, 3)
     n = PER_SAMPLE * samples
-    if isinstance(q, latent.Latent | Sample):
-        received = (q.means if isinstance(q, latent.Latent) else q.points).shape[1]
+    if (received := numbers_of(q)) is not None:
         if received != latent.dimension(sim):
             raise ValueError(
                 f"{name}: source must be of this simulator, with {latent.dimension(sim)} random"

@@ -41,6 +41,8 @@ class Particles(NamedTuple):
     """[n] int32: how many of the numbers decided the episode"""
     square: jax.Array
     """[n] sum of the squares of these"""
+    distance: jax.Array
+    """[n] miss distance, of failures too"""
 
 
 class Steering(NamedTuple):
@@ -75,6 +77,7 @@ def blank(sim: Simulator, n: int) -> Particles:
             score=zeros + np.inf,
             used=np.zeros(n, np.int32),
             square=zeros,
+            distance=zeros,
         )
     )
 
@@ -154,7 +157,7 @@ def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ra
         taken = score <= level
         new = jax.tree.map(
             lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-            Particles(z, score, o.used, square),
+            Particles(z, score, o.used, square, o.distance.astype(score.dtype)),
             old,
         )
         particles = jax.tree.map(

@@ -16,13 +16,17 @@ from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
+from jast.estimate.batches import resampled
 from jast.estimate.descents import SETTINGS, WAYS, Descent, Settings, size
+from jast.estimate.draws import Draws, drawn_by
 from jast.estimate.estimate import Estimate, of_counts
-from jast.estimate.particles import LANES, blank, counter_key, fresh
+from jast.estimate.particles import LANES, Particles, blank, counter_key, fresh
 from jast.estimate.sums import nothing
 from jast.intervals import checked_level, clopper_pearson, log_normal
 from jast.memory import require
+from jast.outline import outline
 from jast.places import Task
+from jast.pytrees import count
 from jast.results import asked
 from jast.rounding import rounded
 from jast.watch import Watch
@@ -58,6 +62,8 @@ INVALID = 0.01
 """Part of an answer that invalid episodes may add, if they failed."""
 FEWEST = 512
 """Points that a population at least has where it is one of several: its own error is then told."""
+DRAWS = 20_000
+"""Failures that are kept for further answers."""
 REPEATED = 4
 """Populations from which on their spread speaks beside what their genealogies say."""
 
@@ -78,6 +84,8 @@ class Sample(NamedTuple):
     """[m, D]"""
     used: Any
     """[m] int32: how many of the numbers decided each"""
+    distance: Any
+    """[m] miss distances"""
     log_weight: Any
     """[m] of the population that it comes from, whose estimate may be greater or less"""
     group: Any
@@ -254,6 +262,7 @@ class _Search:
         self.interrupted = ""
         self.reasons = [] if (coarse := rounded(sim)) is None else [coarse]
         self.history = []
+        self.found, self.looked = [], 0  # failures of plain draws, and among how many
 
     def run(self, kind, count, n=None):
         """``count`` more populations of a kind, of ``n`` points."""
@@ -310,8 +319,11 @@ class _Search:
             while self.spent < self.budget:
                 m = min(self.capacity, self.budget - self.spent)
                 particles, invalid = fresh(self.sim, particles, jax.random.fold_in(key, i), m)
-                failing = int((np.asarray(particles.score)[:m] == -np.inf).sum())
-                self.plain += failing, invalid, m
+                rows = np.flatnonzero(np.asarray(particles.score)[:m] == -np.inf)
+                if sum(map(len, self.found)) < DRAWS:  # the rest adds to the count alone
+                    self.found.append(Particles(*(np.asarray(a)[rows] for a in particles)))
+                    self.looked += m
+                self.plain += len(rows), invalid, m
                 self.spent, self.invalid, i = self.spent + m, self.invalid + invalid, i + 1
                 self.watch.reach(min(self.spent, self.budget))
                 self.watch.tell()
@@ -323,7 +335,7 @@ class _Search:
         """The `Estimate` of plain draws."""
         failing, invalid, drawn = map(int, self.plain)
         total = nothing(drawn)._replace(
-            samples=drawn, failures=failing, invalid=invalid, draws=None
+            samples=drawn, failures=failing, invalid=invalid, draws=self.drawn_plainly()
         )
         return of_counts(
             f"{name}: plain draws",
@@ -334,6 +346,15 @@ class _Search:
             evaluations=self.spent,
             history=tuple(self.history),
         )
+
+    def drawn_plainly(self):
+        """`Draws` of plain draws; None where there were none but those of populations."""
+        if not self.found:
+            return None
+        p = jax.tree.map(lambda *a: np.concatenate(a), *self.found)
+        none = np.zeros(len(p.z))
+        sample = Sample(p.z, p.used, p.distance, none, none.astype(np.int32))
+        return self.kept(sample, none, self.looked)
 
     def witnesses(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
@@ -420,7 +441,7 @@ class _Search:
                 f"relative standard error {exact.relative:.2g}, above {ROUGH}: the interval holds"
                 " the truth as often as it says, and a greater budget narrows it"
             )
-        runs = [r for k in kinds for r in self.runs[k]]
+        runs, sample = [r for k in kinds for r in self.runs[k]], sample_of(self.runs[kinds[0]])
         log_mean, mean = min(exact.log_mean, 0.0), math.exp(min(exact.log_mean, 0.0))
         return Estimate(
             method=f"{name}: populations " + " and ".join(dict.fromkeys(str(k) for k in kinds)),
@@ -441,10 +462,35 @@ class _Search:
             modes=None,
             reliable=not reasons,
             warnings=tuple(reasons),
-            proposal=sample_of(self.runs[kinds[0]]),
+            proposal=sample,
             history=tuple(self.history),
             plain=(failing, drawn),
+            draws=self.draws(sample, log_mean, int(exact.relative**-2)),
         )
+
+    def draws(self, sample, log_mean, worth):
+        """`Draws` as of so many independent ones, half of them failures of the ``sample``: those
+        of one population have common ancestors, and all of them would claim too much.
+        """
+        m = int(np.clip(worth // 2, 2, min(len(sample.points), DRAWS)))
+        rows = resampled(sample.log_weight, m, 0.5)
+        chosen = Sample(*(a[rows] for a in sample))
+        return self.kept(chosen, np.full(m, log_mean + math.log(2)), 2 * m)
+
+    def kept(self, sample, log_weight, samples):
+        """`Draws` of the failures ``sample``, in whose order they are found again."""
+        about = outline(self.sim)
+        steps = (sample.used - count(about.x0)) // max(count(about.x), 1)
+        found = Draws(
+            log_weight=log_weight,
+            distance=sample.distance,
+            failure=np.ones(len(sample.points), bool),
+            length=steps.astype(np.int32),
+            row=np.arange(len(sample.points)),
+            samples=samples,
+            reach=0.0,
+        )
+        return drawn_by(found, self.key, max(len(sample.points), 1), sample)
 
 
 def answer_of(runs: Sequence[Descent]) -> Answer | None:
@@ -466,7 +512,9 @@ def answer_of(runs: Sequence[Descent]) -> Answer | None:
 def sample_of(runs: Sequence[Descent]) -> Sample:
     """The `Sample` of all populations of one kind."""
     runs = [r for r in runs if len(r.points)]
-    parts = [(r.points, r.used, np.full(len(r.points), float(r.log_mean))) for r in runs]
+    parts = [
+        (r.points, r.used, r.distance, np.full(len(r.points), float(r.log_mean))) for r in runs
+    ]
     groups = np.repeat(np.arange(len(runs), dtype=np.int32), [len(r.points) for r in runs])
     return Sample(*map(np.concatenate, zip(*parts, strict=True)), groups)
 

@@ -11,19 +11,30 @@ from jast.counter import generator
 from jast.distributions.parts import parts
 from jast.episode import rollout
 from jast.estimate import markov_tilts as tilts
-from jast.estimate.batches import drawn, numbers, of_chunk, plain_chunk
+from jast.estimate.batches import drawn, numbers, of_chunk, plain_chunk, resampled
 from jast.estimate.draws import Draws, key_of
+from jast.estimate.population import Sample
+from jast.limit_state import Outcomes
+from jast.outline import outline
 from jast.policy import Policy
+from jast.pytrees import count
 
-__all__ = ["failing", "fits", "points", "redrawn"]
+__all__ = ["failing", "fits", "numbers_of", "points", "redrawn"]
 
 
 def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.ndarray]:
-    """``n`` episodes of ``q``, a `Latent` or `Tilts`: (points z [n, D], `Outcomes`, log p - log q).
+    """``n`` episodes of ``q``, a `Latent`, `Tilts` or `Sample`: (points z [n, D], `Outcomes`,
+    log p - log q).
     On the host.
 
-    A choice that was made without a normal number has the middle of its interval as one.
+    A choice that was made without a normal number has the middle of its interval as one. Of a
+    `Sample` its own failures come back, chosen by weight, and nothing is run.
     """
+    if isinstance(q, Sample):
+        rows = resampled(q.log_weight, n, generator(key).random())
+        steps = (q.used - count(outline(sim).x0)) // max(count(outline(sim).x), 1)
+        some = Outcomes(np.ones(n, bool), *(a[rows] for a in (q.distance, q.used, steps)), None)
+        return q.points[rows], some._replace(invalid=np.zeros(n, bool)), np.zeros(n)
     if isinstance(q, latent.Latent):
         return drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
     about, dtype = tilts.shape(sim), latent.normal_numbers(sim)
@@ -35,8 +46,8 @@ def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.nda
 
 def fits(sim: Any, q: Any) -> bool:
     """Whether ``q`` is a proposal of `jast.estimate.failure_probability` for this simulator."""
-    if isinstance(q, latent.Latent):
-        return q.means.shape[1] == latent.dimension(sim)
+    if (d := numbers_of(q)) is not None:
+        return d == latent.dimension(sim)
     if not isinstance(q, tilts.Tilts):
         return False
     about = tilts.shape(sim)
@@ -48,12 +59,23 @@ def fits(sim: Any, q: Any) -> bool:
     )
 
 
+def numbers_of(q: Any) -> int | None:
+    """Random numbers of an episode of the system that ``q`` is of, where it is a mixture of
+    Gaussians or a `Sample`; else None.
+    """
+    if isinstance(q, latent.Latent):
+        return q.means.shape[1]
+    return q.points.shape[1] if isinstance(q, Sample) else None
+
+
 def points(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.ndarray:
     """The first ``n`` points, or more, of the ``lanes`` of chunk ``i`` of an estimate with the
     draws of ``q``. On the host.
     """
     if isinstance(q, str):
         return plain_chunk(key, i, n, sim)
+    if isinstance(q, Sample):
+        return q.points[i * lanes : i * lanes + n]
     if isinstance(q, tilts.Tilts):
         return redrawn(generator(key, 2, i), sim, q, lanes)[0]
     return latent.place(q, *of_chunk(key, i, n, q))

@@ -20,7 +20,7 @@ from jast.estimate.answers import asked
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.estimate.redrawn import failing
+from jast.estimate.redrawn import failing, numbers_of
 from jast.explain.point import names, steps_of
 from jast.intervals import clopper_pearson, log_normal
 from jast.judge import Judge
@@ -173,13 +173,11 @@ def indices(
         )
     if not kept.failure.any():
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if isinstance(kept.source, latent.Latent):
-        of, d = kept.source.means.shape[1], latent.dimension(sim)
-        if of != d:
-            raise ValueError(
-                f"{name}: sim must be the simulator of the estimate, with {of} random numbers in"
-                f" an episode, received one with {d}"
-            )
+    if (of := numbers_of(kept.source)) not in (None, d := latent.dimension(sim)):
+        raise ValueError(
+            f"{name}: sim must be the simulator of the estimate, with {of} random numbers in an"
+            f" episode, received one with {d}"
+        )
     rng = generator(key)
     z, log_w, length, spent = failing(sim, kept, KEPT)
     z = _placed(sim, z, length, rng)

@@ -14,6 +14,7 @@ from jast import limit_state as latent
 from jast.episode import replay
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
+from jast.estimate.population import Sample
 from jast.estimate.redrawn import fits, redrawn
 from jast.intervals import checked_level
 from jast.simulator import Simulator
@@ -126,9 +127,12 @@ def sensitivity(
             " parameter), received functions without parameters"
         )
     logs, scores = [], []
+    if isinstance(q, Sample):  # as many of its failures as are worth independent ones
+        q, samples = estimate.draws.source, LANES
     for i in range(-(-samples // LANES)):
         own = jax.random.fold_in(key, i)
-        z, o, log_w = redrawn(own, sim, q, LANES)
+        n = min(LANES, len(q.points)) if isinstance(q, Sample) else LANES
+        z, o, log_w = redrawn(own, sim, q, n)
         rows = np.flatnonzero(np.asarray(o.failure) & np.isfinite(log_w))
         if len(rows):
             # all lanes, so that there is one program

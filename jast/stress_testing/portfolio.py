@@ -87,12 +87,12 @@ def stress(
         key: consumed.
         sim: the simulator.
         budget: evaluations (episodes; one with its gradient counts as 3 or 4) in all, nearly; at
-            least 300. Default: what a cheap system simulates in eight CPU seconds, rounded to a
-            power of 2; 200,000 of others. The report's ``settings`` name the one that was used.
+            least 300. Default: what a cheap system simulates in some eight CPU seconds, at most
+            33,554,432; 200,000 of others. The report's ``settings`` name the one that was used.
             Below 10,417 the probability is a surrogate's (`failure_probability` with few calls),
             and with more than 20 numbers an episode that of the plain draws alone.
         seconds: in place of ``budget``: as many evaluations as the system simulates in so many CPU
-            seconds (a black box: seconds), rounded to a power of 2.
+            seconds (a black box: seconds), rounded down to 2^k or 3 2^k.
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
         callback: called as ``callback(done, total, None)`` after every piece of the work.

@@ -48,14 +48,11 @@ def shares(
         return np.ones(1), 0, 0
     if not n:
         return np.full(k, np.nan), 0, 0
-    if isinstance(q, Sample):
-        z, log_w, failing, n = q.points, q.log_weight, len(q.points), 0
-        rows = resampled(log_w, DRAWS[1] // PART, 0.5)
-    else:
-        z, o, log_w = redrawn(key, sim, q, n)
-        if not (failing := int(o.failure.sum())):
-            return np.full(k, np.nan), 0, n
-        rows = resampled(np.where(o.failure, log_w.astype(np.float64), -np.inf), n // PART, 0.5)
+    z, o, log_w = redrawn(key, sim, q, n)
+    if not (failing := int(o.failure.sum())):
+        return np.full(k, np.nan), 0, n
+    rows = resampled(np.where(o.failure, log_w.astype(np.float64), -np.inf), n // PART, 0.5)
+    n = 0 if isinstance(q, Sample) else n  # they had been run before
     of_modes = centred(sim)
     place = lambda e: (latent.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length))
     bests = [m.failure._replace(states=None) for m in modes]
