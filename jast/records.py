@@ -41,7 +41,7 @@ RECORDS = {
     "Tilts": "jast.estimate.markov_tilts:Tilts",
     "TiltFrame": "jast.estimate.markov_tilts:Frame",
     "TiltBlock": "jast.estimate.markov_tilts:Block",
-    "Sample": "jast.estimate.population:Sample",
+    "Sample": "jast.estimate.sample:Sample",
     "FailureSamples": "jast.estimate.failure_samples:FailureSamples",
     "FailureProposal": "jast.estimate.multilevel:FailureProposal",
     "Traces": "jast.estimate.importance_sampling:Traces",

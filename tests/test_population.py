@@ -14,8 +14,9 @@ import jast
 from jast import distributions as D
 from jast.estimate import budgets, failure_probability, failure_samples, population
 from jast.estimate import descents as ways
+from jast.estimate.agreement import BLUNT, answer_of
 from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, fresh, moved
-from jast.estimate.population import BLUNT, Sample, answer_of
+from jast.estimate.sample import Sample
 from jast.limit_state import outcomes
 from jast.simulators import limit_state, walk1d
 

@@ -23,8 +23,9 @@ from jast.estimate.events import Event, GivenStart, events, given_start
 from jast.estimate.failure_samples import FailureSamples, failure_samples
 from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
-from jast.estimate.population import Sample, population
+from jast.estimate.population import population
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
+from jast.estimate.sample import Sample
 from jast.estimate.subset import subset_simulation
 from jast.intervals import chernoff, clopper_pearson, delta_bound, jeffreys, normal
 

@@ -24,9 +24,10 @@ from jast.estimate.estimate import Estimate, estimate, of_counts
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
-from jast.estimate.population import Sample, by_populations
+from jast.estimate.population import by_populations
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import fits
+from jast.estimate.sample import Sample
 from jast.estimate.seek import Seeker, seek
 from jast.estimate.subset import by_levels
 from jast.intervals import checked_level

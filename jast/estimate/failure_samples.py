@@ -20,10 +20,10 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.population import Sample
 from jast.estimate.populations import settled
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, redrawn
+from jast.estimate.sample import Sample
 from jast.journal import answered, kept
 from jast.memory import require_episodes
 

@@ -13,7 +13,7 @@ from jast.episode import rollout
 from jast.estimate import markov_tilts as tilts
 from jast.estimate.batches import drawn, numbers, of_chunk, plain_chunk, resampled
 from jast.estimate.draws import Draws, key_of
-from jast.estimate.population import Sample
+from jast.estimate.sample import Sample
 from jast.limit_state import Outcomes
 from jast.outline import outline
 from jast.policy import Policy

@@ -14,8 +14,8 @@ from jast import limit_state as latent
 from jast.episode import replay
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.estimate.population import Sample
 from jast.estimate.redrawn import fits, redrawn
+from jast.estimate.sample import Sample
 from jast.intervals import checked_level
 from jast.simulator import Simulator
 

@@ -17,8 +17,9 @@ from jast.estimate import adaptive, budgets, few_calls
 from jast.estimate.batches import resampled
 from jast.estimate.budgets import CHEAP
 from jast.estimate.descents import SETTINGS, cooled
-from jast.estimate.population import Sample, by_populations
+from jast.estimate.population import by_populations
 from jast.estimate.redrawn import redrawn
+from jast.estimate.sample import Sample
 from jast.failures import Failures, collect, empty, merge
 from jast.outline import outline
 from jast.results import asked

@@ -7,8 +7,8 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast.estimate.batches import resampled
-from jast.estimate.population import Sample
 from jast.estimate.redrawn import redrawn
+from jast.estimate.sample import Sample
 from jast.search.centred import centred
 from jast.search.failure_modes import Modes
 from jast.search.paths import Paths, assigned, nearest
