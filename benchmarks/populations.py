@@ -36,7 +36,7 @@ CHANGES = {
 }
 CASES = (
     ("toy, z 3, 100", "distance"),
-    ("crossing", "distance"),
+    ("cart-pole", "distance"),
     ("Gayton of 8", "width"),
     ("piecewise", "width"),
     ("breaker", "width"),

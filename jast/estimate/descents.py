@@ -91,7 +91,7 @@ class _Population:
         self.rng, self.key, self.calls = generator(key, 1), counter_key(key, 2), 0
         self.particles, self.steering = blank(sim, capacity), begun()
         self.evaluations, self.invalid = 0, 0
-        self.log_mean, self.family, self.generations = 0.0, np.arange(n), 1
+        self.log_mean, self.family = 0.0, np.arange(n)
         self.plain, self.levels = (0, 0, 0), []
 
     def next_key(self):
@@ -120,7 +120,7 @@ class _Population:
     def move(self, log_w, level, **width):
         """Go on from points chosen by weight (systematic resampling)."""
         rows = resampled(log_w, self.n, self.rng.random())
-        self.family, self.generations = self.family[rows], self.generations + 1
+        self.family = self.family[rows]
         self.particles, self.steering, invalid = moved(
             self.sim,
             self.particles,
@@ -139,11 +139,12 @@ class _Population:
 
     def variance(self, log_w):
         """Relative variance of the estimate whose last weights are these: what families of a common
-        ancestor carry (Lee and Whiteley 2018, eq. 5).
+        ancestor carry (Lee and Whiteley 2018, eq. 5). Their factor n / (n - 1) stands for the first
+        draws alone: systematic resampling adds no noise of its own, as multinomial would.
         """
         w = np.exp(log_w - log_w.max())
         together = (np.bincount(self.family, w, self.n) ** 2).sum() / w.sum() ** 2
-        return max(1 - (self.n / (self.n - 1)) ** self.generations * (1 - together), 0.0)
+        return max(1 - self.n / (self.n - 1) * (1 - together), 0.0)
 
     def lost(self):
         """The `Descent` that reached no failure."""

@@ -1,0 +1,473 @@
+"""What populations are made of, by references of their own: moves by exact draws, genealogies by all
+pairs, chains by closed forms; and how their search ends, is stopped and goes on.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import jast
+from jast import distributions as D
+from jast.estimate import adaptive, agreement, budgets, descents, failure_probability, population
+from jast.estimate.agreement import Answer, answer_of
+from jast.estimate.descents import WAYS, by_distance, by_width
+from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, moved
+from jast.intervals import clopper_pearson
+from jast.limit_state import outcomes
+from jast.simulators import limit_state, walk1d
+
+norm = stats.norm
+N = 1024
+HALF = limit_state(lambda u: 3.0 - jnp.sum(u) / 4**0.5, 4)  # P = Phi(-3)
+SIDES = limit_state(lambda u: 3.0 - jnp.abs(u[0]), 2)  # P = 2 Phi(-3)
+SPHERE = limit_state(lambda u: 5.0 - jnp.sqrt(jnp.sum(u**2)), 5)
+CHANCE = 1e-4
+"""Of a test of a distribution to fail by chance, if its key were another one."""
+
+
+def as_particles(sim, z):
+    """Points [n, D] as a population has them."""
+    o = jax.device_get(outcomes(sim, jnp.asarray(z)))
+    p = blank(sim, len(z))
+    own = np.arange(z.shape[1]) < o.used[:, None]
+    square = (z**2 * own).sum(axis=1)
+    dtype = p.z.dtype
+    return Particles(*map(jnp.asarray, (z.astype(dtype), o.score, o.used, square.astype(dtype), o.distance)))
+
+
+# --- moves
+
+
+@pytest.mark.parametrize("kinds", [1, 2])
+@pytest.mark.parametrize("width", [1.0, 2.0])
+def test_moves_among_failures_keep_what_is_normal_there(key, width, kinds):
+    """Exact draws of N(0, w^2 I) given x.e >= 3: after 40 moves x.e is still normal, truncated, and
+    what is at right angles normal, by Kolmogorov and Smirnov. Each point moved.
+    """
+    rng, e = np.random.default_rng(0), np.full(4, 0.5)
+    along = width * stats.truncnorm(3 / width, np.inf).rvs(N, random_state=rng)
+    z = width * rng.standard_normal((N, 4))
+    z = (z + np.outer(along - z @ e, e)).astype(np.float32)
+    z += np.maximum(3 + 1e-5 - z @ e, 0)[:, None].astype(np.float32)
+    start = as_particles(HALF, z)
+    assert (np.asarray(start.score) == -np.inf).all()
+    after, _, _ = moved(
+        HALF,
+        start,
+        counter_key(key, 1),
+        np.arange(N),
+        begun(),
+        moves=40,
+        level=-np.inf,
+        width=width,
+        kinds=kinds,
+    )
+    new = np.asarray(after.z, np.float64)
+    truncated = stats.truncnorm(3 / width, np.inf).cdf
+    assert stats.kstest(new @ e / width, truncated).pvalue > CHANCE
+    across = new @ [0.5, -0.5, 0.5, -0.5] / width
+    assert stats.kstest(across, norm.cdf).pvalue > CHANCE
+    assert (new != z).any(axis=1).mean() > 0.99
+    # what is nearly independent has a correlation of 1 / sqrt(n)
+    assert abs(np.corrcoef(across, z @ [0.5, -0.5, 0.5, -0.5])[0, 1]) < 0.5
+
+
+def test_a_window_draws_neighbours_anew(key):
+    """Three of ten numbers, which are neighbours in a ring; each begins a window as often as another
+    (chi-square). The small move beside it has a size of 0 and changes no bit.
+    """
+    sim = limit_state(lambda u: 99.0 - u[0], 10)
+    z = np.random.default_rng(0).standard_normal((N, 10)).astype(np.float32)
+    still = Steering(np.array([0, 0.3], np.float32), np.zeros(2, np.float32))
+    after, steering, _ = moved(
+        sim, as_particles(sim, z), counter_key(key, 1), np.arange(N), still, moves=2, level=np.inf
+    )
+    changed = np.asarray(after.z) != z
+    begin = changed & ~np.roll(changed, 1, axis=1)
+    assert (changed.sum(axis=1) == 3).all() and (begin.sum(axis=1) == 1).all()
+    assert stats.chisquare(begin.sum(axis=0)).pvalue > CHANCE
+    assert stats.kstest(np.asarray(after.z)[changed], norm.cdf).pvalue > CHANCE
+    assert (steering.accepted == 1).all()
+
+
+def test_sizes_are_steered_to_a_third_of_acceptance(key):
+    """40 moves among failures that are a thousandth of all: a share of .2 to .5 is taken at last, of
+    small changes; those of 4 numbers take more where a window has a single one.
+    """
+    run = by_distance(key, HALF, N, 4, N)
+    start = as_particles(HALF, run.points)
+    after, steering, _ = moved(
+        HALF, start, counter_key(key, 1), np.arange(N), begun(), moves=40, level=-np.inf
+    )
+    assert 0.2 < steering.accepted[0] < 0.5 and (0.02 <= steering.size).all()
+    assert (steering.size <= 1).all()
+
+
+def test_a_key_tells_every_bit(key, equal):
+    one, other = jax.random.split(key)
+    runs = [by_width(k, SIDES, 256, 4, 256) for k in (one, one, other)]
+    equal(tuple(runs[0]), tuple(runs[1]))
+    assert runs[0].log_mean != runs[2].log_mean
+
+
+# --- genealogy
+
+
+@pytest.mark.parametrize("way", ["distance", "width"])
+def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
+    """Lee and Whiteley (2018): with the rows of every resampling and the last weights, 1 - (n / (n -
+    1))^generations times the weight of all pairs of points that have no common ancestor.
+    """
+    chosen, real = [], descents.resampled
+
+    def record(log_w, size, shift):
+        rows = real(log_w, size, shift)
+        chosen.append((np.exp(log_w - log_w.max()), rows))
+        return rows
+
+    monkeypatch.setattr(descents, "resampled", record)
+    n = 256
+    run = WAYS[way](key, HALF, n, 4, n)
+    *before, (w, _) = chosen
+    ancestor = list(range(n))
+    for _, rows in before:
+        ancestor = [ancestor[i] for i in rows]
+    apart = sum(
+        w[i] * w[j] for i in range(n) for j in range(n) if ancestor[i] != ancestor[j]
+    )
+    expected = 1 - (n / (n - 1)) ** (len(before) + 1) * apart / w.sum() ** 2
+    assert len(before) >= 2 and run.variance == pytest.approx(expected, rel=1e-9)
+    logs = sum(np.log(w.mean()) + np.log(1.0) for w, _ in before[:0])
+    logs = 0.0 if way == "width" else sum(np.log(w.mean()) for w, _ in chosen)
+    if way == "distance":  # weights are 0 and 1: a mean of them is a share
+        assert run.log_mean == pytest.approx(logs, rel=1e-12)
+
+
+@pytest.mark.parametrize("way", ["distance", "width"])
+def test_variances_are_those_of_repeated_populations(key, way):
+    """The mean of 60 told variances over the variance of 60 estimates. The latter has a relative
+    standard error of sqrt(2 / 59) = .18 if they are normal, and some .3 as they are: half to double.
+    """
+    runs = [WAYS[way](k, HALF, 512, 10, 512) for k in jax.random.split(key, 60)]
+    p = np.exp([r.log_mean for r in runs]) / norm.sf(3)
+    assert 0.5 < np.mean([r.variance for r in runs]) / p.var(ddof=1) < 2
+    assert abs(p.mean() - 1) < 4 * p.std() / 60**0.5
+
+
+def test_levels_are_quantiles_and_evaluations_are_counted(key):
+    """Each level keeps ceil(n / 5) points, so the estimate is that share to their number times j /
+    n; an evaluation is a draw or a move.
+    """
+    n, moves = 512, 6
+    run = by_distance(key, HALF, n, moves, n)
+    kept = np.ceil(0.2 * n) / n
+    j = np.exp(run.log_mean) / kept ** len(run.levels) * n
+    assert j == pytest.approx(round(j), rel=1e-9) and 0.2 * n <= round(j) < n
+    assert (np.diff(run.levels) < 0).all() and (run.levels > 0).all()
+    assert run.evaluations == n * (1 + moves * (len(run.levels) + 1))
+    assert run.plain[2] == n and run.size == n
+
+
+def test_several_populations_are_one_answer():
+    """The mean of those of 100 and 300 points, a lost one among them as 0; of four and more the
+    spread counts, where it is greater.
+    """
+    about = dict.fromkeys(descents.Descent._fields, None)
+    run = lambda p, size=100, v=0.01: descents.Descent(
+        **{**about, "log_mean": np.log(p) if p else -np.inf, "variance": v, "size": size}
+    )
+    a = answer_of([run(0.1), run(0.2, 300, 0.04)])
+    assert np.exp(a.log_mean) == pytest.approx(0.175)
+    expected = (0.25 * 0.1) ** 2 * 0.01 + (0.75 * 0.2) ** 2 * 0.04
+    assert a.relative == pytest.approx(expected**0.5 / 0.175)
+    lost = answer_of([run(0.1), run(0.0, v=np.nan)])
+    assert np.exp(lost.log_mean) == pytest.approx(0.05) and lost.relative == pytest.approx(1)
+    p = np.array([0.1, 0.2, 0.3, 0.4])
+    four = answer_of([run(v) for v in p])
+    assert four.relative == pytest.approx(p.std(ddof=1) / 2 / p.mean())
+    assert answer_of([run(0.0)]) is None
+    assert Answer(0.0, 0.3).apart(Answer(1.0, 0.4)) == pytest.approx(2)
+
+
+# --- chains, by closed forms
+
+
+def start_and_steps():
+    """A random start of deviation 2 and four steps of 1: the sum has a deviation of sqrt 8."""
+    return jast.Simulator(
+        init=lambda x0: x0,
+        step=lambda s, x: s + x,
+        disturbance=lambda s: D.Normal(jnp.zeros(()), 1.0),
+        evaluate=lambda s: (s >= 9.0, jnp.maximum(9.0 - s, 0.0)),
+        horizon=4,
+        start=lambda: D.Normal(jnp.zeros(()), 2.0),
+        episodic=True,
+    )
+
+
+def wheel():
+    """Eight turns of a wheel that shows 0, 1 or 4, in .6, .3 and .1 of all; 22 and more fail."""
+    value = jnp.asarray([0.0, 1.0, 4.0])
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + value[x],
+        disturbance=lambda s: D.Categorical(probs=jnp.asarray([0.6, 0.3, 0.1]), dtype=jnp.int32),
+        evaluate=lambda s: (s >= 22, jnp.maximum(22 - s, 0.0)),
+        horizon=8,
+        episodic=True,
+    )
+
+
+def turned():
+    """P of `wheel`, by convolution."""
+    one, total = np.array([0.6, 0.3, 0, 0, 0.1]), np.ones(1)
+    for _ in range(8):
+        total = np.convolve(total, one)
+    return total[22:].sum()
+
+
+@pytest.mark.parametrize("way", ["distance", "width"])
+@pytest.mark.parametrize(
+    "sim, truth",
+    [
+        (SPHERE, stats.chi2(5).sf(25)),
+        (start_and_steps(), norm.sf(9 / 8**0.5)),
+        (wheel(), turned()),
+    ],
+    ids=["sphere", "start", "wheel"],
+)
+def test_chains_tell_closed_forms(key, way, sim, truth):
+    """1.4e-4, 7.3e-4 and 1.5e-4, from four populations."""
+    runs = [WAYS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    a = answer_of(runs)
+    assert abs(a.log_mean - np.log(truth)) < 4 * a.relative and a.relative < 0.2
+    assert bool(outcomes(sim, jnp.asarray(runs[0].points)).failure.all())
+
+
+def test_the_failures_of_a_population_are_those_of_the_model(key):
+    """x.e of a half-space is a truncated normal number, by both ways. As many points as the
+    genealogy's variance says are independent: Kolmogorov's distance below 2 / sqrt(1 / variance).
+    """
+    for way in WAYS.values():
+        run = way(key, HALF, N, 10, N)
+        along = run.points.astype(np.float64) @ np.full(4, 0.5)
+        gap = stats.kstest(along, stats.truncnorm(3, np.inf).cdf).statistic
+        assert gap < 2 * run.variance**0.5
+
+
+def test_numbers_that_an_episode_did_not_use_are_the_models(key):
+    """A walk that ended has numbers left over, which the width of the noise has scaled: at the end
+    they have a variance of 1, within 5 standard errors of a quarter as many.
+    """
+    for k in jax.random.split(key, 3):
+        run = by_width(k, walk1d("one-sided", threshold=6.0), N, 10, N)
+        unused = run.points[np.arange(10) >= run.used[:, None]]
+        assert len(unused) > 500 and abs(unused.var() - 1) < 5 * (2 / (len(unused) / 4)) ** 0.5
+
+
+def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
+    sim = limit_state(lambda u: jnp.nan * u[0], 2)
+    for way in WAYS.values():
+        run = way(key, sim, 256, 2, 256)
+        assert run.log_mean == -np.inf and run.points.shape == (0, 2)
+        assert run.invalid == run.evaluations
+    found = population(key, sim, 20_000, particles=256)
+    assert np.isnan(found.mean) and not found.reliable and found.interval == (0, found.interval[1])
+    assert any("invalid" in w for w in found.warnings)
+
+
+# --- the search
+
+
+def test_plain_draws_have_the_interval_of_their_counts(key):
+    found = population(key, limit_state(lambda u: 1.0 - u[0], 2), 60_000, particles=N, level=0.9)
+    k, n = found.plain
+    assert found.samples == n == 60_000 and found.failing == k and found.mean == k / n
+    assert found.interval == clopper_pearson(k, n, 0.9)
+
+
+def test_a_few_invalid_episodes_are_counted_and_do_no_harm(key):
+    """NaN in 3e-6 of all, .1 % of P: less than the hundredth that matters."""
+    sim = limit_state(lambda u: jnp.where(u[1] > 4.5, jnp.nan, 3.0 - jnp.abs(u[0])), 2)
+    found = population(key, sim, 300_000, particles=N)
+    truth = 2 * norm.sf(3)
+    assert found.invalid > 0 and found.reliable and found.interval[0] < found.mean
+    assert found.mean < found.interval[1]
+    assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
+
+
+def stop_at(number):
+    """A callback that interrupts at its call of this number."""
+    calls = []
+
+    def callback(done, total, result):
+        calls.append(done)
+        if len(calls) >= number:
+            raise KeyboardInterrupt
+
+    return callback, calls
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_an_interruption_ends_the_call_at_once(key, number):
+    """No population begins after it; the estimate says so and is not reliable."""
+    callback, calls = stop_at(number)
+    found = population(key, SIDES, 400_000, particles=N, callback=callback)
+    assert len(calls) == number
+    assert not found.reliable and any("interrupted" in w for w in found.warnings)
+    assert found.evaluations == calls[-1] or number < 3
+
+
+def test_an_interruption_before_plain_draws_ends_the_call(key):
+    callback, calls = stop_at(1)
+    found = population(
+        key, limit_state(lambda u: 1.0 - u[0], 2), 400_000, particles=N, callback=callback
+    )
+    assert len(calls) == 1 and found.evaluations < 100_000
+    assert any("interrupted" in w for w in found.warnings)
+
+
+def test_an_interruption_within_the_second_population_keeps_the_first(key, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(WAYS, "width", interrupted)
+    found = population(key, SIDES, 200_000, particles=N)
+    assert found.mean > 0 and not found.reliable
+    assert any("interrupted" in w for w in found.warnings)
+
+
+def test_an_interruption_before_anything_is_raised(key, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(WAYS, "distance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        population(key, SIDES, 200_000, particles=N)
+
+
+def test_a_stopped_call_goes_on_from_its_checkpoint(key, tmp_path, equal, monkeypatch):
+    """To the bits of one that was not stopped; a third call runs no population."""
+    call = lambda **more: population(key, SIDES, 200_000, particles=N, **more)
+    call(checkpoint=tmp_path, callback=stop_at(3)[0])
+    found, alone = call(checkpoint=tmp_path), call()
+    for name in WAYS:
+        monkeypatch.setitem(WAYS, name, None)  # which nobody can call
+    for one in (found, call(checkpoint=tmp_path)):
+        assert one.log_mean == alone.log_mean and one.interval == alone.interval
+        assert one.history == alone.history and one.evaluations == alone.evaluations
+        equal(tuple(one.proposal), tuple(alone.proposal))
+
+
+def test_another_budget_and_other_parameters_compile_nothing(key):
+    heard = []
+
+    def listen(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            heard.append(event)
+
+    population(key, walk1d("one-sided", threshold=9.0), 60_000, particles=N)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        population(key, walk1d("one-sided", threshold=9.5), 80_000, particles=N)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not heard
+
+
+# --- who asks for populations
+
+
+@pytest.mark.parametrize("seconds", [0, -1.0, float("nan"), float("inf"), "1", True])
+def test_seconds_that_are_no_time_are_refused(key, seconds):
+    with pytest.raises(ValueError, match="failure_probability: seconds must be a number above 0"):
+        failure_probability(key, SIDES, seconds=seconds)
+
+
+def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
+    """With either the answer is not of populations, whatever the budget; a neighbour that was one of
+    populations has nothing to draw from.
+    """
+    asked = []
+
+    def by_populations(name, key, sim, budget, **_):
+        asked.append(budget)
+        return known
+
+    def sought(key, seeker, *_):
+        asked.append("proposal")
+        return known
+
+    known = jast.estimate.monte_carlo(key, walk1d(), 2000)
+    near = population(key, SIDES, 40_000, particles=256)
+    monkeypatch.setattr(adaptive, "by_populations", by_populations)
+    monkeypatch.setattr(adaptive, "_sought", sought)
+    monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e6)
+    failures = jast.failures.collect(
+        SIDES, jast.rewards.likelihood(SIDES), episodes_of(SIDES, near.proposal.points[:10])
+    )
+    failure_probability(key, SIDES, 400_000, failures=failures)
+    failure_probability(key, SIDES, failures=failures)
+    failure_probability(key, SIDES, 400_000, near=near)
+    failure_probability(key, SIDES)
+    assert asked == ["proposal", "proposal", 400_000, 3 * 2**21]
+
+
+def episodes_of(sim, z):
+    return jax.device_get(jast.limit_state.episodes(sim, jnp.asarray(z)))
+
+
+def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
+    """Its rate is of the clock; 100 calls a second in 2 s are 192."""
+    slow = jast.blackbox.from_python(
+        lambda x: (bool(x[0] > 2), float(max(2 - x[0], 0))),
+        horizon=1,
+        disturbance=D.Normal(0.0, 1.0),
+    )
+    monkeypatch.setattr(budgets, "_rate_on_host", lambda key, sim: 100.0)
+    seen = []
+    few = lambda key, sim, budget, *_: seen.append(budget) or jast.estimate.monte_carlo(key, sim, 50)
+    monkeypatch.setattr(adaptive.few_calls, "few_calls", few)
+    found = failure_probability(key, slow, seconds=2.0)
+    assert seen == [192] and found.settings["budget"] == 192
+    assert budgets.budget_of("f", key, slow, None, 50) == budgets.DEAR
+
+
+def test_stress_where_failures_are_frequent_or_none(key):
+    """P = .16: plain draws, with the likeliest failure at e^-.5; and none at all, told without a
+    number.
+    """
+    often = jast.stress(key, limit_state(lambda u: 1.0 - u[0], 2), 300_000)
+    p = often.probability
+    assert p.reliable and abs(p.mean - norm.sf(1)) < 4 * p.standard_error
+    assert float(often.failures.best.reward) == pytest.approx(-0.5, abs=0.05)
+    assert len(often.modes) == 1 and often.episodes <= 1.2 * 300_000
+
+
+def test_stress_of_a_rare_failure(key):
+    """The half-space at 4.5: its design point, e^-10.1, and all of the probability in one mode."""
+    sim = limit_state(lambda u: 4.5 - jnp.sum(u) / 3**0.5, 3)
+    report = jast.stress(key, sim, 400_000)
+    p = report.probability
+    assert abs(p.log_mean - norm.logsf(4.5)) < 4 * p.relative_error
+    assert float(report.failures.best.reward) == pytest.approx(-(4.5**2) / 2, abs=0.05)
+    assert [m.share for m in report.modes] == [1.0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "sim, truth", [(SIDES, 2 * norm.sf(3)), (HALF, norm.sf(3)), (SPHERE, stats.chi2(5).sf(25))]
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(key, sim, truth):
+    """60 calls: at 95 % 9 or more miss in 1 of 500, at four standard errors none does; what is
+    told to be 68 % is hardly ever below a half.
+    """
+    found = [population(k, sim, 200_000) for k in jax.random.split(key, 60)]
+    missed = sum(not f.interval[0] <= truth <= f.interval[1] for f in found)
+    z = np.array([(f.log_mean - np.log(truth)) / f.relative_error for f in found])
+    assert missed < 9 and np.abs(z).max() < 4.5
+    assert (np.abs(z) < 1).mean() > 0.5 and np.mean([f.reliable for f in found]) > 0.9
+    # not far too wide either: z would have a deviation of 1
+    assert 0.6 < z.std() < 1.5
