@@ -152,11 +152,11 @@ class _Population:
         none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32), np.zeros(0, p.z.dtype)
         return self._end(*none, -math.inf, math.nan)
 
-    def arrived(self, log_w):
-        """The `Descent` whose last weights, of failures, are these."""
+    def arrived(self, log_w, before=None):
+        """The `Descent` whose last weights, of failures, are these; ``before``: see `moved`."""
         self.weigh(log_w)
         variance = self.variance(log_w)
-        self.move(log_w, -np.inf)
+        self.move(log_w, -np.inf, before=before)
         p = jax.device_get(self.particles)
         own = (a[: self.n] for a in (p.z, p.used, p.distance))
         return self._end(*own, self.log_mean, variance)
@@ -240,7 +240,7 @@ def by_width(
         s.levels.append(width)
         if s.log_mean < settings.least or s.variance(log_w) > settings.scattered:
             return s.lost()
-    return s.arrived(log_w)
+    return s.arrived(log_w, before=s.levels[-2] if len(s.levels) > 1 else None)
 
 
 def cooled(

@@ -165,10 +165,11 @@ def by_populations(
     with Watch(name, budget, "episode", *watched) as watch:
         s = Search(key, sim, budget, n, capacity, watch, ways, settings)
         s.run(Kind("distance", settings.moves), 1)
-        if s.plain_is_best():
+        if s.plain_is_best() and not s.interrupted:
             s.draw_plainly()
             return s.counted(name, level)
-        s.run(Kind("width", settings.moves), 1)
+        if not s.interrupted:
+            s.run(Kind("width", settings.moves), 1)
         kinds = s.witnesses()
         if kinds and not s.interrupted:
             s.repeat(kinds)
