@@ -1,5 +1,5 @@
-"""What populations are made of, by references of their own: moves by exact draws, genealogies by all
-pairs, chains by closed forms; and how their search ends, is stopped and goes on.
+"""What populations are made of, by references of their own: moves by exact draws, genealogies by
+all pairs, chains by closed forms; and how their search ends, is stopped and goes on.
 """
 
 import jax
@@ -76,8 +76,8 @@ def test_moves_among_failures_keep_what_is_normal_there(key, width, kinds):
 
 
 def test_a_window_draws_neighbours_anew(key):
-    """Three of ten numbers, which are neighbours in a ring; each begins a window as often as another
-    (chi-square). The small move beside it has a size of 0 and changes no bit.
+    """Three of ten numbers, which are neighbours in a ring; each begins a window as often as
+    another (chi-square). The small move beside it has a size of 0 and changes no bit.
     """
     sim = limit_state(lambda u: 99.0 - u[0], 10)
     z = np.random.default_rng(0).standard_normal((N, 10)).astype(np.float32)
@@ -94,7 +94,7 @@ def test_a_window_draws_neighbours_anew(key):
 
 
 def test_small_changes_are_steered_to_a_third_of_acceptance(key):
-    """40 moves among failures that are a thousandth of all: a share of .2 to .5 is taken at last."""
+    """40 moves among failures, a thousandth of all: a share of .2 to .5 is taken at last."""
     run = by_distance(key, HALF, N, 4, N)
     start = as_particles(HALF, run.points)
     after, steering, _ = moved(
@@ -116,8 +116,8 @@ def test_a_key_tells_every_bit(key, equal):
 
 @pytest.mark.parametrize("way", ["distance", "width"])
 def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
-    """With the rows of every resampling and the last weights: 1 - n / (n - 1) times the weight of all
-    pairs of points that have no common ancestor (Lee and Whiteley 2018, without the noise that
+    """With the rows of every resampling and the last weights: 1 - n / (n - 1) times the weight of
+    all pairs of points that have no common ancestor (Lee and Whiteley 2018, without the noise that
     systematic resampling has not); and where weights are 0 and 1 the estimate is the product of
     their means.
     """
@@ -147,7 +147,7 @@ def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
 @pytest.mark.parametrize("way", ["distance", "width"])
 def test_variances_are_those_of_repeated_populations(key, way):
     """The mean of 60 told variances over the variance of 60 estimates. The latter has a relative
-    standard error of sqrt(2 / 59) = .18 if they are normal, and some .3 as they are: half to double.
+    standard error of sqrt(2 / 59) = .18 if they are normal, some .3 as they are: half to double.
     """
     runs = [WAYS[way](k, HALF, 512, 10, 512) for k in jax.random.split(key, 60)]
     p = np.exp([r.log_mean for r in runs]) / norm.sf(3)
@@ -257,14 +257,14 @@ def test_the_failures_of_a_population_are_those_of_the_model(key):
 
 
 def test_numbers_that_an_episode_did_not_use_are_the_models(key):
-    """A walk that ended has numbers left over, which had the width of the noise: at the end they have
-    a variance of 1. Three populations differ by less than .03; a last width of 1.17 that stays makes
-    1.2 of it.
+    """A walk that ended has numbers left over, which had the width of the noise: at the end they
+    have a variance of 1. Of two populations it has a standard error of .01 (over keys); a width of
+    1.17 that stays until two moves before the end makes 1.19 of it.
     """
     sim = walk1d("one-sided", threshold=6.0)
-    runs = [by_width(k, sim, N, 2, N) for k in jax.random.split(key, 3)]
+    runs = [by_width(k, sim, 4096, 2, 4096) for k in jax.random.split(key)]
     unused = np.concatenate([r.points[np.arange(10) >= r.used[:, None]] for r in runs])
-    assert len(unused) > 10_000 and abs(unused.var() - 1) < 0.1
+    assert len(unused) > 4_000 and abs(unused.var() - 1) < 0.12
 
 
 def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
@@ -376,8 +376,8 @@ def test_seconds_that_are_no_time_are_refused(key, seconds):
 
 
 def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
-    """With either the answer is not of populations, whatever the budget; a neighbour that was one of
-    populations has nothing to draw from.
+    """Known failures are for a proposal, whatever the budget; a neighbour whose answer is of
+    populations has nothing to draw from, and changes nothing.
     """
     asked = []
 
@@ -445,8 +445,8 @@ def test_stress_where_failures_are_frequent(key, small):
 
 
 def test_stress_of_a_rare_failure(key, small):
-    """The half-space at 4: its design point, e^-8, and all of the probability in one mode. The plain
-    draws of the first look are among those that guarantee an interval.
+    """The half-space at 4: its design point, e^-8, and all of the probability in one mode. The
+    plain draws of the first look are among those that guarantee an interval.
     """
     report = jast.stress(key, limit_state(lambda u: 4.0 - jnp.sum(u) / 3**0.5, 3), 150_000)
     p = report.probability
@@ -466,13 +466,12 @@ def test_stress_of_a_rare_failure(key, small):
     "sim, truth", [(SIDES, 2 * norm.sf(3)), (HALF, norm.sf(3)), (SPHERE, stats.chi2(5).sf(25))]
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(key, sim, truth):
-    """60 calls: at 95 % 9 or more miss in 1 of 500, at four standard errors none does; what is
-    told to be 68 % is hardly ever below a half.
+    """60 calls: at 95 % 9 or more miss in 1 of 500; the errors in their standard errors have a
+    deviation of about 1, and none is beyond 4.5.
     """
     found = [population(k, sim, 200_000) for k in jax.random.split(key, 60)]
     missed = sum(not f.interval[0] <= truth <= f.interval[1] for f in found)
     z = np.array([(f.log_mean - np.log(truth)) / f.relative_error for f in found])
     assert missed < 9 and np.abs(z).max() < 4.5
-    assert (np.abs(z) < 1).mean() > 0.5 and np.mean([f.reliable for f in found]) > 0.9
-    # not far too wide either: z would have a deviation of 1
-    assert 0.6 < z.std() < 1.5
+    assert 0.6 < z.std() < 1.4 and abs(z.mean()) < 0.8
+    assert all(f.reliable == (f.relative_error <= agreement.ROUGH) for f in found)
