@@ -287,6 +287,19 @@ def test_an_interruption_keeps_the_populations_that_are_done(key):
     assert found.mean > 0 and found.evaluations < 400_000
 
 
+def test_an_interruption_within_a_population_keeps_those_before(key, monkeypatch):
+    def stopped(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(ways.WAYS, "width", stopped)
+    try:
+        found = population(key, SIDES, 400_000, particles=N)
+    except KeyboardInterrupt:
+        pytest.fail("what was done is lost")
+    assert not found.reliable and any("interrupted" in w for w in found.warnings)
+    assert found.mean > 0
+
+
 @pytest.mark.parametrize(
     "call, words",
     [

@@ -86,15 +86,21 @@ class Search:
         task = Task(_unit, (*shared, self.settings), lambda: Descent(*Descent._fields))
         cost = before[-1].evaluations if before else 0
         done, total = self.spent, self.budget
-        ran = units.run(
-            task,
-            count,
-            lambda runs, number, run: (*runs, run),
-            (),
-            self.watch,
-            self.ways._replace(name=f"{kind.way}-{kind.moves}-{len(before)}"),
-            size=lambda units: min(int(done + units * cost), total),
-        )
+        try:
+            ran = units.run(
+                task,
+                count,
+                lambda runs, number, run: (*runs, run),
+                (),
+                self.watch,
+                self.ways._replace(name=f"{kind.way}-{kind.moves}-{len(before)}"),
+                size=lambda units: min(int(done + units * cost), total),
+            )
+        except KeyboardInterrupt:
+            if not self.runs:
+                raise
+            self.interrupted = f"interrupted after {self.spent} of {self.budget} evaluations"
+            return
         self.runs[kind] = before + ran.state
         for r in ran.state:
             self.spent += int(r.evaluations)
