@@ -127,7 +127,7 @@ def pole_distance(s):
 
 
 def breaker_step(s, w):
-    """A breaker trips where four surges in a row are above 2: nothing shows before."""
+    """A breaker trips where four surges in a row are above 1.9: nothing shows before."""
     row = jnp.where(w > 1.9, s[0] + 1, 0.0)
     return jnp.stack([row, jnp.maximum(s[1], 1.0 * (row >= 4))])
 
@@ -269,7 +269,7 @@ def store_distance(s):
     return jnp.where(s[1] > 0, 0.0, 1 + s[0])
 
 
-def tank_probability(cells: int = 4000) -> float:
+def tank_probability(cells: int = 2400) -> float:
     """By the transition operator of the level and the pump on a grid of ``cells``."""
     t = TANK
     edges = np.linspace(0, t["most"], cells + 1)
