@@ -29,10 +29,10 @@ class Sample(NamedTuple):
 
     Example:
         >>> import jax, jast
-        >>> sim = jast.simulators.walk1d()
-        >>> found = jast.estimate.population(jax.random.key(0), sim, 50_000)
+        >>> sim = jast.simulators.landing()  # 11 numbers an episode, probability 4e-13
+        >>> found = jast.estimate.population(jax.random.key(0), sim, 300_000)
         >>> found.proposal.points.shape[1]
-        10
+        11
     """
 
     points: Any
