@@ -18,9 +18,10 @@ from jast._jax import was_interrupted
 from jast.checkpoints import stored
 from jast.contract import contract
 from jast.estimate import budgets, diagnostics, few_calls, sums, tilt_estimate, tilt_guard
-from jast.estimate.batches import balanced, drawn, of_chunk, picks, plain_chunk
+from jast.estimate.batches import balanced, plain_chunk
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.gaussian_estimate import estimated
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
 from jast.estimate.multilevel import failure_proposal
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 __all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo"]
 
 NAME, LEAST = "failure_probability", 5000
-APART = 0.6
 SEEN, LOST = 100, 2.0
 """Failures of the model from which plain draws tell a probability; what may be lost, as a multiple
 of what was found, from which the proposal is given up.
@@ -288,27 +288,10 @@ def _with_the_rest(key, s, t, level, watched, ways):
         )
         return found._replace(draws=drawn_by(found.draws, key, lanes, "model"))
     share = _of_the_model(_promised(s, n))
-    q = together(s.q, s.model(), share)
-    modes = _by_direction(q)
-    member = np.eye(len(q.means))[_owner(modes, len(q.means))]
     watch = Watch(NAME, n, "episode", *watched)
-    model = latent.of_the_model(q)
-    plain = lambda i: model[latent.component(q, picks(key, i, lanes, q.means.dtype))]
-    total, notes, lost = chunks(_traces, (key, sim, q, member, lanes, n), lanes, watch, ways, plain)
-    about["reasons"] += lost
-    groups = _groups(q, modes, total) if total.first > 0 else []
-    found = estimate(
-        NAME,
-        total,
-        notes=notes,
-        evaluations=s.spent + total.samples,
-        groups=groups,
-        proposal=s.q,
-        control=int(share * total.samples) + s.batch,
-        plain=s.plain,
-        **about,
-    )
-    return found._replace(draws=drawn_by(found.draws, key, lanes, q))
+    about |= dict(spent=s.spent, plain=s.plain, share=share, drawn=s.batch)
+    q = together(s.q, s.model(), share)
+    return estimated(key, sim, q, lanes, watch, ways, **about)._replace(proposal=s.q)
 
 
 def _enough(s, t):
@@ -491,64 +474,6 @@ def _plain_is_better(s):
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
     return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
-
-
-def _groups(q, modes, total):
-    """The ``modes`` as `estimate` has them, by number; what the model's own draws carry is one of
-    its own where it matters, and else counts with the greatest.
-    """
-    groups, share = (
-        [[i] for i in range(len(modes))],
-        lambda g: total.by_component[g[0]] / total.first,
-    )
-    central = lambda g: not np.asarray(q.means)[modes[g[0]]].any()
-    plain = [g for g in groups if central(g) and share(g) < diagnostics.MATTERS]
-    others = sorted((g for g in groups if g not in plain), key=share)
-    return [*others[:-1], sum(plain, others[-1])] if others else groups
-
-
-def _owner(modes, components):
-    """[K] number of the mode of each component; those that are not used have the last place."""
-    owner = np.full(components, components - 1)
-    for i, group in enumerate(modes):
-        owner[group] = i
-    return owner
-
-
-def _by_direction(q):
-    """Groups of the components whose means point the same way: failure modes, as lists of
-    numbers.
-    """
-    means, left, out = (
-        np.asarray(q.means, np.float64),
-        list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))),
-        [],
-    )
-    ways = latent.unit(means)
-    while left:
-        group, grown = {left[0]}, True
-        while grown:
-            new = {
-                j
-                for j in left
-                if j not in group and max(float(ways[i] @ ways[j]) for i in group) > APART
-            }
-            group, grown = group | new, bool(new)
-        out.append(sorted(group))
-        left = [i for i in left if i not in group]
-    return out
-
-
-def _traces(shared, i, post):
-    """`Traces` of chunk ``i`` of a mixture ``q``; ``member`` [K, K]: the mode of each component, of
-    which are shares.
-    """
-    key, sim, q, member, lanes, samples = shared
-    n = min(lanes, samples - i * lanes)
-    _, o, log_w, shares = drawn(sim, q, *of_chunk(key, i, n, q))
-    with np.errstate(divide="ignore"):
-        shares = np.log(np.exp(shares) @ member)
-    return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
 
 
 def _plain(shared, i, post):
