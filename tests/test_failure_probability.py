@@ -31,9 +31,10 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.adaptive import LEAST, ROUGH, _or_rough
+from jast.estimate.adaptive import LEAST
 from jast.estimate.batches import Batch, drawn, log_ratio, numbers
 from jast.estimate.design_points import design_points, distinct
+from jast.estimate.diagnostics import ROUGH, or_rough
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
 from jast.estimate.populations import cool, explore, settled
 from jast.simulators import landing, limit_state
@@ -154,7 +155,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
     model, u = L.of_the_model(q), np.random.default_rng(0).random(100_000)
     share = np.exp(q.log_weights[model].astype(float)).sum()
     assert model.any() and abs(model[L.component(q, u)].mean() - share) < 0.01
-    lines = str(_or_rough(found._replace(relative_error=2 * ROUGH))).splitlines()
+    lines = str(or_rough(found._replace(relative_error=2 * ROUGH))).splitlines()
     assert lines[2].startswith("probability    between ") and lines[3].startswith("doubtful ")
 
 
@@ -642,13 +643,13 @@ def test_a_rough_estimate_says_so(key):
     """Where nothing else does, the standard error speaks against it; the numbers stay."""
     counted = jast.estimate.monte_carlo(key, planes(1.0), 2000)
     assert counted.reliable and counted.relative_error > ROUGH
-    rough = _or_rough(counted)
+    rough = or_rough(counted)
     assert not rough.reliable and rough.mean == counted.mean
     assert rough.warnings[0].startswith(f"relative standard error {counted.relative_error:.2g}")
     fine = counted._replace(relative_error=ROUGH)
-    assert _or_rough(fine) is fine
+    assert or_rough(fine) is fine
     flagged = counted._replace(reliable=False, warnings=("another reason",))
-    assert _or_rough(flagged) is flagged
+    assert or_rough(flagged) is flagged
 
 
 def test_log_ratios(key):

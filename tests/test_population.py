@@ -288,7 +288,7 @@ def test_an_interruption_keeps_the_populations_that_are_done(key):
 
 
 def test_an_interruption_within_a_population_keeps_those_before(key, monkeypatch):
-    def stopped(*args):
+    def stopped(*args, **more):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(ways.WAYS, "width", stopped)

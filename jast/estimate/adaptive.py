@@ -58,8 +58,6 @@ TILTS, POOR, PLENTY = 0.2, 0.05, 500
 """Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
 below which they are, and of all that are left at which they are not.
 """
-ROUGH = 0.05
-"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
 EXACT, MODEL = 0.01, (0.1, 0.4)
 """Relative standard error beyond which draws serve better as the model's own; their least and
 greatest share of the last part.
@@ -201,19 +199,8 @@ def failure_probability(
             ways, watched = ways._replace(store=store), (progress, callback)
             s = Seeker(key, sim, budget, known, similar)
             s.recorded = None if failures is None else failures.episodes
-            found = _or_rough(_sought(key, s, gradients, level, watched, ways))
+            found = diagnostics.or_rough(_sought(key, s, gradients, level, watched, ways))
     return found._replace(settings=settings)
-
-
-def _or_rough(found):
-    """The `Estimate` that is UNRELIABLE where nothing is wrong with it but its standard error."""
-    if not (found.reliable and found.relative_error > ROUGH):
-        return found
-    text = (
-        f"relative standard error {found.relative_error:.2g}, above {ROUGH}: the interval holds the"
-        " truth as often as it says, and a greater budget narrows it"
-    )
-    return found._replace(reliable=False, warnings=(text, *found.warnings))
 
 
 def _sought(key, s, gradients, level, watched, ways):

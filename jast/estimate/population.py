@@ -15,10 +15,12 @@ from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
-from jast.estimate.agreement import Kind, Search
 from jast.estimate.descents import SETTINGS, Settings, size
 from jast.estimate.estimate import Estimate
 from jast.estimate.particles import blank, counter_key, fresh
+from jast.estimate.population_estimate import of_plain_draws, of_populations
+from jast.estimate.population_search import Search
+from jast.estimate.population_weights import weighted
 from jast.intervals import checked_level
 from jast.memory import require
 from jast.results import asked
@@ -35,8 +37,8 @@ __all__ = ["by_populations", "episodes_a_second", "population"]
 LEAST = 20_000
 """Evaluations of a call at least: a population of 128 points meets 1e-6 within them."""
 PILOT = 500
-"""Share of the budget, as its denominator, that a population has as points: those that cost 10
-moves at each of 13 levels, as of a probability of 1e-9, then leave three quarters of the budget."""
+"""Share of the budget, as its denominator, that a population has as points: at 5 moves and 13
+levels, as of a probability of 1e-9, one takes an eighth of the budget."""
 
 
 def population(
@@ -164,13 +166,19 @@ def by_populations(
     require(name, 4 * numbers, f"populations of {capacity} points", "use fewer particles")
     with Watch(name, budget, "episode", *watched) as watch:
         s = Search(key, sim, budget, n, capacity, watch, ways, settings)
-        s.run(Kind("distance", settings.moves), 1)
-        if s.plain_is_best() and not s.interrupted:
+        s.run(s.kind("distance"), 1)
+        plain = s.plain_is_best()
+        if not plain and not s.interrupted:
+            s.run(s.kind("width"), 1)
+        kinds, weighed = () if plain else s.witnesses(), None
+        if not kinds:  # they are all that tells the probability
             s.draw_plainly()
-            return s.counted(name, level)
-        if not s.interrupted:
-            s.run(Kind("width", settings.moves), 1)
-        kinds = s.witnesses()
-        if kinds and not s.interrupted:
-            s.repeat(kinds)
-    return s.estimate(name, kinds, level)
+            return of_plain_draws(s, name, level)
+        s.witness(kinds)
+        if len(kinds) == 2 and not s.interrupted:
+            weighed = weighted(s, name, kinds, level)
+        if weighed is None:
+            s.fill(kinds[0], s.budget - s.spent)
+        else:
+            watch.reach(budget)
+    return of_populations(s, name, kinds, level, weighed)

@@ -1,0 +1,120 @@
+"""The `Estimate` that a search by populations ends with, and what speaks against it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from jast.estimate.agreement import APART, Answer, Kind, against, pooled
+from jast.estimate.diagnostics import or_rough
+from jast.estimate.estimate import Estimate, of_counts
+from jast.estimate.population_search import Search
+from jast.estimate.sample import KEPT, Sample, counted, independent, sample_of
+from jast.estimate.sums import nothing
+from jast.intervals import log_normal
+
+__all__ = ["of_plain_draws", "of_populations"]
+
+
+def of_populations(
+    s: Search, name: str, kinds: Sequence[Kind], level: float, weighted: Estimate | None = None
+) -> Estimate:
+    """The `Estimate` of all populations of ``kinds``; or that of importance sampling, ``weighted``,
+    which these check.
+    """
+    reasons = [*s.reasons, *([s.interrupted] if s.interrupted else [])]
+    exact, reason = _agreed(s, kinds)
+    if weighted is not None:
+        populations, exact = exact, Answer(weighted.log_mean, weighted.relative_error)
+        if exact.apart(populations) > APART:
+            reasons.append(f"importance sampling, {exact}, against populations, {populations}")
+    reasons += [*reason, *against(exact, tuple(map(int, s.plain)))]
+    sample = sample_of(s.runs[kinds[0]])
+    found = _of_answer(s, kinds, level, exact, sample) if weighted is None else weighted
+    method = f"{name}: populations " + " and ".join(dict.fromkeys(map(str, kinds)))
+    found = found._replace(
+        method=method + (", then importance sampling" if weighted is not None else ""),
+        episodes=s.spent,
+        invalid=s.invalid,
+        reliable=not reasons,
+        warnings=(*reasons, *found.warnings),
+        history=tuple(s.history),
+        proposal=sample,
+        plain=(int(s.plain[0]), int(s.plain[2])),
+    )
+    return or_rough(found)
+
+
+def of_plain_draws(s: Search, name: str, level: float) -> Estimate:
+    """The `Estimate` of the model's own draws."""
+    failing, invalid, drawn = map(int, s.plain)
+    total = nothing(drawn)._replace(
+        samples=drawn, failures=failing, invalid=invalid, draws=_draws(s)
+    )
+    return of_counts(
+        f"{name}: plain draws",
+        total,
+        level=level,
+        reasons=s.reasons,
+        notes=(s.interrupted,) if s.interrupted else (),
+        evaluations=s.spent,
+        history=tuple(s.history),
+    )
+
+
+def _agreed(s, kinds):
+    """The `Answer` of ``kinds`` and why it must not be believed: pooled where two agree, else of
+    the first.
+    """
+    answers = [s.answer(k) for k in kinds]
+    if len(answers) == 1:
+        return answers[0], [
+            f"populations {kinds[0]}, are all that tells the probability, and none checks them"
+        ]
+    apart = answers[0].apart(answers[1])
+    said = " and ".join(f"{a} {k}" for k, a in zip(kinds, answers, strict=True))
+    s.history.append(f"{said}: {apart:.1f} standard errors apart")
+    if apart > APART:
+        return answers[0], [f"the ways do not agree: {said}"]
+    return pooled(answers), []
+
+
+def _of_answer(s, kinds, level, exact, sample):
+    """The `Estimate` of an `Answer` of populations, which left this ``sample``."""
+    runs = [r for k in kinds for r in s.runs[k]]
+    log_mean = min(exact.log_mean, 0.0)
+    mean, worth = math.exp(log_mean), exact.relative**-2 if exact.relative > 0 else math.inf
+    return Estimate(
+        method="",
+        log_mean=log_mean,
+        mean=mean,
+        standard_error=mean * exact.relative,
+        relative_error=exact.relative,
+        interval=log_normal(log_mean, exact.relative, level),
+        level=level,
+        ess=worth,
+        k_hat=math.nan,
+        max_share=math.nan,
+        failing=sum(len(r.points) for r in runs),
+        samples=sum(int(r.size) for r in runs),
+        episodes=s.spent,
+        steps=0,
+        invalid=s.invalid,
+        modes=None,
+        reliable=True,
+        warnings=(),
+        draws=independent(s.key, s.sim, sample, log_mean, int(min(worth, KEPT))),
+    )
+
+
+def _draws(s):
+    """`Draws` of plain draws; None where there were none but those of populations."""
+    if not s.found:
+        return None
+    p = jax.tree.map(lambda *a: np.concatenate(a), *s.found)
+    none = np.zeros(len(p.z))
+    sample = Sample(p.z, p.used, p.distance, none, none.astype(np.int32))
+    return counted(s.key, s.sim, sample, s.looked)

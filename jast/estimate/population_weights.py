@@ -1,0 +1,121 @@
+"""Importance sampling after populations: Gaussians that are fitted to thousands of their failures
+draw the last part, where they promise more than further populations.
+
+Where failures lie in a curved set of many numbers no Gaussians serve, and their weights would not
+say so; the failures of populations do (`benchmarks.closed_loops`: crossing, cart-pole).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jast.counter import generator
+from jast.estimate.agreement import Answer, Kind
+from jast.estimate.batches import log_ratio
+from jast.estimate.estimate import Estimate
+from jast.estimate.gaussian_estimate import estimated
+from jast.estimate.gaussians import as_latent, fit
+from jast.estimate.importance_sampling import even
+from jast.estimate.next_proposal import defended
+from jast.estimate.particles import LANES
+from jast.estimate.population_search import Search
+from jast.estimate.sample import sample_of
+from jast.limit_state import Latent, dimension, normal_numbers
+from jast.watch import Watch
+
+__all__ = ["weighted"]
+
+EXACT = 0.003
+"""Relative standard error at which it ends: no population checks a smaller one."""
+PRODUCTS = 5e10
+"""Products that the densities of a proposal may cost: some five seconds of a core."""
+COMPONENTS = 16
+"""Gaussians at most."""
+DRAWS = 100_000
+"""Draws that `PRODUCTS` are to pay: of long episodes there are fewer Gaussians."""
+
+
+class Promise(NamedTuple):
+    """A proposal, and what it promises."""
+
+    q: Latent
+    draws: int
+    """As many as serve"""
+    relative: float
+    """Relative standard error of these"""
+
+
+def weighted(s: Search, name: str, kinds: Sequence[Kind], level: float) -> Estimate | None:
+    """The `Estimate` by Gaussians fitted to the failures of ``kinds``; None where populations
+    promise as much with what is left of the budget, and where its own weights speak against it.
+    """
+    left = s.budget - s.spent
+    if left < LANES:
+        return None
+    wide = 2  # of each component there is a wide copy
+    several = int(min(PRODUCTS / (wide * DRAWS * dimension(s.sim) ** 2), COMPONENTS))
+    tried = [_promise(s, kinds, left, k) for k in sorted({1, max(several, 1)})]
+    promise = min(tried, key=lambda p: p.relative)
+    if promise.relative > _of_populations(s, kinds[0], left):
+        return None
+    found = _drawn(s, name, promise, level)
+    if found is None:
+        return None
+    s.spent, s.invalid = s.spent + found.samples, s.invalid + found.invalid
+    if found.samples < promise.draws:
+        s.interrupt()
+    answer = Answer(found.log_mean, found.relative_error)
+    s.history.append(f"importance sampling: {answer}, {found.samples} draws")
+    if found.reliable:
+        return found
+    s.history.append(f"which is not used: {'; '.join(found.warnings)}")
+    return None
+
+
+def _promise(s, kinds, left, components):
+    """The `Promise` of so many Gaussians at most, fitted to the failures of the first kind. The
+    second moment of their weights, E[p / q | failure] / P, is the greater one of those that the
+    failures of the two kinds tell.
+    """
+    samples = [sample_of(s.runs[k]) for k in kinds]
+    weights = [np.exp(a.log_weight - np.logaddexp.reduce(a.log_weight)) for a in samples]
+    points, log_mean = samples[0].points.astype(np.float64), s.pooled(kinds).log_mean
+    g = fit(generator(s.key, 7), points, weights[0], len(points), limit=components)
+    q = as_latent(defended(g, 0.0, True), normal_numbers(s.sim))
+    moment = max(
+        float(w @ np.exp(-log_ratio(q, a.points, a.used) - log_mean))
+        for w, a in zip(weights, samples, strict=True)
+    )
+    products = len(q.means) * points.shape[1] ** 2
+    draws = max(int(min(moment / EXACT**2, PRODUCTS / products, left)), LANES)
+    return Promise(q, draws, math.sqrt(moment / draws))
+
+
+def _of_populations(s, kind, left):
+    """The relative standard error that populations of this kind promise with the rest."""
+    held = sum(int(r.evaluations) for r in s.runs[kind])
+    return s.answer(kind).relative / math.sqrt(1 + left / held)
+
+
+def _drawn(s, name, promise, level):
+    """The `Estimate` of the draws that are promised; None where an interruption left none."""
+    try:
+        return estimated(
+            s.key,
+            s.sim,
+            promise.q,
+            even(promise.draws),
+            Watch(name, promise.draws, "episode", False, None),
+            s.ways._replace(name="weighted"),
+            spent=s.spent,
+            reasons=(),
+            drawn=int(s.plain[2]),
+            level=level,
+        )
+    except KeyboardInterrupt:
+        s.interrupt()
+        return None
