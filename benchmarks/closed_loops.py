@@ -3,8 +3,10 @@ failure: ``python -m benchmarks.closed_loops [--json] [--quick | --smoke] [--loo
 computes them.
 
 `TUNED` are loops that settings may be chosen on, `JUDGED` those on which nothing was: 80 to 400
-random numbers an episode. Truths are plain draws by a loop of its own, with JAX's Threefry; those
-of the tank and of the store come from their transition operators on a grid.
+random numbers an episode. `RARE` are two more to judge on, of about one in a million. Truths are
+plain draws by jast's own player, with JAX's Threefry, which a bare loop (`bare`) repeats; those of
+the tank, of the store and of `RARE` come from their transition operators on a grid, and `easier`
+compares these operators with plain draws where failures are frequent.
 """
 
 import argparse
@@ -26,7 +28,17 @@ from benchmarks.sizes import options, size
 from jast.distributions import Bernoulli, Independent, Joint, Normal
 from jast.limit_state import outcome
 
-__all__ = ["JUDGED", "TUNED", "Loop", "store_probability", "tank_probability"]
+__all__ = [
+    "JUDGED",
+    "RARE",
+    "TUNED",
+    "Loop",
+    "breaker_probability",
+    "oven_probability",
+    "rail_probability",
+    "store_probability",
+    "tank_probability",
+]
 
 LANES = 128
 """Episodes that are drawn side by side."""
@@ -315,6 +327,109 @@ def store_probability() -> float:
     return float(lost)
 
 
+def breaker_probability() -> float:
+    """By the chain of how many surges in a row there were."""
+    surge = stats.norm.sf(1.9)
+    row, total = np.eye(4)[0], 0.0
+    for _ in range(80):
+        total += row[3] * surge
+        row = np.append(row.sum() * (1 - surge), row[:3] * surge)
+    return float(total)
+
+
+OVEN = dict(
+    start=1.5,
+    loss=0.06,
+    heat=0.22,
+    noise=0.085,
+    low=1.2,
+    high=1.8,
+    trip=2.3,
+    least=-0.7,
+    most=2.4,
+    steps=120,
+)
+
+
+def oven_step(s, w):
+    """An oven's temperature and its heater: 0 off, 1 on, 2 tripped. It heats below 1.2 until it is
+    above 1.8; above 2.3 it trips for good, and what is in it may freeze.
+    """
+    heat, mode = s
+    new = jnp.where(heat < OVEN["low"], 1.0, jnp.where(heat > OVEN["high"], 0.0, mode))
+    mode = jnp.where((mode > 1) | (heat > OVEN["trip"]), 2.0, new)
+    heat = heat - OVEN["loss"] * heat + OVEN["heat"] * (mode == 1) + OVEN["noise"] * w
+    return jnp.stack([heat, mode])
+
+
+def oven_distance(s):
+    """To the nearer of too hot and frozen."""
+    return jnp.minimum(OVEN["most"] - s[0], s[0] - OVEN["least"])
+
+
+def oven_probability(cells: int, t: dict = OVEN) -> float:
+    """By the transition operator of the temperature in each mode of the heater. The cells are at
+    least ``cells``, with an edge at each threshold (a multiple of .05).
+    """
+    parts = round((t["most"] - t["least"]) / 0.05)
+    edges = np.linspace(t["least"], t["most"], parts * -(-cells // parts) + 1)
+    middle = (edges[:-1] + edges[1:]) / 2
+    kernels = [
+        _moved(edges, middle - t["loss"] * middle + t["heat"] * (mode == 1), t["noise"])
+        for mode in range(3)
+    ]
+    switched = [
+        np.where(middle < t["low"], 1, np.where(middle > t["high"], 0, mode)) for mode in (0, 1)
+    ]
+    switched = [np.where(middle > t["trip"], 2, new) for new in switched]
+    switched.append(np.full(len(middle), 2))
+    mass = np.zeros((3, len(middle)))
+    mass[0] = _moved(edges, np.array([(1 - t["loss"]) * t["start"]]), t["noise"])[0]
+    for _ in range(t["steps"] - 1):
+        to = np.zeros_like(mass)
+        for mode in range(3):
+            for new in range(3):
+                to[new] += np.where(switched[mode] == new, mass[mode], 0)
+        mass = np.stack([to[mode] @ kernels[mode] for mode in range(3)])
+    return float(1 - mass.sum())
+
+
+RAIL = dict(dead=0.3, gain=0.35, reach=0.25, drift=0.02, noise=0.18, left=-1.75, right=1.9)
+RAIL_STEPS = 150
+
+
+def rail_step(s, w):
+    """A cart's offset on a rail that leans to the right; its correction has a dead zone and
+    saturates.
+    """
+    beyond = jnp.sign(s) * jnp.maximum(jnp.abs(s) - RAIL["dead"], 0.0)
+    push = jnp.clip(RAIL["gain"] * beyond, -RAIL["reach"], RAIL["reach"])
+    return s - push + RAIL["drift"] + RAIL["noise"] * w
+
+
+def rail_distance(s):
+    """To the nearer end of the rail."""
+    return jnp.minimum(RAIL["right"] - s[0], s[0] - RAIL["left"])
+
+
+def rail_probability(cells: int, t: dict = RAIL) -> float:
+    """By the transition operator of the offset."""
+    edges = np.linspace(t["left"], t["right"], cells + 1)
+    middle = (edges[:-1] + edges[1:]) / 2
+    beyond = np.sign(middle) * np.maximum(np.abs(middle) - t["dead"], 0.0)
+    push = np.clip(t["gain"] * beyond, -t["reach"], t["reach"])
+    kernel = _moved(edges, middle - push + t["drift"], t["noise"])
+    mass = _moved(edges, np.array([t["drift"]]), t["noise"])[0]
+    for _ in range(RAIL_STEPS - 1):
+        mass = mass @ kernel
+    return float(1 - mass.sum())
+
+
+def _moved(edges, means, noise):
+    """The mass that each mean [m] sends into each cell: [m, cells]."""
+    return np.diff(stats.norm.cdf((edges - means[:, None]) / noise), axis=1)
+
+
 def plain(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
     """Failures among so many plain draws, nearly, and how many they were."""
     blocks = max(draws // LANES, 1)
@@ -338,8 +453,44 @@ def _failing(sim, key, blocks):
     return lax.fori_loop(0, blocks, block, jnp.zeros((), jnp.int32))
 
 
+def bare(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
+    """As `plain`, by a loop that uses the simulator's functions only, with other draws."""
+    blocks = min(max(draws // LANES, 1), 1024)
+    failing = done = 0
+    while done < draws:
+        key = jax.random.key(seed * 100_000 + done // (blocks * LANES), impl="rbg")
+        failing += int(_bare(loop.simulator, key, blocks))
+        done += blocks * LANES
+    return failing, done
+
+
+@partial(jax.jit, static_argnames="blocks")
+def _bare(sim, key, blocks):
+    def fails(key):
+        first, rest = jax.random.split(key)
+        state = sim.init(sim.start().sample(seed=first))
+
+        def step(carry, key):
+            state, failed, over = carry
+            new = sim.step(state, sim.disturbance(state).sample(seed=key))
+            failed = failed | (~over & sim.evaluate(new)[0])
+            return (new, failed, over | failed | sim.is_terminal(new)), None
+
+        failed = sim.evaluate(state)[0]
+        begun = (state, failed, failed | sim.is_terminal(state))
+        return lax.scan(step, begun, jax.random.split(rest, sim.horizon))[0][1]
+
+    def block(i, count):
+        keys = jax.random.split(jax.random.fold_in(key, i), LANES)
+        return count + jnp.sum(jax.vmap(fails)(keys), dtype=jnp.int32)
+
+    return lax.fori_loop(0, blocks, block, jnp.zeros((), jnp.int32))
+
+
 DRAWS = "plain draws"
 OPERATOR = "transition operator"
+MOST_DRAWS = {"follower": 2.09, "ship": 1.67, "arm": 2.93}
+"""How many times as many draws as of the others the truths of these took."""
 
 
 def _two(state):
@@ -368,11 +519,14 @@ TUNED = (
     _loop(
         "cart-pole", 400, 0.000116, 0.0294, DRAWS, [0.0, 0, 0, 0], pole_step, pole_distance, 4, 100
     ),
-    _loop("breaker", 80, 5.188e-05, 0.0439, DRAWS, [0.0, 0], breaker_step, breaker_distance, 1, 80),
+    _loop(
+        *("breaker", 80, 5.0877e-05, 0, OPERATOR),
+        *([0.0, 0], breaker_step, breaker_distance, 1, 80),
+    ),
 )
 JUDGED = (
     _loop(
-        *("follower", 200, 6.8e-05, 0.0383, DRAWS),
+        *("follower", 200, 6.976e-05, 0.0261, DRAWS),
         *([5.0, 0, 20, 0], follower_step, lambda s: s[0] / 5, 2, 100),
     ),
     _loop(
@@ -384,7 +538,7 @@ JUDGED = (
         *([120.0, 0.3, 0], insulin_step, lambda s: (s[0] - 70) / 50, 2, 100),
     ),
     _loop(
-        *("ship", 160, 9.747e-05, 0.032, DRAWS),
+        *("ship", 160, 9.942e-05, 0.0245, DRAWS),
         *([0.0, 0, 0, 0], ship_step, lambda s: 1 - jnp.abs(s[0]) / 45, 2, 80),
     ),
     _loop(
@@ -402,7 +556,7 @@ JUDGED = (
         **_LANDED,
     ),
     _loop(
-        *("arm", 201, 4.215e-05, 0.0487, DRAWS),
+        *("arm", 201, 4.203e-05, 0.0285, DRAWS),
         *([0.0, 0, 0, 0], arm_step, lambda s: 1 - jnp.abs(s[2]) / 0.67, 2, 100),
         **_ARM,
     ),
@@ -417,12 +571,104 @@ JUDGED = (
 )
 
 
+RARE = (
+    _loop(
+        *("oven", 120, 1.2206e-06, 0, OPERATOR),
+        *([OVEN["start"], 0.0], oven_step, oven_distance, 1, OVEN["steps"]),
+    ),
+    _loop(
+        *("rail", 150, 9.1717e-07, 0, OPERATOR), *([0.0], rail_step, rail_distance, 1, RAIL_STEPS)
+    ),
+)
+OPERATORS = {
+    "breaker": lambda cells: breaker_probability(),
+    "tank": tank_probability,
+    "store": lambda cells: store_probability(),
+    "oven": oven_probability,
+    "rail": rail_probability,
+}
+
+
 def truth_of(loop: Loop, draws: int, cells: int) -> tuple[float, float]:
     """The probability of failure, recomputed, and its relative standard error."""
     if loop.how == OPERATOR:
-        return (tank_probability(cells) if loop.name == "tank" else store_probability()), 0.0
+        return OPERATORS[loop.name](cells), 0.0
     failing, drawn = plain(loop, draws)
     return failing / drawn, failing**-0.5 if failing else math.inf
+
+
+def easier(draws: int, cells: int, seed: int = 0) -> dict[str, dict]:
+    """The operators against plain draws in NumPy where failures are frequent."""
+    rows = {}
+    rng = np.random.default_rng(seed)
+    for name, (settings, change, probability, fails) in EASIER.items():
+        kept = dict(settings)
+        settings.update(change)
+        try:
+            truth = probability(cells)
+            failing = sum(
+                int(np.sum(fails(rng, min(draws, 10_000)))) for _ in range(max(draws // 10_000, 1))
+            )
+        finally:
+            settings.update(kept)
+        drawn = min(draws, 10_000) * max(draws // 10_000, 1)
+        error = math.sqrt(truth * (1 - truth) / drawn)
+        rows[name] = dict(operator=truth, drawn=failing / drawn)
+        rows[name]["apart"] = abs(failing / drawn - truth) / error
+    return rows
+
+
+def _tank_fails(rng, n):
+    t = TANK
+    level, pump, failed = np.full(n, 1.0), np.zeros(n), np.zeros(n, bool)
+    for _ in range(t["steps"]):
+        pump = np.where(level > t["high"], 1.0, np.where(level < t["low"], 0.0, pump))
+        flow = t["fill"] - t["drain"] * pump + t["noise"] * rng.standard_normal(n)
+        level = np.maximum(level + flow, 0.0)
+        failed |= level >= t["most"]
+    return failed
+
+
+def _store_fails(rng, n):
+    t = STORE
+    stock, failed = np.full(n, t["stock"]), np.zeros(n, bool)
+    for _ in range(t["steps"]):
+        demand = np.round(t["mean"] + t["spread"] * rng.standard_normal(n))
+        demand = np.clip(demand, 0, 15).astype(int)
+        failed |= demand > stock
+        stock = np.maximum(stock - demand, 0) + np.where(stock < t["below"], t["order"], 0)
+    return failed
+
+
+def _oven_fails(rng, n):
+    t = OVEN
+    heat, mode, failed = np.full(n, t["start"]), np.zeros(n), np.zeros(n, bool)
+    for _ in range(t["steps"]):
+        new = np.where(heat < t["low"], 1, np.where(heat > t["high"], 0, mode))
+        mode = np.where((mode == 2) | (heat > t["trip"]), 2, new)
+        noise = t["noise"] * rng.standard_normal(n)
+        heat = heat - t["loss"] * heat + t["heat"] * (mode == 1) + noise
+        failed |= (heat >= t["most"]) | (heat <= t["least"])
+    return failed
+
+
+def _rail_fails(rng, n):
+    t = RAIL
+    offset, failed = np.zeros(n), np.zeros(n, bool)
+    for _ in range(RAIL_STEPS):
+        beyond = np.sign(offset) * np.maximum(np.abs(offset) - t["dead"], 0.0)
+        push = np.clip(t["gain"] * beyond, -t["reach"], t["reach"])
+        offset = offset - push + t["drift"] + t["noise"] * rng.standard_normal(n)
+        failed |= (offset >= t["right"]) | (offset <= t["left"])
+    return failed
+
+
+EASIER = {
+    "tank": (TANK, {"most": 2.0}, tank_probability, _tank_fails),
+    "store": (STORE, {"spread": 2.4}, lambda cells: store_probability(), _store_fails),
+    "oven": (OVEN, {"trip": 2.0, "least": 0.2, "most": 2.2}, oven_probability, _oven_fails),
+    "rail": (RAIL, {"left": -1.2, "right": 1.3}, rail_probability, _rail_fails),
+}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -431,24 +677,41 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     draws, cells = size(args, 10_000_000, 200_000, LANES), size(args, 2400, 600, 100)
     rows = []
-    for loop in TUNED + JUDGED:
+    for loop in TUNED + JUDGED + RARE:
         if args.loops and loop.name not in args.loops:
             continue
         begun = time.process_time()
-        p, error = truth_of(loop, draws, cells)
+        more = size(args, MOST_DRAWS.get(loop.name, 1.0), 1.0, 1.0)
+        p, error = truth_of(loop, int(more * draws), cells)
         both = math.hypot(error * p, loop.error * loop.truth)
         apart = abs(p - loop.truth) / both if 0 < both < math.inf else 0.0
         row = dict(name=loop.name, numbers=loop.numbers, truth=loop.truth, error=loop.error)
         row |= dict(recomputed=p, apart=apart, cpu_seconds=time.process_time() - begun)
+        text = f"recomputed {p:.4g}  {apart:.1f} standard errors apart"
+        if loop.how == DRAWS:
+            failing, drawn = bare(loop, draws // 10)
+            other = failing / drawn
+            both = math.hypot(math.sqrt(loop.truth / drawn), loop.error * loop.truth)
+            row |= dict(bare=other, bare_apart=abs(other - loop.truth) / both)
+            text += f"  bare loop {other:.3g}, {row['bare_apart']:.1f} apart"
+        else:
+            row |= dict(relative=p / loop.truth - 1)
+            text = f"recomputed {p:.5g}, {row['relative']:+.1e} of it"
         rows.append(row)
         if not args.json:
             print(
                 f"{loop.name:10s} {loop.numbers:4d} numbers  truth {loop.truth:.4g}"
-                f" +- {loop.error:.1%}  recomputed {p:.4g}  {apart:.1f} standard errors apart",
+                f" +- {loop.error:.1%}  {text}",
                 flush=True,
             )
+    checked = easier(size(args, 1_000_000, 200_000, 1000), cells)
+    for name, row in ({} if args.json else checked).items():
+        print(
+            f"{name:10s} made easier: operator {row['operator']:.4g}, drawn {row['drawn']:.4g},"
+            f" {row['apart']:.1f} standard errors apart"
+        )
     if args.json:
-        print(json.dumps(dict(loops=rows)))
+        print(json.dumps(dict(loops=rows, easier=checked)))
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ __all__ = ["CHANGES", "work"]
 CHANGES = {
     "as they are": {},
     "small moves": dict(kinds=1),
-    "5 moves": dict(moves=5),
-    "20 moves": dict(moves=20),
+    "half the moves": dict(moves=0.5),
+    "twice the moves": dict(moves=2),
     "quantile .1": dict(quantile=0.1),
     "quantile .5": dict(quantile=0.5),
     "effective .3": dict(effective=0.3),
@@ -45,9 +45,11 @@ CASES = (
 
 def work(name: str, way: str, keys: int, particles: int, changes: dict[str, Any]) -> dict[str, Any]:
     """The figure of a system and a way down with these settings, and the mean over the truth."""
-    settings, about = replace(SETTINGS, **changes), SYSTEMS[name]
+    changes, about = dict(changes), SYSTEMS[name]
+    moves = int(changes.pop("moves", 1) * getattr(SETTINGS, f"moves_by_{way}"))
+    settings = replace(SETTINGS, **changes)
     runs = [
-        WAYS[way](key, about.simulator, particles, settings.moves, particles, settings)
+        WAYS[way](key, about.simulator, particles, moves, particles, settings)
         for key in jax.random.split(jax.random.key(0), keys)
     ]
     p = np.exp([float(r.log_mean) for r in runs])
@@ -81,7 +83,7 @@ def main(argv: list[str] | None = None) -> None:
             if not args.json:
                 r = rows[-1]
                 print(
-                    f"{name:14s} by {way:8s} {words:12s} variance x evaluations"
+                    f"{name:14s} by {way:8s} {words:16s} variance x evaluations"
                     f" {r['work'] or 0:8.0f}  by genealogy {r['told'] or 0:8.0f}"
                     f"  mean / truth {r['of_truth']:.3f}",
                     flush=True,

@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 from jax.tree_util import Partial  # noqa: E402
 
 import jast  # noqa: E402
-from benchmarks.closed_loops import JUDGED, TUNED, system  # noqa: E402
+from benchmarks.closed_loops import JUDGED, RARE, TUNED, system  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast.limit_state import dimension  # noqa: E402
 from jast.simulators import limit_state  # noqa: E402
@@ -116,7 +116,7 @@ def _static(g, d, truth):
 
 SYSTEMS = {
     **{a.name: System(a.simulator, a.truth, a.error, "tuned loops") for a in TUNED},
-    **{a.name: System(a.simulator, a.truth, a.error, "judged loops") for a in JUDGED},
+    **{a.name: System(a.simulator, a.truth, a.error, "judged loops") for a in JUDGED + RARE},
     "leaf": _static(leaf, 2, 4.7934155e-6),
     "ring": _static(ring, 2, 2.9539733e-4),
     "Gayton": _static(gayton, 2, 2.8745376e-5),
