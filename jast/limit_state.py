@@ -22,11 +22,12 @@ from jast.contract import contract
 from jast.cross_entropy.sequences import player
 from jast.distributions.numbers import unflat
 from jast.episode import Episode, replay, rollout
+from jast.incidents import hosted
 from jast.outline import outline
 from jast.policy import Policy
 from jast.products import product, rows_of
 from jast.progress import Progress, advance, begin, conclude
-from jast.pytrees import count
+from jast.pytrees import count, in_lanes
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
@@ -34,6 +35,10 @@ __all__ = ["log_ratios", "outcomes", "place"]
 
 ROWS = 2**18
 """Numbers that densities are worked out for at a time."""
+FEW = 16
+"""Episodes of the program for few of them."""
+LANES = 128
+"""Episodes of the program for many."""
 
 
 class Outcomes(NamedTuple):
@@ -205,6 +210,20 @@ def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     )
 
 
+def played(sim: Simulator, z: np.ndarray) -> Episode:
+    """The `jast.Episode` of each of ``z`` [n, D], without states. On the host."""
+    return _few_programs(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
+
+
+def _few_programs(sim, function, rows):
+    """``function`` of ``rows`` [n, ...], in a program for few of them or one for many; a black box
+    plays none twice.
+    """
+    n = len(jax.tree.leaves(rows)[0])
+    size = n if hosted(sim) else FEW if n <= FEW else LANES
+    return in_lanes(size, function, rows)
+
+
 def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
     """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
     rows = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
@@ -242,5 +261,10 @@ def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
     """The points [n, D] of the episodes ``given`` [n]; numbers that decided nothing are 0."""
     if not len(given.length):
         return np.zeros((0, dimension(sim)), normal_numbers(sim))
-    recorded = given.x0, given.disturbances, jnp.asarray(given.length)
-    return np.asarray(flat(sim, *latents(sim, recorded, outline(sim).random_start)))
+    recorded = given.x0, given.disturbances, np.asarray(given.length)
+    return _few_programs(sim, partial(_points, sim), recorded)
+
+
+@jax.jit
+def _points(sim, recorded):
+    return flat(sim, *latents(sim, recorded, outline(sim).random_start))

@@ -28,10 +28,14 @@ def clear(pred: Any, tree: Any) -> Any:
 
 
 def padded(rows: Any, length: int) -> Any:
-    """``rows`` [T, ...] with zeros behind them, [length, ...]."""
-    return jax.tree.map(
-        lambda a: jnp.zeros((length, *a.shape[1:]), a.dtype).at[: a.shape[0]].set(a), rows
-    )
+    """``rows`` [T, ...] with zeros behind them, [length, ...]; those of that length as they are."""
+
+    def longer(a: Any) -> Any:
+        if len(a) == length:
+            return a
+        return jnp.zeros((length, *a.shape[1:]), a.dtype).at[: len(a)].set(a)
+
+    return jax.tree.map(longer, rows)
 
 
 def in_parts(size: int, function: Callable, *trees: Any) -> Any:
@@ -40,7 +44,7 @@ def in_parts(size: int, function: Callable, *trees: Any) -> Any:
     """
     n = len(jax.tree.leaves(trees)[0])
     parts = [
-        function(*jax.tree.map(lambda a, k=k: jnp.asarray(a[k : k + size]), trees))
+        function(*jax.tree.map(lambda a, k=k: np.asarray(a)[k : k + size], trees))
         for k in range(0, n, size)
     ]
     return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
@@ -52,7 +56,7 @@ def in_lanes(size: int, function: Callable, *trees: Any) -> Any:
     """
     n = len(jax.tree.leaves(trees)[0])
     rows = np.arange(-(-n // size) * size) % n
-    found = in_parts(size, function, *jax.tree.map(lambda a: a[rows], trees))
+    found = in_parts(size, function, *jax.tree.map(lambda a: np.asarray(a)[rows], trees))
     return jax.tree.map(lambda a: a[:n], found)
 
 

@@ -92,7 +92,7 @@ class _Population:
 
     def __init__(self, key, sim, n, moves, capacity, settings=SETTINGS):
         self.sim, self.n, self.moves, self.kinds = sim, n, moves, settings.kinds
-        self.rng, self.key, self.calls = generator(key, 1), counter_key(key, 2), 0
+        self.rng, self.key, self.calls = generator(key, 1), key, 0
         self.particles, self.steering = blank(sim, capacity), begun()
         self.evaluations, self.invalid = 0, 0
         self.log_mean, self.family = 0.0, np.arange(n)
@@ -100,7 +100,7 @@ class _Population:
 
     def next_key(self):
         self.calls += 1
-        return jax.random.fold_in(self.key, self.calls)
+        return counter_key(self.key, 2, self.calls)
 
     def draw(self, width):
         """Begin with independent points of this width; returns which of them fail."""
@@ -292,13 +292,13 @@ def cooled(
     z[:m] = points
     # all of them fail, and only a failure takes the place of one
     particles = particles._replace(z=jax.device_put(z))
-    key, steering, rows = counter_key(key, 3), begun(), np.arange(m)
+    steering, rows = begun(), np.arange(m)
     moves = max(evaluations // (m * settings.coolings), 2)
     for i, width in enumerate(np.geomspace(1.0, settings.coldest, settings.coolings)):
         particles, steering, _ = moved(
             sim,
             particles,
-            jax.random.fold_in(key, i),
+            counter_key(key, 3, i),
             rows,
             steering,
             moves=moves,

@@ -108,11 +108,11 @@ class Search:
         """Spend the rest on the model's own draws."""
         if self.interrupted:
             return
-        particles, key, i = blank(self.sim, self.capacity), counter_key(self.key, 5), 0
+        particles, i = blank(self.sim, self.capacity), 0
         try:
             while self.spent < self.budget:
                 m = min(self.capacity, self.budget - self.spent)
-                particles, invalid = fresh(self.sim, particles, jax.random.fold_in(key, i), m)
+                particles, invalid = fresh(self.sim, particles, counter_key(self.key, 5, i), m)
                 rows = np.flatnonzero(np.asarray(particles.score)[:m] == -np.inf)
                 if sum(map(len, self.found)) < KEPT:  # the rest adds to the count alone
                     self.found.append(Particles(*(np.asarray(a)[rows] for a in particles)))

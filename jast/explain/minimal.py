@@ -112,7 +112,7 @@ def minimal(
         g = farther
     kept = _needed(g, orders, budget)
     v = _shrunk(g, np.where(kept, g.v, 0.0), budget)
-    e = jax.device_get(latent.episodes(g.sim, np.asarray(v, g.judge.dtype)[None]))
+    e = latent.played(g.sim, v[None])
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
     kept &= steps_of(sim) <= int(e.length)
     x0, needed = like_disturbances(sim, kept)

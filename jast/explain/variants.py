@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
@@ -14,11 +13,10 @@ from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
 from jast.estimate.redrawn import failing, fits
 from jast.explain.gathered import distinct, gathered, kinds_of
-from jast.incidents import hosted
 from jast.judge import Judge
 from jast.markov import proposed
 from jast.outline import outline
-from jast.pytrees import count, in_lanes
+from jast.pytrees import count
 from jast.search.failure_modes import Modes, owners
 from jast.simulator import Simulator
 
@@ -218,6 +216,4 @@ def _chosen(rng: np.random.Generator, s: Seeds, kind: int, n: int) -> np.ndarray
 
 def _played(sim: Simulator, z: np.ndarray) -> tuple[Episode, int]:
     """The episodes [n] of the points ``z`` [n, D], and how many were simulated."""
-    points = jnp.asarray(z, latent.normal_numbers(sim))
-    size = len(z) if hosted(sim) else LANES  # a black box plays none twice
-    return in_lanes(size, lambda part: latent.episodes(sim, part), points), len(z)
+    return latent.played(sim, z), len(z)

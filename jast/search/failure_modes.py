@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jast import results
@@ -15,8 +13,7 @@ from jast.failures import Failures
 from jast.limit_state import normal_of, unit
 from jast.rewards import likelihood
 from jast.search.centred import centred
-from jast.search.moves import moved_in_time
-from jast.search.paths import ALIKE, Paths, assigned, components
+from jast.search.paths import ALIKE, Paths, assigned, components, moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
@@ -171,10 +168,8 @@ def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
         return np.zeros(len(episodes.length), int)
     of_modes = centred(sim)
     there, best = (normal_of(of_modes, each) for each in (episodes, heads))
-    move = jax.vmap(partial(moved_in_time, of_modes))
     cosines = [unit(there) @ unit(best).T]
     ends = np.asarray(episodes.length)
     for head, end in zip(best, heads.length, strict=True):
-        moved = np.asarray(move(there, np.asarray(end - ends, np.int32)))
-        cosines.append(unit(moved) @ unit(head))
+        cosines.append(unit(moved_in_time(of_modes, there, end - ends)) @ unit(head))
     return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)

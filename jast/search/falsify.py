@@ -21,7 +21,7 @@ from jast import _checks
 from jast._jax import is_traced, is_tracing
 from jast._threads import apart
 from jast.incidents import hosted, incidents, since
-from jast.limit_state import check, episodes, normal_numbers, outcome
+from jast.limit_state import check, normal_numbers, outcome, played
 from jast.outline import outline
 from jast.pytrees import count
 from jast.results import asked
@@ -232,7 +232,7 @@ def _result(sim: Simulator, found: _Found, settings: dict, top: int) -> SearchRe
     points = [u for _, u in found.failing] or [
         np.concatenate([pool.first[0], pool.rows[0].ravel()])
     ]
-    e = jax.device_get(episodes(sim, _normal(jnp.asarray(np.stack(points), normal_numbers(sim)))))
+    e = played(sim, _normal(jnp.asarray(np.stack(points), normal_numbers(sim))))
     numbers = [i for i, _ in found.failing]
     failing = jax.tree.map(lambda a: a[: len(numbers)], e)
     ends, best, failures = zip(*found.moments, strict=True)

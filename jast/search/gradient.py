@@ -7,7 +7,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import _checks
@@ -15,7 +14,7 @@ from jast import boundary as B
 from jast._jax import is_traced, is_tracing
 from jast.episode import Episode, play_back
 from jast.incidents import hosted
-from jast.limit_state import check, dimension, episodes, normal_numbers
+from jast.limit_state import check, dimension, normal_numbers, played
 from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
@@ -127,7 +126,7 @@ class _Search:
         ends = np.where(np.isfinite(d.point).all(axis=1) & d.found)[0]
         failing = self._failing(d.point[ends])
         i = int(np.argmin(d.distance))
-        nearest = jax.tree.map(lambda a: a[0], episodes(sim, jnp.asarray(d.nearest[i][None])))
+        nearest = jax.tree.map(lambda a: a[0], played(sim, d.nearest[i][None]))
         first = int(d.first.min())
         # side by side, the gradients of a step before its other episodes
         order = (first * (GRADIENT * n + n * (B.EPISODES // B.STEPS))) + GRADIENT * n
@@ -149,7 +148,7 @@ class _Search:
         if not len(z):
             return None
         lifted = z[None] * (1 + np.array(LIFTS, z.dtype))[:, None, None]
-        e = jax.device_get(episodes(self.sim, jnp.asarray(lifted.reshape(-1, z.shape[1]))))
+        e = played(self.sim, lifted.reshape(-1, z.shape[1]))
         fails = e.failure.reshape(len(LIFTS), -1)
         rows = (np.argmax(fails, axis=0) * len(z) + np.arange(len(z)))[fails.any(axis=0)]
         return self._scored(jax.tree.map(lambda a: a[rows], e)) if len(rows) else None

@@ -27,7 +27,7 @@ from jast.outline import outline
 from jast.pytrees import count
 from jast.simulator import Simulator
 
-__all__ = ["Noise", "Point", "along", "around", "moved_in_time", "resized", "SIZE"]
+__all__ = ["Noise", "Point", "along", "around", "resized", "SIZE"]
 
 RAYS, LENGTHS, LIFTS, WALKS, REMOVALS, EXCHANGES, SHIFTS = 6, 3, 4, 8, 6, 8, 4
 KINDS = RAYS, LENGTHS * LIFTS, WALKS + 1, REMOVALS, EXCHANGES, SHIFTS
@@ -225,12 +225,12 @@ def _picked(among, uniform, worth):
 
 def _shifted(sim, v, steps, fill):
     """``v`` moved in time, at equal distance from the origin or a little nearer."""
-    moved = moved_in_time(sim, v, steps, fill)
+    moved = _in_time(sim, v, steps, fill)
     size = jnp.maximum(jnp.linalg.norm(moved), NEAREST)
     return moved * (jnp.linalg.norm(v) * (1 - 1e-5) / size)
 
 
-def moved_in_time(sim: Simulator, v: jax.Array, steps: Any, fill: Any = 0) -> jax.Array:
+def _in_time(sim, v, steps, fill):
     """``v`` [D] with its disturbances that many ``steps`` later, sooner where negative. What comes
     in is the first of them times ``fill``, at the end modes.
     """

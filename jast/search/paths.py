@@ -2,15 +2,15 @@
 
 from functools import partial
 
-import jax
 import numpy as np
 
 from jast.judge import Judge
 from jast.limit_state import unit
-from jast.search.moves import moved_in_time
+from jast.outline import outline
+from jast.pytrees import count
 from jast.simulator import Simulator
 
-__all__ = ["Paths", "assigned", "components", "nearest"]
+__all__ = ["Paths", "assigned", "components", "moved_in_time", "nearest"]
 
 PLACES = 7
 LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
@@ -169,8 +169,8 @@ class Paths:
             sooner = (v_ends <= w_ends)[rows, None]
             early, late = np.where(sooner, v[rows], w[rows]), np.where(sooner, w[rows], v[rows])
             steps = np.abs(w_ends - v_ends)[rows]
-            moved = jax.vmap(partial(moved_in_time, self.sim))(early, steps)
-            joined[rows] = self.straight(np.asarray(moved), late, of_both=True)
+            moved = moved_in_time(self.sim, early, steps)
+            joined[rows] = self.straight(moved, late, of_both=True)
         return joined
 
     def straight(self, v, w, of_both=False):
@@ -197,6 +197,18 @@ class Paths:
             if len(rows):
                 out[rows] = self.judge(lift * points[rows]).failure
         return out
+
+
+def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """The points ``v`` [n, D] with their disturbances so many ``steps`` [n] later, sooner where
+    negative; what comes in is the mode. On the host.
+    """
+    first, n = count(outline(sim).x0), len(v)
+    rows, t = v[:, first:].reshape(n, sim.horizon, -1), np.arange(sim.horizon) - steps[:, None]
+    inside = (t >= 0) & (t < sim.horizon)
+    moved = np.take_along_axis(rows, np.clip(t, 0, sim.horizon - 1)[..., None], axis=1)
+    moved = np.where(inside[..., None], moved, 0)
+    return np.concatenate([v[:, :first], moved.reshape(n, -1)], axis=1)
 
 
 def _arcs(v, w, t):

@@ -6,7 +6,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import _checks, results
@@ -14,7 +13,7 @@ from jast.counter import generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
-from jast.limit_state import check, episodes, normal_of, unit
+from jast.limit_state import check, normal_of, played, unit
 from jast.pytrees import in_parts
 from jast.results import asked
 from jast.rewards import likelihood
@@ -311,12 +310,13 @@ class _Work:
                 residual = in_parts(self.lanes, residuals, rows)
                 residual = residual[:n].astype(np.float64)
         reward, kept = likelihood(self.sim), []
+        if n:
+            lifted = points.v[:, None] * (1 + np.array(LIFTS))[:, None]
+            tries = played(self.centred, lifted.reshape(-1, self.v.shape[1]))
         for i in range(n):
-            tries = points.v[i] * (1 + np.array(LIFTS))[:, None]
-            tries = jax.device_get(episodes(self.centred, jnp.asarray(tries, points.v.dtype)))
             own = jax.tree.map(lambda a, i=i: a[origin[i]], self.given)
-            tries = [jax.tree.map(lambda a, k=k: a[k], tries) for k in range(len(LIFTS))]
-            for e in [*tries, own]:
+            mine = range(len(LIFTS) * i, len(LIFTS) * (i + 1))
+            for e in [*(jax.tree.map(lambda a, k=k: a[k], tries) for k in mine), own]:
                 # compiled programs may differ on a knife edge: what the replay says counts
                 e = replay(self.sim, e, reward=reward)._replace(states=None)
                 if bool(e.failure):

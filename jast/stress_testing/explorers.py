@@ -169,6 +169,6 @@ def of_points(sim: Simulator, points: np.ndarray) -> Haul:
     points = points[:KEPT]
     if not len(points):
         return Haul(empty(sim).episodes, 0, 0, 0)
-    e = jax.device_get(latent.episodes(sim, jnp.asarray(points, latent.normal_numbers(sim))))
+    e = latent.played(sim, points)
     e = jax.tree.map(lambda a: a[e.failure], e)
     return Haul(e, len(points), len(e.length), 0)

@@ -158,7 +158,7 @@ COOLED = 0.1
 """Share of the evaluations by which failures of the populations are cooled to the likeliest near to
 each."""
 POLISHED = 100_000
-"""Evaluations for pulling what was cooled to where log p is greatest."""
+"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all."""
 LARGE, BY_SURROGATE, NO_ESTIMATE = (
     Shares(0.05, 0.15, 0.14, 0.18),
     Shares(0.05, 0.3, 0, 0.35),
@@ -213,13 +213,15 @@ class _Work:
     def populate(self):
         """The probability by populations, and the likeliest failures from theirs."""
         cooling = int(COOLED * self.budget)
-        rest = self.budget - self.spent - cooling - 2 * POLISHED
+        polishing = min(POLISHED, self.budget // 8)
+        rest = self.budget - self.spent - cooling - 2 * polishing
         p = by_populations("stress", self.next_key(), self.sim, max(rest, CHEAP // 2))
         self.probability = self.beside_nominal(p)
         self.note("populations", p.episodes, p.failing, invalid=p.invalid)
         sample = p.proposal
         if not isinstance(sample, Sample):
-            self.parts = Shares(0, POLISHED, 0, POLISHED)  # nothing leads to failures, or all does
+            # nothing leads to failures, or all does
+            self.parts = Shares(0, polishing, 0, polishing)
             if not len(self.pool):
                 self.search()
             return self.refine()
@@ -228,7 +230,7 @@ class _Work:
         near = np.argsort((points**2).sum(axis=1), kind="stable")
         haul = of_points(self.sim, points[near])._replace(evaluations=evaluations)
         self.gather("cooled", haul)
-        self.parts, self.paths = Shares(0, 0, 0, POLISHED), POLISHED // 4
+        self.parts, self.paths = Shares(0, 0, 0, polishing), polishing // 4
         self.refine()
         if self.modes and p.reliable:
             self.tell_shares(sample)

@@ -57,7 +57,7 @@ def shares(
     place = lambda e: (latent.normal_of(of_modes, e).astype(np.float64), np.asarray(e.length))
     bests = [m.failure._replace(states=None) for m in modes]
     known = place(jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *bests))
-    points, ends = place(latent.episodes(sim, z[rows]))
+    points, ends = place(latent.played(sim, z[rows]))
     near = nearest(points, known[0])
     few = slice(len(rows) // PATHS // 2, None, len(rows) // PATHS)
     paths = Paths(of_modes, int(WALKS * budget))
