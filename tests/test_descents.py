@@ -15,12 +15,12 @@ from jast.estimate import (
     agreement,
     budgets,
     descents,
-    diagnostics,
     failure_probability,
     population,
 )
 from jast.estimate.agreement import Answer, answer_of
 from jast.estimate.descents import WAYS, by_distance, by_width
+from jast.estimate.estimate import ROUGH
 from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, moved
 from jast.intervals import clopper_pearson
 from jast.limit_state import outcomes
@@ -482,4 +482,4 @@ def test_intervals_hold_the_truth_as_often_as_they_say(key, sim, truth):
     z = np.array([(f.log_mean - np.log(truth)) / f.relative_error for f in found])
     assert missed < 9 and np.abs(z).max() < 4.5
     assert 0.6 < z.std() < 1.4 and abs(z.mean()) < 0.8
-    assert all(f.reliable == (f.relative_error <= diagnostics.ROUGH) for f in found)
+    assert all(f.reliable == (f.relative_error <= ROUGH) for f in found)

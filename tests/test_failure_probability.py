@@ -34,7 +34,7 @@ from jast.estimate import (
 from jast.estimate.adaptive import LEAST
 from jast.estimate.batches import Batch, drawn, log_ratio, numbers
 from jast.estimate.design_points import design_points, distinct
-from jast.estimate.diagnostics import ROUGH, or_rough
+from jast.estimate.estimate import ROUGH, or_rough
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
 from jast.estimate.populations import cool, explore, settled
 from jast.simulators import landing, limit_state

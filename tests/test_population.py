@@ -255,7 +255,7 @@ def test_no_failure_leaves_what_plain_draws_guarantee(key):
     assert str(found).index("between 0 and") < str(found).index("failures")
 
 
-@pytest.mark.parametrize("beta", [-9.0, 0.0, 1.5])
+@pytest.mark.parametrize("beta", [-9.0, 0.0, 1.0])
 def test_frequent_failures_are_counted(key, beta):
     found = population(key, limit_state(lambda u: beta - u[0], 2), 60_000, particles=N)
     truth = stats.norm.sf(beta)

@@ -67,8 +67,8 @@ def test_on_a_knife_edge_the_replay_counts(key, monkeypatch):
     """Another program may round a failing episode to one that does not fail."""
     sim = linear(10)
     found = draws(sim, 4.0)
-    says_no = lambda sim, z: latent.episodes(sim, z)._replace(failure=jnp.zeros(len(z), bool))
-    monkeypatch.setattr(refinement, "episodes", says_no)
+    says_no = lambda sim, z: latent.played(sim, z)._replace(failure=np.zeros(len(z), bool))
+    monkeypatch.setattr(refinement, "played", says_no)
     result = refine(key, sim, found, budget=200)
     assert len(result.failures) == 1 and result.gain[0] > 0
     assert float(result.failures.best.reward) > float(found.best.reward)

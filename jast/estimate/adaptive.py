@@ -20,7 +20,7 @@ from jast.contract import contract
 from jast.estimate import budgets, diagnostics, few_calls, sums, tilt_estimate, tilt_guard
 from jast.estimate.batches import balanced, plain_chunk
 from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.estimate import Estimate, estimate, of_counts, or_rough
 from jast.estimate.gaussian_estimate import estimated
 from jast.estimate.gaussians import effective, together
 from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
@@ -199,7 +199,7 @@ def failure_probability(
             ways, watched = ways._replace(store=store), (progress, callback)
             s = Seeker(key, sim, budget, known, similar)
             s.recorded = None if failures is None else failures.episodes
-            found = diagnostics.or_rough(_sought(key, s, gradients, level, watched, ways))
+            found = or_rough(_sought(key, s, gradients, level, watched, ways))
     return found._replace(settings=settings)
 
 

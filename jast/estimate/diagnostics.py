@@ -11,13 +11,10 @@ import numpy as np
 if TYPE_CHECKING:
     import chex
 
-    from jast.estimate.estimate import Estimate
 
-__all__ = ["or_rough", "pareto_k", "reasons"]
+__all__ = ["pareto_k", "reasons"]
 
 K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW, PART = 0.7, 100, 0.05, 0.01, 0.02, 30, 0.5
-ROUGH = 0.05
-"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
 
 
 def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
@@ -121,14 +118,3 @@ def reasons(failures, ess, k_hat, max_share):
             f"effective sample size {ess:.3g} is below {PER_FAILURE:.0%} of the {failures} failures"
         )
     return found
-
-
-def or_rough(found: Estimate) -> Estimate:
-    """The `Estimate` that is UNRELIABLE where nothing is wrong with it but its standard error."""
-    if not (found.reliable and found.relative_error > ROUGH):
-        return found
-    text = (
-        f"relative standard error {found.relative_error:.2g}, above {ROUGH}: too wide an interval"
-        " to be an answer, which a greater budget narrows"
-    )
-    return found._replace(reliable=False, warnings=(text, *found.warnings))

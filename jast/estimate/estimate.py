@@ -206,6 +206,22 @@ def doubtful(p: Estimate) -> bool:
     return guarantee(p) is not None and p.chernoff is None and not math.isnan(p.log_mean)
 
 
+ROUGH = 0.05
+"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
+
+
+def or_rough(found: Estimate) -> Estimate:
+    """The `Estimate` that is UNRELIABLE where nothing is wrong with it but its standard error."""
+    if not (found.reliable and found.relative_error > ROUGH):
+        return found
+    enough = found.episodes * (found.relative_error / ROUGH) ** 2
+    text = (
+        f"relative standard error {found.relative_error:.2g}, above {ROUGH}: the interval is too"
+        f" wide for an answer, and some {enough:.1g} evaluations would narrow it to that"
+    )
+    return found._replace(reliable=False, warnings=(text, *found.warnings))
+
+
 def estimate(
     method,
     sums,

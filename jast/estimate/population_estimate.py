@@ -9,8 +9,7 @@ import jax
 import numpy as np
 
 from jast.estimate.agreement import APART, Answer, Kind, against, pooled
-from jast.estimate.diagnostics import or_rough
-from jast.estimate.estimate import Estimate, of_counts
+from jast.estimate.estimate import Estimate, of_counts, or_rough
 from jast.estimate.population_search import Search
 from jast.estimate.sample import KEPT, Sample, counted, independent, sample_of
 from jast.estimate.sums import nothing

@@ -1,0 +1,125 @@
+"""Importance sampling after populations: where it serves it is exact, where it does not it is left,
+and populations check it.
+"""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import jast
+from jast.estimate import descents, population, population_weights
+from jast.estimate.sample import Sample
+from jast.limit_state import Latent
+from jast.simulators import limit_state
+
+PLANE = limit_state(lambda u: 4.0 - jnp.sum(u) / 20**0.5, 20)  # P = Phi(-4)
+ANY = limit_state(lambda u: 4.5 - jnp.max(jnp.abs(u)), 200)  # 400 modes
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return population(jax.random.key(3), PLANE, 300_000)
+
+
+def test_gaussians_of_the_failures_draw_the_last_part(plane):
+    """A half-space is what one Gaussian fits: some 1 % by less than 300,000 evaluations, where
+    populations come to 4 %.
+    """
+    assert plane.reliable and plane.method.endswith("then importance sampling")
+    assert abs(plane.log_mean - stats.norm.logsf(4)) < 4 * plane.relative_error < 4 * 0.01
+    assert plane.evaluations <= 300_000 and plane.k_hat < 0.7
+    assert plane.interval[0] < stats.norm.sf(4) < plane.interval[1]
+
+
+def test_what_populations_left_stays(plane, key):
+    """Their failures, as a `Sample`; the draws, which further answers use, are those of Gaussians;
+    the model's own draws guarantee an interval.
+    """
+    assert isinstance(plane.proposal, Sample) and isinstance(plane.draws.source, Latent)
+    failing, drawn = plane.plain
+    assert failing <= drawn < plane.evaluations and plane.unseen > 0
+    drawn = jast.estimate.failure_samples(key, PLANE, plane, 50, moves=1)
+    assert bool(drawn.failures.failure.all())
+
+
+def test_the_same_bits_with_a_checkpoint(plane, tmp_path):
+    for _ in range(2):
+        kept = population(jax.random.key(3), PLANE, 300_000, checkpoint=tmp_path)
+        assert kept.log_mean == plane.log_mean and kept.interval == plane.interval
+
+
+def test_where_no_gaussians_serve_populations_answer(key):
+    """Any of 200 numbers is great: 400 modes, P = 1 - (1 - 2 Phi(-4.5))^200."""
+    found = population(key, ANY, 400_000)
+    truth = np.log(-np.expm1(200 * np.log1p(-2 * stats.norm.sf(4.5))))
+    assert "importance" not in found.method
+    assert abs(found.log_mean - truth) < 4 * found.relative_error
+
+
+@pytest.mark.parametrize("factor, words", [(0.5, "against populations"), (1.0, None)])
+def test_populations_check_it(key, monkeypatch, factor, words):
+    """Half the probability, as where a mode were missing, is flagged."""
+    weighted = population_weights.weighted
+
+    def wrong(*args):
+        found = weighted(*args)
+        return found._replace(log_mean=found.log_mean + np.log(factor))
+
+    monkeypatch.setattr(sys.modules["jast.estimate.population"], "weighted", wrong)
+    found = population(key, PLANE, 300_000)
+    assert found.reliable == (words is None)
+    assert words is None or words in found.warnings[0]
+
+
+def test_weights_that_speak_against_themselves_are_left(key, monkeypatch):
+    drawn = population_weights._drawn
+    doubted = lambda *args: drawn(*args)._replace(reliable=False, warnings=("a doubt",))
+    monkeypatch.setattr(population_weights, "_drawn", doubted)
+    found = population(key, PLANE, 300_000)
+    assert "importance" not in found.method and any("a doubt" in line for line in found.history)
+
+
+def test_an_interruption_of_the_draws_leaves_the_populations(key, monkeypatch):
+    def interrupted(*args, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(population_weights, "estimated", interrupted)
+    found = population(key, PLANE, 300_000)
+    assert not found.reliable and "interrupted" in found.warnings[0]
+    assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
+
+
+def test_the_first_population_by_width_costs_as_much_as_it_may(key):
+    """In 400 numbers the way from width 2 to 1 has some 24 widths; the guess of their number is
+    right to a fifth.
+    """
+    sim = limit_state(lambda u: 24.0 - jnp.linalg.norm(u), 400)  # P = P(chi2_400 > 576) = 1.5e-8
+    whole = descents.by_width(key, sim, 1024, 10, 1024)
+    less = descents.by_width(key, sim, 1024, 10, 1024, most=60_000)
+    assert whole.size == 1024 and 128 <= less.size < 512
+    assert less.evaluations < 1.3 * (60_000 + 2 * 1024) < whole.evaluations
+
+
+def test_the_width_where_failures_are_least_rare(key):
+    """A ball about a point two standard deviations away: noise that is wider misses it."""
+    sim = limit_state(lambda u: jnp.where(jnp.sum((u - 1.2) ** 2) < 0.3, -1.0, 1.0), 3)
+    run = descents.by_width(key, sim, 8192, 10, 8192)
+    truth = stats.ncx2.cdf(0.3, 3, 3 * 1.2**2)
+    assert run.levels[0] < 3
+    assert abs(float(run.log_mean) - np.log(truth)) < 4 * np.sqrt(run.variance)
+
+
+def test_where_no_way_leads_to_failures_the_rest_is_plain_draws(key, monkeypatch):
+    lost = lambda key, sim, n, moves, capacity, settings, **_: (
+        descents._Population(key, sim, n, moves, capacity, settings)
+        .lost()
+        ._replace(plain=np.array([0, 0, n]), evaluations=np.int64(n))
+    )
+    monkeypatch.setitem(descents.WAYS, "distance", lost)
+    monkeypatch.setitem(descents.WAYS, "width", lost)
+    found = population(key, PLANE, 200_000)
+    assert "plain draws" in found.method and found.evaluations == 200_000
