@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
-from jast._jax import is_traced, is_tracing
+from jast._jax import is_traced, is_tracing, quick
 from jast.actions import Quantiles, Samples, UniformBox, Wide
 from jast.incidents import incidents, since, sources
 from jast.memory import release
@@ -280,7 +280,7 @@ def _box(box, x):
                 )
 
 
-@jax.jit
+@quick
 def _probe(sim, actions):
     """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps
     of each (all, of an episodic system).

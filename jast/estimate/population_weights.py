@@ -29,7 +29,7 @@ from jast.watch import Watch
 
 __all__ = ["weighted"]
 
-EXACT = 0.003
+EXACT = 0.005
 """Relative standard error at which it ends: no population checks a smaller one."""
 PRODUCTS = 5e10
 """Products that the densities of a proposal may cost: some five seconds of a core."""
