@@ -35,10 +35,8 @@ __all__ = ["log_ratios", "outcomes", "place"]
 
 ROWS = 2**18
 """Numbers that densities are worked out for at a time."""
-FEW = 16
-"""Episodes of the program for few of them."""
-LANES = 128
-"""Episodes of the program for many."""
+LANES = 32
+"""Episodes that are played side by side on the host's order: any number of them by one program."""
 
 
 class Outcomes(NamedTuple):
@@ -212,15 +210,12 @@ def policy_of(sim: Simulator, z: jax.Array) -> Policy:
 
 def played(sim: Simulator, z: np.ndarray) -> Episode:
     """The `jast.Episode` of each of ``z`` [n, D], without states. On the host."""
-    return _few_programs(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
+    return _side_by_side(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
 
 
-def _few_programs(sim, function, rows):
-    """``function`` of ``rows`` [n, ...], in a program for few of them or one for many; a black box
-    plays none twice.
-    """
-    n = len(jax.tree.leaves(rows)[0])
-    size = n if hosted(sim) else FEW if n <= FEW else LANES
+def _side_by_side(sim, function, rows):
+    """``function`` of ``rows`` [n, ...]; a black box plays none twice."""
+    size = len(jax.tree.leaves(rows)[0]) if hosted(sim) else LANES
     return in_lanes(size, function, rows)
 
 
@@ -262,7 +257,7 @@ def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
     if not len(given.length):
         return np.zeros((0, dimension(sim)), normal_numbers(sim))
     recorded = given.x0, given.disturbances, np.asarray(given.length)
-    return _few_programs(sim, partial(_points, sim), recorded)
+    return _side_by_side(sim, partial(_points, sim), recorded)
 
 
 @jax.jit

@@ -63,6 +63,10 @@ def population(
     budget. Standard errors come from their genealogies (Lee and Whiteley 2018) and from their
     spread, whichever is greater.
 
+    Where a mixture of Gaussians that is fitted to their failures promises a smaller error than
+    further populations, it draws the last part (importance sampling), down to a standard error of
+    half a per cent, and the populations check it.
+
     Two ways that know nothing of each other must agree within three standard errors. Where only one
     of them reaches failures, its moves are doubled until its answer stays. The model's own draws,
     with which each population begins, are a third witness. Otherwise the estimate is UNRELIABLE and
@@ -81,7 +85,7 @@ def population(
             or episodes have very many numbers.
         level: of the interval, in (0, 1).
         progress: whether to show a progress bar.
-        callback: called as ``callback(done, total, None)`` after each population.
+        callback: called as ``callback(done, total, None)`` after each population, and at the end.
         checkpoint: a folder that keeps finished populations. The same call then goes on where it
             was stopped, to the same result.
         executor: runs the populations: anything with ``submit(function, *args)``, such as the

@@ -26,10 +26,10 @@ SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
 """How far the disturbances of a move go: 1 is a new draw. None: they all come some steps later,
 those at the end first.
 """
-LANES, MOST, MANY = 256, 6, 0.25
-"""Episodes that are played at a time; modes that are told apart; the share of the chains that may
-start from one seed for seeds to be held out as a whole.
-"""
+MOST = 6
+"""Modes that are told apart."""
+MANY = 0.25
+"""Share of the chains that may start from one seed for seeds to be held out as a whole."""
 
 
 class Seeds(NamedTuple):
