@@ -23,8 +23,13 @@ _STORE = contextvars.ContextVar("store", default=None)
 
 @contextlib.contextmanager
 def kept(store: Store | None) -> Iterator[None]:
-    """A context in which `answered` keeps answers in ``store``; where that is None, it does not."""
-    before = _STORE.set(None if store is None else (store, itertools.count()))
+    """A context in which `answered` keeps answers in ``store``; where that is None, those of the
+    call around it, if any.
+    """
+    if store is None:
+        yield
+        return
+    before = _STORE.set((store, itertools.count()))
     try:
         yield
     finally:

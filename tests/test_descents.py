@@ -2,6 +2,8 @@
 all pairs, chains by closed forms; and how their search ends, is stopped and goes on.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -483,3 +485,50 @@ def test_intervals_hold_the_truth_as_often_as_they_say(key, sim, truth):
     assert missed < 9 and np.abs(z).max() < 4.5
     assert 0.6 < z.std() < 1.4 and abs(z.mean()) < 0.8
     assert all(f.reliable == (f.relative_error <= ROUGH) for f in found)
+
+
+def counted_box():
+    """A black box that counts its calls: a sum of three numbers."""
+    calls = []
+
+    def run(x):
+        calls.append(1)
+        gap = 3.0 - float(x.sum()) / 3**0.5
+        return gap <= 0, max(gap, 0.0)
+
+    return jast.blackbox.from_python(run, horizon=3, disturbance=D.Normal(0.0, 1.0)), calls
+
+
+def test_stress_goes_on_where_it_was_stopped(key, tmp_path):
+    """A second run of the same call asks a black box for the first look alone, a twentieth of the
+    budget, and what it replays.
+    """
+    sim, calls = counted_box()
+    whole = jast.stress(key, sim, 3000)
+    stop, _ = stop_at(4)
+    cut = jast.stress(key, sim, 3000, checkpoint=tmp_path / "kept", callback=stop)
+    assert "interrupted" in cut.settings
+    again = jast.stress(key, sim, 3000, checkpoint=tmp_path / "kept")
+    calls.clear()
+    last = jast.stress(key, sim, 3000, checkpoint=tmp_path / "kept")
+    assert str(last) == str(again) == str(whole) and len(calls) < 800
+
+
+def test_refine_goes_on_where_it_was_stopped(key, tmp_path):
+    sim, calls = counted_box()
+    found = jast.search.monte_carlo(key, sim, episodes=2000, refine=0).failures
+    whole = jast.search.refine(key, sim, found, budget=600)
+    kept = [jast.search.refine(key, sim, found, budget=600, checkpoint=tmp_path) for _ in range(2)]
+    assert {str(each) for each in kept} == {str(whole)}
+    calls.clear()
+    jast.search.refine(key, sim, found, budget=600, checkpoint=tmp_path)
+    assert len(calls) < 150
+    with pytest.raises(ValueError, match="refine: .*checkpoint"):
+        jast.search.refine(key, sim, found, budget=700, checkpoint=tmp_path)
+
+
+def test_stress_is_the_same_wherever_its_populations_run(key, small):
+    sim = limit_state(lambda u: 3.5 - jnp.sum(u) / 3**0.5, 3)
+    with ThreadPoolExecutor(2) as pool:
+        elsewhere = jast.stress(key, sim, 150_000, executor=pool)
+    assert str(elsewhere) == str(jast.stress(key, sim, 150_000))

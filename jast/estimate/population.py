@@ -185,4 +185,5 @@ def by_populations(
             s.fill(kinds[0], s.budget - s.spent)
         else:
             watch.reach(budget)
+            watch.tell()
     return of_populations(s, name, kinds, level, weighed)

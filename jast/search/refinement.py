@@ -9,10 +9,12 @@ import jax
 import numpy as np
 
 from jast import _checks, results
+from jast.checkpoints import stored
 from jast.counter import generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
+from jast.journal import kept, stepped
 from jast.limit_state import check, normal_of, played, unit
 from jast.pytrees import in_parts
 from jast.results import asked
@@ -24,6 +26,8 @@ from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
+
+    from jast.typing import PathLike
 
 __all__ = ["Refined", "refine"]
 
@@ -92,6 +96,7 @@ def refine(
     *,
     budget: int = 10_000,
     gradients: bool = True,
+    checkpoint: PathLike | None = None,
 ) -> Refined:
     """Pull failures to local maxima of log p among the failures.
 
@@ -102,6 +107,8 @@ def refine(
         budget: evaluations, at least 100.
         gradients: differentiate through the simulator; a system on the host, and one whose miss
             distance is flat, has its slopes told from differences.
+        checkpoint: a folder that keeps what the system answered. The same call then goes on where
+            it was stopped, to the same result.
 
     Returns:
         `Refined`: the likeliest failures near those given, which are started with 16 at a time, the
@@ -132,9 +139,11 @@ def refine(
     if not np.ndim(given.length):
         given = jax.tree.map(lambda a: np.asarray(a)[None], given)
     given = jax.device_get(given._replace(states=None))
-    work = _Work(generator(key), sim, given, gradients)
-    work.run(budget)
-    return work.result(settings)
+    about = dict(sim=sim, failures=given, budget=budget, gradients=gradients)
+    with stored(name, checkpoint, key, **about) as store, kept(store):
+        work = _Work(generator(key), sim, given, gradients)
+        work.run(budget)
+        return work.result(settings)
 
 
 class _Track:
@@ -204,7 +213,7 @@ class _Work:
         rows_of = len(LIFTS) * self.lanes
         flat = np.resize(lifted.reshape(-1, d), (-(-n // self.lanes) * rows_of, d))
         flat = flat.astype(self.v.dtype)
-        points, verdict = in_parts(rows_of, partial(begun, self.centred), flat)
+        points, verdict = _kept(rows_of, partial(begun, self.centred), flat)
         self.spent += len(flat)
         fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
         for k, row in enumerate(rows):
@@ -254,7 +263,7 @@ class _Work:
             self.rng.standard_normal((size, M.SHIFTS)).astype(real),
         )
         step = lambda points, noise: round_of(self.centred, points, noise, self.gradients)
-        points, invalid = in_parts(self.lanes, step, points, noise)
+        points, invalid = _kept(self.lanes, step, points, noise)
         for k, track in enumerate(self.live):
             track.point = jax.tree.map(lambda a, k=k: a[k], points)
         self.invalid += int(invalid.sum())
@@ -307,9 +316,9 @@ class _Work:
             if self.gradients:
                 padded = np.arange(-(-n // self.lanes) * self.lanes) % n
                 rows = jax.tree.map(lambda a: a[padded], points)
-                residual = in_parts(self.lanes, residuals, rows)
+                residual = _kept(self.lanes, residuals, rows)
                 residual = residual[:n].astype(np.float64)
-        reward, kept = likelihood(self.sim), []
+        reward, failing = likelihood(self.sim), []
         if n:
             lifted = points.v[:, None] * (1 + np.array(LIFTS))[:, None]
             tries = played(self.centred, lifted.reshape(-1, self.v.shape[1]))
@@ -320,15 +329,20 @@ class _Work:
                 # compiled programs may differ on a knife edge: what the replay says counts
                 e = replay(self.sim, e, reward=reward)._replace(states=None)
                 if bool(e.failure):
-                    kept.append((i, jax.device_get(e)))
+                    failing.append((i, jax.device_get(e)))
                     break
-        if not kept:
+        if not failing:
             found, i = empty(self.sim), np.zeros(0, np.int64)
         else:
-            stacked = jax.tree.map(lambda *a: np.stack(a), *(e for _, e in kept))
-            which = np.array([i for i, _ in kept])
+            stacked = jax.tree.map(lambda *a: np.stack(a), *(e for _, e in failing))
+            which = np.array([i for i, _ in failing])
             found = collect(self.sim, reward, stacked, simulation=which, top=len(which))
             i = found.simulation
         return Refined(
             found, origin[i], residual[i], gain[i], late[i], self.spent, self.invalid, settings
         )
+
+
+def _kept(size, function, *rows):
+    """`in_parts`, whose answer is kept where the call around it has a checkpoint."""
+    return stepped(lambda: in_parts(size, function, *rows), *rows, like=lambda: function(*rows))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
 
-from jast import _checks
+from jast import _checks, units
 from jast import limit_state as latent
+from jast.checkpoints import stored
 from jast.contract import check
 from jast.crude import nominal
 from jast.episode import rollout
@@ -21,6 +24,7 @@ from jast.estimate.population import by_populations
 from jast.estimate.redrawn import redrawn
 from jast.estimate.sample import Sample
 from jast.failures import Failures, collect, empty, merge
+from jast.journal import kept
 from jast.outline import outline
 from jast.results import asked
 from jast.rewards import likelihood
@@ -36,7 +40,7 @@ from jast.watch import Watch
 if TYPE_CHECKING:
     import chex
 
-    from jast.typing import Callback
+    from jast.typing import Callback, Executor, PathLike
 
 __all__ = ["PORTFOLIO", "stress"]
 
@@ -69,6 +73,9 @@ def stress(
     top: int = 64,
     progress: bool = False,
     callback: Callback | None = None,
+    checkpoint: PathLike | None = None,
+    executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Report:
     """How does the system fail, how likely, and what is its likeliest failure?
 
@@ -97,6 +104,12 @@ def stress(
         top: failures kept, at least one for each mode.
         progress: whether there is a bar.
         callback: called as ``callback(done, total, None)`` after every piece of the work.
+        checkpoint: a folder that keeps finished populations and what the system answered to
+            searches and draws. The same call, with its ``budget``, then goes on where it was
+            stopped, to the same result; first looks and refinement run again.
+        executor: runs the parts of the probability: anything with ``submit(function, *args)``, such
+            as the executors of `concurrent.futures` and Dask's client. It changes no result.
+        devices: some of `jax.devices()`, one thread each, likewise (docs/scale.md).
 
     Returns:
         `Report`: print it. A KeyboardInterrupt ends the work with what was found by then, and is
@@ -126,8 +139,13 @@ def stress(
     if budget is None:
         budget = budgets.budget_of(name, key, sim, seconds, LEAST, PORTFOLIO)
     settings = asked(name, key, budget=budget, top=top)
-    with Watch(name, budget, "sim", progress, callback) as watch:
-        work = _Work(key, sim, budget, top, watch)
+    ways = units.ways(name, executor, devices)
+    with (
+        stored(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
+        kept(store),
+        Watch(name, budget, "sim", progress, callback) as watch,
+    ):
+        work = _Work(key, sim, budget, top, watch, ways._replace(store=store), checkpoint)
         try:
             work.look()
             if quantiles and budgets.cheap(sim, budget):
@@ -169,8 +187,9 @@ LARGE, BY_SURROGATE, NO_ESTIMATE = (
 class _Work:
     """What is known so far, and what it cost."""
 
-    def __init__(self, key, sim, budget, top, watch):
+    def __init__(self, key, sim, budget, top, watch, ways, checkpoint):
         self.key, self.sim, self.budget, self.top, self.watch = key, sim, budget, top, watch
+        self.ways, self.checkpoint = ways, checkpoint
         about = outline(sim)
         self.latent = about.start.quantile and about.disturbance.quantile
         self.reward = likelihood(sim)
@@ -215,7 +234,8 @@ class _Work:
         cooling = int(COOLED * self.budget)
         polishing = min(POLISHED, self.budget // 8)
         rest = self.budget - self.spent - cooling - 2 * polishing
-        p = by_populations("stress", self.next_key(), self.sim, max(rest, CHEAP // 2))
+        rest = max(rest, CHEAP // 2)
+        p = by_populations("stress", self.next_key(), self.sim, rest, ways=self.ways)
         self.probability = self.beside_nominal(p)
         self.note("populations", p.episodes, p.failing, invalid=p.invalid)
         sample = p.proposal
@@ -329,8 +349,10 @@ class _Work:
     def estimate(self):
         """The probability, with what is left."""
         rest = max(self.budget - self.spent, 1)
+        folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
+        places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
         if not self.estimable:
-            more = adaptive.monte_carlo(self.next_key(), self.sim, max(rest, 100))
+            more = adaptive.monte_carlo(self.next_key(), self.sim, max(rest, 100), **places)
             self.note("plain draws", more.episodes, more.failing, invalid=more.invalid)
             self.probability = self.beside_nominal(more)
             return
@@ -338,7 +360,7 @@ class _Work:
         if not len(self.pool):  # the estimate may find what the search did not
             rest -= self.parts.refine + self.parts.onward
         rest = max(rest - self.counted(), few_calls.LEAST)
-        p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known)
+        p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known, **places)
         self.probability = self.beside_nominal(p)
         self.note("probability", p.episodes, p.failing, invalid=p.invalid)
         if p.proposal is None:
