@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 import jast
+from jast import distributions as D
 from jast.estimate import descents, population, population_weights
 from jast.estimate.sample import Sample
 from jast.limit_state import Latent
@@ -123,3 +124,23 @@ def test_where_no_way_leads_to_failures_the_rest_is_plain_draws(key, monkeypatch
     monkeypatch.setitem(descents.WAYS, "width", lost)
     found = population(key, PLANE, 200_000)
     assert "plain draws" in found.method and found.evaluations == 200_000
+
+
+def test_sensitivities_are_told_by_the_gaussians_that_drew(key):
+    """d log P / d mean of 20 numbers N(m, 1), P = Phi(sqrt(20) m - 4), m = 0."""
+    noise = jax.tree_util.Partial(lambda m, s: D.Normal(m, 1.0), jnp.zeros(()))
+    gap = lambda s: 4.0 - s / 20**0.5
+    sim = jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, w: s + w,
+        disturbance=noise,
+        evaluate=lambda s: (gap(s) <= 0, jnp.maximum(gap(s), 0.0)),
+        horizon=20,
+        episodic=True,
+    )
+    found = population(key, sim, 300_000)
+    assert found.method.endswith("then importance sampling")
+    told = jast.explain.sensitivity(sim, found)
+    truth = 20**0.5 * stats.norm.pdf(4) / stats.norm.sf(4)
+    row = next(r for r in told.rows if r[1] == 0)
+    assert told.reliable and abs(row[2] - truth) < 4 * row[3] < 0.1 * truth

@@ -127,8 +127,9 @@ def sensitivity(
             " parameter), received functions without parameters"
         )
     logs, scores = [], []
-    if isinstance(q, Sample):  # as many of its failures as are worth independent ones
-        q, samples = estimate.draws.source, LANES
+    if isinstance(q, Sample):  # as many of its failures as are worth independent ones, or Gaussians
+        q = estimate.draws.source
+        samples = LANES if isinstance(q, Sample) else samples
     for i in range(-(-samples // LANES)):
         own = jax.random.fold_in(key, i)
         n = min(LANES, len(q.points)) if isinstance(q, Sample) else LANES
