@@ -18,6 +18,9 @@ LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
 path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
 least of those that are alike.
 """
+FINE = 0.05
+"""Angle, in radians, between two places of a path that is believed: between the two sides of
+README's lane there is one with eight gaps of .12, of which one holds no failure."""
 RARER = 1.0
 """By how many nats one on the way between two modes may be rarer than the rarer of the two."""
 PAIRS, LEAST, IN_VAIN = 32, 2, 4
@@ -184,10 +187,18 @@ class Paths:
         places = np.arange(0 if of_both else 1, PLACES + 1) / (PLACES + 1)
         middle = places == 0.5  # first: most that leave the failures have left them there
         for t in (places[middle], places[~middle]):
-            rows = np.flatnonzero(joined)
-            points = _arcs(v[rows], w[rows], t)
-            joined[rows] = self.failing(points.reshape(-1, v.shape[1])).reshape(len(t), -1).all(0)
+            self._keep(joined, joined, v, w, t)
+        gaps, angle = PLACES + 1, np.arccos(np.clip(cosine, -1, 1))
+        while (wide := joined & (angle > FINE * gaps)).any():
+            self._keep(joined, wide, v, w, (np.arange(gaps) + 0.5) / gaps)
+            gaps *= 2
         return joined
+
+    def _keep(self, joined, among, v, w, t):
+        """Of the pairs ``among`` [n] only those stay ``joined`` that fail at the shares ``t``."""
+        rows = np.flatnonzero(among)
+        points = _arcs(v[rows], w[rows], t)
+        joined[rows] = self.failing(points.reshape(-1, v.shape[1])).reshape(len(t), -1).all(0)
 
     def failing(self, points):
         """Which of ``points`` [n, D] fail as they are or a little farther out: [n]."""
