@@ -18,7 +18,7 @@ LIFTS, OPPOSITE, ALIKE = (1.0, 1.03, 1.06, 1.1), -0.5, 0.8
 path may run: "by much" is a tenth of the way from the origin. The least cosine between the two; the
 least of those that are alike.
 """
-FINE = 0.05
+FINE = 0.1
 """Angle, in radians, between two places of a path that is believed: between the two sides of
 README's lane there is one with eight gaps of .12, of which one holds no failure."""
 RARER = 1.0
