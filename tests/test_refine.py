@@ -233,3 +233,10 @@ def test_results_print_and_save(key, tmp_path):
     kinds = modes(sim, result.failures, found)
     jast.save(tmp_path / "modes", kinds)
     assert str(jast.load(tmp_path / "modes")) == str(kinds)
+
+
+def test_what_are_no_failures_is_refused(key):
+    with pytest.raises(
+        ValueError, match="refine: failures must be an archive .* received NoneType"
+    ):
+        refine(key, linear(4), None)
