@@ -58,7 +58,9 @@ def weighted(s: Search, name: str, kinds: Sequence[Kind], level: float) -> Estim
         return None
     wide = 2  # of each component there is a wide copy
     several = int(min(PRODUCTS / (wide * DRAWS * dimension(s.sim) ** 2), COMPONENTS))
-    tried = [_promise(s, kinds, left, k) for k in sorted({1, max(several, 1)})]
+    samples = [sample_of(s.runs[k]) for k in kinds]
+    log_mean = s.pooled(kinds).log_mean
+    tried = [_promise(s, samples, log_mean, left, k) for k in sorted({1, max(several, 1)})]
     promise = min(tried, key=lambda p: p.relative)
     if promise.relative > _of_populations(s, kinds[0], left):
         return None
@@ -76,20 +78,20 @@ def weighted(s: Search, name: str, kinds: Sequence[Kind], level: float) -> Estim
     return None
 
 
-def _promise(s, kinds, left, components):
-    """The `Promise` of so many Gaussians at most, fitted to the failures of the first kind. The
-    second moment of their weights, E[p / q | failure] / P, is the greater one of those that the
-    failures of the two kinds tell.
+def _promise(s, samples, log_mean, left, components):
+    """The `Promise` of so many Gaussians at most, fitted to the first of the `Sample`. The second
+    moment of their weights, E[p / q | failure] / P, is the greatest one that a `Sample` tells.
     """
-    samples = [sample_of(s.runs[k]) for k in kinds]
-    weights = [np.exp(a.log_weight - np.logaddexp.reduce(a.log_weight)) for a in samples]
-    points, log_mean = samples[0].points.astype(np.float64), s.pooled(kinds).log_mean
-    g = fit(generator(s.key, 7), points, weights[0], len(points), limit=components)
+    points, log_w = samples[0].points.astype(np.float64), samples[0].log_weight
+    weights = np.exp(log_w - np.logaddexp.reduce(log_w))
+    g = fit(generator(s.key, 7), points, weights, len(points), limit=components)
     q = as_latent(defended(g, 0.0, True), normal_numbers(s.sim))
-    moment = max(
-        float(w @ np.exp(-log_ratio(q, a.points, a.used) - log_mean))
-        for w, a in zip(weights, samples, strict=True)
+    log_moment = max(
+        np.logaddexp.reduce(a.log_weight - log_ratio(q, a.points, a.used))
+        - np.logaddexp.reduce(a.log_weight)
+        for a in samples
     )
+    moment = math.exp(min(log_moment - log_mean, 700.0))  # e^700: no Gaussians serve
     products = len(q.means) * points.shape[1] ** 2
     draws = max(int(min(moment / EXACT**2, PRODUCTS / products, left)), LANES)
     return Promise(q, draws, math.sqrt(moment / draws))

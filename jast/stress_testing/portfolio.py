@@ -105,8 +105,8 @@ def stress(
         progress: whether there is a bar.
         callback: called as ``callback(done, total, None)`` after every piece of the work.
         checkpoint: a folder that keeps finished populations and what the system answered to
-            searches and draws. The same call, with its ``budget``, then goes on where it was
-            stopped, to the same result; first looks and refinement run again.
+            searches, refinement and draws. The same call, with its ``budget``, then goes on where
+            it was stopped, to the same result; first looks run again.
         executor: runs the parts of the probability: anything with ``submit(function, *args)``, such
             as the executors of `concurrent.futures` and Dask's client. It changes no result.
         devices: some of `jax.devices()`, one thread each, likewise (docs/scale.md).
