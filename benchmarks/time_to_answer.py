@@ -15,7 +15,6 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,6 +27,7 @@ from jax.tree_util import Partial  # noqa: E402
 import jast  # noqa: E402
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
+from jast.judge import judged  # noqa: E402
 from jast.limit_state import dimension  # noqa: E402
 from jast.simulators import limit_state  # noqa: E402
 
@@ -41,47 +41,45 @@ class System(NamedTuple):
     truth: float
     error: float = 0.0
     group: str = "static"
-    g: Callable | None = None
-    """The limit state of a static problem, of points [D] and a namespace"""
 
 
-def leaf(u, np=jnp):
+def leaf(u):
     """Two circles, each as far from the origin."""
-    return np.minimum(np.sum((u + 3.8) ** 2, -1), np.sum((u - 3.8) ** 2, -1)) - 1
+    return jnp.minimum(jnp.sum((u + 3.8) ** 2, -1), jnp.sum((u - 3.8) ** 2, -1)) - 1
 
 
-def ring(u, np=jnp):
+def ring(u):
     """Between two circles about the origin."""
-    r = np.sum(u**2, -1)
-    return np.maximum(16 - r, r - 20.25)
+    r = jnp.sum(u**2, -1)
+    return jnp.maximum(16 - r, r - 20.25)
 
 
-def gayton(u, np=jnp):
+def gayton(u):
     """Gayton's hat."""
     return 0.5 * (u[..., 0] - 2) ** 2 - 1.5 * (u[..., 1] - 5) ** 3 - 3
 
 
-def piecewise(u, np=jnp):
+def piecewise(u):
     """Breitung's piecewise branches, of which the farther one looks nearer."""
     a, b = u[..., 0], u[..., 1]
-    first = np.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
-    return np.minimum(first, np.where(b > 2, 0.5 - 0.1 * b, 2.3 - b))
+    first = jnp.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
+    return jnp.minimum(first, jnp.where(b > 2, 0.5 - 0.1 * b, 2.3 - b))
 
 
-def cube(u, np=jnp):
+def cube(u):
     """All of six numbers are great."""
-    return np.max(1.8 - u, -1)
+    return jnp.max(1.8 - u, -1)
 
 
-def plane(beta, u, np=jnp):
+def plane(beta, u):
     """A half-space."""
-    return beta - np.sum(u, -1) / u.shape[-1] ** 0.5
+    return beta - jnp.sum(u, -1) / u.shape[-1] ** 0.5
 
 
-def slab(u, np=jnp):
+def slab(u):
     """Between two parallel paraboloids."""
-    value = u[..., 0] - np.sum(u[..., 1:] ** 2, -1)
-    return np.maximum(3.5 - value, value - 3.52)
+    value = u[..., 0] - jnp.sum(u[..., 1:] ** 2, -1)
+    return jnp.maximum(3.5 - value, value - 3.52)
 
 
 def toy_step(steps, s, w):
@@ -111,7 +109,7 @@ def well_distance(s):
 
 
 def _static(g, d, truth):
-    return System(limit_state(g, d), truth, g=g)
+    return System(limit_state(g, d), truth)
 
 
 SYSTEMS = {
@@ -150,10 +148,12 @@ def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
 
 
 def _subset(about, seed):
-    """OpenTURNS's subset simulation with 10,000 points a level, as it comes."""
+    """OpenTURNS's subset simulation with 10,000 points a level, as it comes; the system runs in the
+    program of `jast.judge`.
+    """
     import openturns as ot
 
-    d = dimension(about.simulator)
+    sim, d = about.simulator, dimension(about.simulator)
     ot.RandomGenerator.SetSeed(seed)
 
     class Function(ot.OpenTURNSPythonFunction):
@@ -161,7 +161,8 @@ def _subset(about, seed):
             super().__init__(d, 1)
 
         def _exec_sample(self, x):
-            return np.asarray(about.g(np.asarray(x), np=np)).reshape(-1, 1)
+            o = judged(sim, np.asarray(x, np.float32))
+            return np.where(o.failure, -1.0, np.maximum(o.distance, 1e-30)).reshape(-1, 1)
 
     vector = ot.RandomVector(ot.Normal(d))
     event = ot.ThresholdEvent(
@@ -236,8 +237,6 @@ def main(argv: list[str] | None = None) -> None:
     seeds, rows = args.seeds or size(args, 20, 2, 1), []
     for name in names:
         for method in methods:
-            if method == "subset" and SYSTEMS[name].g is None:
-                continue
             row = row_of(name, method, seeds)
             if method == "failure_probability":
                 row["plain"] = plain_draws(name, row["warm"] or row["first"])

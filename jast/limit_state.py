@@ -18,6 +18,7 @@ from jax import lax
 
 from jast import actions as choices
 from jast import distributions as D
+from jast._jax import quick
 from jast.contract import contract
 from jast.cross_entropy.sequences import player
 from jast.distributions.numbers import unflat
@@ -28,7 +29,7 @@ from jast.policy import Policy
 from jast.products import product, rows_of
 from jast.progress import Progress, advance, begin, conclude
 from jast.pytrees import count, in_lanes
-from jast.rewards import log_likelihood
+from jast.rewards import likelihood
 from jast.simulator import Simulator
 
 __all__ = ["log_ratios", "outcomes", "place"]
@@ -52,6 +53,9 @@ class Outcomes(NamedTuple):
     """int32: steps"""
     invalid: Any
     """bool"""
+    log_p: Any = None
+    """Log density of its disturbances, relative to the mode where these have modes; None where
+    nobody asked"""
 
     @property
     def score(self):
@@ -125,10 +129,10 @@ def unit(z: np.ndarray) -> np.ndarray:
 
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
-    end, length = ended(sim, z, log_likelihood)
+    end, length = ended(sim, z, likelihood(sim))
     about = outline(sim)
     used = count(about.x0) + length * count(about.x)
-    return Outcomes(end.failure, end.distance, used, length, end.invalid)
+    return Outcomes(end.failure, end.distance, used, length, end.invalid, end.reward)
 
 
 @jax.jit
@@ -137,7 +141,7 @@ def outcomes(sim, z):
     return jax.vmap(lambda z: outcome(sim, z))(z)
 
 
-@jax.jit
+@quick
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
     return jax.vmap(
@@ -260,6 +264,6 @@ def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
     return _side_by_side(sim, partial(_points, sim), recorded)
 
 
-@jax.jit
+@quick
 def _points(sim, recorded):
     return flat(sim, *latents(sim, recorded, outline(sim).random_start))

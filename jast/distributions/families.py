@@ -7,11 +7,10 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import ndtr, ndtri
 
 from jast.distributions import containers, kinds, normal, verbs
 from jast.distributions.base import tree_map
-from jast.distributions.numerics import inside, standard
+from jast.distributions.numerics import inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 from jast.distributions.tilted import tilted
 

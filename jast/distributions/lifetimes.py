@@ -8,11 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtr, ndtri
 
 from jast.distributions.base import Distribution, float_array
 from jast.distributions.normal import HALF_LOG_2PI, LocationScale
-from jast.distributions.numerics import inside, log_one_less, log_tails, normal_of_log_tails
+from jast.distributions.numerics import (
+    inside,
+    log_one_less,
+    log_tails,
+    ndtr,
+    ndtri,
+    normal_of_log_tails,
+)
 from jast.distributions.table import register
 from jast.distributions.tails import of_log_tails
 

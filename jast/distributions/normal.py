@@ -4,20 +4,18 @@ scale. Draws and log densities agree with distrax's to the bit.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, float_array
+from jast.distributions.numerics import HALF_LOG_2PI, ndtr
 
 if TYPE_CHECKING:
     import chex
 
 __all__ = ["MultivariateNormalDiag", "MultivariateNormalTri", "Normal"]
-
-HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
 class LocationScale(Distribution):
@@ -88,7 +86,7 @@ class Normal(Symmetric):
         return exponent - (HALF_LOG_2PI + jnp.log(self._scale))
 
     def cdf(self, value: Any) -> Any:
-        return jax.scipy.special.ndtr(self._standardize(value))
+        return ndtr(self._standardize(value))
 
     def stddev(self) -> Any:
         return self.scale

@@ -7,12 +7,51 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import log_ndtr, ndtr, ndtri
+from jax.scipy import special
+from jax.scipy.special import log_ndtr
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["float_dtype", "fraction", "log_tails", "normal_of_log_tails", "normal_score", "phi"]
+__all__ = [
+    "float_dtype",
+    "fraction",
+    "log_tails",
+    "ndtr",
+    "ndtri",
+    "normal_of_log_tails",
+    "normal_score",
+    "phi",
+]
+
+HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+
+
+@jax.custom_jvp
+def ndtr(z: jax.Array) -> jax.Array:
+    """The normal distribution function Phi. Its derivative is told: through the series that compute
+    it a program of gradients would be several times as large, and as long in the compiler.
+    """
+    return special.ndtr(z)
+
+
+@ndtr.defjvp
+def _ndtr_jvp(primals: Any, tangents: Any) -> Any:
+    (z,), (slope,) = primals, tangents
+    return ndtr(z), slope * jnp.exp(-0.5 * jnp.square(z) - HALF_LOG_2PI)
+
+
+@jax.custom_jvp
+def ndtri(p: jax.Array) -> jax.Array:
+    """The normal quantile function Phi^-1, likewise."""
+    return special.ndtri(p)
+
+
+@ndtri.defjvp
+def _ndtri_jvp(primals: Any, tangents: Any) -> Any:
+    (p,), (slope,) = primals, tangents
+    z = ndtri(p)
+    return z, slope * jnp.exp(0.5 * jnp.square(z) + HALF_LOG_2PI)
 
 
 def float_dtype(dtype: Any) -> Any:

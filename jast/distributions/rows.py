@@ -2,11 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import expit, log_ndtr, logit, ndtr, ndtri
+from jax.scipy.special import expit, log_ndtr, logit
 
 from jast.distributions import continuous, discrete, verbs
 from jast.distributions.families import both
-from jast.distributions.numerics import cell, cells, fraction, inside, standard
+from jast.distributions.numerics import cell, cells, fraction, inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 
 LOG_2 = continuous.LOG_2
@@ -52,8 +52,8 @@ both(
 
 
 def _uniform_of_normal(d, z):
-    width = d.high - d.low
-    return jnp.where(z < 0, d.low + width * ndtr(z), d.high - width * ndtr(-z))
+    part = (d.high - d.low) * ndtr(jnp.where(z < 0, z, -z))
+    return jnp.where(z < 0, d.low + part, d.high - part)
 
 
 def _normal_of_uniform(d, x):
@@ -61,7 +61,8 @@ def _normal_of_uniform(d, x):
     # at an end of the support half a unit of rounding from there
     least = jnp.maximum(jnp.abs(x) * (jnp.finfo(x.dtype).eps / 4), jnp.finfo(x.dtype).tiny)
     below, above = (jnp.maximum(gap, least) / (d.high - d.low) for gap in (x - d.low, d.high - x))
-    return jnp.where(below < above, ndtri(jnp.minimum(below, 0.5)), -ndtri(jnp.minimum(above, 0.5)))
+    z = ndtri(jnp.where(below < above, below, jnp.minimum(above, 0.5)))
+    return jnp.where(below < above, z, -z)
 
 
 both(

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from jax.lax import lgamma, stop_gradient
-from jax.scipy.special import betainc, erfinv, ndtri
+from jax.scipy.special import betainc, erfinv
 
 from jast.distributions.base import Distribution, float_array
 from jast.distributions.normal import HALF_LOG_2PI, LocationScale
-from jast.distributions.numerics import inside, log_tails, normal_of_log_tails
+from jast.distributions.numerics import inside, log_tails, ndtri, normal_of_log_tails
 from jast.distributions.table import register
 from jast.distributions.tails import tails
 from jast.distributions.verbs import from_normal

@@ -15,17 +15,13 @@ its cost is log p of the mode less log p, over the steps that it takes. Candidat
 - *shifts*: the same disturbances some steps later or sooner, drawn in a little.
 
 Sizes of steps grow where they pay and shrink where they do not, for each point by itself.
+
+All of it is NumPy's, for n points at a time: there is nothing to compile.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-
-from jast.outline import outline
-from jast.pytrees import count
-from jast.simulator import Simulator
+import numpy as np
 
 __all__ = ["Noise", "Point", "along", "around", "resized", "SIZE"]
 
@@ -40,13 +36,17 @@ ENTRANTS = 4
 SHARES = 8, 4, 2, 1, 0.5, 0.25
 STRETCHES = 2.5, 1, 0.4
 """Rays, as shares of the gap; slopes, as shares of the length."""
+RAISED = 0, 0.1, 0.3, 0.6
+"""How far a step along the boundary is lifted for one that bends, as shares of its angle."""
+WIDTHS = 3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1
+"""Of the walks, as shares of the width."""
 
 
 class Point(NamedTuple):
-    """A failing point on its way, and the sizes of its steps."""
+    """Failing points [n] on their way, and the sizes of their steps."""
 
     v: Any
-    """[D]"""
+    """[n, D]"""
     cost: Any
     used: Any
     gap: Any
@@ -56,18 +56,18 @@ class Point(NamedTuple):
     width: Any
     """Of random steps, as a share of the distance from the origin"""
     last: Any
-    """[D] the last step that paid"""
+    """[n, D] the last step that paid"""
     slope: Any
-    """[D] of the distance, and"""
+    """[n, D] of the distance, and"""
     rise: Any
-    """[D] of the cost, both at the last round"""
+    """[n, D] of the cost, both at the last round"""
 
 
 class Noise(NamedTuple):
-    """Random numbers of a round: `walks` [WALKS, D] normal; uniform `masks` [REMOVALS, D], `rates`
-    and `shrinks` [REMOVALS], `pairs` [EXCHANGES, 2] and `sizes` [EXCHANGES]; `part` [k] int32, the
-    numbers that differences are taken of; `shifts` [SHIFTS] int32, steps, with normal `fills`
-    [SHIFTS].
+    """Random numbers of a round, for each of n points: `walks` [n, WALKS, D] normal; uniform
+    `masks` [n, REMOVALS, D], `rates` and `shrinks` [n, REMOVALS], `pairs` [n, EXCHANGES, 2,
+    ENTRANTS] and `sizes` [n, EXCHANGES]; `shifts` [n, SHIFTS] int32, steps, with normal `fills` [n,
+    SHIFTS].
     """
 
     walks: Any
@@ -76,81 +76,93 @@ class Noise(NamedTuple):
     shrinks: Any
     pairs: Any
     sizes: Any
-    part: Any
     shifts: Any
     fills: Any
 
 
-def around(sim: Simulator, point: Point, slope: Any, rise: Any, noise: Noise) -> jax.Array:
-    """The candidates [SIZE, D] around ``point``, by the slope of the distance and the rise of the
-    cost there [D]; both are 0 where they are not known.
+def around(point: Point, noise: Noise, first: int, horizon: int) -> np.ndarray:
+    """The candidates [n, SIZE, D] around the points; slope and rise are 0 where they are not
+    known. ``first``: how many of the D numbers are of the start; the others are of ``horizon``
+    steps.
     """
-    return jnp.concatenate(
+    return np.concatenate(
         [
             _rays(point),
-            _slid(point, slope, rise),
+            _slid(point),
             _walked(point, noise.walks),
             _removed(point, noise),
-            _exchanged(point, slope, rise, noise),
-            jax.vmap(partial(_shifted, sim, point.v))(noise.shifts, noise.fills),
-        ]
+            _exchanged(point, noise),
+            _shifted(point.v, noise.shifts, noise.fills, first, horizon),
+        ],
+        axis=1,
     )
 
 
-def resized(point: Point, i: Any, better: Any, failing: Any) -> Point:
-    """The point with the sizes of its steps after candidate ``i`` was the best of its round;
-    ``failing`` [RAYS]: which rays failed.
+def resized(point: Point, i: np.ndarray, better: np.ndarray, failing: np.ndarray) -> Point:
+    """The points with the sizes of their steps after candidates ``i`` [n] were the best of the
+    round; ``failing`` [n, RAYS]: which rays failed.
     """
     rays, slopes, walks = (sum(KINDS[:k]) for k in (1, 2, 3))
     took = lambda low, high: better & (i >= low) & (i < high)
-    shares, lengths, widths = jnp.asarray(SHARES, point.v.dtype), _lengths(point), _widths(point)
-    paid = shares[jnp.minimum(i, rays - 1)]
-    missed = jnp.min(jnp.where(failing, 2 * shares[0], shares))
-    gap = point.gap * jnp.where(better, 2 * missed, 0.25)
-    gap = jnp.where(took(0, rays), point.gap * jnp.where(paid <= 1, 0.5, paid), gap)
-    length = point.length * jnp.where(better, 1, 0.5)
-    grown = lengths[jnp.clip((i - rays) // LIFTS, 0, LENGTHS - 1)]
-    length = jnp.where(took(rays, slopes), grown, length)
-    wide = widths[jnp.clip(i - slopes, 0, WALKS - 1)] * 1.5
-    width = jnp.where(took(slopes, walks - 1), wide, point.width * 0.93)
+    shares, lengths, widths = _of(point, SHARES), _lengths(point), _widths(point)
+    at = lambda a, k: np.take_along_axis(a, np.clip(k, 0, a.shape[1] - 1)[:, None], axis=1)[:, 0]
+    paid = shares[np.minimum(i, rays - 1)]
+    missed = np.where(failing, 2 * shares[0], shares).min(axis=1)
+    gap = point.gap * np.where(better, 2 * missed, 0.25)
+    gap = np.where(took(0, rays), point.gap * np.where(paid <= 1, 0.5, paid), gap)
+    length = point.length * np.where(better, 1, 0.5)
+    length = np.where(took(rays, slopes), at(lengths, (i - rays) // LIFTS), length)
+    width = point.width * 0.93
+    width = np.where(took(slopes, walks - 1), 1.5 * at(widths, i - slopes), width)
+    dtype = point.v.dtype
     return point._replace(
-        gap=jnp.clip(gap, NEAREST, FARTHEST),
-        length=jnp.clip(length, 1e-3, 1),
-        width=jnp.clip(width, 1e-3, 1),
+        gap=np.clip(gap, NEAREST, FARTHEST).astype(dtype),
+        length=np.clip(length, 1e-3, 1).astype(dtype),
+        width=np.clip(width, 1e-3, 1).astype(dtype),
     )
 
 
+def _of(point, numbers):
+    return np.asarray(numbers, point.v.dtype)
+
+
 def _lengths(point):
-    return jnp.minimum(point.length * jnp.asarray(STRETCHES, point.v.dtype), 1.5)
+    return np.minimum(point.length[:, None] * _of(point, STRETCHES), 1.5)
 
 
 def _widths(point):
-    return point.width * jnp.asarray([3, 1, 0.3, 0.1, 3, 1, 0.3, 0.1], point.v.dtype)
+    return point.width[:, None] * _of(point, WIDTHS)
 
 
 def _live(point):
-    """Which numbers decide something [D], and how many."""
-    live = jnp.arange(len(point.v), dtype=jnp.int32) < point.used
-    return live, jnp.maximum(jnp.sum(live, dtype=jnp.int32), 1).astype(point.v.dtype)
+    """Which numbers decide something [n, D], and how many [n]."""
+    live = np.arange(point.v.shape[1]) < point.used[:, None]
+    return live, np.maximum(live.sum(axis=1), 1).astype(point.v.dtype)
+
+
+def _norm(a):
+    """Of the last axis, which stays."""
+    return np.linalg.norm(a, axis=-1, keepdims=True)
 
 
 def _rays(point):
-    shares = jnp.asarray(SHARES, point.v.dtype)
-    return point.v[None] * (1 - jnp.minimum(shares * point.gap, 1))[:, None]
+    drawn = 1 - np.minimum(_of(point, SHARES) * point.gap[:, None], 1)
+    return point.v[:, None] * drawn[:, :, None]
 
 
-def _slid(point, slope, rise):
+def _slid(point):
     """Steps along the boundary, each lifted a little, for a boundary that bends. No number crosses
     0 to the side where the distance grows.
     """
-    lengths, radius, way = _lengths(point), jnp.linalg.norm(point.v), along(point, slope, rise)
-    angle = lengths * jnp.sum(way**2) / jnp.maximum(radius, NEAREST) ** 2
-    lifts = jnp.asarray([0, 0.1, 0.3, 0.6], point.v.dtype)
-    lifts = 1e-5 + lifts[None] * jnp.minimum(angle, 1)[:, None]
-    slid = point.v[None] + lengths[:, None] * way[None]
-    slid = jnp.where((point.v * slope < 0)[None] & (slid * slope[None] > 0), 0, slid)
-    slid = slid[:, None] * (1 + lifts)[:, :, None]
-    return slid.reshape(-1, len(point.v))
+    v, slope = point.v[:, None], point.slope[:, None]
+    lengths, way = _lengths(point), along(point)
+    bend = (way**2).sum(axis=1) / np.maximum(_norm(point.v)[:, 0], NEAREST) ** 2
+    angle = np.minimum(lengths * bend[:, None], 1)
+    lifts = 1e-5 + _of(point, RAISED) * angle[:, :, None]
+    slid = v + lengths[:, :, None] * way[:, None]
+    slid = np.where((v * slope < 0) & (slid * slope > 0), 0, slid)
+    slid = slid[:, :, None] * (1 + lifts)[:, :, :, None]
+    return slid.reshape(len(v), -1, v.shape[-1])
 
 
 def _walked(point, normals):
@@ -158,85 +170,93 @@ def _walked(point, normals):
     nearer.
     """
     live, count_live = _live(point)
-    radius, widths = jnp.linalg.norm(point.v), _widths(point)
-    strides = jnp.where(live[None], normals, 0) / jnp.sqrt(count_live)
-    walks = point.v[None] + widths[:, None] * radius * strides
-    walks = jnp.concatenate([walks, (point.v + point.last)[None]])
-    drop = 1 - 0.3 * jnp.concatenate([widths, point.width[None]]) ** 2 / count_live
-    size = jnp.linalg.norm(walks, axis=1)
-    return walks * (radius * jnp.minimum(drop, 1) / jnp.maximum(size, NEAREST))[:, None]
+    radius, widths = _norm(point.v)[:, None], _widths(point)
+    strides = np.where(live[:, None], normals, 0) / np.sqrt(count_live)[:, None, None]
+    walks = point.v[:, None] + widths[:, :, None] * radius * strides
+    walks = np.concatenate([walks, (point.v + point.last)[:, None]], axis=1)
+    all_widths = np.concatenate([widths, point.width[:, None]], axis=1)
+    drop = np.minimum(1 - 0.3 * all_widths**2 / count_live[:, None], 1)
+    return walks * (radius * drop[:, :, None] / np.maximum(_norm(walks), NEAREST))
 
 
-def along(point: Point, slope: jax.Array, rise: jax.Array) -> jax.Array:
-    """The way along the boundary that lowers the cost [D]. A number at 0 leaves it for the side
+def along(point: Point) -> np.ndarray:
+    """The way along the boundary that lowers the cost [n, D]. A number at 0 leaves it for the side
     where the distance falls or not at all: the other is dearer and of no use.
     """
-    size, rise, free = jnp.abs(slope), _helpful(slope) * rise, jnp.ones(slope.shape, bool)
+    side = _helpful(point.slope)
+    size, rise, free = np.abs(point.slope), side * point.rise, np.ones(point.v.shape, bool)
+    total = lambda a: np.where(free, a, 0).sum(axis=1, keepdims=True)
     for _ in range(3):
-        square = jnp.sum(jnp.where(free, size**2, 0))
-        price = jnp.sum(jnp.where(free, size * rise, 0)) / jnp.where(square > 0, square, 1)
-        way = jnp.where(free, price * size - rise, 0)
+        square = total(size**2)
+        price = total(size * rise) / np.where(square > 0, square, 1)
+        way = np.where(free, price * size - rise, 0)
         free &= (point.v != 0) | (way > 0)
-    return jnp.where(free, _helpful(slope) * way, 0)
+    return np.where(free, side * way, 0)
 
 
 def _helpful(slope):
-    """The side, +-1, to which a number moves where the distance falls [D]."""
-    return jnp.where(slope > 0, -1, 1).astype(slope.dtype)
+    """The side, +-1, to which a number moves where the distance falls."""
+    return np.where(slope > 0, -1, 1).astype(slope.dtype)
 
 
 def _removed(point, noise):
     _, count_live = _live(point)
-    hit = noise.masks < jnp.maximum(noise.rates, 1 / count_live)[:, None]
-    return point.v[None] * jnp.where(hit, 1 - noise.shrinks[:, None], 1)
+    hit = noise.masks < np.maximum(noise.rates, 1 / count_live[:, None])[:, :, None]
+    return point.v[:, None] * np.where(hit, 1 - noise.shrinks[:, :, None], 1)
 
 
-def _exchanged(point, slope, rise, noise):
+def _exchanged(point, noise):
     """Of each pair of numbers one is drawn towards 0 by the share ``sizes``, and the other makes up
     for it. In the first half the number drawn in is, of a few, the one whose part in the failure is
     the dearest, and the other that of which more is the cheapest.
     """
-    live, _ = _live(point)
-    price = jnp.where(slope != 0, _helpful(slope) * rise / jnp.abs(slope), 0)
-    dear = jnp.where(point.v * slope < 0, -price, jnp.inf)
-    lowered = _picked(live & (point.v != 0), noise.pairs[:, 0], dear)
-    raised = _picked(live & (slope != 0), noise.pairs[:, 1], price)
-    drop = noise.sizes * point.v[lowered]
+    v, slope, (live, _) = point.v, point.slope, _live(point)
+    steep = np.where(slope != 0, slope, 1)
+    price = np.where(slope != 0, _helpful(slope) * point.rise / np.abs(steep), 0)
+    dear = np.where(v * slope < 0, -price, np.inf)
+    lowered = _picked(live & (v != 0), noise.pairs[:, :, 0], dear)
+    raised = _picked(live & (slope != 0), noise.pairs[:, :, 1], price)
+    of = lambda a, k: np.take_along_axis(a, k, axis=1)
+    drop = noise.sizes * of(v, lowered)
     # by a little more than to first order, for a boundary that bends
-    back = drop * (1 + 0.1 * noise.sizes) * slope[lowered] / slope[raised]
-    back = jnp.where((raised != lowered) & jnp.isfinite(back), back, 0)
-    rows = jnp.arange(len(drop), dtype=jnp.int32)
-    moved = point.v[None].repeat(len(rows), 0).at[rows, lowered].add(-drop)
-    return moved.at[rows, raised].add(back)
+    back = drop * (1 + 0.1 * noise.sizes) * of(slope, lowered) / of(steep, raised)
+    back = np.where((raised != lowered) & (of(slope, raised) != 0) & np.isfinite(back), back, 0)
+    moved = v[:, None].repeat(drop.shape[1], axis=1)
+    n, e = np.indices(drop.shape)
+    moved[n, e, lowered] -= drop
+    moved[n, e, raised] += back
+    return moved
 
 
 def _picked(among, uniform, worth):
-    """For each of ``uniform`` [n, k] one of the numbers that are ``among`` [D]: in the first half
-    the one least in ``worth`` [D] of k, else any.
+    """For each of ``uniform`` [n, E, k] one of the numbers that are ``among`` [n, D]: in the first
+    half the one least in ``worth`` [n, D] of k, else any.
     """
-    ranks = jnp.cumsum(among.astype(jnp.int32), dtype=jnp.int32)
-    at = jnp.floor(uniform * ranks[-1].astype(uniform.dtype)).astype(jnp.int32) + 1
-    picked = jnp.minimum(jnp.searchsorted(ranks, at), len(among) - 1).astype(jnp.int32)
-    best = jnp.argmin(worth[picked], axis=1, keepdims=True)
-    n = len(uniform)
-    column = jnp.where(jnp.arange(n, dtype=jnp.int32)[:, None] * 2 < n, best, 0)
-    return jnp.take_along_axis(picked, column, axis=1)[:, 0]
+    ranks = np.cumsum(among, axis=1)
+    at = np.floor(uniform * ranks[:, -1, None, None]).astype(int) + 1
+    picked = np.stack([np.searchsorted(r, a) for r, a in zip(ranks, at, strict=True)])
+    picked = np.minimum(picked, among.shape[1] - 1)
+    best = np.argmin(worth[np.arange(len(worth))[:, None, None], picked], axis=2)
+    best[:, best.shape[1] // 2 :] = 0
+    return np.take_along_axis(picked, best[:, :, None], axis=2)[:, :, 0]
 
 
-def _shifted(sim, v, steps, fill):
+def _shifted(v, steps, fill, first, horizon):
     """``v`` moved in time, at equal distance from the origin or a little nearer."""
-    moved = _in_time(sim, v, steps, fill)
-    size = jnp.maximum(jnp.linalg.norm(moved), NEAREST)
-    return moved * (jnp.linalg.norm(v) * (1 - 1e-5) / size)
+    moved = _in_time(v, steps, fill, first, horizon)
+    radius = _norm(v)[:, None] * (1 - 1e-5)
+    return moved * (radius / np.maximum(_norm(moved), NEAREST)).astype(v.dtype)
 
 
-def _in_time(sim, v, steps, fill):
-    """``v`` [D] with its disturbances that many ``steps`` later, sooner where negative. What comes
-    in is the first of them times ``fill``, at the end modes.
+def _in_time(v, steps, fill, first, horizon):
+    """``v`` [n, D] with its disturbances that many ``steps`` [n, k] later, sooner where negative.
+    What comes in is the first of them times ``fill`` [n, k], at the end modes.
     """
-    first = count(outline(sim).x0)
-    rows = v[first:].reshape(sim.horizon, -1)
-    t = jnp.arange(sim.horizon, dtype=jnp.int32) - steps
-    share = jnp.where(t < 0, fill, jnp.where(t < sim.horizon, 1, 0)).astype(v.dtype)
-    rows = rows[jnp.clip(t, 0, sim.horizon - 1)] * share[:, None]
-    return jnp.concatenate([v[:first], rows.reshape(-1)])
+    n, d = v.shape
+    rows = v[:, first:].reshape(n, horizon, -1)
+    t = np.arange(horizon) - steps[:, :, None]
+    share = np.where(t < 0, fill[:, :, None], t < horizon).astype(v.dtype)
+    at = np.clip(t, 0, horizon - 1)
+    moved = rows[np.arange(n)[:, None, None], at] * share[:, :, :, None]
+    start = v[:, None, :first].repeat(steps.shape[1], axis=1)
+    return np.concatenate([start, moved.reshape(n, -1, d - first)], axis=2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -14,9 +13,10 @@ from jast.counter import generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
-from jast.journal import kept, stepped
+from jast.journal import kept
 from jast.limit_state import check, normal_of, played, unit
-from jast.pytrees import in_parts
+from jast.outline import outline
+from jast.pytrees import count
 from jast.results import asked
 from jast.rewards import likelihood
 from jast.search import moves as M
@@ -31,10 +31,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Refined", "refine"]
 
-POINTS, GROUP, DIFFERENCES, GRADIENT = 16, 4, 64, 4
-"""Failures that are pulled side by side, and in one program; differences of a point in a round;
-evaluations that a gradient of distance and log p is counted as.
-"""
+POINTS = 16
+"""Failures that are pulled side by side."""
+DIFFERENCES = 64
+"""Differences of a point in a round."""
+GRADIENT = 4
+"""Evaluations that a gradient of distance and log p is counted as."""
 LOOK, LIKE, STILL, STILL_FOR, ENOUGH, FILLING, ALIKE = 5, 0.02, 1e-6, 6, 15, 0.5, 0.7
 """Rounds between two looks at the points; those nearer to one another than this share of their way
 from the origin go on as one; a point has arrived where so many looks gained less than this share of
@@ -172,7 +174,7 @@ class _Work:
 
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
-        self.centred = centred(sim)
+        self.centred, self.first = centred(sim), count(outline(sim).x0)
         self.v = normal_of(self.centred, given)
         self.value = np.asarray(given.reward, np.float64)
         self.left = list(np.argsort(-self.value, kind="stable"))
@@ -182,8 +184,6 @@ class _Work:
         self.spent = self.invalid = self.turn = 0
 
     def run(self, budget):
-        # programs of two sizes only, as each is compiled
-        self.lanes = GROUP if budget >= GROUP * ENOUGH * self.cost else 1
         thinned = False
         while True:
             if self.spent < FILLING * budget or not self.live + self.arrived:
@@ -193,11 +193,10 @@ class _Work:
                 thinned = True
             if not self.live:
                 return
-            size = -(-len(self.live) // self.lanes) * self.lanes
             for _ in range(LOOK):
-                if self.spent + size * self.cost > budget:
+                if self.spent + len(self.live) * self.cost > budget:
                     return
-                self._round(size)
+                self._round()
             for track in self.live:
                 track.log.append((self.spent, float(track.point.cost)))
             self._merge()
@@ -213,18 +212,14 @@ class _Work:
         rows = self._next(room - len(self.live))
         if not len(rows):
             return
-        lifted = self.v[rows] * (1 + np.array(LIFTS))[:, None, None]
-        n, d = len(rows), lifted.shape[-1]
-        rows_of = len(LIFTS) * self.lanes
-        flat = np.resize(lifted.reshape(-1, d), (-(-n // self.lanes) * rows_of, d))
-        flat = flat.astype(self.v.dtype)
-        points, verdict = _kept(rows_of, partial(begun, self.centred), flat)
-        self.spent += len(flat)
-        fails = verdict.failure[: len(LIFTS) * n].reshape(len(LIFTS), n)
+        lifted = self.v[rows] * (1 + np.array(LIFTS, self.v.dtype))[:, None, None]
+        points, fails = begun(self.centred, lifted.reshape(-1, lifted.shape[-1]))
+        self.spent += len(fails)
+        fails = fails.reshape(len(LIFTS), len(rows))
         for k, row in enumerate(rows):
             if fails[:, k].any():
-                first = int(np.argmax(fails[:, k])) * n + k
-                point = jax.tree.map(lambda a, first=first: a[first], points)
+                first = int(np.argmax(fails[:, k])) * len(rows) + k
+                point = M.Point(*(a[first] for a in points))
                 self.live.append(_Track(point, int(row), self.spent))
 
     def _next(self, n):
@@ -249,29 +244,28 @@ class _Work:
     def _scale(self):
         return max(-self.value.max(initial=-1.0), 1.0)
 
-    def _round(self, size):
-        tracks = [self.live[k % len(self.live)] for k in range(size)]
-        points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
-        d, real = self.v.shape[1], points.v.dtype
-        part = min(DIFFERENCES, d)
-        uniform = lambda *shape: self.rng.random(shape).astype(real)
-        powers = lambda *shape: (10.0 ** -self.rng.integers(0, 5, shape)).astype(real)
+    def _round(self):
+        size, points = len(self.live), _stacked(self.live)
+        d, real = points.v.shape[1], points.v.dtype
+        uniform = lambda *shape: self.rng.random((size, *shape)).astype(real)
+        normal = lambda *shape: self.rng.standard_normal((size, *shape)).astype(real)
+        powers = lambda n: (10.0 ** -self.rng.integers(0, 5, (size, n))).astype(real)
         noise = M.Noise(
-            self.rng.standard_normal((size, M.WALKS, d)).astype(real),
-            uniform(size, M.REMOVALS, d),
-            uniform(size, M.REMOVALS) ** 2,
-            powers(size, M.REMOVALS),
-            uniform(size, M.EXCHANGES, 2, M.ENTRANTS),
-            powers(size, M.EXCHANGES),
-            np.tile((part * self.turn + np.arange(part)) % d, (size, 1)).astype(np.int32),
-            self._shifts(size).astype(np.int32),
-            self.rng.standard_normal((size, M.SHIFTS)).astype(real),
+            walks=normal(M.WALKS, d),
+            masks=uniform(M.REMOVALS, d),
+            rates=uniform(M.REMOVALS) ** 2,
+            shrinks=powers(M.REMOVALS),
+            pairs=uniform(M.EXCHANGES, 2, M.ENTRANTS),
+            sizes=powers(M.EXCHANGES),
+            shifts=self._shifts(size).astype(np.int32),
+            fills=normal(M.SHIFTS),
         )
-        step = lambda points, noise: round_of(self.centred, points, noise, self.gradients)
-        points, invalid = _kept(self.lanes, step, points, noise)
-        for k, track in enumerate(self.live):
-            track.point = jax.tree.map(lambda a, k=k: a[k], points)
-        self.invalid += int(invalid.sum())
+        k = min(DIFFERENCES, d)
+        part = None if self.gradients else (k * self.turn + np.arange(k)) % d
+        points, invalid = round_of(self.centred, self.first, points, noise, part)
+        for i, track in enumerate(self.live):
+            track.point = M.Point(*(a[i] for a in points))
+        self.invalid += invalid
         self.turn += 1
         self.spent += size * self.cost
 
@@ -317,12 +311,9 @@ class _Work:
         late = np.array([c[-1] for c in before]) - costs
         origin, residual = np.array([t.origin for t in tracks], np.int64), np.full(n, np.nan)
         if n:
-            points = jax.tree.map(lambda *a: np.stack(a), *(t.point for t in tracks))
+            points = _stacked(tracks)
             if self.gradients:
-                padded = np.arange(-(-n // self.lanes) * self.lanes) % n
-                rows = jax.tree.map(lambda a: a[padded], points)
-                residual = _kept(self.lanes, residuals, rows)
-                residual = residual[:n].astype(np.float64)
+                residual = residuals(points).astype(np.float64)
         reward, failing = likelihood(self.sim), []
         if n:
             lifted = points.v[:, None] * (1 + np.array(LIFTS))[:, None]
@@ -348,6 +339,6 @@ class _Work:
         )
 
 
-def _kept(size, function, *rows):
-    """`in_parts`, whose answer is kept where the call around it has a checkpoint."""
-    return stepped(lambda: in_parts(size, function, *rows), *rows, like=lambda: function(*rows))
+def _stacked(tracks):
+    """The `Point` of all ``tracks``."""
+    return M.Point(*(np.stack(a) for a in zip(*(t.point for t in tracks), strict=True)))

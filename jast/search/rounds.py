@@ -1,139 +1,138 @@
 """One round of `jast.search.refine`: every point's candidates, the cheapest of them that fails, and
-the slopes that the next candidates follow.
+the slopes that the next candidates follow. The system's steps are in two programs alone, that of
+`jast.judge` and that of the gradients.
 """
-
-from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jast._jax import quick
 from jast.episode import rollout
-from jast.limit_state import ended, policy_of
-from jast.outline import outline
-from jast.pytrees import count
+from jast.incidents import hosted
+from jast.journal import stepped
+from jast.judge import judged
+from jast.limit_state import Outcomes, policy_of
+from jast.pytrees import in_lanes
 from jast.rewards import likelihood
 from jast.search import moves as M
 from jast.simulator import Simulator
 
-__all__ = ["Verdict", "begun", "residuals", "round_of"]
+__all__ = ["begun", "residuals", "round_of"]
 
-ASIDE, OUTSIDE = 1e-4, 0.01
+ASIDE = 1e-4
+"""How far aside numbers at 0 are moved for gradients: there may be a kink."""
+OUTSIDE = 0.01
+"""How far outside of the failures gradients are taken at most, as a share of the way there."""
 EDGE = 0.05
-"""How far aside numbers at 0 are moved for gradients, and how far outside of the failures, as a
-share of the way to the origin, these are taken at most; where differences are taken at least.
-"""
+"""How far outside of them differences are taken at least."""
+GROUP = 4
+"""Points whose gradients are one call of the program."""
 
 
-class Verdict(NamedTuple):
-    """What episodes came to."""
-
-    failure: Any
-    cost: Any
-    """log p(mode) - log p; inf where invalid"""
-    distance: Any
-    invalid: Any
-    used: Any
-    """int32: how many of the numbers decided it"""
+def begun(sim: Simulator, v: np.ndarray) -> tuple[M.Point, np.ndarray]:
+    """The `Point` of each of ``v`` [n, D], and which of them fail."""
+    o = _judged(sim, v[:, None])
+    full = lambda value: np.full(len(v), value, v.dtype)
+    zero = np.zeros_like(v)
+    cost, used = -o.log_p[:, 0].astype(v.dtype), o.used[:, 0]
+    return M.Point(v, cost, used, full(0.3), full(1), full(0.5), zero, zero, zero), o.failure[:, 0]
 
 
-def _judge(sim: Simulator, v: jax.Array) -> Verdict:
-    """The `Verdict` of the episode of ``v`` [D]."""
-    end, length = ended(sim, v, likelihood(sim))
-    about = outline(sim)
-    used = count(about.x0) + length * count(about.x)
-    cost = jnp.where(end.invalid, jnp.inf, -end.reward)
-    return Verdict(end.failure, cost.astype(v.dtype), end.distance, end.invalid, used)
-
-
-@jax.jit
-def begun(sim: Simulator, v: jax.Array) -> tuple[M.Point, Verdict]:
-    """The `Point` of each of ``v`` [n, D], and the `Verdict`."""
-    verdict = jax.vmap(partial(_judge, sim))(v)
-    full = lambda value: jnp.full(len(v), value, v.dtype)
-    zero = jnp.zeros_like(v)
-    sizes = full(0.3), full(1), full(0.5)
-    return M.Point(v, verdict.cost, verdict.used, *sizes, zero, zero, zero), verdict
-
-
-@partial(jax.jit, static_argnums=3)
 def round_of(
-    sim: Simulator, points: M.Point, noise: M.Noise, gradients: bool
-) -> tuple[M.Point, jax.Array]:
-    """One round of all ``points`` [n] with their ``noise`` [n], and how many of the candidates of
-    each were invalid [n].
+    sim: Simulator, first: int, points: M.Point, noise: M.Noise, part: np.ndarray | None
+) -> tuple[M.Point, int]:
+    """One round of all ``points`` [n] with their ``noise``, and how many of the candidates were
+    invalid. ``part`` [k]: the numbers whose slopes are told anew, by differences; None: those of
+    all, by gradients. ``first``: how many numbers are of the start.
     """
-    return jax.vmap(partial(_round, sim, gradients))(points, noise)
-
-
-def _round(sim, gradients, point, noise):
-    slope, rise = (_slopes if gradients else _differences)(sim, point, noise.part)
-    usable = _usable(slope, rise)
-    slope, rise = (jnp.where(usable, a, 0) for a in (slope, rise))
-    moves = M.around(sim, point, slope, rise, noise)
-    verdict = jax.vmap(partial(_judge, sim))(moves)
-    cost = jnp.where(verdict.failure, verdict.cost, jnp.inf)
-    i = jnp.argmin(cost).astype(jnp.int32)
-    better = cost[i] < point.cost
-    new = M.resized(point, i, better, verdict.failure[: M.RAYS])._replace(slope=slope, rise=rise)
-    took = lambda a, b: jnp.where(better, a, b)
-    decides = jnp.arange(len(point.v), dtype=jnp.int32) < verdict.used[i]
-    best = jnp.where(decides, moves[i], 0)  # the others stay at the mode
+    told = _gradients(sim, points) if part is None else _differences(sim, points, part)
+    usable = _usable(*told)
+    slope, rise = (np.where(usable, a, 0) for a in told)
+    points = points._replace(slope=slope, rise=rise)
+    moves = M.around(points, noise, first, sim.horizon)
+    o = _judged(sim, moves)
+    cost = np.where(o.failure, -o.log_p, np.inf).astype(moves.dtype)
+    i, rows = np.argmin(cost, axis=1), np.arange(len(cost))
+    better = cost[rows, i] < points.cost
+    new = M.resized(points, i, better, o.failure[:, : M.RAYS])
+    decides = np.arange(moves.shape[2]) < o.used[rows, i][:, None]
+    best = np.where(decides, moves[rows, i], 0)  # the others stay at the mode
+    took = lambda a, b: np.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
     new = new._replace(
-        v=took(best, point.v),
-        cost=took(cost[i], point.cost),
-        used=took(verdict.used[i], point.used),
-        last=took(best - point.v, point.last),
+        v=took(best, points.v),
+        cost=took(cost[rows, i], points.cost),
+        used=took(o.used[rows, i], points.used),
+        last=took(best - points.v, points.last),
     )
-    return new, jnp.sum(verdict.invalid, dtype=jnp.int32)
+    return new, int(o.invalid.sum())
 
 
-def _usable(slope, rise):
-    """Whether the slopes lead anywhere."""
-    square = jnp.sum(slope**2)
-    return jnp.isfinite(square) & (square > 0) & jnp.all(jnp.isfinite(rise))
-
-
-def _slopes(sim, point, _):
-    """The gradients of the distance and of the cost, a little outside of the failures. Numbers at 0
-    are moved aside for it, to where the distance fell: there may be a kink.
-    """
-    v = (1 - jnp.minimum(point.gap, OUTSIDE)) * point.v
-    v = jnp.where(v == 0, -ASIDE * jnp.sign(point.slope), v)
-
-    def both(v):
-        e = rollout(jax.random.key(0), sim, policy_of(sim, v), likelihood(sim))
-        return e.distance, -e.reward
-
-    (distance, _), back = jax.vjp(both, v)
-    one, zero = jnp.ones_like(distance), jnp.zeros_like(distance)
-    return back((one, zero))[0], back((zero, one))[0]
-
-
-def _differences(sim, point, part):
-    """Both slopes with the numbers ``part`` told anew, from differences outside the failures."""
-    gap, radius = jnp.maximum(EDGE, point.gap), jnp.linalg.norm(point.v)
-    edge, h = (1 - gap) * point.v, 0.2 * EDGE * jnp.maximum(radius, 1e-3)
-    rows = jnp.arange(len(part), dtype=jnp.int32)
-    there = _judge(sim, edge)
-    moved = jax.vmap(partial(_judge, sim))(edge[None].repeat(len(part), 0).at[rows, part].add(h))
-    good = jnp.isfinite(moved.distance) & jnp.isfinite(moved.cost)
-    told = lambda a, b: jnp.where(good, (a - b) / h, 0)
-    slope = point.slope.at[part].set(told(moved.distance, there.distance))
-    return slope, point.rise.at[part].set(told(moved.cost, there.cost))
-
-
-@jax.jit
-def residuals(points: M.Point) -> jax.Array:
+def residuals(points: M.Point) -> np.ndarray:
     """How far each of ``points`` [n] was, at its last round, from the conditions of Karush, Kuhn
     and Tucker: the slope of its cost along the boundary, as a share of the whole slope; NaN where
     the distance has none.
     """
+    whole = np.maximum(np.linalg.norm(points.rise, axis=1), M.NEAREST)
+    share = np.linalg.norm(M.along(points), axis=1) / whole
+    return np.where(_usable(points.slope, points.rise)[:, 0], share, np.nan)
 
-    def one(point):
-        usable = _usable(point.slope, point.rise)
-        along = M.along(point, point.slope, point.rise)
-        share = jnp.linalg.norm(along) / jnp.maximum(jnp.linalg.norm(point.rise), M.NEAREST)
-        return jnp.where(usable, share, jnp.nan)
 
-    return jax.vmap(one)(points)
+def _judged(sim: Simulator, v: np.ndarray) -> Outcomes:
+    """The `Outcomes` [n, k] of the episodes of ``v`` [n, k, D]. A black box runs those of one point
+    at a time: its programs then have few shapes.
+    """
+    n, k, d = v.shape
+    parts = v if hosted(sim) else v.reshape(1, n * k, d)
+    found = [judged(sim, part) for part in parts]
+    return Outcomes(*(np.concatenate(a).reshape(n, k) for a in zip(*found, strict=True)))
+
+
+def _usable(slope, rise):
+    """Whether the slopes lead anywhere [n, 1]."""
+    finite = np.isfinite(slope).all(axis=1) & np.isfinite(rise).all(axis=1)
+    return (finite & slope.any(axis=1))[:, None]
+
+
+def _gradients(sim, points):
+    """The gradients of the distance and of the cost, a little outside of the failures. Numbers at 0
+    are moved aside for it, to where the distance fell.
+    """
+    v = (1 - np.minimum(points.gap, OUTSIDE))[:, None] * points.v
+    v = np.where(v == 0, -ASIDE * np.sign(points.slope), v).astype(points.v.dtype)
+    run = lambda v: in_lanes(GROUP, lambda v: _slopes(sim, v), v)
+    found = stepped(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
+    return found[:, 0], found[:, 1]
+
+
+@quick
+def _slopes(sim, v):
+    """The gradients of the distance and of the cost [n, 2, D] at ``v`` [n, D]."""
+
+    def both(v):
+        e = rollout(jax.random.key(0), sim, policy_of(sim, v), likelihood(sim))
+        return jnp.stack([e.distance.astype(v.dtype), -e.reward.astype(v.dtype)])
+
+    def one(v):
+        _, back = jax.vjp(both, v)
+        return jax.vmap(lambda row: back(row)[0])(jnp.eye(2, dtype=v.dtype))
+
+    return jax.vmap(one)(v)
+
+
+def _differences(sim, points, part):
+    """Both slopes with the numbers ``part`` told anew, from differences outside the failures."""
+    gap, radius = np.maximum(EDGE, points.gap), np.linalg.norm(points.v, axis=1)
+    edge = ((1 - gap)[:, None] * points.v)[:, None]
+    h = (0.2 * EDGE * np.maximum(radius, 1e-3)).astype(points.v.dtype)
+    moved = edge.repeat(len(part), axis=1)
+    moved[:, np.arange(len(part)), part] += h[:, None]
+    o = _judged(sim, np.concatenate([edge, moved], axis=1))
+    slopes = []
+    for before, value in ((points.slope, o.distance), (points.rise, -o.log_p)):
+        with np.errstate(invalid="ignore"):
+            told = (value[:, 1:] - value[:, :1]) / h[:, None]
+        slope = before.copy()
+        slope[:, part] = np.where(np.isfinite(told) & ~o.invalid[:, 1:], told, 0)
+        slopes.append(slope)
+    return slopes
