@@ -31,6 +31,8 @@ class Offer:
     """Name of the class, of the first part in a joint, that has no quantile function; "" where
     `jast.distributions.quantile` is defined.
     """
+    mode_is_median: bool = False
+    """It is known to be: the mode is the normal number 0, whatever the parameters."""
 
     @property
     def quantile(self) -> bool:
@@ -123,7 +125,21 @@ def _outlined(sim: Simulator) -> Outline:
 
 def _offer(dist: Any) -> Offer:
     lacking = "" if _can(D.has_quantile, dist) else _without_quantile(dist)
-    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking)
+    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking, _mode_is_median(dist))
+
+
+MEDIANS = {"Laplace", "Logistic", "MultivariateNormalDiag", "MultivariateNormalTri", "Normal"}
+"""Families, of jast and distrax, whose mode is their median."""
+
+
+def _mode_is_median(dist: Any) -> bool:
+    if hasattr(dist, "distributions"):
+        parts = jax.tree.leaves(dist.distributions, is_leaf=D.is_distribution)
+        return all(map(_mode_is_median, parts))
+    if isinstance(dist, D.Independent):
+        return _mode_is_median(dist.distribution)
+    kind = type(dist)
+    return kind.__name__ in MEDIANS and kind.__module__.split(".")[0] in ("jast", "distrax")
 
 
 def _can(question: Callable[[Any], bool], dist: Any) -> bool:

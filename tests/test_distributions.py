@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jast import distributions as D
+from jast.distributions import numerics
 
 unit = st.floats(0.0, 1.0, width=32)
 
@@ -599,3 +600,15 @@ def test_quantiles_of_uniform_numbers_are_draws(key):
             d.sample(seed=jax.random.fold_in(key, 1), sample_shape=(20_000,)), np.float64
         )
         assert abs(x.mean() - other.mean()) < 4 * np.sqrt((x.var() + other.var()) / 20_000)
+
+
+def test_slopes_of_the_normal_distribution_function_and_of_its_inverse(dtype):
+    z = np.linspace(-5, 5, 41).astype(dtype)
+    p = scipy.stats.norm.cdf(z).astype(dtype)
+    density = scipy.stats.norm.pdf(z.astype(float))
+    rtol = 1e-5 if dtype == "float32" else 1e-12
+    slope = jax.vmap(jax.grad(numerics.ndtr))(z)
+    np.testing.assert_allclose(slope, density, rtol=rtol)
+    inverse = jax.vmap(jax.grad(numerics.ndtri))(p[z < 0])
+    of_p = 1 / scipy.stats.norm.pdf(scipy.stats.norm.ppf(p[z < 0].astype(float)))
+    np.testing.assert_allclose(inverse, of_p, rtol=30 * rtol)  # z itself is rounded, to z^2 eps

@@ -115,7 +115,7 @@ def test_of_a_black_box_without_a_run(monkeypatch):
 
     about = outline(jast.blackbox.from_python(system, horizon=4, disturbance=D.Normal(0.0, 1.0)))
     assert not about.random_start and about.x.shape == ()
-    assert about.disturbance == Offer("Normal", True, "")
+    assert about.disturbance == Offer("Normal", True, "", mode_is_median=True)
     sim = jast.blackbox.from_python(blackboxes.walk, horizon=4)
     assert outline(sim).disturbance == Offer("Seeds", False, "Seeds")
 

@@ -1,6 +1,7 @@
 """refine and modes, against closed forms."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -139,6 +140,14 @@ def test_modes_are_the_origin_of_a_centred_simulator(key):
     quiet = lambda v: jast.rollout(key, same, latent.policy_of(same, v), likelihood(sim)).reward
     assert float(quiet(jnp.zeros(4))) == pytest.approx(0, abs=1e-5)
     assert np.isfinite(jax.grad(quiet)(jnp.full(4, 0.5))).all()
+
+
+def test_a_simulator_whose_modes_are_medians_is_centred_already():
+    """So its programs serve refinement and estimates alike."""
+    lane = linear(3)
+    assert centred(lane) == lane
+    other = replace(lane, disturbance=lambda y: Exponential(1.0))
+    assert centred(other) != other
 
 
 def test_a_random_start_is_refined_too(key):

@@ -63,14 +63,14 @@ class Centred(Distribution):
 
 
 def centred(sim: Simulator) -> Simulator:
-    """``sim`` with `Centred` distributions: the same episodes, told by other numbers. One whose
-    distributions have no mode stays as it is.
+    """``sim`` with `Centred` distributions: the same episodes, told by other numbers. Distributions
+    without a mode, or whose mode is 0 already, stay as they are: they share compiled programs.
     """
     about = outline(sim)
     changes = {}
-    if about.disturbance.mode:
+    if about.disturbance.mode and not about.disturbance.mode_is_median:
         changes["disturbance"] = Partial(_of_state, sim.disturbance)
-    if about.random_start and about.start.mode:
+    if about.random_start and about.start.mode and not about.start.mode_is_median:
         changes["start"] = Partial(_of_start, sim.start)
     return replace(sim, **changes)
 
