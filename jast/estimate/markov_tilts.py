@@ -26,7 +26,7 @@ from jast.limit_state import Outcomes, normal_numbers
 from jast.outline import ask, outline
 from jast.progress import advance, begin, conclude
 from jast.pytrees import count
-from jast.rewards import log_likelihood
+from jast.rewards import likelihood
 
 __all__ = ["Frame", "Tilts", "features", "of_the_model", "played", "shape"]
 
@@ -338,19 +338,19 @@ def _played(sim, q, u, first, noise):
     edges = jnp.cumsum(jnp.exp(q.log_weights))
     live = jnp.sum(jnp.isfinite(q.log_weights))
     k = jnp.minimum(jnp.sum(u[:, None] >= edges[None], axis=1), live - 1)
-    length_of = sim.horizon
+    length_of, density = sim.horizon, likelihood(sim)
 
     def start(k, *chance):
         one = jnp.ones(1, u.dtype)
         x0, z, i, log_p, ratio = _drawn(parts(sim.start()), k, one, q.first, q.floors, chance)
-        return begin(sim, log_likelihood, x0), ratio, (z, i, log_p)
+        return begin(sim, density, x0), ratio, (z, i, log_p)
 
     def one(progress, ratio, length, k, chance, t):
         seen = look(sim, progress.state)
         f = features(q.frame, seen, t.astype(u.dtype) / length_of)
         p = parts(sim.disturbance(progress.state))
         x, z, i, log_p, gain = _drawn(p, k, f, q.steps, q.floors, chance)
-        after = advance(sim, log_likelihood, progress, x, t + 1 >= length_of)
+        after = advance(sim, density, progress, x, t + 1 >= length_of)
         done = progress.done
         keep = lambda a, b: jnp.where(done, a, b)
         after = jax.tree.map(keep, progress, after)
@@ -380,10 +380,10 @@ def _played(sim, q, u, first, noise):
         body,
         (progress, ratio, jnp.zeros(n, jnp.int32), zero, rows),
     )
-    end = jax.vmap(lambda p: conclude(sim, log_likelihood, p))(progress)
+    end = jax.vmap(lambda p: conclude(sim, density, p))(progress)
     about = outline(sim)
     used = count(about.x0) + length * count(about.x)
-    outcome = Outcomes(end.failure, end.distance, used, length, end.invalid)
+    outcome = Outcomes(end.failure, end.distance, used, length, end.invalid, end.reward)
     return outcome, ratio, Trace(z0, i0, log_p0, *rows)
 
 
