@@ -3,8 +3,9 @@ threaded.
 
 A simulation of a search draws its disturbance x_t with a key folded from (tree key, simulation, t),
 so that any simulation can be rebuilt from its number. Threefry spends most of a cheap simulator's
-time on that; two rounds of a 32-bit finaliser (the one of MurmurHash3) per word do not. It serves
-search only: its statistics are tested, but estimators keep the user's own key.
+time on that; two rounds of a 32-bit finaliser (the one of MurmurHash3) per word do not. Searches,
+populations and plain draws use it, and its statistics are tested; other estimators keep the user's
+own key.
 """
 
 import jax
@@ -14,7 +15,7 @@ from jax import lax
 
 from jast._jax import define_prng_impl
 
-__all__ = ["COUNTER", "generator", "tree_keys"]
+__all__ = ["COUNTER", "counter_key", "generator", "tree_keys"]
 
 
 def _mix(h):
@@ -97,3 +98,11 @@ def generator(key, *numbers):
         return key
     words = np.asarray(jax.random.key_data(key)).astype(np.uint32).ravel().tolist()
     return np.random.default_rng([*words, *numbers])
+
+
+def counter_key(key: jax.Array, *numbers: int) -> jax.Array:
+    """A counter key from a user's key, another one for each ``numbers``: normal
+    numbers of Threefry would take most of the time of a cheap system.
+    """
+    words = generator(key, *numbers).integers(0, 2**32, 2, np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=COUNTER)

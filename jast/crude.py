@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -26,7 +26,7 @@ from jast.intervals import clopper_pearson
 from jast.outline import outline
 from jast.places import Post, Task
 from jast.policy import undisturbed
-from jast.progress import advance, begin, conclude
+from jast.progress import Progress, advance, begin, conclude
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["nominal"]
+__all__ = ["nominal", "outcome"]
 
 FEW = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three
@@ -276,7 +276,9 @@ def _counts(key, sim, episodes, begin, end):
     def chunk(i, counts):
         index = i * LANES + jnp.arange(LANES, dtype=jnp.int32)
         live = (index < episodes) & (index >= 0)
-        last = jax.vmap(lambda k, on: _outcome(jax.random.fold_in(key, k), sim, on))(index, live)
+        reward = rewards.standard()
+        play = lambda k, on: outcome(jax.random.fold_in(key, k), sim, on, reward)[0]
+        last = jax.vmap(play)(index, live)
         valid, failing = live & ~last.invalid, live & last.failure
         new = Counts(
             jnp.sum(failing, dtype=jnp.int32),
@@ -295,11 +297,10 @@ def _counts(key, sim, episodes, begin, end):
 _count, _count_quickly = jax.jit(_counts), quick(_counts)
 
 
-def _outcome(key, sim, live):
-    """The end of the episode that `rollout` plays with ``key``, without its rows; not played where
-    ``live`` is False.
+def outcome(key: Any, sim: Any, live: Any, reward: Callable) -> tuple[Progress, Any]:
+    """The end of the episode that `rollout` plays with ``key``, without its rows, and its steps;
+    not played where ``live`` is False.
     """
-    reward = rewards.standard()
     keys = jax.random.split(key, sim.horizon + 1)
     first = begin(sim, reward, D.sample(sim.start(), keys[0]))
 
@@ -310,5 +311,5 @@ def _outcome(key, sim, live):
         return advance(sim, reward, progress, x, t + 1 >= sim.horizon), t + 1
 
     first = first._replace(done=first.done | ~jnp.asarray(live))
-    last, _ = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
-    return conclude(sim, reward, last, live)
+    last, steps = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
+    return conclude(sim, reward, last, live), steps

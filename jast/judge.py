@@ -14,7 +14,7 @@ from jast.incidents import hosted
 from jast.journal import answered
 from jast.simulator import Simulator
 
-__all__ = ["Judge", "judged"]
+__all__ = ["Judge", "judged", "lanes_of"]
 
 LANES, BLOCK, HELD = 4096, 128, 2**20
 """Points of a call at most, those that run side by side, and numbers that a call may take."""
@@ -39,8 +39,7 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
     if hosted(sim):
         return answered(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
     n, d = z.shape
-    lanes = max(min(LANES, HELD // d // BLOCK * BLOCK), BLOCK)
-    out = []
+    lanes, out = lanes_of(d), []
     for i in range(0, n, lanes):
         part = z[i : i + lanes]
         padded = np.zeros((lanes, d), z.dtype)
@@ -48,6 +47,11 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
         run = lambda part, all=padded: _in_blocks(sim, all, np.int32(len(part)))
         out.append(answered(run, part, rows=len(part)))
     return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+
+
+def lanes_of(d: int) -> int:
+    """Points of ``d`` numbers that one call of the program takes."""
+    return max(min(LANES, HELD // max(d, 1) // BLOCK * BLOCK), BLOCK)
 
 
 @jax.jit

@@ -31,8 +31,18 @@ class Offer:
     """Name of the class, of the first part in a joint, that has no quantile function; "" where
     `jast.distributions.quantile` is defined.
     """
-    mode_is_median: bool = False
-    """It is known to be: the mode is the normal number 0, whatever the parameters."""
+    families: frozenset[str] = frozenset()
+    """Names of the families of its parts; of a user's own, with the module."""
+
+    @property
+    def mode_is_median(self) -> bool:
+        """It is known to be: the mode is the normal number 0, whatever the parameters."""
+        return self.families <= MEDIANS
+
+    @property
+    def closed(self) -> bool:
+        """Whether its quantile is known to be a function that costs no more than a draw."""
+        return self.quantile and self.families <= CLOSED
 
     @property
     def quantile(self) -> bool:
@@ -65,6 +75,11 @@ class Outline:
     def random_start(self) -> bool:
         """Whether x0 is a choice: ``start`` is not `jast.simulator.fixed`."""
         return bool(jax.tree.leaves(self.x0))
+
+    @property
+    def closed(self) -> bool:
+        """Whether x0 and x are quantiles that cost no more than draws."""
+        return self.start.closed and self.disturbance.closed
 
     @property
     def density(self) -> str:
@@ -125,21 +140,36 @@ def _outlined(sim: Simulator) -> Outline:
 
 def _offer(dist: Any) -> Offer:
     lacking = "" if _can(D.has_quantile, dist) else _without_quantile(dist)
-    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking, _mode_is_median(dist))
+    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking, _families(dist))
 
 
 MEDIANS = {"Laplace", "Logistic", "MultivariateNormalDiag", "MultivariateNormalTri", "Normal"}
 """Families, of jast and distrax, whose mode is their median."""
+CLOSED = (MEDIANS - {"Logistic"}) | {
+    "Bernoulli",
+    "Categorical",
+    "Exponential",
+    "Fixed",
+    "Geometric",
+    "Gumbel",
+    "LogNormal",
+    "TruncatedNormal",
+    "Uniform",
+    "Weibull",
+}
+"""Families whose quantiles at counter normals take 1.3 to 4 times less CPU time than draws with
+JAX's keys, in episodes of 50 steps; those of the others take 2 to 20 times more."""
 
 
-def _mode_is_median(dist: Any) -> bool:
+def _families(dist: Any) -> frozenset[str]:
     if hasattr(dist, "distributions"):
         parts = jax.tree.leaves(dist.distributions, is_leaf=D.is_distribution)
-        return all(map(_mode_is_median, parts))
+        return frozenset().union(*map(_families, parts))
     if isinstance(dist, D.Independent):
-        return _mode_is_median(dist.distribution)
+        return _families(dist.distribution)
     kind = type(dist)
-    return kind.__name__ in MEDIANS and kind.__module__.split(".")[0] in ("jast", "distrax")
+    ours = kind.__module__.split(".")[0] in ("jast", "distrax")
+    return frozenset({kind.__name__ if ours else f"{kind.__module__}.{kind.__name__}"})
 
 
 def _can(question: Callable[[Any], bool], dist: Any) -> bool:

@@ -1,4 +1,6 @@
-"""What holds in every result of a search."""
+"""What holds in every result of a search, and how many programs were compiled."""
+
+from contextlib import contextmanager
 
 import jax
 import numpy as np
@@ -79,3 +81,19 @@ def same(a, b):
     np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
     np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
     assert a.failures.seen == b.failures.seen
+
+
+@contextmanager
+def compiled():
+    """A list that grows by each program that is compiled meanwhile."""
+    heard = []
+
+    def listen(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            heard.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield heard
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)

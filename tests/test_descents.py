@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import compiled
 from scipy import stats
 
 import jast
 from jast import distributions as D
+from jast.counter import counter_key
 from jast.estimate import (
     adaptive,
     agreement,
@@ -23,7 +25,7 @@ from jast.estimate import (
 from jast.estimate.agreement import Answer, answer_of
 from jast.estimate.descents import WAYS, by_distance, by_width
 from jast.estimate.estimate import ROUGH
-from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, moved
+from jast.estimate.particles import Particles, Steering, begun, blank, moved
 from jast.intervals import clopper_pearson
 from jast.limit_state import outcomes
 from jast.simulators import limit_state, walk1d
@@ -360,36 +362,26 @@ def test_a_stopped_call_goes_on_from_its_checkpoint(key, tmp_path, equal, monkey
         equal(tuple(one.proposal), tuple(alone.proposal))
 
 
-def compiled(run):
-    """How many programs are compiled meanwhile."""
-    heard = []
-
-    def listen(event, seconds, **about):
-        if event == "/jax/core/compile/backend_compile_duration":
-            heard.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        run()
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-    return len(heard)
-
-
 def test_stress_compiles_few_programs_and_hardly_more_with_a_second_key(key, small):
     """A walk that fails on either side, at any of its last steps; 26 were measured. A key whose
     first look meets a failure compiles two to play it.
     """
     one, other = jax.random.split(key)
     sim = walk1d(threshold=16.0)
-    assert compiled(lambda: jast.stress(one, sim, 150_000)) <= 45
-    assert compiled(lambda: jast.stress(other, sim, 150_000)) <= 2
+    with compiled() as programs:
+        jast.stress(one, sim, 150_000)
+    assert len(programs) <= 45
+    with compiled() as programs:
+        jast.stress(other, sim, 150_000)
+    assert len(programs) <= 2
 
 
 def test_another_budget_and_other_parameters_compile_nothing(key):
     population(key, walk1d("one-sided", threshold=9.0), 60_000, particles=N)
     other = walk1d("one-sided", threshold=9.5)
-    assert not compiled(lambda: population(key, other, 80_000, particles=N))
+    with compiled() as programs:
+        population(key, other, 80_000, particles=N)
+    assert not programs
 
 
 # --- who asks for populations

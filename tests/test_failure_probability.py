@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from checks import compiled
 from jax.scipy.special import ndtri
 from jax.tree_util import Partial
 from scipy.special import logsumexp
@@ -916,25 +917,17 @@ def _along(beta, x):
 def test_another_budget_and_parameter_compile_nothing(key):
     """Also where tilts are tried after the Gaussians, as with the least budget here."""
     plane = lambda beta: limit_state(Partial(_along, jnp.asarray(beta, jnp.zeros(()).dtype)), 20)
-    seen = []
 
-    def listener(event, *_, **__):
-        if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    try:
+    with compiled() as programs:
         failure_probability(key, plane(4.0), 30_000)
         failure_probability(key, plane(4.0), 8000)
-        assert seen
-        for beta, budget in ((4.0, 20_001), (3.5, 30_000), (3.5, 9000)):
-            sim = plane(beta)
-            seen.clear()
+    assert programs
+    for beta, budget in ((4.0, 20_001), (3.5, 30_000), (3.5, 9000)):
+        sim = plane(beta)
+        with compiled() as programs:
             found = failure_probability(key, sim, budget)
-            error = abs(found.log_mean - np.log(norm.sf(beta)))
-            assert not seen and error < 5 * found.relative_error
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listener)
+        error = abs(found.log_mean - np.log(norm.sf(beta)))
+        assert not programs and error < 5 * found.relative_error
 
 
 LOST = [("walks", 16), ("walks", 32), ("scaled", 25), ("union", 33), ("branches", 22)]

@@ -45,7 +45,9 @@ def test_of_a_walk():
     assert (about.x.shape, about.x.dtype) == ((), default())
     assert (about.state.shape, about.state.dtype) == ((), default())
     assert about.dtype == default() and about.observation == (1,)
-    assert about.start == Offer("Fixed", True, "") and about.disturbance.quantile
+    assert (
+        about.start == Offer("Fixed", True, "", frozenset({"Fixed"})) and about.disturbance.quantile
+    )
 
 
 def test_of_a_tree_of_disturbances_and_a_random_start():
@@ -63,7 +65,8 @@ def test_of_a_tree_of_disturbances_and_a_random_start():
         )
     assert about.dtype == episode.log_prob.dtype
     assert (count(about.x0), count(about.x), about.observation) == (2, 3, (5,))
-    assert about.start == about.disturbance == Offer("Joint", True, "")
+    assert about.start == about.disturbance
+    assert about.start == Offer("Joint", True, "", frozenset({"Categorical", "Normal"}))
 
 
 def test_what_distributions_do_not_offer():
@@ -76,8 +79,9 @@ def test_what_distributions_do_not_offer():
         start=lambda: D.seeds((2,)),
     )
     about = outline(seeds)
-    assert about.start == Offer("Seeds", False, "Seeds")
-    assert about.disturbance == Offer("Joint", False, "Seeds") and not about.disturbance.quantile
+    assert about.start == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
+    assert about.disturbance == Offer("Joint", False, "Seeds", frozenset({"Normal", "Seeds"}))
+    assert not about.disturbance.quantile and not about.closed
     assert (about.x0.shape, about.x0.dtype) == ((2,), jnp.uint32)
 
 
@@ -101,7 +105,9 @@ def test_what_raises_is_not_offered_and_not_missed(key):
         observe=lambda s: s.nothing,
     )
     about = outline(sim)
-    assert about.disturbance == Offer("Odd", False, "Odd") and about.observation is None
+    families = frozenset({f"{Odd.__module__}.Odd"})
+    assert about.disturbance == Offer("Odd", False, "Odd", families)
+    assert about.observation is None and not about.closed
     assert jast.search.monte_carlo(key, sim, episodes=10).episodes == 10
     with pytest.raises(ValueError, match="observe: raised AttributeError"):
         jast.search.forest(key, sim, trees=2, prunes=1, simulations=2, heads="value")
@@ -115,9 +121,10 @@ def test_of_a_black_box_without_a_run(monkeypatch):
 
     about = outline(jast.blackbox.from_python(system, horizon=4, disturbance=D.Normal(0.0, 1.0)))
     assert not about.random_start and about.x.shape == ()
-    assert about.disturbance == Offer("Normal", True, "", mode_is_median=True)
+    assert about.disturbance == Offer("Normal", True, "", frozenset({"Normal"}))
+    assert about.disturbance.mode_is_median and about.closed
     sim = jast.blackbox.from_python(blackboxes.walk, horizon=4)
-    assert outline(sim).disturbance == Offer("Seeds", False, "Seeds")
+    assert outline(sim).disturbance == Offer("Seeds", False, "Seeds", frozenset({"Seeds"}))
 
 
 def _drift(drift, s, x):

@@ -8,14 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import compiled
 from scipy import stats
 
 import jast
 from jast import distributions as D
+from jast.counter import counter_key
 from jast.estimate import budgets, failure_probability, failure_samples, population
 from jast.estimate import descents as ways
 from jast.estimate.agreement import BLUNT, answer_of
-from jast.estimate.particles import Particles, Steering, begun, blank, counter_key, fresh, moved
+from jast.estimate.particles import Particles, Steering, begun, blank, fresh, moved
 from jast.estimate.sample import Sample
 from jast.limit_state import outcomes
 from jast.simulators import limit_state, walk1d
@@ -352,17 +354,8 @@ def test_stress_by_populations_tells_both_modes(key):
 
 
 def test_a_second_key_compiles_nothing(key):
-    heard = []
-
-    def listen(event, seconds, **about):
-        if event == "/jax/core/compile/backend_compile_duration":
-            heard.append(event)
-
     one, other = jax.random.split(key)
     population(one, SIDES, 60_000, particles=N)
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compiled() as programs:
         population(other, SIDES, 60_000, particles=N)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-    assert not heard
+    assert not programs

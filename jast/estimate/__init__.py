@@ -3,11 +3,7 @@ estimators that find their own proposal.
 """
 
 from jast._doors import listed
-from jast.estimate.adaptive import (
-    adaptive_cross_entropy,
-    failure_probability,
-    monte_carlo,
-)
+from jast.estimate.adaptive import adaptive_cross_entropy, failure_probability
 from jast.estimate.answers import (
     Exceedance,
     FailureTimes,
@@ -23,6 +19,7 @@ from jast.estimate.events import Event, GivenStart, events, given_start
 from jast.estimate.failure_samples import FailureSamples, failure_samples
 from jast.estimate.importance_sampling import Traces, importance, log_weights
 from jast.estimate.multilevel import FailureProposal, failure_proposal
+from jast.estimate.plain import monte_carlo
 from jast.estimate.population import population
 from jast.estimate.proposals import Proposal, policy_proposal, trace_proposal
 from jast.estimate.sample import Sample

@@ -16,25 +16,22 @@ from jast import units
 from jast._checks import random_key, whole
 from jast._jax import was_interrupted
 from jast.checkpoints import stored
-from jast.contract import contract
 from jast.estimate import budgets, diagnostics, few_calls, sums, tilt_estimate, tilt_guard
-from jast.estimate.batches import balanced, plain_chunk
+from jast.estimate.batches import balanced
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, estimate, of_counts, or_rough
 from jast.estimate.gaussian_estimate import estimated
 from jast.estimate.gaussians import effective, together
-from jast.estimate.importance_sampling import Traces, chunks, even, importance, of_policies
+from jast.estimate.importance_sampling import Traces, chunks, importance
 from jast.estimate.multilevel import failure_proposal
+from jast.estimate.plain import of_points
 from jast.estimate.population import by_populations
-from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import fits
 from jast.estimate.sample import Sample
 from jast.estimate.seek import Seeker, seek
 from jast.estimate.subset import by_levels
 from jast.intervals import checked_level
 from jast.journal import kept
-from jast.judge import judged
-from jast.policy import nominal_policy
 from jast.results import asked
 from jast.rounding import rounded
 from jast.watch import Watch
@@ -46,7 +43,7 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["adaptive_cross_entropy", "failure_probability", "monte_carlo"]
+__all__ = ["adaptive_cross_entropy", "failure_probability"]
 
 NAME, LEAST = "failure_probability", 5000
 SEEN, LOST = 100, 2.0
@@ -268,7 +265,7 @@ def _with_the_rest(key, s, t, level, watched, ways):
             )
     if s.log_mean is None or (astray and enough) or _plain_is_better(s):
         watch = Watch(NAME, n, "episode", *watched)
-        total, notes, lost = chunks(_plain, (key, sim, lanes, n), lanes, watch, ways)
+        total, notes, lost = chunks(of_points, (key, sim, lanes, n), lanes, watch, ways)
         about["reasons"] = [*s.coarse, *lost]  # the others are about the proposal
         found = of_counts(
             NAME, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
@@ -344,67 +341,6 @@ def _of_the_search(s, level):
     )
 
 
-def monte_carlo(
-    key: chex.PRNGKey,
-    sim: Simulator,
-    samples: int = 100_000,
-    *,
-    level: float = 0.95,
-    progress: bool = False,
-    callback: Callback | None = None,
-    checkpoint: PathLike | None = None,
-    executor: Executor | None = None,
-    devices: Sequence[jax.Device] | None = None,
-) -> Estimate:
-    """How probable is a failure, by counting alone? Crude Monte Carlo, the baseline of estimators:
-    an exact interval, and Chernoff's and Jeffreys' upper bounds also where no failure was seen.
-
-    `jast.nominal` is for a first look at a system, and `jast.search.monte_carlo` keeps the
-    failures. In float32 the normal numbers of a step end at 5.42 standard deviations. A
-    KeyboardInterrupt is treated as in `importance`.
-
-    Args:
-        key: consumed.
-        sim: any simulator.
-        samples: episodes, at least 2.
-        level: of the interval, in (0, 1).
-        progress: whether to show a progress bar.
-        callback: called as ``callback(done, total, None)`` after each chunk.
-        checkpoint: a folder that keeps finished units of the work. The same call then goes on where
-            it was stopped, to the same result.
-        executor: runs the units: anything with ``submit(function, *args)``, such as the executors
-            of `concurrent.futures` and Dask's client. It changes no result.
-        devices: some of `jax.devices()`, one thread each. They change no result (docs/scale.md).
-
-    Returns:
-        `Estimate`.
-
-    Raises:
-        ValueError: as `importance`.
-
-    Example:
-        >>> import jax, jast
-        >>> found = jast.estimate.monte_carlo(jax.random.key(0), jast.simulators.walk1d(), 2000)
-        >>> found.interval[0] < found.mean < found.interval[1]
-        True
-    """
-    name = "monte_carlo"
-    random_key(name, key)
-    samples = whole(name, "samples", samples)
-    level = checked_level(name, level)
-    contract(sim, observed=False)
-    proposal, lanes = as_proposal(name, sim, nominal_policy(sim)), even(samples)
-    ways = units.ways(name, executor, devices)
-    with stored(name, checkpoint, key, sim=sim, samples=samples) as store:
-        watch = Watch(name, samples, "episode", progress, callback)
-        shared = key, sim, proposal, lanes
-        total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
-    settings = asked(name, key, samples=samples, level=level)
-    found = of_counts(name, total, level=level, notes=notes, reasons=lost)
-    draws = drawn_by(found.draws, key, lanes, "policy")
-    return found._replace(settings=settings, draws=draws)
-
-
 def adaptive_cross_entropy(
     key: chex.PRNGKey, sim: Simulator, budget: int = 100_000, *, level: float = 0.95
 ) -> Estimate:
@@ -461,11 +397,3 @@ def _plain_is_better(s):
     b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
     w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
     return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p
-
-
-def _plain(shared, i, post):
-    """`Traces` of chunk ``i`` of the model itself."""
-    key, sim, lanes, samples = shared
-    n = min(lanes, samples - i * lanes)
-    o, none = judged(sim, plain_chunk(key, i, n, sim)), np.zeros(n)
-    return Traces(none, none[:, None], o.failure, o.invalid, o.length, o.distance)

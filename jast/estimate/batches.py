@@ -2,14 +2,16 @@
 batches. Only the system runs on the device, in one program whatever the number of points.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import counter_key, generator
 from jast.estimate.gaussians import log_sum
-from jast.judge import judged
+from jast.judge import judged, lanes_of
 
 __all__ = ["drawn", "numbers"]
 
@@ -96,8 +98,19 @@ def picks(key, i, n, dtype):
 
 def plain_chunk(key, i, n, sim):
     """The first ``n`` points [n, D] of chunk ``i`` of the model itself."""
-    z = generator(key, 3, i).standard_normal((n, latent.dimension(sim)))
-    return z.astype(latent.normal_numbers(sim))
+    d, dtype, m = latent.dimension(sim), latent.normal_numbers(sim), rows_of(sim)
+    parts = (_normals(counter_key(key, 3, i, j), m, d, dtype) for j in range(-(-n // m)))
+    return np.concatenate([np.asarray(z) for z in parts])[:n]
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _normals(key, n, d, dtype):
+    return jax.random.normal(key, (n, d), dtype)
+
+
+def rows_of(sim):
+    """Points that are drawn, and judged, by one call of a program."""
+    return lanes_of(latent.dimension(sim))
 
 
 def resampled(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:

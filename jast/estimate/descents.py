@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast.counter import generator
+from jast.counter import counter_key, generator
 from jast.estimate.batches import resampled
-from jast.estimate.particles import LANES, begun, blank, counter_key, fresh, moved
+from jast.estimate.particles import LANES, begun, blank, fresh, moved
 from jast.limit_state import dimension
 from jast.simulator import Simulator
 

@@ -54,7 +54,7 @@ class Draws(NamedTuple):
     """Draws of a chunk"""
     source: Any = None
     """What they were drawn from: a mixture of Gaussians, "model" for plain draws of normal numbers,
-    "policy" for one that is not kept
+    "keys" for plain draws by keys, "policy" for a policy that is not kept
     """
 
     @property

@@ -23,11 +23,11 @@ from jast.estimate import diagnostics
 from jast.estimate.answers import asked
 from jast.estimate.draws import interval, key_of, of_weights, share, shares
 from jast.estimate.importance_sampling import component
+from jast.estimate.plain import episode_keys
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, points
 from jast.intervals import clopper_pearson, log_normal
 from jast.limit_state import dimension, policy_of
-from jast.policy import nominal_policy
 from jast.pytrees import clear, select, strong
 
 if TYPE_CHECKING:
@@ -262,15 +262,17 @@ def _happened(name, sim, estimate, draws, functions, of, proposal):
             f" numbers in an episode, received one with {dimension(sim)}"
         )
     if draws.source == "policy":
-        if estimate.method != "monte_carlo" and proposal is None:
+        if proposal is None:
             raise ValueError(f"{name}: proposal must be the one that the estimate was made with")
-        proposal = as_proposal(name, sim, nominal_policy(sim) if proposal is None else proposal)
+        proposal = as_proposal(name, sim, proposal)
     key, out = key_of(draws), {k: [] for k in functions}
     for i in np.unique(rows // draws.lanes):
         mine = rows // draws.lanes == i
         lanes, steps = rows[mine] % draws.lanes, length[mine]
         if draws.source == "policy":
             made = jax.random.split(jax.random.fold_in(key, i), draws.lanes)
+        elif draws.source == "keys":
+            made = episode_keys(key, int(i), np.arange(draws.lanes))
         else:
             made = points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
         for a in range(0, len(lanes), BLOCK):
@@ -293,7 +295,11 @@ def _judged(sim, functions, proposal, made, length, of):
     """Name -> what it returns for each of the draws ``made``, points or keys, of known length."""
 
     def one(made, length):
-        if proposal is None:
+        if proposal is None and jax.dtypes.issubdtype(made.dtype, jax.dtypes.prng_key):
+            keys = jax.random.split(made, sim.horizon + 1)  # as `jast.rollout` does
+            x0 = D.sample(sim.start(), keys[0])
+            choose = lambda s, t: D.sample(sim.disturbance(s), jax.random.clone(keys[t + 1]))
+        elif proposal is None:
             player = policy_of(sim, made)
             x0, choose = D.mode(player.start()), lambda s, t: D.mode(player.disturbance(s, t))
         else:

@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast.counter import COUNTER, generator
 from jast.limit_state import dimension, normal_numbers, outcome
 from jast.simulator import Simulator
 
-__all__ = ["LANES", "Particles", "Steering", "blank", "counter_key", "fresh", "moved"]
+__all__ = ["LANES", "Particles", "Steering", "blank", "fresh", "moved"]
 
 LANES = 128
 """Points that are simulated side by side: their numbers then stay in the caches of a core."""
@@ -57,14 +56,6 @@ class Steering(NamedTuple):
 def begun() -> Steering:
     """Before the first move."""
     return Steering(np.array([0.5, 0.3], np.float32), np.full(2, np.nan, np.float32))
-
-
-def counter_key(key: jax.Array, *numbers: int) -> jax.Array:
-    """A counter key (`jast.counter`) from a user's key, another one for each ``numbers``: normal
-    numbers of Threefry would take most of the time of a cheap system.
-    """
-    words = generator(key, *numbers).integers(0, 2**32, 2, np.uint32)
-    return jax.random.wrap_key_data(jnp.asarray(words), impl=COUNTER)
 
 
 def blank(sim: Simulator, n: int) -> Particles:

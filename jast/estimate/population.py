@@ -15,9 +15,10 @@ from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
+from jast.counter import counter_key
 from jast.estimate.descents import SETTINGS, Settings, size
 from jast.estimate.estimate import Estimate
-from jast.estimate.particles import blank, counter_key, fresh
+from jast.estimate.particles import blank, fresh
 from jast.estimate.population_estimate import of_plain_draws, of_populations
 from jast.estimate.population_search import Search
 from jast.estimate.population_weights import weighted

@@ -8,9 +8,10 @@ import jax
 import numpy as np
 
 from jast import units
+from jast.counter import counter_key
 from jast.estimate.agreement import APART, BLUNT, Answer, Kind, answer_of, pooled, told
 from jast.estimate.descents import WAYS, Descent
-from jast.estimate.particles import LANES, Particles, blank, counter_key, fresh
+from jast.estimate.particles import LANES, Particles, blank, fresh
 from jast.estimate.sample import KEPT
 from jast.places import Task
 from jast.rounding import rounded

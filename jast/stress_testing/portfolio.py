@@ -20,6 +20,7 @@ from jast.estimate import adaptive, budgets, few_calls
 from jast.estimate.batches import resampled
 from jast.estimate.budgets import CHEAP
 from jast.estimate.descents import SETTINGS, cooled
+from jast.estimate.plain import monte_carlo
 from jast.estimate.population import by_populations
 from jast.estimate.redrawn import redrawn
 from jast.estimate.sample import Sample
@@ -352,7 +353,7 @@ class _Work:
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
         places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
         if not self.estimable:
-            more = adaptive.monte_carlo(self.next_key(), self.sim, max(rest, 100), **places)
+            more = monte_carlo(self.next_key(), self.sim, max(rest, 100), **places)
             self.note("plain draws", more.episodes, more.failing, invalid=more.invalid)
             self.probability = self.beside_nominal(more)
             return

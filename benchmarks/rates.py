@@ -1,0 +1,111 @@
+"""Episodes that a CPU second buys: ``python -m benchmarks.rates [--json] [--quick | --smoke]
+[--systems NAME ...]``.
+
+`jast.estimate.monte_carlo`, `jast.estimate.failure_probability` and `jast.stress`, the last two
+with 2,097,152 evaluations, beside a bare loop in one program: blocks of 128 vectors of normal
+numbers by `jax.random.normal`, put through ``step`` and ``evaluate`` and counted. All were compiled
+before (the second call of each is timed), and all in this process, one after the other.
+"""
+
+import argparse
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+from jax import lax  # noqa: E402
+
+import jast  # noqa: E402
+from benchmarks.closed_loops import JUDGED, RARE, TUNED  # noqa: E402
+from benchmarks.sizes import options, size  # noqa: E402
+
+__all__ = ["SYSTEMS", "rates"]
+
+SYSTEMS = {a.name: a.simulator for a in (*TUNED, *JUDGED, *RARE) if a.name not in ("camera", "arm")}
+"""Closed loops all of whose random numbers are standard normal ones"""
+BLOCK = 128
+"""Episodes that the bare loop runs side by side."""
+EVALUATIONS = 2**21
+METHODS = ("monte_carlo", "failure_probability", "stress")
+
+
+@partial(jax.jit, static_argnames="blocks")
+def bare(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
+    """Failures among so many blocks of episodes."""
+    start = sim.init(sim.start().sample(seed=key))
+    like = sim.disturbance(start).sample(seed=key)
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (BLOCK, *jnp.shape(a))), start)
+
+    def block(i, count):
+        own = jax.random.fold_in(key, i)
+        noise = jax.random.normal(own, (sim.horizon, BLOCK, *like.shape), like.dtype)
+
+        def step(carry, w):
+            state, failed, over = carry
+            state = jax.vmap(sim.step)(state, w)
+            failed = failed | (~over & jax.vmap(sim.evaluate)(state)[0])
+            return (state, failed, over | failed | jax.vmap(sim.is_terminal)(state)), None
+
+        none = jnp.zeros(BLOCK, bool)
+        failed = lax.scan(step, (every, none, none), noise)[0][1]
+        return count + jnp.sum(failed, dtype=jnp.int32)
+
+    return lax.fori_loop(0, blocks, block, jnp.zeros((), jnp.int32))
+
+
+def _rate(work: Callable[[int], float]) -> float:
+    """Episodes a CPU second of ``work(seed)``, which says how many it ran, by its second call."""
+    work(0)
+    begun = time.process_time()
+    done = work(1)
+    return done / (time.process_time() - begun)
+
+
+def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, float]:
+    """Episodes a CPU second of the bare loop, and the share of it that each method reaches."""
+    blocks = max(episodes // BLOCK, 1)
+
+    def loop(seed):
+        bare(jax.random.key(seed), sim, blocks).block_until_ready()
+        return blocks * BLOCK
+
+    calls = dict(
+        monte_carlo=lambda key: jast.estimate.monte_carlo(key, sim, episodes).evaluations,
+        failure_probability=lambda key: (
+            jast.estimate.failure_probability(key, sim, evaluations).evaluations
+        ),
+        stress=lambda key: jast.stress(key, sim, evaluations).episodes,
+    )
+    alone = _rate(loop)
+    shares = {m: _rate(lambda seed, m=m: calls[m](jax.random.key(seed))) / alone for m in METHODS}
+    return dict(bare=alone, **shares)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = options(argparse.ArgumentParser(description=__doc__), "three systems")
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
+    args = parser.parse_args(argv)
+    names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
+    episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
+    rows = []
+    for name in names:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations)))
+        if not args.json:
+            shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
+            print(
+                f"{name:12s} bare loop {rows[-1]['bare']:9.0f} a CPU second; {shares}", flush=True
+            )
+    if args.json:
+        print(json.dumps(dict(episodes=episodes, evaluations=evaluations, rows=rows)))
+
+
+if __name__ == "__main__":
+    main()
