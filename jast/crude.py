@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["nominal", "outcome"]
+__all__ = ["BRIEF", "nominal", "outcome"]
 
-FEW = 4096
+BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three
 closed loops that takes .4 CPU seconds in place of 2.8, and the episodes .08 to .9 in place of .02
 to .2.
@@ -244,7 +244,7 @@ def _played(key: Any, sim: Any, episodes: int, watch: Watch, ways: units.Ways) -
 def _unit(job: Job, number: int, post: Post) -> Counts:
     end = min((number + 1) * job.chunks, -(-job.episodes // LANES))
     bounds = job.episodes, number * job.chunks, end
-    count = _count_quickly if job.episodes <= FEW else _count
+    count = _count_quickly if job.episodes <= BRIEF else _count
     return count(job.key, job.sim, *(np.int32(n) for n in bounds))
 
 

@@ -14,7 +14,7 @@ from jast import _checks, units
 from jast import limit_state as latent
 from jast.checkpoints import stored
 from jast.contract import check
-from jast.crude import nominal
+from jast.crude import BRIEF, nominal
 from jast.episode import rollout
 from jast.estimate import adaptive, budgets, few_calls
 from jast.estimate.batches import resampled
@@ -149,7 +149,7 @@ def stress(
         work = _Work(key, sim, budget, top, watch, ways._replace(store=store), checkpoint)
         try:
             work.look()
-            if quantiles and budgets.cheap(sim, budget):
+            if work.by_populations:
                 work.populate()
             else:
                 work.search()
@@ -200,6 +200,7 @@ class _Work:
         self.residual = self.late = np.nan
         large = (1 - sum(LARGE)) * budget >= ESTIMABLE
         self.estimable = self.latent and (large or latent.dimension(sim) <= SMALL)
+        self.by_populations = self.latent and budgets.cheap(sim, budget)
         shares = (LARGE if large else BY_SURROGATE) if self.estimable else NO_ESTIMATE
         self.parts = Shares(*(int(share * min(budget, PORTFOLIO)) for share in shares))
         self.paths = int(PATHS * budget)
@@ -217,10 +218,11 @@ class _Work:
 
     def look(self):
         """The system as it is."""
-        key = self.next_key()
+        # populations draw plainly, too, and so few are compiled quickly
+        key, episodes = self.next_key(), BRIEF if self.by_populations else self.parts.nominal
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
-            self.nominal = n = nominal(key, self.sim, self.parts.nominal)
+            self.nominal = n = nominal(key, self.sim, episodes)
         found = [] if n.undisturbed is None or not bool(n.undisturbed.failure) else [n.undisturbed]
         if n.first is not None:
             found.append(rollout(jax.random.fold_in(key, n.first), self.sim))
