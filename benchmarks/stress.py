@@ -4,7 +4,8 @@
 For each system: seeds that found a failure, and the best log p relative to the mode (median of
 those that found one, and the worst), beside the closed form where there is one. Searches are called
 as a user types them. `stress` also estimates the probability within the same budget, and counts its
-failure modes.
+failure modes. ``--leave-out`` compares `stress` with itself without each of its explorers in turn,
+whose evaluations the others then have.
 """
 
 import argparse
@@ -12,6 +13,8 @@ import importlib.util
 import json
 import time
 import warnings
+from functools import partial
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +24,11 @@ import jast
 from benchmarks import cma_es as driver
 from benchmarks.sizes import options, size
 from benchmarks.stress_systems import CASES, JUDGED
+from jast.failures import empty
 from jast.limit_state import dimension, normal_numbers, policy_of
 from jast.rewards import likelihood
 from jast.search.centred import centred
+from jast.stress_testing import explorers, portfolio
 
 __all__ = ["METHODS", "run"]
 
@@ -113,6 +118,22 @@ METHODS = {
     f.__name__: f
     for f in (stress, monte_carlo, cem, forest, mcts, cma_es, gradient, go_explore, chain)
 }
+
+
+def _without(name, key, sim, budget):
+    """`stress` where one of its explorers is not called."""
+    few = {k: v for k, v in explorers.LEAST.items() if k != name}
+    nothing = lambda *_: explorers.Haul(empty(sim).episodes, 0, 0, 0)
+    with (
+        mock.patch.object(explorers, "LEAST", few),
+        mock.patch.dict(explorers.EXPLORERS, {name: nothing}),
+        mock.patch.object(portfolio, "onward", nothing if name == SLOW else explorers.onward),
+    ):
+        return stress(key, sim, budget)
+
+
+SLOW = "slow cross-entropy"
+LEFT_OUT = {f"- {name}": partial(_without, name) for name in (*explorers.EXPLORERS, SLOW)}
 SINGLE = "gradient", "go_explore", "chain"
 """Searches for some kinds of system alone: measured where they are asked for."""
 
@@ -129,7 +150,7 @@ def _searched(sim, result):
 
 def run(cases, methods, budget, seeds):
     """Rows by case and method."""
-    report = {}
+    report, calls = {}, METHODS | LEFT_OUT
     for name in cases:
         case, rows = CASES[name], {}
         sim = case.make()  # once, so that all seeds share its programs
@@ -138,7 +159,7 @@ def run(cases, methods, budget, seeds):
             for seed in range(seeds):
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    found.append(METHODS[method](jax.random.key(seed), sim, budget))
+                    found.append(calls[method](jax.random.key(seed), sim, budget))
             best = [b for b, _, _ in found if b is not None]
             rows[method] = dict(
                 found=len(best),
@@ -157,7 +178,7 @@ def table(report):
     """The report as text."""
     number = lambda v: f"{'-':>9}" if v is None else f"{v:9.3f}"
     lines = [
-        f"{'system':<16} {'optimum':>9} {'method':<12} {'found':>7} {'median':>9} {'worst':>9}"
+        f"{'system':<16} {'optimum':>9} {'method':<23} {'found':>7} {'median':>9} {'worst':>9}"
         f" {'evaluations':>12} {'modes':>12} {'CPU s':>7}"
     ]
     for name, case in report.items():
@@ -168,7 +189,7 @@ def table(report):
                 planted = case["modes"] is not None
                 modes = f"{right}/{r['seeds']} right" if planted else f"{np.median(r['modes']):g}"
             lines.append(
-                f"{name:<16} {number(case['optimum'])} {method:<12}"
+                f"{name:<16} {number(case['optimum'])} {method:<23}"
                 f" {r['found']:3d}/{r['seeds']:<3d} {number(r['median'])} {number(r['worst'])}"
                 f" {r['evaluations']:12.0f} {modes:>12} {r['cpu_seconds']:7.1f}"
             )
@@ -180,6 +201,8 @@ def main(argv=None):
     parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
     help = f"default: all but {', '.join(SINGLE)}; cma_es needs the package cma (extra `benchmark`)"
     parser.add_argument("--methods", nargs="+", choices=METHODS, help=help)
+    help = "stress with and without each of its explorers, in place of --methods"
+    parser.add_argument("--leave-out", action="store_true", help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
@@ -187,6 +210,7 @@ def main(argv=None):
     absent = () if importlib.util.find_spec("cma") else ("cma_es",)
     there = [m for m in METHODS if m not in (*SINGLE, *absent)]
     methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
+    methods = ["stress", *LEFT_OUT] if args.leave_out else methods
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)
     report = run(cases, methods, budget, seeds)
