@@ -5,7 +5,8 @@ For each system: seeds that found a failure, and the best log p relative to the 
 those that found one, and the worst), beside the closed form where there is one. Searches are called
 as a user types them. `stress` also estimates the probability within the same budget, and counts its
 failure modes. ``--leave-out`` compares `stress` with itself without each of its explorers in turn,
-whose evaluations the others then have.
+whose evaluations the others then have. The cases named "... loop" are those of
+`benchmarks.closed_loops`.
 """
 
 import argparse
@@ -23,7 +24,9 @@ import numpy as np
 import jast
 from benchmarks import cma_es as driver
 from benchmarks.sizes import options, size
-from benchmarks.stress_systems import CASES, JUDGED
+from benchmarks.stress_systems import CASES, JUDGED, LOOPS
+from jast.estimate.batches import resampled
+from jast.estimate.descents import SETTINGS, cooled
 from jast.failures import empty
 from jast.limit_state import dimension, normal_numbers, policy_of
 from jast.rewards import likelihood
@@ -107,6 +110,21 @@ def cma_es(key, sim, budget):
     return _best(more.failures), spent + more.episodes, None
 
 
+def slow_cooling(key, sim, budget):
+    """The failures of populations cooled ten times as slowly as in `stress`, then refined."""
+    for_failures, for_cooling, for_refinement = jax.random.split(key, 3)
+    found = jast.estimate.population(for_failures, sim, budget)
+    if (sample := found.proposal) is None:
+        return None, found.episodes, None
+    rows = resampled(sample.log_weight, SETTINGS.cooled, 0.5)
+    slowly = int(10 * portfolio.COOLED * budget)
+    points, spent = cooled(for_cooling, sim, sample.points[rows], slowly)
+    near = np.argsort((points**2).sum(axis=1), kind="stable")
+    haul = explorers.of_points(sim, points[near])
+    more = jast.search.refine(for_refinement, sim, haul.episodes, budget=portfolio.POLISHED)
+    return _best(more.failures), found.episodes + spent + more.episodes, None
+
+
 @jax.jit
 def _scored(sim, z):
     """The episodes [n] of the normal numbers ``z`` [n, D], by log p relative to the mode."""
@@ -116,7 +134,18 @@ def _scored(sim, z):
 
 METHODS = {
     f.__name__: f
-    for f in (stress, monte_carlo, cem, forest, mcts, cma_es, gradient, go_explore, chain)
+    for f in (
+        stress,
+        monte_carlo,
+        cem,
+        forest,
+        mcts,
+        cma_es,
+        gradient,
+        go_explore,
+        chain,
+        slow_cooling,
+    )
 }
 
 
@@ -134,8 +163,8 @@ def _without(name, key, sim, budget):
 
 SLOW = "slow cross-entropy"
 LEFT_OUT = {f"- {name}": partial(_without, name) for name in (*explorers.EXPLORERS, SLOW)}
-SINGLE = "gradient", "go_explore", "chain"
-"""Searches for some kinds of system alone: measured where they are asked for."""
+SINGLE = "gradient", "go_explore", "chain", "slow_cooling"
+"""Searches for some kinds of system or budget alone: measured where they are asked for."""
 
 
 def _best(failures):
@@ -152,7 +181,7 @@ def run(cases, methods, budget, seeds):
     """Rows by case and method."""
     report, calls = {}, METHODS | LEFT_OUT
     for name in cases:
-        case, rows = CASES[name], {}
+        case, rows = (CASES | LOOPS)[name], {}
         sim = case.make()  # once, so that all seeds share its programs
         for method in methods:
             begin, found = time.process_time(), []
@@ -198,7 +227,7 @@ def table(report):
 
 def main(argv=None):
     parser = options(argparse.ArgumentParser(description=__doc__), "two systems, few evaluations")
-    parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
+    parser.add_argument("--cases", nargs="+", choices=CASES | LOOPS, help="default: all but loops")
     help = f"default: all but {', '.join(SINGLE)}; cma_es needs the package cma (extra `benchmark`)"
     parser.add_argument("--methods", nargs="+", choices=METHODS, help=help)
     help = "stress with and without each of its explorers, in place of --methods"

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 import jast
+from benchmarks import closed_loops
 from jast import simulators
 from jast.distributions import Categorical, MultivariateNormalDiag, Normal
 
-__all__ = ["BUILT_IN", "CASES", "Case", "JUDGED", "TUNED"]
+__all__ = ["BUILT_IN", "CASES", "Case", "JUDGED", "LOOPS", "TUNED"]
 
 
 class Case(NamedTuple):
@@ -259,3 +260,8 @@ BUILT_IN = {
     "colav turn": Case(lambda: simulators.colav("sharp turn", "delay")),
 }
 CASES = TUNED | JUDGED | BUILT_IN
+LOOPS = {
+    f"{a.name} loop": Case(lambda sim=a.simulator: sim)
+    for a in (*closed_loops.TUNED, *closed_loops.JUDGED, *closed_loops.RARE)
+}
+"""Those of `benchmarks.closed_loops`, whose likeliest failures are not known."""

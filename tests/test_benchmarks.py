@@ -36,6 +36,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "peers": "--seeds 1 --cases branin --peers random_search differential_evolution".split(),
     "populations": ["--smoke"],
     "probability": ["--smoke"],
+    "rates": ["--smoke"],
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
     "scale": ["--smoke"],
