@@ -105,7 +105,8 @@ def modes(
 
     Two failures are of one mode where a path between them never leaves the failures by much: the
     great arc between their normal numbers, each point of it failing at most a tenth farther from
-    the origin (the episode of modes) than the arc itself. The same failure some steps sooner or
+    the origin (the episode of modes) than the arc itself, or bent to a failure beside the arc, at
+    most a tenth of that way from it. The same failure some steps sooner or
     later is of the same mode: where there is no path, one is looked for once more from the shorter
     one moved in time, so that both end together. A path may lead by way of other failures
     that are known, where none is more than a nat rarer than both ends.
