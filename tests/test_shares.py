@@ -74,7 +74,8 @@ def covered(sim, heads, share, proposals):
     ways, inside, widths = known(sim, heads), 0, []
     for i, q in enumerate(proposals):
         found, _, spent = shares(jax.random.key(i), sim, q, ways, BUDGET)
-        assert sum(m.share for m in found) == pytest.approx(1) and spent <= cost(BUDGET)
+        # paths that begin within their 500 evaluations, a room for 45, may take 24 lifts more each
+        assert sum(m.share for m in found) == pytest.approx(1) and spent <= cost(BUDGET) + 24 * 45
         for m in found:
             assert 0 <= m.share_interval[0] <= m.share <= m.share_interval[1] <= 1
         low, high = found[0].share_interval
@@ -202,6 +203,7 @@ def test_a_share_in_words_and_in_files(key):
     text = str(Modes([first, second]))
     assert "52 % [49, 56]" in text and max(map(len, text.splitlines())) < 64
     assert first._replace(share_interval=UNKNOWN).share_words == "52 %"
+    assert first._replace(share=1.0, share_interval=(1.0, 1.0)).share_words == "100 %"
     arrays, bare = {}, first._replace(failure=None)
     node = records.encode(bare, arrays, lambda value: None)
     again = lambda: records.decode(node, "file", arrays, lambda node: node, None)

@@ -53,8 +53,8 @@ class Mode(NamedTuple):
         if np.isnan(self.share):
             return "-"
         low, high = self.share_interval
-        known = "" if np.isnan(low) else f" [{math.floor(100 * low)}, {math.ceil(100 * high)}]"
-        return f"{100 * self.share:.0f} %{known}"
+        more = f" [{math.floor(100 * low)}, {math.ceil(100 * high)}]" if low < high else ""
+        return f"{100 * self.share:.0f} %{more}"
 
 
 class Modes(tuple):

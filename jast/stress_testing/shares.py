@@ -30,7 +30,7 @@ and what these may cost, as a share of the budget.
 
 
 def cost(budget: int) -> int:
-    """Evaluations that `shares` takes at most."""
+    """Evaluations that `shares` takes at most, nearly: the last paths may take a little more."""
     n = _draws(budget)
     return n + n // PART + int(WALKS * budget) if n else 0
 
@@ -42,7 +42,9 @@ def shares(
     failures of ``q``: of a proposal, or of the `Sample` that populations leave.
 
     Every failure is of the mode in whose direction it lies; a part of them are told apart by paths,
-    too, and say how many of those that lie towards one mode are of another.
+    too, and say how many of those that lie towards one mode are of another. What a path says is
+    taken as the truth: of the failures of the README's lane, of which many are far out and near to
+    both sides, it names the side on which they left the lane for four of five, for either side.
 
     Returns:
         (`Modes`, whose shares are NaN where there was nothing to tell them from; draws that failed;
