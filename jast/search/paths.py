@@ -25,10 +25,10 @@ RARER = 1.0
 """By how many nats one on the way between two modes may be rarer than the rarer of the two."""
 BENT, MOVES, TRIALS = 0.1, 2, 8
 """How far beside the line a path may bend, as a share of the way from the origin; in how many
-moves, each the best of so many trials. Of the failures of the ferry, told apart by 12,500
-evaluations, straight paths make 10, 13 and 11 modes (three keys) and these one; of the ship's 12
-and 7 (8 with four moves, 9 with one move or six trials). The two of the lane and of the arm, four
-branches and the 14 found of "2 of 10" and of "series 60, turned" stay apart.
+moves, each the best of so many trials. Of the failures of the ferry straight paths make 10, 13 and
+11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of the ship's 12
+and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six trials). The two of the lane and
+of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay apart.
 """
 PAIRS, LEAST, IN_VAIN = 32, 2, 4
 """Paths looked for at a time, of all modes together and at least of each; times in a row in which
