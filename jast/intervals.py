@@ -35,11 +35,37 @@ def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
         (0.0, 0.003682)
     """
     _counts("clopper_pearson", k, n, level)
-    k, n, tail = int(k), int(n), (1 - level) / 2
+    return _exact(int(k), int(n), level)
+
+
+def of_effective(share, number, freedom=math.inf, level=0.95):
+    """(low, high) of a share that varies as that of ``number`` independent draws would, which need
+    be no whole number: Clopper and Pearson's for as many, times (z / t)^2 where the variance is
+    known with so many degrees of ``freedom`` only (Korn and Graubard 1998, Survey Methodology 24,
+    193-201). From 0 to 1 where there are none.
+    """
+    from statistics import NormalDist  # here: slow to import
+
+    if not freedom > 0:
+        return 0.0, 1.0
+    if freedom < math.inf:
+        z = NormalDist().inv_cdf((1 + level) / 2)
+        number *= min(z / _student(freedom, level), 1.0) ** 2
+    return _exact(share * number, number, level)
+
+
+def _student(freedom, level):
+    """The t that Student's distribution exceeds, on either side, with probability 1 - level."""
+    x = _solve(lambda x: _betainc(freedom / 2, 0.5, x) - (1 - level))  # P(|T| > t)
+    return math.sqrt(freedom * (1 - x) / x) if x > 0 else math.inf
+
+
+def _exact(k, n, level):
+    tail = (1 - level) / 2
     # P(X >= k; p) = I_p(k, n - k + 1) and P(X <= k; p) = I_(1-p)(n - k, k + 1): each tail is solved
     # as itself, none as 1 less the other
-    low = 0.0 if k == 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
-    high = 1.0 if k == n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
+    low = 0.0 if k <= 0 else _solve(lambda p: _betainc(k, n - k + 1, p) - tail)
+    high = 1.0 if k >= n else _solve(lambda p: tail - _betainc(n - k, k + 1, 1 - p))
     return low, high
 
 

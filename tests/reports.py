@@ -44,7 +44,7 @@ def made(**changes):
     )
     assert len(found) == 2
     quiet = jax.device_get(jast.replay(SIM, {EVIL: jnp.zeros(8)}))
-    modes = Modes([Mode(found[0], 3, 0.75), Mode(found[1], 1, np.nan)])
+    modes = Modes([Mode(found[0], 3, 0.75, (0.702, 0.801)), Mode(found[1], 1, np.nan)])
     nominal = Nominal(quiet, 0, 9, 0.0, (0.0, 0.3), 3.0, 0)
     tried = (Tried(EVIL, 9, 0, -np.inf), Tried(EVIL, 5, 2, -1.5))
     settings = dict(method="stress", seed=[0, 1], note=EVIL)

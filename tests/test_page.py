@@ -43,6 +43,7 @@ def test_a_page_stands_alone_and_lets_nothing_out(page):
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "")  # the name of a language
     assert page.count("&lt;script&gt;fail()&lt;/script&gt;") >= 3  # explanation, tried, settings
     assert EVIL in seen.data["modes"][0]["pictures"]["fragments"][0]
+    assert "75 % [70, 81]" in page and "not known" in page
 
 
 def test_explanations_are_told_drawn_and_marked(page):

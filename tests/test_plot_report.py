@@ -39,7 +39,7 @@ def test_a_report_on_one_page(tmp_path):
         "in all",
     ):
         assert word in words, word
-    assert any("share 75.0 %" in word for word in words)
+    assert any("share 75 % [70, 81]" in word for word in words)
     assert any("share not known" in word for word in words)
     labels = [ax.get_ylabel() for ax in figure.axes]
     assert len(labels) == 6 and labels.count("disturbance (sd)") == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -17,6 +18,8 @@ from jast.search.paths import ALIKE, Paths, assigned, components, moved_in_time
 from jast.simulator import Simulator
 
 __all__ = ["Mode", "Modes", "modes"]
+
+UNKNOWN = (math.nan, math.nan)
 
 
 @results.shown()
@@ -40,6 +43,18 @@ class Mode(NamedTuple):
     share: float
     """Of the probability of failure, where there is an estimate, or NaN where that is too small to
     be divided; else of the failures found."""
+    share_interval: tuple[float, float] = UNKNOWN
+    """(low, high) of a share of the probability, at 95 %; NaN where that is not known. Modes that
+    were not found are no part of it."""
+
+    @property
+    def share_words(self) -> str:
+        """The share and its interval, rounded outwards, in per cent."""
+        if np.isnan(self.share):
+            return "-"
+        low, high = self.share_interval
+        more = f" [{math.floor(100 * low)}, {math.ceil(100 * high)}]" if low < high else ""
+        return f"{100 * self.share:.0f} %{more}"
 
 
 class Modes(tuple):
@@ -69,15 +84,14 @@ class Modes(tuple):
     def __str__(self) -> str:
         if not self:
             return "no failure mode"
-        lines = [
-            f"{'mode':>4} {'log p rel.':>11} {'log p':>11} {'steps':>6} {'members':>8} {'share':>7}"
-        ]
+        wide = max(7, *(len(mode.share_words) for mode in self))
+        head = f"{'mode':>4} {'log p rel.':>11} {'log p':>11} {'steps':>6} {'members':>8}"
+        lines = [f"{head} {'share':>{wide}}"]
         for i, mode in enumerate(self, 1):
             e = mode.failure
-            share = "-" if np.isnan(mode.share) else f"{100 * mode.share:.0f} %"
             lines.append(
                 f"{i:4d} {float(e.reward):11.4f} {float(e.log_prob):11.4f} {int(e.length):6d}"
-                f" {mode.members:8d} {share:>7}"
+                f" {mode.members:8d} {mode.share_words:>{wide}}"
             )
         return "\n".join(lines)
 
@@ -91,7 +105,8 @@ def modes(
 
     Two failures are of one mode where a path between them never leaves the failures by much: the
     great arc between their normal numbers, each point of it failing at most a tenth farther from
-    the origin (the episode of modes) than the arc itself. The same failure some steps sooner or
+    the origin (the episode of modes) than the arc itself, or bent to a failure beside the arc, at
+    most a tenth of that way from it. The same failure some steps sooner or
     later is of the same mode: where there is no path, one is looked for once more from the shorter
     one moved in time, so that both end together. A path may lead by way of other failures
     that are known, where none is more than a nat rarer than both ends.

@@ -23,6 +23,13 @@ FINE = 0.1
 README's lane there is one with eight gaps of .12, of which one holds no failure."""
 RARER = 1.0
 """By how many nats one on the way between two modes may be rarer than the rarer of the two."""
+BENT, MOVES, TRIALS = 0.1, 2, 8
+"""How far beside the line a path may bend, as a share of the way from the origin; in how many
+moves, each the best of so many trials. Of the failures of the ferry straight paths make 10, 13 and
+11 modes (three keys, 6,000 evaluations at most) and these one (14,300 at most); of the ship's 12
+and 7 (within 12,500: 7, 8 with four moves, 9 with one move or six trials). The two of the lane and
+of the arm, four branches and the 14 found of "2 of 10" and of "series 60, turned" stay apart.
+"""
 PAIRS, LEAST, IN_VAIN = 32, 2, 4
 """Paths looked for at a time, of all modes together and at least of each; times in a row in which
 others join no two modes, after which it is enough.
@@ -148,6 +155,7 @@ class Paths:
 
     def __init__(self, sim: Simulator, budget: int):
         self.sim, self.budget, self.judge = sim, budget, Judge(sim)
+        self.rng = np.random.default_rng(0)  # of moves: the same failures are always told the same
 
     @property
     def spent(self) -> int:
@@ -156,7 +164,7 @@ class Paths:
     @property
     def room(self) -> int:
         """The straight paths that the rest of the budget does for, nearly: one that is no path
-        takes a lift at each try, another one a place each.
+        takes a lift at each try, another one a place each. What bends ends within the budget.
         """
         return max(self.budget - self.spent, 0) // (PLACES + len(LIFTS))
 
@@ -197,8 +205,10 @@ class Paths:
     def _keep(self, joined, among, v, w, t):
         """Of the pairs ``among`` [n] only those stay ``joined`` that fail at the shares ``t``."""
         rows = np.flatnonzero(among)
-        points = _arcs(v[rows], w[rows], t)
-        joined[rows] = self.failing(points.reshape(-1, v.shape[1])).reshape(len(t), -1).all(0)
+        points = _arcs(v[rows], w[rows], t).reshape(-1, v.shape[1])
+        out, ways = self.failing(points), np.tile(unit(w[rows]) - unit(v[rows]), (len(t), 1))
+        out[~out] = self.bent(points[~out], ways[~out])
+        joined[rows] = out.reshape(len(t), -1).all(0)
 
     def failing(self, points):
         """Which of ``points`` [n, D] fail as they are or a little farther out: [n]."""
@@ -208,6 +218,25 @@ class Paths:
             if len(rows):
                 out[rows] = self.judge(lift * points[rows]).failure
         return out
+
+    def bent(self, points, ways):
+        """Beside which of ``points`` [n, D] there is a failure to which the path may bend: [n].
+        Moves that lower the miss distance look for it, across the path, whose direction there is
+        that of ``ways`` [n, D]: so no place slips along the path out of a gap.
+        """
+        found, at, norm = np.zeros(len(points), bool), points.copy(), np.linalg.norm(points, axis=1)
+        along = unit(_across(ways, unit(points)))
+        for _ in range(MOVES):
+            rows = np.flatnonzero(~found)
+            if not len(rows) or self.spent + TRIALS * len(rows) > self.budget:
+                break
+            moves = self.rng.standard_normal((len(rows), TRIALS, points.shape[1]))
+            moves = unit(_across(moves, along[rows, None])) * norm[rows, None, None]
+            tried = at[rows, None] + BENT / MOVES * moves
+            score = self.judge(tried.reshape(-1, points.shape[1])).score.reshape(-1, TRIALS)
+            at[rows] = tried[np.arange(len(rows)), np.argmin(score, axis=1)]
+            found[rows] = score.min(axis=1) == -np.inf
+        return found
 
 
 def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -220,6 +249,11 @@ def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarra
     moved = np.take_along_axis(rows, np.clip(t, 0, sim.horizon - 1)[..., None], axis=1)
     moved = np.where(inside[..., None], moved, 0)
     return np.concatenate([v[:, :first], moved.reshape(n, -1)], axis=1)
+
+
+def _across(a, b):
+    """``a`` [..., D] less what of it is along the unit vectors ``b``."""
+    return a - np.sum(a * b, axis=-1, keepdims=True) * b
 
 
 def _arcs(v, w, t):

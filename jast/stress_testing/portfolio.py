@@ -394,12 +394,13 @@ class _Work:
 
     def tell_shares(self, q):
         """The share of the probability that each mode has, of failures drawn from the proposal."""
+        drawn = self.probability.draws
+        if drawn is not None and isinstance(drawn.source, latent.Latent):
+            q = drawn.source  # independent draws tell more than few populations
         budget = min(self.budget, PORTFOLIO)
-        found, failing, cost = shares(self.next_key(), self.sim, q, self.modes, budget)
+        self.modes, failing, cost = shares(self.next_key(), self.sim, q, self.modes, budget)
         if cost:
             self.note("shares of modes", cost, failing)
-        pairs = zip(self.modes, found, strict=True)
-        self.modes = Modes(m._replace(share=float(s)) for m, s in pairs)
 
     def report(self, settings):
         return Report(

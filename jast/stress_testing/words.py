@@ -87,9 +87,9 @@ def mode_facts(r: Any, i: int, failure: Any) -> list[tuple[str, Any]]:
         ("steps", int(failure.length)),
     ]
     if i < len(r.modes):
-        share = r.modes[i].share
-        words = "not known" if np.isnan(share) else f"{100 * share:.1f} %"
-        facts += [("members", r.modes[i].members), ("share", words)]
+        mode = r.modes[i]
+        words = "not known" if np.isnan(mode.share) else mode.share_words
+        facts += [("members", mode.members), ("share", words)]
     return facts
 
 

@@ -1,0 +1,212 @@
+"""The share of the probability that each failure mode has, and its interval, against systems whose
+shares are known in closed form.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+from scipy import stats
+
+from jast import intervals, records
+from jast.estimate import clopper_pearson
+from jast.estimate.descents import by_distance
+from jast.estimate.sample import sample_of
+from jast.limit_state import Latent, normal_numbers, played
+from jast.search.failure_modes import UNKNOWN, Mode, Modes
+from jast.simulators import limit_state
+from jast.stress_testing.shares import corrected, cost, shares
+
+BUDGET = 10_000
+
+
+def _sides(ends, u):
+    return jnp.minimum(ends[0] - u[0], ends[1] + u[0])
+
+
+def _axes(ends, u):
+    return jnp.min(ends - u[:2])
+
+
+def sides(a, b):
+    """Fails above ``a`` or below ``-b``: (simulator, the likeliest failures, the first share)."""
+    sim = limit_state(Partial(_sides, jnp.asarray([a, b])), 1)
+    p, q = stats.norm.sf([a, b])
+    return sim, np.array([[a + 1e-3], [-b - 1e-3]]), p / (p + q)
+
+
+def axes(a, b, d):
+    """Fails where the first of ``d`` numbers is above ``a`` or the second above ``b``. Where both
+    are counts for either half, at the most; that is less than ``b``'s tail of all.
+    """
+    sim = limit_state(Partial(_axes, jnp.asarray([a, b])), d)
+    heads = np.zeros((2, d))
+    heads[[0, 1], [0, 1]] = a + 1e-3, b + 1e-3
+    p, q = stats.norm.sf([a, b])
+    return sim, heads, p / (p + q)
+
+
+def known(sim, heads):
+    """`Modes` whose likeliest failures are these points."""
+    episodes = jax.device_get(played(sim, np.asarray(heads, normal_numbers(sim))))
+    return Modes(
+        Mode(jax.tree.map(lambda a, i=i: a[i], episodes), 1, math.nan) for i in range(len(heads))
+    )
+
+
+def mixture(sim, heads):
+    """Equal Gaussians of width 1 at these points."""
+    dtype, (k, d) = normal_numbers(sim), heads.shape
+    eye = np.broadcast_to(np.eye(d, dtype=dtype), (k, d, d))
+    return Latent(np.full(k, -math.log(k), dtype), heads.astype(dtype), eye, eye)
+
+
+def fewest(n, level=0.95):
+    """A correct interval covers fewer of ``n`` times once in 10,000."""
+    return stats.binom.ppf(1e-4, n, level)
+
+
+def covered(sim, heads, share, proposals):
+    """How often the interval of the first share holds the truth, and the mean width."""
+    ways, inside, widths = known(sim, heads), 0, []
+    for i, q in enumerate(proposals):
+        found, _, spent = shares(jax.random.key(i), sim, q, ways, BUDGET)
+        # paths that begin within their 500 evaluations, a room for 45, may take 24 lifts more each
+        assert sum(m.share for m in found) == pytest.approx(1) and spent <= cost(BUDGET) + 24 * 45
+        for m in found:
+            assert 0 <= m.share_interval[0] <= m.share <= m.share_interval[1] <= 1
+        low, high = found[0].share_interval
+        inside, widths = inside + (low <= share <= high), [*widths, high - low]
+    return inside, np.mean(widths)
+
+
+@pytest.mark.parametrize(
+    "case", [sides(3.0, 3.2), axes(3.0, 3.3, 6)], ids=["sides", "two weights in 6 dimensions"]
+)
+def test_weighted_draws_cover(case):
+    """256 failures chosen of some 500: a standard error of .03 or more, and of little more."""
+    sim, heads, share = case
+    inside, width = covered(sim, heads, share, [mixture(sim, heads)] * 40)
+    assert inside >= fewest(40) and 0.11 < width < 0.3
+
+
+def test_few_failures_cover(key):
+    """Some 19 of 1024 draws of the model fail."""
+    sim, heads, share = sides(2.3, 2.4)
+    inside, width = covered(sim, heads, share, [mixture(sim, np.zeros((1, 1)))] * 40)
+    assert inside >= fewest(40) and 0.35 < width < 0.65
+
+
+def populations(sim, seeds, n=256):
+    """The `Sample` of a small population by each seed."""
+    return sample_of([by_distance(jax.random.key(s), sim, n, 5, n) for s in seeds])
+
+
+@pytest.mark.parametrize(
+    "case",
+    [sides(3.0, 3.2), pytest.param(axes(3.0, 3.3, 6), marks=pytest.mark.long)],
+    ids=["sides", "two weights in 6 dimensions"],
+)
+def test_populations_cover(case):
+    """Six of 256 points each: their spread has some five degrees of freedom."""
+    sim, heads, share = case
+    samples = [populations(sim, range(1000 + 6 * i, 1006 + 6 * i)) for i in range(40)]
+    inside, width = covered(sim, heads, share, samples)
+    assert inside >= fewest(40) and width < 0.4
+
+
+def test_one_population_says_nothing_of_its_error(key):
+    sim, heads, _ = sides(3.0, 3.2)
+    found, *_ = shares(key, sim, populations(sim, [0]), known(sim, heads), BUDGET)
+    assert found[0].share > 0.3 and [m.share_interval for m in found] == [(0, 1)] * 2
+
+
+def test_a_mode_of_no_failure_is_bounded_by_counts(key):
+    """Below -6 is 1e-9 of what is above 3: 0 of the 128 failures that paths tell apart, which are
+    of fewer draws where one was chosen twice.
+    """
+    sim, heads, _ = sides(3.0, 6.0)
+    first, second = shares(key, sim, mixture(sim, heads[:1]), known(sim, heads), BUDGET)[0]
+    assert (first.share, second.share) == (1, 0)
+    low, high = second.share_interval
+    assert low == 0 and clopper_pearson(0, 128)[1] <= high < clopper_pearson(0, 64)[1]
+    np.testing.assert_allclose(first.share_interval, (1 - high, 1), atol=1e-9)
+
+
+def test_where_nothing_fails_nothing_is_told(key):
+    sim, heads, _ = sides(7.0, 7.0)
+    found, failing, spent = shares(
+        key, sim, mixture(sim, np.zeros((1, 1))), known(sim, heads), BUDGET
+    )
+    assert failing == 0 and spent == 1024
+    assert np.isnan([[m.share, *m.share_interval] for m in found]).all()
+    found, *rest = shares(key, sim, mixture(sim, heads), known(sim, heads), BUDGET - 1)
+    assert rest == [0, 0] and np.isnan([m.share for m in found]).all()
+
+
+def test_one_mode_has_all(key):
+    sim, heads, _ = sides(3.0, 3.0)
+    (only,), *rest = shares(key, sim, None, known(sim, heads[:1]), BUDGET)
+    assert (only.share, only.share_interval) == (1, (1, 1)) and rest == [0, 0]
+
+
+def wrong(rng, m, towards, seldom):
+    """What `corrected` is given of ``m`` failures: 60 % of mode 0, of whose others a part
+    ``towards`` lies towards mode 0 too; each its own unit, or of one of eight whose shares differ
+    as a beta distribution of ``seldom`` counts, and that are chosen as log-normal weights ask.
+    """
+    unit, own = np.arange(m), 0.6
+    if seldom:
+        w = rng.lognormal(0, 0.2, 8)
+        unit = np.sort(rng.choice(8, m, p=w / w.sum()))
+        own = rng.beta(0.6 * seldom, 0.4 * seldom, 8)[unit]
+    truly = (rng.random(m) > own).astype(int)
+    near = truly * (rng.random(m) >= towards)
+    few = np.arange(m // 256, m, m // 128)
+    return near, few, truly[few], unit, 2
+
+
+@pytest.mark.parametrize("towards, seldom", [(0.0, 0), (0.3, 0), (0.0, 50), (0.3, 50)])
+def test_a_correction_by_few_failures_covers(towards, seldom):
+    """Of draws and of eight populations, where directions are right and where they are wrong of a
+    tenth of all; the mean lies within 4 standard errors.
+    """
+    rng, n = np.random.default_rng(0), 200
+    found = [corrected(*wrong(rng, 1024, towards, seldom)) for _ in range(n)]
+    told = np.array([shares[0] for shares, _ in found])
+    assert abs(told.mean() - 0.6) < 4 * told.std() / math.sqrt(n)
+    low, high = np.array([limits[0] for _, limits in found]).T
+    assert ((low <= 0.6) & (high >= 0.6)).sum() >= fewest(n)
+    # no wider than 4 standard errors and what few degrees of freedom cost: t is 2.4 with 7
+    assert (high - low).mean() < 4 * told.std() * (1.6 if seldom else 1.2)
+
+
+def test_an_effective_number_of_draws():
+    """Whole numbers are Clopper and Pearson's; few degrees of freedom are fewer draws."""
+    np.testing.assert_allclose(intervals.of_effective(0.3, 50), clopper_pearson(15, 50))
+    k, n = 2.5, 12.5 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 3.3)) ** 2
+    k *= n / 12.5
+    expected = stats.beta.ppf(0.025, k, n - k + 1), stats.beta.ppf(0.975, k + 1, n - k)
+    np.testing.assert_allclose(intervals.of_effective(0.2, 12.5, 3.3), expected, rtol=1e-9)
+    for freedom in (-1.0, 0.0, 1e-9, 0.01):
+        low, high = intervals.of_effective(0.2, 12.5, freedom)
+        assert low == pytest.approx(0, abs=1e-6) and high == pytest.approx(1)
+
+
+def test_a_share_in_words_and_in_files(key):
+    sim, heads, _ = sides(3.0, 3.2)
+    (first, second) = known(sim, heads)
+    first = first._replace(share=0.524, share_interval=(0.491, 0.551))
+    text = str(Modes([first, second]))
+    assert "52 % [49, 56]" in text and max(map(len, text.splitlines())) < 64
+    assert first._replace(share_interval=UNKNOWN).share_words == "52 %"
+    assert first._replace(share=1.0, share_interval=(1.0, 1.0)).share_words == "100 %"
+    arrays, bare = {}, first._replace(failure=None)
+    node = records.encode(bare, arrays, lambda value: None)
+    again = lambda: records.decode(node, "file", arrays, lambda node: node, None)
+    assert again() == bare
+    del node["record"][1]["share_interval"]  # as before there were any
+    assert np.isnan(again().share_interval).all() and again().share == bare.share
