@@ -4,11 +4,18 @@
 The calls are on simulators that are built one by one, each of new functions, as a loop would. CPU
 seconds hold the compilation. The sweep goes first, so that it pays for what both share. `filter`
 has a known probability: its rows say how many intervals hold it, and where it crosses a level.
+
+`joined` are sweeps of cheap systems of known probability, whose rows are joined: root mean square
+errors of log P and of the log ratio of neighbours, by the rows alone, joined, and by plain draws
+with common random numbers for as many CPU seconds; how many intervals hold the truth; and the
+programs that the first sweep compiles.
 """
 
 import argparse
+import functools
 import json
 import math
+import time
 from statistics import NormalDist
 
 import jax
@@ -21,10 +28,13 @@ from benchmarks.sizes import options, size
 from benchmarks.stress_systems import lane
 from jast.distributions import Normal
 from jast.estimate import failure_probability
+from jast.judge import judged
+from jast.limit_state import dimension
 
 __all__ = ["run"]
 
 STEPS, LIMIT, LEVEL = 10, 7.0, 1e-5
+NUMBERS = 200
 
 
 def filtered(decay):
@@ -77,6 +87,118 @@ def run(name, n, budget):
     return report
 
 
+def walked(limit, scale=1.0):
+    """The sum of ten steps leaves [-limit, limit] at the end."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x,
+        disturbance=lambda s: Normal(0.0, scale),
+        evaluate=lambda s: (jnp.abs(s) > limit, jnp.maximum(limit - jnp.abs(s), 0.0)),
+        horizon=STEPS,
+        episodic=True,
+    )
+
+
+def of_walk(limit):
+    """The probability that it does."""
+    return 2 * NormalDist().cdf(-limit / math.sqrt(STEPS))
+
+
+def squared(limit):
+    """The sum of the squares of so many normal numbers is above ``limit``: no Gaussians serve."""
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(()),
+        step=lambda s, x: s + x * x,
+        disturbance=lambda s: Normal(0.0, 1.0),
+        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
+        horizon=NUMBERS,
+        episodic=True,
+    )
+
+
+def of_squares(limit):
+    """The probability that it is, of an even number of them."""
+    x = limit / 2
+    return sum(math.exp(k * math.log(x) - x - math.lgamma(k + 1)) for k in range(NUMBERS // 2))
+
+
+JOINED = {
+    "limit of a walk": (walked, "limit", 12.0, 14.0, of_walk),
+    "scale of its noise": (
+        functools.partial(walked, 13.0),
+        "scale",
+        0.93,
+        1.08,
+        lambda v: of_walk(13.0 / v),
+    ),
+    "sum of 200 squares": (squared, "limit", 280.0, 296.0, of_squares),
+}
+
+
+def run_joined(name, n, keys, budget):
+    """Numbers of one case, over so many ``keys``."""
+    make, setting, low, high, truth = JOINED[name]
+    values = np.linspace(low, high, n)
+    log_p, compiled = np.log([truth(v) for v in values]), []
+    heard = lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
+    swept = lambda i: timed(
+        lambda: jast.sweep(jax.random.key(i), make, {setting: values}, budget=budget)
+    )
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    first = swept(0)
+    jax.monitoring.clear_event_listeners()
+    tables, spent, _ = zip(first, *map(swept, range(1, keys)), strict=True)
+    seconds = float(np.median(spent))  # the first one compiles
+    plain = [_plainly(tables[0].simulators, i, seconds) for i in range(keys)]
+    alone = np.array([[r.log_mean for r in t.results] for t in tables])
+    own = np.array([[r.interval for r in t.results] for t in tables])
+    curve, ratios = (
+        np.array([getattr(t, of) for t in tables if t.curve is not None])
+        for of in ("curve", "ratios")
+    )
+    steps = np.diff(log_p)
+    return dict(
+        values=n,
+        keys=keys,
+        budget=budget,
+        joined=int(np.isfinite(curve[..., 0]).sum()),
+        log_error_alone=_rms(alone - log_p),
+        log_error_joined=_rms(np.log(curve[..., 0]) - log_p),
+        log_error_plain=_rms(np.log(plain) - log_p),
+        ratio_error_alone=_rms(np.diff(alone) - steps),
+        ratio_error_joined=_rms(np.log(ratios[..., 0]) - steps),
+        ratio_error_plain=_rms(np.diff(np.log(plain)) - steps),
+        hold_alone=_held(own[..., 0], own[..., 1], np.exp(log_p)),
+        hold_joined=_held(curve[..., 1], curve[..., 2], np.exp(log_p)),
+        hold_ratios=_held(ratios[..., 1], ratios[..., 2], np.exp(steps)),
+        apart=sum(len(t.settings.get("apart", ())) for t in tables),
+        seconds=seconds,
+        first_seconds=spent[0],
+        programs=len(compiled),
+    )
+
+
+def _plainly(sims, seed, seconds):
+    """The share of plain draws that fail, the same for all systems, within so many CPU seconds."""
+    rng, failing, n, d = np.random.default_rng(seed), np.zeros(len(sims)), 0, dimension(sims[0])
+    [judged(s, np.zeros((1, d), np.float32)) for s in sims[:1]]  # compiled
+    begun = time.process_time()
+    while not n or time.process_time() - begun < seconds:
+        z = rng.standard_normal((8192, d), np.float32)
+        failing += [judged(s, z).failure.sum() for s in sims]
+        n += len(z)
+    return np.maximum(failing, 0.5) / n  # none at all counts as half a failure
+
+
+def _rms(errors):
+    return float(np.sqrt(np.nanmean(np.square(errors))))
+
+
+def _held(low, high, truth):
+    """Share of the intervals, of those that there are, that hold the truth."""
+    return float(((low <= truth) & (truth <= high)).sum() / np.isfinite(low).sum())
+
+
 def _worth(who, results, values, truth):
     """How many rows are reliable, the median of their standard errors, and how many intervals hold
     the truth: of all rows, and of the reliable ones.
@@ -102,10 +224,13 @@ def _solved(rising, low, high):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__)
-    args = options(parser, quick="12 values").parse_args(argv)
-    n, budget = size(args, 50, 12, 2), size(args, 10_000, 10_000, 5000)
+    args = options(parser, quick="4 values; 3 keys of one joined case").parse_args(argv)
+    n, budget = size(args, 50, 4, 2), size(args, 10_000, 10_000, 5000)
     names = size(args, list(CASES), list(CASES), ["filter"])
     report = {name: run(name, n, budget) for name in names}
+    n, keys = size(args, (10, 20), (8, 3), (3, 1))
+    for name in size(args, list(JOINED), list(JOINED)[:1], list(JOINED)[:1]):
+        report[name] = run_joined(name, n, keys, 300_000)
     if args.json:
         print(json.dumps(report))
         return

@@ -79,6 +79,8 @@ class Descent(NamedTuple):
     """[m] int32: how many of the numbers decided each"""
     distance: Any
     """[m] miss distances"""
+    family: Any
+    """[m] int64: which of its first points each descends from"""
     log_mean: Any
     """Log of the estimate; -inf where no failure was reached"""
     variance: Any
@@ -166,7 +168,7 @@ class _Population:
         """The `Descent` that reached no failure."""
         p, d = self.particles, dimension(self.sim)
         none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32), np.zeros(0, p.z.dtype)
-        return self._end(*none, -math.inf, math.nan)
+        return self._end(*none, np.zeros(0, np.int64), -math.inf, math.nan)
 
     def arrived(self, log_w, before=None):
         """The `Descent` whose last weights, of failures, are these; ``before``: see `moved`."""
@@ -175,13 +177,14 @@ class _Population:
         self.move(log_w, -np.inf, before=before)
         p = jax.device_get(self.particles)
         own = (a[: self.n] for a in (p.z, p.used, p.distance))
-        return self._end(*own, self.log_mean, variance)
+        return self._end(*own, self.family, self.log_mean, variance)
 
-    def _end(self, points, used, distance, log_mean, variance):
+    def _end(self, points, used, distance, family, log_mean, variance):
         return Descent(
             points=points,
             used=used,
             distance=distance,
+            family=family,
             log_mean=np.float64(log_mean),
             variance=np.float64(variance),
             plain=np.array(self.plain, np.int64),

@@ -44,7 +44,9 @@ class Sample(NamedTuple):
     log_weight: Any
     """[m] of the population that it comes from, whose estimate may be greater or less"""
     group: Any
-    """[m] int32: which population that was; members of one are not independent"""
+    """[m] int32: which first point of which population it descends from; members of one are not
+    independent
+    """
 
 
 def sample_of(runs: Sequence[Descent]) -> Sample:
@@ -53,7 +55,9 @@ def sample_of(runs: Sequence[Descent]) -> Sample:
     parts = [
         (r.points, r.used, r.distance, np.full(len(r.points), float(r.log_mean))) for r in runs
     ]
-    groups = np.repeat(np.arange(len(runs), dtype=np.int32), [len(r.points) for r in runs])
+    first = np.cumsum([0, *(int(r.size) for r in runs)])
+    families = [r.family + n for r, n in zip(runs, first[:-1], strict=True)]
+    groups = np.unique(np.concatenate(families), return_inverse=True)[1].astype(np.int32)
     return Sample(*map(np.concatenate, zip(*parts, strict=True)), groups)
 
 

@@ -15,6 +15,7 @@ from jast.places import executor_of
 from jast.results import asked
 from jast.simulator import Simulator
 from jast.sweeping.batch import batch, kinds
+from jast.sweeping.join import joined
 from jast.sweeping.rows import Rows, elsewhere, here, options_of
 from jast.sweeping.table import Sweep
 from jast.watch import Watch, terminable
@@ -56,6 +57,12 @@ def sweep(
     functions at each call. Where it cannot (it branches on a setting, or a setting is no number, or
     changes a shape or the horizon), each value compiles its own; ``settings["programs"]`` says how
     many kinds there are.
+
+    Cheap systems of one kind, which `jast.estimate.failure_probability` answers by populations, are
+    then joined: the failures of each row are simulated under its neighbours, which tells the ratio
+    of both probabilities. ``table.probability``, its intervals and crossings are those of the
+    joined curve, ``table.ratios`` those of neighbours, and ``table.results`` stay as they are. So
+    put values in order, and near enough that many failures are common to neighbours.
 
     Args:
         key: consumed; row i has ``jax.random.fold_in(key, i)``.
@@ -127,6 +134,7 @@ def sweep(
             found, ended = here(rows, follow, store, watch)
         else:
             found, ended = elsewhere(rows, executor, store, watch)
+        curve = _joined(function, rows, found)
     outcomes, errors = zip(*found, strict=True)
     if all(e is not None for e in errors) and len(found) == n:
         raise errors[0]
@@ -135,13 +143,28 @@ def sweep(
     )
     if len(found) < n:
         settings["interrupted"] = f"after {len(found)} of {n} values{ended}"
+    if curve is not None:
+        settings["judged"] = curve.episodes
+    if curve is not None and curve.apart:
+        settings["apart"] = list(curve.apart)
     return Sweep(
         {k: v[: len(found)] for k, v in columns.items()},
         outcomes,
         tuple(None if e is None else f"{type(e).__name__}: {e}" for e in errors),
         tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
         settings,
+        *(() if curve is None else curve[:2]),
     )
+
+
+def _joined(function, rows, found):
+    """The `Joined` of the rows that are done, where they are one kind of cheap systems."""
+    if function is not failure_probability or kinds(rows.made) > 1:
+        return None
+    try:
+        return joined(rows.keys, rows.made, [result for result, _ in found])
+    except KeyboardInterrupt:  # the rows stand for themselves
+        return None
 
 
 def _rows(values):

@@ -88,13 +88,29 @@ class Sweep(NamedTuple):
     """[N] `jast.Simulator`; None where it could not be made"""
     settings: dict[str, Any]
     """What was asked for; ``programs``: how many kinds of systems there were, which compile apart;
-    ``interrupted`` where the last rows are missing
+    ``interrupted`` where the last rows are missing; where rows are joined, ``judged``: episodes
+    that it took, and ``apart``: rows that contradict what failures say of the ratio to the next
+    one, of which one may miss a failure mode
+    """
+    curve: Any = None
+    """[N, 3] probabilities and the ends of their intervals that rows have when they are joined with
+    their neighbours; NaN where a row's own result stands; None where all do
+    """
+    ratios: Any = None
+    """[N - 1, 3] probability of the next row over that of a row, and the ends of its interval,
+    where rows are joined; NaN where one of the two takes no part
     """
 
     @property
     def answers(self) -> tuple[Any, ...]:
-        """[N] `Answer` of each row."""
-        return tuple(map(answer, self.results))
+        """[N] `Answer` of each row; as it is joined with its neighbours, where it is."""
+        alone = tuple(map(answer, self.results))
+        if self.curve is None:
+            return alone
+        return tuple(
+            a if np.isnan(c[0]) else Answer(*c.tolist(), a.reliable)
+            for a, c in zip(alone, self.curve, strict=True)
+        )
 
     @property
     def probability(self) -> np.ndarray:
@@ -114,7 +130,8 @@ class Sweep(NamedTuple):
     @property
     def episodes(self) -> int:
         """Episodes simulated in all."""
-        return sum(getattr(r, "episodes", None) or 0 for r in self.results)
+        alone = sum(getattr(r, "episodes", None) or 0 for r in self.results)
+        return alone + self.settings.get("judged", 0)
 
     def crossing(
         self, level: float = 1e-6, against: str | None = None, unreliable: bool = False
@@ -185,7 +202,7 @@ class Sweep(NamedTuple):
         return name, numeric[name]
 
     def __str__(self) -> str:
-        rows = [_row(*each) for each in zip(self.results, self.errors)]
+        rows = [_row(*each) for each in zip(self.results, self.errors, self.answers)]
         columns = [[k, *map(_text, values)] for k, values in self.values.items()]
         names = dict.fromkeys(k for row in rows for k in row if k != NOTE)
         columns += [[k, *(row.get(k, "") for row in rows)] for k in names]
@@ -195,6 +212,8 @@ class Sweep(NamedTuple):
         lines = ["  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
         if "interrupted" in self.settings:
             lines.append(f"interrupted {self.settings['interrupted']}")
+        for i in self.settings.get("apart", ()):
+            lines.append(f"rows {i} and {i + 1}: their failures say another ratio")
         return "\n".join(lines)
 
 
@@ -210,11 +229,11 @@ def answer(result: Any) -> Answer:
     return Answer()
 
 
-def _row(result, error):
+def _row(result, error, a):
     """The cells of a row: name of the column -> text."""
     if error is not None:
         return {NOTE: shorten(error, WIDE, placeholder=" ...")}
-    cells, a = {}, answer(result)
+    cells = {}
     estimate = result.probability if isinstance(result, Report) else result
     if not math.isnan(a.high):
         seen = not math.isnan(a.probability)
