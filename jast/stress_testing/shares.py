@@ -85,7 +85,8 @@ def corrected(
         near: [m] the mode in whose direction each failure lies.
         few: [f] those of them that were told apart by paths, and
         exact: [f] their modes.
-        unit: [m] the draw or the population that each is of; units are independent.
+        unit: [m] the draw, or the first point of a population, that each comes from; units are
+            independent.
         k: modes.
 
     Returns:
