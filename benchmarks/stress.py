@@ -118,9 +118,8 @@ def slow_cooling(key, sim, budget):
         return None, found.episodes, None
     rows = resampled(sample.log_weight, SETTINGS.cooled, 0.5)
     slowly = int(10 * portfolio.COOLED * budget)
-    points, spent = cooled(for_cooling, sim, sample.points[rows], slowly)
-    near = np.argsort((points**2).sum(axis=1), kind="stable")
-    haul = explorers.of_points(sim, points[near])
+    points, spent = cooled(for_cooling, sim, sample.points[rows], slowly, True)
+    haul = explorers.of_points(sim, points)
     more = jast.search.refine(for_refinement, sim, haul.episodes, budget=portfolio.POLISHED)
     return _best(more.failures), found.episodes + spent + more.episodes, None
 

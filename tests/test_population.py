@@ -19,7 +19,7 @@ from jast.estimate import descents as ways
 from jast.estimate.agreement import BLUNT, answer_of
 from jast.estimate.particles import Particles, Steering, begun, blank, fresh, moved
 from jast.estimate.sample import Sample
-from jast.limit_state import outcomes
+from jast.limit_state import normal_numbers, outcomes
 from jast.simulators import limit_state, walk1d
 
 N = 1024
@@ -194,12 +194,24 @@ def test_in_both_precisions(dtype, key):
     assert near(runs, stats.norm.sf(3)) and runs[0].points.dtype == dtype
 
 
-def test_cooling_comes_to_the_likeliest(key):
+@pytest.mark.parametrize("together", [False, True])
+def test_cooling_comes_to_the_likeliest(key, together):
     """The design point of a half-space, |z| = 3: within .05 nats of 4.5."""
     run = ways.by_distance(key, HALF, N, 10, N)
-    points, spent = ways.cooled(key, HALF, run.points[:128], 60_000)
+    points, spent = ways.cooled(key, HALF, run.points[:128], 60_000, together)
     best = 0.5 * (points**2).sum(axis=1).min()
     assert 4.5 <= best * (1 + 1e-5) < 4.55 and spent <= 60_000
+
+
+def test_cooling_alone_loses_no_mode_and_together_goes_to_the_likelier(key):
+    """Of failures on two sides, at 3 and 4: as many points end on each as began there, or only
+    those on the likelier one, 3.5 nats above the other.
+    """
+    sim = limit_state(lambda u: jnp.minimum(3.0 - u[0], 4.0 + u[0]), 2)
+    start = np.zeros((128, 2), np.dtype(normal_numbers(sim)))
+    start[:, 0] = np.where(np.arange(128) % 2, 3.1, -4.1)
+    right = lambda together: np.mean(ways.cooled(key, sim, start, 60_000, together)[0][:, 0] > 0)
+    assert right(False) == 0.5 and right(True) == 1
 
 
 @pytest.fixture(scope="module")

@@ -58,10 +58,6 @@ class Settings:
     deviation away."""
     coolings: int = 40
     """Widths on the way there."""
-    alone: float = 0.25
-    """Share of the moves of which no point replaces another, so that no mode is lost. Where all of
-    them are, the likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of
-    the ship 4; where none is, they are as likely as with a quarter or up to 2 nats likelier."""
     cooled: int = 128
     """Failures that are cooled, as many as are simulated side by side: few of them with many moves
     each get farther than many."""
@@ -289,23 +285,16 @@ def cooled(
     sim: Simulator,
     points: np.ndarray,
     evaluations: int,
+    together: bool,
     settings: Settings = SETTINGS,
 ) -> tuple[np.ndarray, int]:
     """The failures ``points`` [m, D] cooled to the likeliest, for so many ``evaluations``, nearly,
-    and how many they were: (points [2 m, D], evaluations).
+    and how many they were.
 
-    They are cooled twice. At first no point replaces another, so no mode is lost, however little of
-    the probability it has. Then those of high density replace the others at each width, as in every
-    population: their moves are spent where failures are likeliest.
+    Where not ``together`` no point replaces another, so no mode is lost, however little of the
+    probability it has. Else those of high density replace the others at each width, as in every
+    population, and moves are spent where failures are likeliest.
     """
-    alone = int(settings.alone * evaluations)
-    first, spent = _cooled(key, sim, points, alone, settings, False)
-    then, more = _cooled(key, sim, points, evaluations - alone, settings, True)
-    return np.concatenate([first, then]), spent + more
-
-
-def _cooled(key, sim, points, evaluations, settings, replacing):
-    """``points`` [m, D] at the coldest width, and the evaluations that took."""
     m, rng, rows, steering = len(points), generator(key, 6), np.arange(len(points)), begun()
     particles = blank(sim, size(sim, settings.particles, settings))
     z = np.zeros(particles.z.shape, particles.z.dtype)
@@ -315,7 +304,7 @@ def _cooled(key, sim, points, evaluations, settings, replacing):
     moves = max(evaluations // (m * settings.coolings), 2)
     widths = np.geomspace(1.0, settings.coldest, settings.coolings).tolist()
     for i, width in enumerate(widths):
-        if replacing and i:
+        if together and i:
             square = np.asarray(particles.square)[:m].astype(np.float64)
             used, last = np.asarray(particles.used)[:m], widths[i - 1]
             # as far on the way to this width as leaves enough effective points
@@ -324,7 +313,7 @@ def _cooled(key, sim, points, evaluations, settings, replacing):
         particles, steering, _ = moved(
             sim,
             particles,
-            counter_key(key, 3, i + len(widths) * replacing),
+            counter_key(key, 3, i),
             rows,
             steering,
             moves=moves,
