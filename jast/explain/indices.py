@@ -150,7 +150,7 @@ def indices(
         made by tilts, those of the chunks that are drawn again.
 
     Raises:
-        ValueError: for an estimate without draws or without a failure, one by a policy, or of
+        ValueError: for an estimate without draws or without a failure, one by a policy or keys, or of
             another simulator.
 
     Example:
@@ -169,7 +169,7 @@ def indices(
     if isinstance(kept.source, str) and kept.source != "model":
         raise ValueError(
             f"{name}: estimate must have drawn normal numbers, received one by {estimate.method}"
-            f" that drew from a {kept.source}"
+            f" that drew by {kept.source}"
         )
     if not kept.failure.any():
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
