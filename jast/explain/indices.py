@@ -150,8 +150,8 @@ def indices(
         made by tilts, those of the chunks that are drawn again.
 
     Raises:
-        ValueError: for an estimate without draws or without a failure, one by a policy or keys, or of
-            another simulator.
+        ValueError: for an estimate without draws or without a failure, one whose draws were not
+            normal numbers, or of another simulator.
 
     Example:
         >>> import jax, jast
