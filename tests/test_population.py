@@ -14,7 +14,13 @@ from scipy import stats
 import jast
 from jast import distributions as D
 from jast.counter import counter_key
-from jast.estimate import budgets, failure_probability, failure_samples, population
+from jast.estimate import (
+    budgets,
+    failure_probability,
+    failure_samples,
+    population,
+    population_estimate,
+)
 from jast.estimate import descents as ways
 from jast.estimate.agreement import BLUNT, answer_of
 from jast.estimate.particles import Particles, Steering, begun, blank, fresh, moved
@@ -371,3 +377,12 @@ def test_a_second_key_compiles_nothing(key):
     with compiled() as programs:
         population(other, SIDES, 60_000, particles=N)
     assert not programs
+
+
+def test_plain_draws_are_in_the_checkpoint(key, tmp_path, monkeypatch):
+    sim = limit_state(lambda u: 1.0 - u[0], 2)
+    found = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
+    assert "plain draws" in found.method and found.evaluations == 100_000
+    monkeypatch.setattr(population_estimate, "of_points", None)
+    again = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
+    assert again.failing == found.failing and again.interval == found.interval

@@ -177,7 +177,6 @@ def by_populations(
             s.run(s.kind("width"), 1)
         kinds, weighed = () if plain else s.witnesses(), None
         if not kinds:  # they are all that tells the probability
-            s.draw_plainly()
             return of_plain_draws(s, name, level)
         s.witness(kinds)
         if len(kinds) == 2 and not s.interrupted:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import jax
-import numpy as np
-
 from jast.estimate.agreement import APART, Answer, Kind, against, pooled
+from jast.estimate.batches import rows_of
+from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, of_counts, or_rough
+from jast.estimate.importance_sampling import chunks
+from jast.estimate.plain import of_points
 from jast.estimate.population_search import Search
-from jast.estimate.sample import KEPT, Sample, counted, independent, sample_of
+from jast.estimate.sample import KEPT, independent, sample_of
 from jast.estimate.sums import nothing
 from jast.intervals import log_normal
+from jast.watch import Watch
 
 __all__ = ["of_plain_draws", "of_populations"]
 
@@ -48,12 +50,25 @@ def of_populations(
 
 
 def of_plain_draws(s: Search, name: str, level: float) -> Estimate:
-    """The `Estimate` of the model's own draws."""
+    """The `Estimate` of the model's own draws, for which the rest of the budget is spent."""
     failing, invalid, drawn = map(int, s.plain)
-    total = nothing(drawn)._replace(
-        samples=drawn, failures=failing, invalid=invalid, draws=_draws(s)
+    n, lanes, total = s.budget - s.spent, 4 * rows_of(s.sim), nothing(drawn)
+    if n > 0 and not s.interrupted:
+        watch, ways = Watch(name, n, "episode", False, None), s.ways._replace(name="plain")
+        try:
+            total, notes, lost = chunks(of_points, (s.key, s.sim, lanes, n), lanes, watch, ways)
+            s.reasons += lost
+            s.spent, s.interrupted = s.spent + total.samples, " ".join(notes)
+        except KeyboardInterrupt:
+            s.interrupt()
+    s.plain += total.failures, total.invalid, total.samples
+    s.history.append(f"plain draws: {s.plain[0]} of {s.plain[2]} fail")
+    total = total._replace(
+        samples=drawn + total.samples,
+        failures=failing + total.failures,
+        invalid=invalid + total.invalid,
     )
-    return of_counts(
+    found = of_counts(
         f"{name}: plain draws",
         total,
         level=level,
@@ -62,6 +77,7 @@ def of_plain_draws(s: Search, name: str, level: float) -> Estimate:
         evaluations=s.spent,
         history=tuple(s.history),
     )
+    return found._replace(draws=drawn_by(found.draws, s.key, lanes, "model"))
 
 
 def _agreed(s, kinds):
@@ -107,13 +123,3 @@ def _of_answer(s, kinds, level, exact, sample):
         warnings=(),
         draws=independent(s.key, s.sim, sample, log_mean, int(min(worth, KEPT))),
     )
-
-
-def _draws(s):
-    """`Draws` of plain draws; None where there were none but those of populations."""
-    if not s.found:
-        return None
-    p = jax.tree.map(lambda *a: np.concatenate(a), *s.found)
-    none = np.zeros(len(p.z))
-    sample = Sample(p.z, p.used, p.distance, none, none.astype(np.int32))
-    return counted(s.key, s.sim, sample, s.looked)

@@ -8,11 +8,9 @@ import jax
 import numpy as np
 
 from jast import units
-from jast.counter import counter_key
 from jast.estimate.agreement import APART, BLUNT, Answer, Kind, answer_of, pooled, told
 from jast.estimate.descents import WAYS, Descent
-from jast.estimate.particles import LANES, Particles, blank, fresh
-from jast.estimate.sample import KEPT
+from jast.estimate.particles import LANES
 from jast.places import Task
 from jast.rounding import rounded
 
@@ -40,7 +38,6 @@ class Search:
         self.interrupted = ""
         self.reasons = [] if (coarse := rounded(sim)) is None else [coarse]
         self.history = []
-        self.found, self.looked = [], 0  # failures of plain draws, and among how many
 
     def kind(self, way):
         """A way with its first number of moves."""
@@ -104,27 +101,6 @@ class Search:
         """Whether plain draws alone tell the probability."""
         failing, _, drawn = self.plain
         return failing >= SEEN and failing / drawn * (self.budget - self.spent) >= PLENTY
-
-    def draw_plainly(self):
-        """Spend the rest on the model's own draws."""
-        if self.interrupted:
-            return
-        particles, i = blank(self.sim, self.capacity), 0
-        try:
-            while self.spent < self.budget:
-                m = min(self.capacity, self.budget - self.spent)
-                particles, invalid = fresh(self.sim, particles, counter_key(self.key, 5, i), m)
-                rows = np.flatnonzero(np.asarray(particles.score)[:m] == -np.inf)
-                if sum(map(len, self.found)) < KEPT:  # the rest adds to the count alone
-                    self.found.append(Particles(*(np.asarray(a)[rows] for a in particles)))
-                    self.looked += m
-                self.plain += len(rows), invalid, m
-                self.spent, self.invalid, i = self.spent + m, self.invalid + invalid, i + 1
-                self.watch.reach(min(self.spent, self.budget))
-                self.watch.tell()
-        except KeyboardInterrupt:
-            self.interrupt()
-        self.history.append(f"plain draws: {self.plain[0]} of {self.plain[2]} fail")
 
     def witnesses(self):
         """The two kinds that are to agree, the more exact for its cost first; one where there is
