@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["episode_keys", "monte_carlo", "of_points"]
+__all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "of_points"]
 
 LANES = 16384
-"""Episodes of a unit of work, fewer where they take many random numbers."""
+"""Episodes of a unit of work that are drawn by keys."""
 BLOCK = 128
 """Episodes that run side by side: their states then stay in the caches of a core."""
 
@@ -95,7 +95,7 @@ def monte_carlo(
     contract(sim, observed=False)
     by_points = outline(sim).closed
     simulate = of_points if by_points else _of_keys
-    lanes = 4 * rows_of(sim) if by_points else LANES
+    lanes = lanes_of_points(sim) if by_points else LANES
     ways = units.ways(name, executor, devices)
     with stored(name, checkpoint, key, sim=sim, samples=samples) as store:
         watch = Watch(name, samples, "episode", progress, callback)
@@ -105,6 +105,11 @@ def monte_carlo(
     found = of_counts(name, total, level=level, notes=notes, reasons=lost)
     draws = drawn_by(found.draws, key, lanes, "model" if by_points else "keys")
     return found._replace(settings=settings, draws=draws)
+
+
+def lanes_of_points(sim: Simulator) -> int:
+    """Episodes of a unit of `of_points`: fewer where they take many random numbers."""
+    return 4 * rows_of(sim)
 
 
 def of_points(shared: tuple[Any, ...], i: int, post: Any) -> Traces:

@@ -6,11 +6,10 @@ import math
 from collections.abc import Sequence
 
 from jast.estimate.agreement import APART, Answer, Kind, against, pooled
-from jast.estimate.batches import rows_of
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, of_counts, or_rough
 from jast.estimate.importance_sampling import chunks
-from jast.estimate.plain import of_points
+from jast.estimate.plain import lanes_of_points, of_points
 from jast.estimate.population_search import Search
 from jast.estimate.sample import KEPT, independent, sample_of
 from jast.estimate.sums import nothing
@@ -52,7 +51,7 @@ def of_populations(
 def of_plain_draws(s: Search, name: str, level: float) -> Estimate:
     """The `Estimate` of the model's own draws, for which the rest of the budget is spent."""
     failing, invalid, drawn = map(int, s.plain)
-    n, lanes, total = s.budget - s.spent, 4 * rows_of(s.sim), nothing(drawn)
+    n, lanes, total = s.budget - s.spent, lanes_of_points(s.sim), nothing(drawn)
     if n > 0 and not s.interrupted:
         watch, ways = Watch(name, n, "episode", False, None), s.ways._replace(name="plain")
         try:

@@ -149,7 +149,7 @@ def stress(
         work = _Work(key, sim, budget, top, watch, ways._replace(store=store), checkpoint)
         try:
             work.look()
-            if work.by_populations:
+            if work.cheap:
                 work.populate()
             else:
                 work.search()
@@ -205,7 +205,7 @@ class _Work:
         self.residual = self.late = np.nan
         large = (1 - sum(LARGE)) * budget >= ESTIMABLE
         self.estimable = self.latent and (large or latent.dimension(sim) <= SMALL)
-        self.by_populations = self.latent and budgets.cheap(sim, budget)
+        self.cheap = self.latent and budgets.cheap(sim, budget)
         shares = (LARGE if large else BY_SURROGATE) if self.estimable else NO_ESTIMATE
         self.parts = Shares(*(int(share * min(budget, PORTFOLIO)) for share in shares))
         self.paths = int(PATHS * budget)
@@ -224,7 +224,7 @@ class _Work:
     def look(self):
         """The system as it is."""
         # populations draw plainly, too, and so few are compiled quickly
-        key, episodes = self.next_key(), BRIEF if self.by_populations else self.parts.nominal
+        key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the report says it
             self.nominal = n = nominal(key, self.sim, episodes)

@@ -88,8 +88,8 @@ def joined(
     """The `Joined` of the results ``found`` of `jast.estimate.failure_probability` with ``keys`` on
     systems of one kind; None where no two of them can be joined.
     """
-    chain = [each for each in zip(keys, made, found) if _takes_part(*each[1:])]
-    places = np.array([i for i, each in enumerate(zip(made, found)) if _takes_part(*each)])
+    places = np.array([i for i, each in enumerate(zip(made, found)) if _takes_part(*each)], int)
+    chain = [(keys[i], made[i], found[i]) for i in places]
     m, n = len(chain), len(found)
     if m < 2:
         return None
