@@ -66,7 +66,7 @@ def monte_carlo(
     Args:
         key: consumed.
         sim: any simulator.
-        samples: episodes, at least 2.
+        samples: episodes, at least 1.
         level: of the interval, in (0, 1).
         progress: whether to show a progress bar.
         callback: called as ``callback(done, total, None)`` after each chunk.
