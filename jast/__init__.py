@@ -18,6 +18,7 @@ __all__ = [
     "Simulator",
     "actions",
     "blackbox",
+    "cache",
     "check",
     "cross_entropy",
     "distributions",
@@ -45,6 +46,10 @@ __all__ = [
 
 # a room is loaded when it is first entered: importing jast costs little more than importing jax
 _ROOMS = [name for name in __all__ if name not in globals()]
-_CALLS = {"stress": "jast.stress_testing:stress", "sweep": "jast.sweeping:sweep"}
+_CALLS = {
+    "cache": "jast.compilation_cache:cache",
+    "stress": "jast.stress_testing:stress",
+    "sweep": "jast.sweeping:sweep",
+}
 __getattr__ = door(__name__, lazy={room: f"jast.{room}" for room in _ROOMS} | _CALLS)
 __dir__ = listed(__all__)

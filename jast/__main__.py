@@ -13,6 +13,7 @@ import numpy as np
 
 from jast import actions, failures, nominal, plot, replay, rewards, save, simulators
 from jast.actions import UniformBox
+from jast.compilation_cache import cache
 from jast.contract import check
 from jast.explain import cards
 from jast.intervals import clopper_pearson
@@ -76,6 +77,8 @@ def main(argv=None):
     except OSError as e:
         parser.error(f"argument --output: {e}")
     try:
+        if not options.no_cache:
+            cache()
         own = _loaded(parser, options.system) if options.system else None
         return _stress(options, own) if options.method == "stress" else _run(options)
     except ValueError as e:
@@ -147,6 +150,12 @@ def _parser():
         "--heads",
         choices=["rollout", "value", "both"],
         help="forest: networks that learn from the trees before (default: none)",
+    )
+    add(
+        "--no-cache",
+        action="store_true",
+        help="compile everything anew; else compiled programs are kept for the next call"
+        " (jast.cache)",
     )
     add("--quiet", action="store_true", help="no progress bars")
     return parser

@@ -7,7 +7,9 @@ of it is followed here, and ``tests/test_jax_shim.py`` says which part broke.
  - `host_call`: NumPy on the host inside of compiled programs (a primitive with lowerings of its
    own, `jax.interpreters`);
  - `custom_vmap`: a function that says itself what a batch of it is (`jax.custom_batching`);
- - `define_prng_impl`: a key implementation (`jax.extend.random`).
+ - `define_prng_impl`: a key implementation (`jax.extend.random`);
+ - `reset_cache`: what makes a new folder of compiled programs count
+   (`jax.experimental.compilation_cache`).
 
 Nothing else in the package imports `jax.core`, `jax.extend`, `jax.interpreters`,
 `jax.custom_batching`, `jax.experimental` or `jax._src`.
@@ -32,6 +34,7 @@ __all__ = [
     "is_traced",
     "is_tracing",
     "quick",
+    "reset_cache",
     "was_interrupted",
 ]
 
@@ -71,6 +74,15 @@ def quick(function: Callable[..., Any]) -> Callable[..., Any]:
     # inside of another program there are no options of its own
     run = lambda *args: (function if is_tracing() else jitted())(*args)
     return functools.wraps(function)(run)
+
+
+def reset_cache() -> None:
+    """Have JAX look anew at its options of the persistent compilation cache, which it reads once,
+    before it compiles anything.
+    """
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache  # seldom needed
+
+    reset_cache()
 
 
 def was_interrupted(error: BaseException) -> bool:

@@ -14,6 +14,8 @@ __all__ = ["Watch", "in_pieces", "terminable"]
 
 Callback = Callable[[int, int, Any], Any]
 State = TypeVar("State")
+FIRST = "compiling"
+"""What a bar says before anything is done: most of that time goes there."""
 
 
 class Watch:
@@ -51,19 +53,28 @@ class Watch:
         self._callback = None if callback is None else _of_three(name, callback, former)
         self._bar = None
         if progress:
-            from tqdm import tqdm  # slow to import
-
-            self._bar = tqdm(
-                total=total, initial=done, unit=unit, unit_scale=total >= 1000, desc=name
+            self._bar = _bar_of_tqdm()(
+                total=total,
+                initial=done,
+                unit=unit,
+                unit_scale=total >= 1000,
+                desc=f"{name}: {FIRST}",
             )
 
     def reach(self, done: int, **words: Any) -> None:
         """``done`` units are done; ``words``: numbers beside the bar."""
         self.done = done
         if self._bar is not None:
+            if self._bar.desc.startswith(f"{self.name}: {FIRST}"):
+                self._bar.set_description(self.name, refresh=False)
             if words:
                 self._bar.set_postfix(**words, refresh=False)
             self._bar.update(done - self._bar.n)
+
+    def doing(self, what: str) -> None:
+        """The bar says what the work is at."""
+        if self._bar is not None:
+            self._bar.set_description(f"{self.name}: {what}")
 
     def tell(self, result: Callable[[], Any] | None = None) -> None:
         """Call the callback; ``result()``, the result so far, is only made where there is one."""
@@ -143,6 +154,16 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _bar_of_tqdm() -> Any:
+    """The bar of a terminal, or of a notebook where it can be drawn there."""
+    from tqdm import TqdmWarning  # slow to import
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TqdmWarning)  # of a notebook without ipywidgets
+        from tqdm.auto import tqdm
+    return tqdm
 
 
 def _of_three(name: str, callback: Any, former: Callable[..., tuple] | None) -> Callback:

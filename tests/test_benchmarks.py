@@ -1,5 +1,5 @@
-"""Every benchmark runs and reports numbers: at its smallest size in the suite, and as its users run
-it with the long tests.
+"""Every benchmark runs and reports numbers: at its smallest size in the suite, and the shorter ones
+as their users run them with the long tests.
 """
 
 import importlib
@@ -46,28 +46,17 @@ SMALLEST = {  # beside each other what shares compiled programs
     "time_to_answer": ["--smoke"],
     "weakness": ["--smoke"],
 }
-QUICK = {
+QUICK = {  # those whose quick mode takes less than half a minute
     "arch": ["--quick"],
     "blackbox": ["--quick"],
-    "bridge": ["--quick"],
-    "colav": ["--quick"],
     "cross_entropy": ["--quick", "--seeds", "4"],
     "engine": ["--quick"],
     "explain": "--quick --seeds 1 --parts rules ferry".split(),
     "ferry": ["--quick", "--trees", "10"],
-    "few_calls": ["--seeds", "1", "--budget", "50"],
-    "failure_samples": "--quick --seeds 1".split(),
-    "fms": ["--quick", "--seeds", "1"],
     "fms_readings": ["--quick", "--seeds", "1"],
     "limit_states": ["--seeds", "1"],
     "memory": ["--quick"],
-    "nasa": ["--quick"],
-    "probability": ["--quick", "--seeds", "1"],
-    "scale": ["--quick"],
-    "stress": ["--quick"],
-    "sweep": ["--quick"],
     "table1_seeds": ["--trees", "2", "--seeds", "2", "--rows", "both, text"],
-    "table1": "--table1 --quick --trees 10 --seeds 1".split(),
     "weakness": ["--quick", "--seeds", "1"],
 }
 # of the extra `benchmark`, which the tests do not install

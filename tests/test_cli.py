@@ -17,6 +17,21 @@ ROOT = Path(__file__).parents[1]
 SMALL = ["--trees", "2", "--simulations", "30", "--quiet"]
 
 
+@pytest.fixture(autouse=True)
+def cached(monkeypatch):
+    """The calls of `jast.cache`, which would change JAX's options for other tests."""
+    calls = []
+    monkeypatch.setattr(cli, "cache", lambda: calls.append("cache"))
+    return calls
+
+
+def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cached):
+    run(capsys, tmp_path, "--method", "monte-carlo", "--no-cache")
+    assert cached == []
+    run(capsys, tmp_path, "--method", "monte-carlo")
+    assert cached == ["cache"]
+
+
 def run(capsys, tmp_path, *argv):
     """Exit status, standard output and the folder of results."""
     status = cli.main([*argv, *SMALL, "--output", str(tmp_path / "out")])

@@ -1,5 +1,6 @@
 """Long work that is watched."""
 
+import re
 import warnings
 
 import pytest
@@ -57,6 +58,20 @@ def test_the_bar_says_how_far(capsys):
         watch.more(8)
     text = capsys.readouterr().err
     assert "search: " in text and "20/20" in text and "failures=3" in text
+
+
+def test_the_bar_says_what_the_work_is_at(capsys):
+    with Watch("search", 20, "sim", True, None) as watch:
+        watch.reach(12)
+        watch.doing("refining")
+        watch.reach(20)
+    said = re.findall(r"search[^|]*?(?=:  *[0-9])", capsys.readouterr().err)
+    assert [text for i, text in enumerate(said) if text not in said[:i]] == [
+        "search: compiling",
+        "search: refining",
+    ]
+    with Watch("search", 20, "sim", False, None) as watch:
+        watch.doing("nothing, without a bar")
 
 
 def test_the_result_so_far_is_made_for_a_callback_only():

@@ -223,6 +223,7 @@ class _Work:
 
     def look(self):
         """The system as it is."""
+        self.watch.doing("compiling, first draws")
         # populations draw plainly, too, and so few are compiled quickly
         key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
         with warnings.catch_warnings():
@@ -243,6 +244,7 @@ class _Work:
         polishing = min(POLISHED, self.budget // 8)
         rest = self.budget - self.spent - cooling - 2 * polishing
         rest = max(rest, CHEAP // 2)
+        self.watch.doing("estimating")
         p = by_populations("stress", self.next_key(), self.sim, rest, ways=self.ways)
         self.probability = self.beside_nominal(p)
         self.note("populations", p.episodes, p.failing, invalid=p.invalid)
@@ -259,6 +261,7 @@ class _Work:
             ("cooled together", True, 1 - ALONE),
         ):
             some, most = sample.points[rows], int(share * cooling)
+            self.watch.doing("cooling failures")
             points, spent = cooled(self.next_key(), self.sim, some, most, together)
             self.gather(name, of_points(self.sim, points)._replace(evaluations=spent))
         self.parts, self.paths = Shares(0, 0, 0, polishing), polishing // 4
@@ -288,6 +291,7 @@ class _Work:
         evaluation.
         """
         before = _best(self.pool)
+        self.watch.doing(f"searching by {name}")
         haul = EXPLORERS[name](self.next_key(), self.sim, budget)
         best = _best(self.gather(name, haul))
         if best <= before:
@@ -316,6 +320,7 @@ class _Work:
         for part in (1.0,) if budget < FEW else (0.5, 0.5):
             if chosen is not self.pool and not self.settled():
                 chosen = self.onward(chosen)
+            self.watch.doing("refining failures")
             result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
             found = result.failures
             if len(found):
@@ -330,6 +335,7 @@ class _Work:
                 result.invalid,
             )
             known = found if len(found) else self.pool[:1]
+            self.watch.doing("telling modes apart")
             if self.modes:  # none is lost to a second refinement that had no time for it
                 known = merge(known, self.bests(), top=8 * self.top)
             self.modes = modes(self.sim, known, self.pool, budget=self.paths)
@@ -347,6 +353,7 @@ class _Work:
         if budget < FEW:
             return known
         for name, around in (("slow cross-entropy", None), ("the same, from the best", known)):
+            self.watch.doing(f"searching by {name}")
             haul = onward(self.next_key(), self.sim, budget, around)
             known = merge(known, self.gather(name, haul), top=8 * self.top)
         return known
@@ -359,6 +366,7 @@ class _Work:
 
     def estimate(self):
         """The probability, with what is left."""
+        self.watch.doing("estimating")
         rest = max(self.budget - self.spent, 1)
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
         places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
@@ -405,6 +413,7 @@ class _Work:
         if drawn is not None and isinstance(drawn.source, latent.Latent):
             q = drawn.source  # independent draws tell more than few populations
         budget = min(self.budget, PORTFOLIO)
+        self.watch.doing("shares of modes")
         self.modes, failing, cost = shares(self.next_key(), self.sim, q, self.modes, budget)
         if cost:
             self.note("shares of modes", cost, failing)

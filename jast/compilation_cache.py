@@ -1,0 +1,86 @@
+"""Compiled programs on disk, for the next process."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+
+from jast._checks import whole
+from jast._jax import reset_cache
+
+if TYPE_CHECKING:
+    from jast.typing import PathLike
+
+__all__ = ["cache"]
+
+LIMIT = 2**30
+"""Bytes: the programs of README's lane take 3 MB, so some three hundred systems fit."""
+
+
+def cache(folder: PathLike | None = None, *, limit: int = LIMIT) -> Path:
+    """Keep compiled programs on disk: the next process that needs one reads it instead of
+    compiling it again, which is most of what a first call takes.
+
+    It sets JAX's persistent compilation cache for this process: its folder, and that programs of
+    any compile time and size are kept (by JAX's own default those that took less than a second are
+    not, which is nearly all of them). A program is known by its code, the version of JAX, the
+    options of the compiler and the features of the CPU: one of another machine is not read.
+
+    Args:
+        folder: of the programs, which may be shared by processes. Default: the folder that JAX is
+            configured with already, else ``jast`` among the caches of this user
+            (``$XDG_CACHE_HOME`` or ``~/.cache``; macOS: ``~/Library/Caches``; Windows:
+            ``%LOCALAPPDATA%``).
+        limit: bytes. Where the folder has more, the oldest programs go, now: it may grow beyond
+            before the next call.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: where the folder cannot be made, or for a limit below 0.
+
+    Example:
+        >>> import jast, tempfile
+        >>> jast.cache(tempfile.mkdtemp()).is_dir()
+        True
+    """
+    limit = whole("cache", "limit", limit, 0)
+    folder = Path(folder or jax.config.jax_compilation_cache_dir or _of_user()).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ValueError(
+            f"cache: folder must be one that can be made, received {folder}: {e}"
+        ) from e
+    _forget(folder, limit)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    reset_cache()
+    return folder
+
+
+def _of_user() -> Path:
+    """The folder of this user's caches, by the custom of the platform."""
+    home = Path.home()
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local")) / "jast" / "cache"
+    if sys.platform == "darwin":
+        return home / "Library" / "Caches" / "jast"
+    return Path(os.environ.get("XDG_CACHE_HOME", home / ".cache")) / "jast"
+
+
+def _forget(folder: Path, limit: int) -> None:
+    """Delete the oldest programs in ``folder`` until those left have at most ``limit`` bytes."""
+    kept = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in folder.glob("*-cache"))
+    size = sum(bytes for _, bytes, _ in kept)
+    for _, bytes, file in kept:
+        if size <= limit:
+            return
+        file.unlink(missing_ok=True)  # another process may be at it, too
+        size -= bytes
