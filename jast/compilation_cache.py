@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["cache"]
 
 LIMIT = 2**30
-"""Bytes: the programs of `stress` for the ferry take 1.6 MB, so those of hundreds of systems fit."""
+"""Bytes: the programs of `stress` for the ferry take 1.6 MB, so hundreds of systems fit."""
 
 
 def cache(folder: PathLike | None = None, *, limit: int = LIMIT) -> Path:
