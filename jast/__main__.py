@@ -78,7 +78,7 @@ def main(argv=None):
         parser.error(f"argument --output: {e}")
     try:
         if not options.no_cache:
-            cache()
+            _kept()
         own = _loaded(parser, options.system) if options.system else None
         return _stress(options, own) if options.method == "stress" else _run(options)
     except ValueError as e:
@@ -159,6 +159,14 @@ def _parser():
     )
     add("--quiet", action="store_true", help="no progress bars")
     return parser
+
+
+def _kept():
+    """Compiled programs stay for the next call, where there is a place for them."""
+    try:
+        cache()
+    except ValueError as e:
+        print(f"{e}; compiled programs are not kept", file=sys.stderr)
 
 
 def _count(text):

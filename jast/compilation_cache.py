@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -50,19 +51,19 @@ def cache(folder: PathLike | None = None, *, limit: int = LIMIT) -> Path:
         True
     """
     limit = whole("cache", "limit", limit, 0)
-    folder = Path(folder or jax.config.jax_compilation_cache_dir or _of_user()).expanduser()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
+        path = Path(folder or jax.config.jax_compilation_cache_dir or _of_user()).expanduser()
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError, TypeError) as e:
         raise ValueError(
-            f"cache: folder must be one that can be made, received {folder}: {e}"
+            f"cache: folder must be one that can be made, received {folder!r}: {e}"
         ) from e
-    _forget(folder, limit)
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+    _forget(path, limit)
+    jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     reset_cache()
-    return folder
+    return path
 
 
 def _of_user() -> Path:
@@ -77,10 +78,14 @@ def _of_user() -> Path:
 
 def _forget(folder: Path, limit: int) -> None:
     """Delete the oldest programs in ``folder`` until those left have at most ``limit`` bytes."""
-    kept = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in folder.glob("*-cache"))
+    kept = []
+    for file in folder.glob("*-cache"):
+        with contextlib.suppress(FileNotFoundError):  # another process may be at it, too
+            about = file.stat()
+            kept.append((about.st_mtime, about.st_size, file))
     size = sum(bytes for _, bytes, _ in kept)
-    for _, bytes, file in kept:
+    for _, bytes, file in sorted(kept):
         if size <= limit:
             return
-        file.unlink(missing_ok=True)  # another process may be at it, too
+        file.unlink(missing_ok=True)
         size -= bytes

@@ -32,6 +32,15 @@ def test_compiled_programs_are_kept_unless_told_otherwise(capsys, tmp_path, cach
     assert cached == ["cache"]
 
 
+def test_a_call_goes_on_where_no_program_can_be_kept(capsys, tmp_path, monkeypatch):
+    def full():
+        raise ValueError("cache: folder must be one that can be made")
+
+    monkeypatch.setattr(cli, "cache", full)
+    assert cli.main(["--method", "monte-carlo", *SMALL, "--output", str(tmp_path)]) == 0
+    assert "can be made; compiled programs are not kept" in capsys.readouterr().err
+
+
 def run(capsys, tmp_path, *argv):
     """Exit status, standard output and the folder of results."""
     status = cli.main([*argv, *SMALL, "--output", str(tmp_path / "out")])

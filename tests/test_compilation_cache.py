@@ -119,5 +119,7 @@ def test_what_it_refuses(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="cache: folder must be one that can be made, received"):
         jast.cache(tmp_path / "file")
+    with pytest.raises(ValueError, match="cache: folder must be one .* received 3"):
+        jast.cache(3)
     with pytest.raises(ValueError, match="cache: limit must be a whole number of at least 0"):
         jast.cache(tmp_path, limit=-1)
