@@ -553,7 +553,7 @@ def test_killed_calls_go_on_to_the_same_result(name, tmp_path, same, monkeypatch
     monkeypatch.setattr(sys.modules[__name__], "EPISODES", 2_000_000)
     key, rng = jax.random.key(7), np.random.default_rng(0)
     whole, lasting = KILLED[name](key), 0
-    for i, delay in enumerate(rng.uniform(0, 0.3, 2)):
+    for i, delay in enumerate(rng.uniform(0, 0.3, 4)):
         folder = tmp_path / str(i)
         folder.mkdir()
         lasting += killed(name, folder, delay) is not None

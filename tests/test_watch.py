@@ -70,6 +70,10 @@ def test_the_bar_says_what_the_work_is_at(capsys):
         "search: compiling",
         "search: refining",
     ]
+    with Watch("search", 20, "sim", True, None) as watch:
+        watch.reach(20)
+    lines = re.split(r"[\r\n]+", capsys.readouterr().err.strip())
+    assert lines[0].startswith("search: compiling: ") and lines[-1].startswith("search: 100%")
     with Watch("search", 20, "sim", False, None) as watch:
         watch.doing("nothing, without a bar")
 

@@ -223,7 +223,6 @@ class _Work:
 
     def look(self):
         """The system as it is."""
-        self.watch.doing("compiling, first draws")
         # populations draw plainly, too, and so few are compiled quickly
         key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
         with warnings.catch_warnings():
@@ -352,8 +351,8 @@ class _Work:
         budget = self.parts.onward // 2
         if budget < FEW:
             return known
+        self.watch.doing("searching by slow cross-entropy")
         for name, around in (("slow cross-entropy", None), ("the same, from the best", known)):
-            self.watch.doing(f"searching by {name}")
             haul = onward(self.next_key(), self.sim, budget, around)
             known = merge(known, self.gather(name, haul), top=8 * self.top)
         return known
