@@ -46,6 +46,12 @@ def begin(sim: Simulator, reward: Callable, x0: Any, last: Any = False) -> Progr
     """The `Progress` at s0, which x0 leads to; a failure there is an episode of length 0. ``last``:
     the episode is to end here.
     """
+    return _begun(sim, rewards.as_pytree(reward), x0, last)
+
+
+@jax.jit  # programs with the system in them trace it once for all of them
+def _begun(sim: Simulator, reward: Callable, x0: Any, last: Any) -> Progress:
+    """`begin`, of a ``reward`` that is a pytree."""
     start = sim.start()
     state = strong(sim.init(x0))
     log_p = (D.log_density(start, x0, density) for density in ("raw", rewards.density_of(reward)))
@@ -58,6 +64,12 @@ def advance(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: 
     """The `Progress` one step on, by disturbance ``x``; ``last``: the horizon is reached by it.
     Meaningless once ``progress.done``.
     """
+    return _advanced(sim, rewards.as_pytree(reward), progress, x, last)
+
+
+@jax.jit  # as `_begun`
+def _advanced(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: Any) -> Progress:
+    """`advance`, of a ``reward`` that is a pytree."""
     dist = sim.disturbance(progress.state)
     log_p = (D.log_density(dist, x, density) for density in ("raw", rewards.density_of(reward)))
     state = strong(sim.step(progress.state, x))
