@@ -21,12 +21,14 @@ import numpy as np  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from benchmarks.time_to_answer import SYSTEMS  # noqa: E402
 from jast.estimate.descents import SETTINGS, WAYS  # noqa: E402
+from jast.estimate.particles import SMALL, WINDOW  # noqa: E402
 
 __all__ = ["CHANGES", "work"]
 
 CHANGES = {
     "as they are": {},
-    "small moves": dict(kinds=1),
+    "small moves": dict(kinds=(SMALL, SMALL)),
+    "and windows": dict(kinds=(SMALL, WINDOW)),
     "half the moves": dict(moves=0.5),
     "twice the moves": dict(moves=2),
     "quantile .1": dict(quantile=0.1),
@@ -37,6 +39,8 @@ CHANGES = {
 CASES = (
     ("toy, z 3, 100", "distance"),
     ("cart-pole", "distance"),
+    ("tank", "distance"),
+    ("oven", "distance"),
     ("Gayton of 8", "width"),
     ("piecewise", "width"),
     ("breaker", "width"),
@@ -47,6 +51,8 @@ def work(name: str, way: str, keys: int, particles: int, changes: dict[str, Any]
     """The figure of a system and a way down with these settings, and the mean over the truth."""
     changes, about = dict(changes), SYSTEMS[name]
     moves = int(changes.pop("moves", 1) * getattr(SETTINGS, f"moves_by_{way}"))
+    if "kinds" in changes:
+        changes[f"kinds_by_{way}"] = changes.pop("kinds")
     settings = replace(SETTINGS, **changes)
     runs = [
         WAYS[way](key, about.simulator, particles, moves, particles, settings)
@@ -70,13 +76,13 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     keys, particles = size(args, (40, 2048), (8, 1024), (2, 128))
     rows = []
-    for name, way in size(args, CASES, CASES[2:4], CASES[3:4]):
+    for name, way in size(args, CASES, CASES[4:6], CASES[5:6]):
         if args.systems and name not in args.systems:
             continue
         for words, changes in CHANGES.items():
-            if ("quantile" in changes and way == "width") or (
-                "effective" in changes and way == "distance"
-            ):
+            other = "effective" if way == "distance" else "quantile"
+            as_it_is = changes.get("kinds") == getattr(SETTINGS, f"kinds_by_{way}")
+            if other in changes or as_it_is:
                 continue
             row = dict(system=name, way=way, settings=words)
             rows.append(row | work(name, way, keys, particles, changes))

@@ -106,20 +106,31 @@ def normal_numbers(sim: Simulator) -> Any:
     return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
 
 
-def ended(sim: Simulator, z: jax.Array, reward: Callable) -> tuple[Progress, jax.Array]:
-    """The `Progress` at the end of the one episode of ``z`` [D], and its steps; differentiable in
-    forward mode.
+def ended(
+    sim: Simulator, z: jax.Array, reward: Callable, level: Any = None
+) -> tuple[Progress, jax.Array, jax.Array | None]:
+    """The `Progress` at the end of the one episode of ``z`` [D], its steps, and of a ``level`` the
+    steps before the episode failed or its distance first came to it; differentiable in forward
+    mode.
     """
     policy, last = policy_of(sim, z), jnp.asarray(sim.horizon, jnp.int32)
-    first = begin(sim, reward, D.mode(policy.start()))
+    begun = begin(sim, reward, D.mode(policy.start()))
+
+    def waited(p, steps):
+        if level is None:
+            return None
+        return steps + (~p.failure & (p.distance > level)).astype(steps.dtype)
 
     def body(carry):
-        progress, t = carry
+        progress, t, steps = carry
         x = D.mode(policy.disturbance(progress.state, t))
-        return advance(sim, reward, progress, x, t + 1 >= last), t + 1
+        new = advance(sim, reward, progress, x, t + 1 >= last)
+        return new, t + 1, waited(new, steps)
 
-    end, length = lax.while_loop(lambda c: ~c[0].done, body, (first, jnp.zeros((), jnp.int32)))
-    return conclude(sim, reward, end), length
+    none = jnp.zeros((), jnp.int32)
+    start = begun, none, waited(begun, none)
+    end, length, steps = lax.while_loop(lambda c: ~c[0].done, body, start)
+    return conclude(sim, reward, end), length, steps
 
 
 def unit(z: np.ndarray) -> np.ndarray:
@@ -129,10 +140,24 @@ def unit(z: np.ndarray) -> np.ndarray:
 
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
-    end, length = ended(sim, z, likelihood(sim))
-    about = outline(sim)
-    used = count(about.x0) + length * count(about.x)
+    end, length, _ = ended(sim, z, likelihood(sim))
+    used = _used(sim, length)
     return Outcomes(end.failure, end.distance, used, length, end.invalid, end.reward)
+
+
+def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes, jax.Array]:
+    """The same, and how many of the numbers were used when the episode failed or its distance first
+    came to the ``level``.
+    """
+    end, length, steps = ended(sim, z, likelihood(sim), level)
+    o = Outcomes(end.failure, end.distance, _used(sim, length), length, end.invalid)
+    return o, _used(sim, steps)
+
+
+def _used(sim, steps):
+    """How many numbers the start and so many ``steps`` take."""
+    about = outline(sim)
+    return count(about.x0) + steps * count(about.x)
 
 
 @jax.jit

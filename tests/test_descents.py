@@ -25,7 +25,17 @@ from jast.estimate import (
 from jast.estimate.agreement import Answer, answer_of
 from jast.estimate.descents import WAYS, by_distance, by_width
 from jast.estimate.estimate import ROUGH
-from jast.estimate.particles import Particles, Steering, begun, blank, moved
+from jast.estimate.particles import (
+    AFTER,
+    SMALL,
+    WINDOW,
+    Particles,
+    Steering,
+    begun,
+    blank,
+    moved,
+    when_reached,
+)
 from jast.intervals import clopper_pearson
 from jast.limit_state import outcomes
 from jast.simulators import limit_state, walk1d
@@ -47,13 +57,13 @@ def as_particles(sim, z):
     own = np.arange(z.shape[1]) < o.used[:, None]
     square = (z**2 * own).sum(axis=1)
     given = z.astype(p.z.dtype), o.score, o.used, square.astype(p.z.dtype), o.distance
-    return Particles(*map(jnp.asarray, given))
+    return Particles(*map(jnp.asarray, given), p.reached)
 
 
 # --- moves
 
 
-@pytest.mark.parametrize("kinds", [1, 2])
+@pytest.mark.parametrize("kinds", [(SMALL, SMALL), (SMALL, WINDOW)])
 @pytest.mark.parametrize("width", [1.0, 2.0])
 def test_moves_among_failures_keep_what_is_normal_there(key, width, kinds):
     """Exact draws of N(0, w^2 I) given x.e >= 3: after 40 moves x.e is still normal, truncated, and
@@ -103,6 +113,36 @@ def test_a_window_draws_neighbours_anew(key):
     assert stats.chisquare(begin.sum(axis=0)).pvalue > CHANCE
     assert stats.kstest(np.asarray(after.z)[changed], norm.cdf).pvalue > CHANCE
     assert (steering.accepted == 1).all()
+
+
+def test_what_comes_after_a_level_is_drawn_anew(key):
+    """Walks of ten steps from 0 with 3 - |s| as the distance, those that came to 1 but did not
+    fail: until then no bit changes, later all numbers do and are normal (Kolmogorov-Smirnov); no
+    draw is refused. The moment is that of a loop in NumPy.
+    """
+    sim, rng = walk1d(threshold=3.0, horizon=10), np.random.default_rng(0)
+    z = rng.standard_normal((4 * N, 10)).astype(np.float32)
+    start = as_particles(sim, z)
+    rows = np.flatnonzero((np.asarray(start.score) <= 1) & (np.asarray(start.score) > -np.inf))
+    for_looks, for_moves = counter_key(key, 1), counter_key(key, 2)
+    looked = when_reached(sim, start, for_looks, rows, 1.0)
+    path = np.cumsum(z[rows], axis=1)
+    reached = [next(t for t, s in enumerate(p, 1) if 3 - abs(s) <= 1) for p in path]
+    assert (np.asarray(looked.reached)[: len(rows)] == reached).all() and len(rows) > N
+    after, steering, _ = moved(
+        sim,
+        looked,
+        for_moves,
+        np.arange(len(rows)),
+        begun(),
+        moves=1,
+        level=1.0,
+        kinds=(AFTER, AFTER),
+    )
+    new = np.asarray(after.z)[: len(rows)]
+    later = np.arange(10) >= np.asarray(reached)[:, None]
+    assert ((new != z[rows]) == later).all() and steering.accepted[0] == 1
+    assert stats.kstest(new[later], norm.cdf).pvalue > CHANCE
 
 
 def test_small_changes_are_steered_to_a_third_of_acceptance(key):
@@ -239,6 +279,29 @@ def turned():
     return total[22:].sum()
 
 
+def latch():
+    """A number above 3 of the first five opens a latch, at a distance of 1, where none else is
+    nearer; behind it the last of five more fails above 1.5.
+    """
+
+    def step(s, x):
+        opened, t, _ = s
+        return jnp.where((t < 5) & (x > 3), 1.0, opened), t + 1, x
+
+    def evaluate(s):
+        opened, t, x = s
+        failure = (opened > 0) & (t == 10) & (x > 1.5)
+        return failure, jnp.where(failure, 0.0, jnp.where(opened > 0, 1.0, 5 - jnp.minimum(x, 3)))
+
+    return jast.Simulator(
+        init=lambda x0: (jnp.zeros(()), jnp.zeros(()), jnp.zeros(())),
+        step=step,
+        disturbance=lambda s: D.Normal(jnp.zeros(()), 1.0),
+        evaluate=evaluate,
+        horizon=10,
+    )
+
+
 @pytest.mark.parametrize("way", ["distance", "width"])
 @pytest.mark.parametrize(
     "sim, truth",
@@ -246,11 +309,12 @@ def turned():
         (SPHERE, stats.chi2(5).sf(25)),
         (start_and_steps(), norm.sf(9 / 8**0.5)),
         (wheel(), turned()),
+        (latch(), (1 - norm.cdf(3) ** 5) * norm.sf(1.5)),
     ],
-    ids=["sphere", "start", "wheel"],
+    ids=["sphere", "start", "wheel", "latch"],
 )
 def test_chains_tell_closed_forms(key, way, sim, truth):
-    """1.4e-4, 7.3e-4 and 1.5e-4, from four populations."""
+    """1.4e-4, 7.3e-4, 1.5e-4 and 4.5e-4, from four populations."""
     runs = [WAYS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
     a = answer_of(runs)
     assert abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * agreement.BLUNT

@@ -17,7 +17,17 @@ import numpy as np
 
 from jast.counter import counter_key, generator
 from jast.estimate.batches import resampled
-from jast.estimate.particles import LANES, begun, blank, fresh, moved
+from jast.estimate.particles import (
+    AFTER,
+    LANES,
+    SMALL,
+    WINDOW,
+    begun,
+    blank,
+    fresh,
+    moved,
+    when_reached,
+)
 from jast.limit_state import dimension
 from jast.simulator import Simulator
 
@@ -36,9 +46,10 @@ class Settings:
     moves_by_width: int = 10
     """Of a point between two widths: half as many make the variance of the breaker 5.6 times as
     great, and its estimate a quarter too low."""
-    kinds: int = 2
-    """Of moves: small ones of all numbers, and new ones of a few; without the latter (1) the
-    variance of the breaker is 9 times as great."""
+    kinds_by_distance: tuple[int, int] = SMALL, AFTER
+    """Of the moves between two levels of a distance that is known at each step."""
+    kinds_by_width: tuple[int, int] = SMALL, WINDOW
+    """Of all other moves; without windows the variance of the breaker is 9 times as great."""
     quantile: float = 0.2
     """Share of the points that a level keeps."""
     effective: float = 0.5
@@ -95,11 +106,13 @@ class _Population:
     """A population on its way: the particles, the family of each, and the counts."""
 
     def __init__(self, key, sim, n, moves, capacity, settings=SETTINGS):
-        self.sim, self.n, self.moves, self.kinds = sim, n, moves, settings.kinds
+        self.sim, self.n, self.moves, self.settings = sim, n, moves, settings
         self.rng, self.key, self.calls = generator(key, 1), key, 0
         self.particles, self.steering = blank(sim, capacity), begun()
         self.evaluations, self.invalid = 0, 0
         self.log_mean, self.family = 0.0, np.arange(n)
+        # else the distance is known at the end of an episode, and nothing comes after it
+        self.watched = not sim.episodic and sim.horizon > 1
         self.plain, self.levels = (0, 0, 0), []
 
     def next_key(self):
@@ -135,6 +148,13 @@ class _Population:
         """Go on from points chosen by weight (systematic resampling)."""
         rows = resampled(log_w, self.n, self.rng.random())
         self.family = self.family[rows]
+        kinds = self.settings.kinds_by_width
+        if level > -np.inf and self.watched:
+            kinds = self.settings.kinds_by_distance
+            # what is chosen more than once is simulated once
+            chosen, rows = np.unique(rows, return_inverse=True)
+            self.particles = when_reached(self.sim, self.particles, self.next_key(), chosen, level)
+            self.evaluations += len(chosen)
         self.particles, self.steering, invalid = moved(
             self.sim,
             self.particles,
@@ -143,7 +163,7 @@ class _Population:
             self.steering,
             moves=self.moves,
             level=level,
-            kinds=self.kinds,
+            kinds=kinds,
             **width,
         )
         self.evaluations, self.invalid = (

@@ -2,10 +2,13 @@
 moves it, and simulates it, whatever its level and its width.
 
 A move proposes a point that N(0, width^2 I) has as often as the old one, and is taken where the
-episode of the new point is at most at the level. Two moves alternate. The first changes all numbers
-a little (preconditioned Crank-Nicolson: Cotter, Roberts, Stuart and White 2013). The second draws a
-few neighbouring numbers anew, which is a Gibbs move of a random window; in long episodes it mixes
-where small changes of everything do not. `python -m benchmarks.populations` measures both.
+episode of the new point is at most at the level. Two kinds of moves alternate. The first changes
+all numbers a little (preconditioned Crank-Nicolson: Cotter, Roberts, Stuart and White 2013). On the
+way down the levels of the miss distance, the second keeps what led to the level and draws anew all
+that came after: every draw stays below it, as in splitting (Cerou and Guyader 2007). Among failures
+nothing comes after, and the second draws a few neighbouring numbers anew, which is a Gibbs move of
+a random window; in long episodes it mixes where small changes of everything do not.
+`python -m benchmarks.populations` measures them all.
 """
 
 from functools import partial
@@ -16,15 +19,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jast.limit_state import dimension, normal_numbers, outcome
+from jast.limit_state import dimension, normal_numbers, outcome_by_level
 from jast.simulator import Simulator
 
-__all__ = ["LANES", "Particles", "Steering", "blank", "fresh", "moved"]
+__all__ = [
+    "AFTER",
+    "LANES",
+    "SMALL",
+    "WINDOW",
+    "Particles",
+    "Steering",
+    "blank",
+    "fresh",
+    "moved",
+    "when_reached",
+]
 
 LANES = 128
 """Points that are simulated side by side: their numbers then stay in the caches of a core."""
 ACCEPTANCE = 0.35
 """Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
+SMALL, WINDOW, AFTER, NONE = range(4)
+"""Kinds of moves: of all numbers, of some neighbours, of those after the level was reached; and the
+point as it is.
+"""
 STEERED = 0.02, 1.0
 """Least and greatest size of a move: 1 is an independent draw, or a window of all numbers."""
 
@@ -42,13 +60,16 @@ class Particles(NamedTuple):
     """[n] sum of the squares of these"""
     distance: jax.Array
     """[n] miss distance, of failures too"""
+    reached: jax.Array
+    """[n] int32: how many of the numbers were used when the last level was reached"""
 
 
 class Steering(NamedTuple):
     """Sizes of the two moves, and what became of them. On the host, [2] each."""
 
     size: np.ndarray
-    """Of the small change, from 0 to 1; of the window, as a share of all numbers"""
+    """Of the small change, from 0 to 1; of the window, as a share of all numbers. What draws anew
+    all after a level has none."""
     accepted: np.ndarray
     """Share of the last moves that were taken"""
 
@@ -69,6 +90,7 @@ def blank(sim: Simulator, n: int) -> Particles:
             used=np.zeros(n, np.int32),
             square=zeros,
             distance=zeros,
+            reached=np.zeros(n, np.int32),
         )
     )
 
@@ -87,6 +109,16 @@ def fresh(
     return after, invalid
 
 
+def when_reached(
+    sim: Simulator, particles: Particles, key: jax.Array, rows: np.ndarray, level: float
+) -> Particles:
+    """The points of ``rows`` [m], which are at most at the ``level``, in the first m places, with
+    the moment at which each came to it.
+    """
+    kinds = NONE, NONE
+    return moved(sim, particles, key, rows, begun(), moves=1, level=level, kinds=kinds)[0]
+
+
 def moved(
     sim: Simulator,
     particles: Particles,
@@ -98,21 +130,21 @@ def moved(
     level: float,
     width: float = 1.0,
     before: float | None = None,
-    kinds: int = 2,
+    kinds: tuple[int, int] = (SMALL, WINDOW),
 ) -> tuple[Particles, Steering, int]:
     """The points of ``rows`` [m] after so many moves that keep N(0, width^2 I) given a score of at
     most ``level``, in the first m places; their new sizes; invalid episodes that were met. What
     stands in the other places means nothing.
 
     ``before``: the width that the points were drawn with, where it was another one. Numbers that an
-    episode did not use are scaled to the new one, as nothing ties them. ``kinds``: 1 leaves out
-    the windows.
+    episode did not use are scaled to the new one, as nothing ties them. ``kinds``: of the moves,
+    which alternate.
     """
     dtype, live = np.dtype(particles.z.dtype), len(rows)
     places = np.arange(len(particles.z), dtype=np.int32)
     places[:live] = rows
     ratio = 1.0 if before is None else width / before
-    counts = np.int32(live), np.int32(moves), np.int32(kinds)
+    counts = np.int32(live), np.int32(moves), np.array(kinds, np.int32)
     numbers = (dtype.type(v) for v in (level, width, ratio))
     out, size, accepted, invalid = _moved(
         sim, particles, key, places, steering.size, *counts, *numbers
@@ -124,31 +156,38 @@ def moved(
 def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
     n, d = particles.z.shape
     lanes = min(LANES, n)
-    play = jax.vmap(partial(outcome, sim))
+    play = jax.vmap(lambda z: outcome_by_level(sim, z, level))
     number = jnp.arange(d, dtype=jnp.int32)[None]
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
-    def small(z, noise, key, size):
+    def small(z, noise, key, size, reached):
         return jnp.sqrt(1 - size**2) * z + size * noise
 
-    def window(z, noise, key, size):
+    def window(z, noise, key, size, reached):
         begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
         length = jnp.maximum(jnp.floor(size * d), 1).astype(jnp.int32)
         return jnp.where(jnp.mod(number - begin, d) < length, noise, z)
+
+    def after(z, noise, key, size, reached):
+        return jnp.where(number < reached[:, None], z, noise)
+
+    def none(z, noise, key, size, reached):
+        return z
 
     def block(i, carry, key, kind, size):
         particles, accepted, invalid = carry
         old = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, i * lanes, lanes), particles)
         for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
         noise = width * jax.random.normal(for_noise, old.z.shape, old.z.dtype)
-        z = lax.switch(kind, (small, window), old.z, noise, for_window, size.astype(old.z.dtype))
-        o = play(z)
+        about = old.z, noise, for_window, size.astype(old.z.dtype), old.reached
+        z = lax.switch(kind, (small, window, after, none), *about)
+        o, reached = play(z)
         score = o.score.astype(old.score.dtype)
         square = jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1)
         taken = score <= level
         new = jax.tree.map(
             lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-            Particles(z, score, o.used, square, o.distance.astype(score.dtype)),
+            Particles(z, score, o.used, square, o.distance.astype(score.dtype), reached),
             old,
         )
         particles = jax.tree.map(
@@ -159,15 +198,15 @@ def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ra
 
     def move(t, carry):
         particles, size, accepted, invalid = carry
-        kind = t % kinds
-        run = partial(block, key=jax.random.fold_in(key, t), kind=kind, size=size[kind])
-        none = jnp.zeros((), jnp.int32)
+        i = t % 2
+        run = partial(block, key=jax.random.fold_in(key, t), kind=kinds[i], size=size[i])
+        zero = jnp.zeros((), jnp.int32)
         particles, taken, wrong = lax.fori_loop(
-            0, (live + lanes - 1) // lanes, run, (particles, none, none)
+            0, (live + lanes - 1) // lanes, run, (particles, zero, zero)
         )
         share = taken.astype(size.dtype) / live.astype(size.dtype)
-        steered = jnp.clip(size[kind] * jnp.exp(share - ACCEPTANCE), *STEERED)
-        size, accepted = size.at[kind].set(steered), accepted.at[kind].set(share)
+        steered = jnp.clip(size[i] * jnp.exp(share - ACCEPTANCE), *STEERED)
+        size, accepted = size.at[i].set(steered), accepted.at[i].set(share)
         return particles, size, accepted, invalid + wrong
 
     particles = jax.tree.map(lambda a: a[rows], particles)

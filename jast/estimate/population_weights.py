@@ -15,7 +15,8 @@ import numpy as np
 
 from jast.counter import generator
 from jast.estimate.agreement import Answer, Kind
-from jast.estimate.batches import log_ratio
+from jast.estimate.batches import log_ratio, resampled
+from jast.estimate.diagnostics import pareto_k
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussian_estimate import estimated
 from jast.estimate.gaussians import as_latent, fit
@@ -86,15 +87,21 @@ def _promise(s, samples, log_mean, left, components):
     weights = np.exp(log_w - np.logaddexp.reduce(log_w))
     g = fit(generator(s.key, 7), points, weights, len(points), limit=components)
     q = as_latent(defended(g, 0.0, True), normal_numbers(s.sim))
-    log_moment = max(
-        np.logaddexp.reduce(a.log_weight - log_ratio(q, a.points, a.used))
-        - np.logaddexp.reduce(a.log_weight)
-        for a in samples
-    )
+    log_moment = max(_log_moment(a, -log_ratio(q, a.points, a.used)) for a in samples)
     moment = math.exp(min(log_moment - log_mean, 700.0))  # e^700: no Gaussians serve
     products = len(q.means) * points.shape[1] ** 2
     draws = max(int(min(moment / EXACT**2, PRODUCTS / products, left)), LANES)
     return Promise(q, draws, math.sqrt(moment / draws))
+
+
+def _log_moment(sample, log_w):
+    """The log mean of weights over failures [m]; inf where their tail is so heavy that they have
+    none (a Pareto shape of 1 and more): whatever mean they show is then too small.
+    """
+    rows = resampled(sample.log_weight, len(log_w), 0.5)
+    if not pareto_k(log_w[rows], len(log_w)) < 1:
+        return math.inf
+    return np.logaddexp.reduce(sample.log_weight + log_w) - np.logaddexp.reduce(sample.log_weight)
 
 
 def _of_populations(s, kind, left):
