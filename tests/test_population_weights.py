@@ -3,6 +3,7 @@ and populations check it.
 """
 
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,21 @@ def test_the_same_bits_with_a_checkpoint(plane, tmp_path):
     for _ in range(2):
         kept = population(jax.random.key(3), PLANE, 300_000, checkpoint=tmp_path)
         assert kept.log_mean == plane.log_mean and kept.interval == plane.interval
+
+
+def test_weights_whose_tail_is_too_heavy_for_a_mean_promise_nothing():
+    """N(0, I) over N(0, v I) in two numbers has the mean v / (2 - 1 / v) for v above a half, and
+    a Pareto shape of 1 / v - 1: within 4 standard errors for .75, none for .4. The model over
+    itself is 1 exactly.
+    """
+    z = np.random.default_rng(0).standard_normal((4096, 2))
+    sample = SimpleNamespace(log_weight=np.zeros(len(z)))
+    log_w = lambda v: (0.5 * (1 / v - 1) * z**2 + 0.5 * np.log(v)).sum(axis=1)
+    moment = lambda v: population_weights._log_moment(sample, log_w(v))
+    assert moment(1.0) == pytest.approx(0, abs=1e-12)
+    spread = np.exp(log_w(0.75)).std() / len(z) ** 0.5
+    assert abs(np.exp(moment(0.75)) - 0.75 / (2 - 1 / 0.75)) < 4 * spread
+    assert moment(0.4) == np.inf
 
 
 def test_where_no_gaussians_serve_populations_answer(key):
