@@ -3,7 +3,6 @@ and populations check it.
 """
 
 import sys
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -54,19 +53,22 @@ def test_the_same_bits_with_a_checkpoint(plane, tmp_path):
         assert kept.log_mean == plane.log_mean and kept.interval == plane.interval
 
 
-def test_weights_whose_tail_is_too_heavy_for_a_mean_promise_nothing():
-    """N(0, I) over N(0, v I) in two numbers has the mean v / (2 - 1 / v) for v above a half, and
-    a Pareto shape of 1 / v - 1: within 4 standard errors for .75, none for .4. The model over
-    itself is 1 exactly.
+@pytest.mark.parametrize("v, serves", [(0.3, False), (0.8, True)])
+def test_weights_without_a_variance_are_left_after_a_pilot(key, monkeypatch, v, serves):
+    """The model over N(m, v I) has the Pareto shape 1 - v where m is the likeliest failure of a
+    half-space: no variance for .3, one for .8.
     """
-    z = np.random.default_rng(0).standard_normal((4096, 2))
-    sample = SimpleNamespace(log_weight=np.zeros(len(z)))
-    log_w = lambda v: (0.5 * (1 / v - 1) * z**2 + 0.5 * np.log(v)).sum(axis=1)
-    moment = lambda v: population_weights._log_moment(sample, log_w(v))
-    assert moment(1.0) == pytest.approx(0, abs=1e-12)
-    spread = np.exp(log_w(0.75)).std() / len(z) ** 0.5
-    assert abs(np.exp(moment(0.75)) - 0.75 / (2 - 1 / 0.75)) < 4 * spread
-    assert moment(0.4) == np.inf
+    sim = limit_state(lambda u: 4.0 - u[0], 2)
+    root = np.sqrt(v, dtype=np.float32)
+    one, two = np.eye(2, dtype=np.float32)[None], np.array([[4.0, 0.0]], np.float32)
+    q = Latent(np.zeros(1, np.float32), two, root * one, one / root)
+    promise = population_weights.Promise(q, 80_000, 1e-3)
+    monkeypatch.setattr(population_weights, "_promise", lambda *_: promise)
+    found = population(key, sim, 300_000)
+    assert ("importance sampling" in found.method) == serves
+    assert any("no variance" in line for line in found.history) != serves
+    assert any("a pilot" in line and "10000 draws" in line for line in found.history)
+    assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
 
 
 def test_where_no_gaussians_serve_populations_answer(key):
@@ -93,9 +95,11 @@ def test_populations_check_it(key, monkeypatch, factor, words):
 
 
 def test_weights_that_speak_against_themselves_are_left(key, monkeypatch):
-    drawn = population_weights._drawn
-    doubted = lambda *args: drawn(*args)._replace(reliable=False, warnings=("a doubt",))
-    monkeypatch.setattr(population_weights, "_drawn", doubted)
+    drawn = population_weights.estimated
+    doubted = lambda *args, **more: drawn(*args, **more)._replace(
+        reliable=False, warnings=("a doubt",)
+    )
+    monkeypatch.setattr(population_weights, "estimated", doubted)
     found = population(key, PLANE, 300_000)
     assert "importance" not in found.method and any("a doubt" in line for line in found.history)
 
