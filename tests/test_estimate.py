@@ -362,11 +362,11 @@ def test_counts():
 )
 def test_what_plain_draws_guarantee(k, n, level):
     """Quantiles of beta distributions, whatever the rest of the estimate says."""
-    found = estimate("x", some(), level=level, reasons=("no",), plain=(k, n))
+    found = estimate("x", some(), level=level, reasons=("no",), plain=(k, 0, n))
     tail = (1 - level) / 2
     low = scipy.stats.beta.ppf(tail, k, n - k + 1) if k else 0.0
     high = scipy.stats.beta.isf(tail, k + 1, n - k) if k < n else 1.0
-    assert found.plain == (k, n) and found.guaranteed == pytest.approx((low, high), rel=1e-9)
+    assert found.plain == (k, 0, n) and found.guaranteed == pytest.approx((low, high), rel=1e-9)
     words = f"between {low:.3g} and {high:.3g} at {level:.4g}: {k} of {n} plain draws fail"
     lines = str(found).splitlines()
     assert lines[0] == "UNRELIABLE: no" and lines[2] == f"probability    {words}"
@@ -377,28 +377,29 @@ def test_what_plain_draws_guarantee(k, n, level):
 def test_plain_draws_of_the_sums_join_the_others():
     whole = traces(np.full(100, -5.0), failure=np.arange(100) < 30)
     total = add(nothing(100), whole, np.arange(100) % 10 == 0)
-    assert total.plain == (3, 10) and estimate("x", total, plain=(1, 5)).plain == (4, 15)
-    assert add(total, whole).plain == (3, 10)  # of which nothing is known
+    assert total.plain == (3, 0, 10)
+    assert estimate("x", total, plain=(1, 2, 5)).plain == (4, 2, 15)
+    assert add(total, whole).plain == (3, 0, 10)  # of which nothing is known
     none = estimate("x", some(), reasons=("no",))
     assert none.plain is None is none.guaranteed and "doubtful" not in str(none)
     assert f"probability    {none.mean:.4g}   0.95 interval" in str(none)
 
 
 def test_a_reliable_estimate_prints_as_if_there_were_no_plain_draws():
-    assert str(estimate("x", some(), plain=(3, 4000))) == str(estimate("x", some()))
+    assert str(estimate("x", some(), plain=(3, 0, 4000))) == str(estimate("x", some()))
 
 
 @pytest.mark.parametrize("k", [0, 3])
 def test_counts_are_printed_once(k):
     found = of_counts("monte_carlo", summed(np.zeros(500), failure=np.arange(500) < k))
-    assert found.plain == (k, 500) and found.guaranteed == found.interval
+    assert found.plain == (k, 0, 500) and found.guaranteed == found.interval
     text = str(found)
     assert not found.reliable and "doubtful" not in text and text.count("between ") == 1
     assert text.count(f"{found.interval[1]:.3g}") == 1 and f"{k} of 500 plain draws" in text
 
 
 def test_a_file_keeps_the_plain_draws(tmp_path):
-    for found in (estimate("x", some(), plain=(2, 99)), estimate("x", some())):
+    for found in (estimate("x", some(), plain=(2, 5, 99)), estimate("x", some())):
         jast.save(tmp_path / "e.npz", found)
         back = jast.load(tmp_path / "e.npz")
         assert back.plain == found.plain and back.guaranteed == found.guaranteed
@@ -415,7 +416,7 @@ def test_no_probability_above_1():
     found = estimate("x", summed(log_w))
     assert found.reliable and (found.mean, found.log_mean) == (1.0, 0.0)
     assert found.interval[0] < 1 == found.interval[1] and "probability    1   0.95" in str(found)
-    wrong = estimate("x", summed(log_w + 1), plain=(9, 10))
+    wrong = estimate("x", summed(log_w + 1), plain=(9, 0, 10))
     assert not wrong.reliable and wrong.mean == 1 and "is 2.721, above 1" in wrong.warnings[0]
     assert "doubtful       1   0.95 interval" in str(wrong)
 

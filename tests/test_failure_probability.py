@@ -148,7 +148,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
     puts them before the estimate.
     """
     found = failure_probability(key, planes(3.0), BUDGET)
-    (k, n), truth = found.plain, norm.sf(3)
+    (k, _, n), truth = found.plain, norm.sf(3)
     assert found.chernoff is None and BUDGET // 25 + found.samples // 10 < n < found.evaluations
     assert abs(k - n * truth) < 4 * np.sqrt(n * truth)
     assert found.guaranteed[0] < truth < found.guaranteed[1] and "plain draws" not in str(found)
@@ -164,7 +164,7 @@ def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
     """Then subset simulation answers, flagged, and its guarantee is the first batch's."""
     monkeypatch.setattr(adaptive, "_astray", lambda s, n: True)
     found = failure_probability(key, planes(4.0), BUDGET)
-    assert "subset simulation" in str(found.warnings) and found.plain == (0, BUDGET // 25)
+    assert "subset simulation" in str(found.warnings) and found.plain == (0, 0, BUDGET // 25)
     lines = str(found).splitlines()
     i = next(i for i, line in enumerate(lines) if line.startswith("probability    between 0 and"))
     assert lines[i + 1].startswith("doubtful ") and lines[0].startswith("UNRELIABLE: ")
@@ -196,6 +196,8 @@ def test_invalid_episodes(key):
     )
     assert not found.reliable and any("if they failed" in w for w in found.warnings)
     assert found.invalid > 0 and "invalid" in found.warnings[-1], str(found)
+    _, invalid, n = found.plain
+    assert 0 < invalid / n < found.guaranteed[1]  # all of them may have failed
 
 
 def test_below_the_least_double(key):

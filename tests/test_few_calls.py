@@ -131,6 +131,7 @@ def test_invalid_episodes_are_counted_and_teach_nothing(coarse):
     g = lambda x: jnp.where(x[1] > 0.6, jnp.nan, 2.5 - x[0])
     r = failure_probability(jax.random.key(0), limit_state(g, 2), 60)
     assert 0 < r.invalid < 36 and "episodes are invalid" in str(r)
+    assert 0 < r.plain[1] <= r.invalid and r.guaranteed[1] > r.plain[1] / r.plain[2]
     truth = norm.sf(2.5) * norm.cdf(0.6)
     assert not r.reliable or abs(r.mean / truth - 1) < 4 * r.relative_error
 
@@ -141,7 +142,7 @@ def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     r = few_calls.few_calls(jax.random.key(0), sim, 50, 0.95, known)
     assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
     common = few_calls.few_calls(jax.random.key(0), limit_state(lambda x: x[0], 2), 60, 0.95)
-    k, n = common.plain  # every other one of the initial design
+    k, _, n = common.plain  # every other one of the initial design
     assert n == pytest.approx(-np.log(0.05) / common.unseen) and 0 < k < n and common.mean <= 1
 
 

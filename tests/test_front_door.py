@@ -114,8 +114,8 @@ def test_a_system_that_never_fails_has_an_upper_bound(key):
     assert "no failure was found" in str(report)
     # draws of the estimate and those before it, which are the model's own too
     p, nominal = report.probability, report.nominal
-    assert p.plain == (0, p.samples + nominal.episodes) and nominal.episodes == 50
-    words = f"between 0 and {p.guaranteed[1]:.3g} at 0.95: 0 of {p.plain[1]} plain draws fail"
+    assert p.plain == (0, 0, p.samples + nominal.episodes) and nominal.episodes == 50
+    words = f"between 0 and {p.guaranteed[1]:.3g} at 0.95: 0 of {p.plain[-1]} plain draws fail"
     assert f"\nprobability  {words}\n" in str(report) and "doubtful" not in str(report)
 
 

@@ -187,13 +187,13 @@ def test_the_verdict_says_whether_to_believe_it(tmp_path):
         ),
         "below 0.003</p><p>no failure in 99 draws": none._replace(probability=blank),
         "value'>between 0 and 3.69e-06</p><p>at 0.95: 0 of 1000000 plain draws fail</p><div": made(
-            probability=p._replace(reliable=False, plain=(0, 1_000_000))
+            probability=p._replace(reliable=False, plain=(0, 0, 1_000_000))
         ),
         "<dt>doubtful</dt><dd>1e-05, 95% interval 8e-06 to 2e-05, not to be believed</dd>": made(
-            probability=p._replace(reliable=False, plain=(0, 1_000_000))
+            probability=p._replace(reliable=False, plain=(0, 0, 1_000_000))
         ),
         "value'>between 0 and 0.0366</p><p>at 0.95: 0 of 99 plain": none._replace(
-            probability=blank._replace(plain=(0, 99))
+            probability=blank._replace(plain=(0, 0, 99))
         ),
     }
     for words, case in cases.items():

@@ -45,7 +45,7 @@ def test_the_probability(family):
     found = monte_carlo(jax.random.key(3), sim, SAMPLES)
     assert found.samples == found.evaluations == SAMPLES
     assert abs(found.failing - p * SAMPLES) < 4.5 * np.sqrt(p * (1 - p) * SAMPLES)
-    assert found.plain == (found.failing, SAMPLES)
+    assert found.plain == (found.failing, found.invalid, SAMPLES)
 
 
 @pytest.mark.parametrize("family", ["Normal", "Logistic"])

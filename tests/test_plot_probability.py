@@ -83,9 +83,9 @@ def test_what_is_not_to_be_believed_is_drawn_otherwise_and_named():
     assert good.get_color() == BLUE and not good.is_dashed() and dot.get_marker() == "o"
     assert bad.get_color() == VERMILION and bad.is_dashed() and cross.get_marker() == "X"
     assert words(ax) == ["1e-09  SE 10 %", "1e-09  UNRELIABLE"] and "UNRELIABLE" in legend(ax)
-    flagged = made(reliable=False)._replace(plain=(0, 1_000_000))
+    flagged = made(reliable=False)._replace(plain=(0, 0, 1_000_000))
     counted = flagged._replace(chernoff=0.1, jeffreys=0.1)
-    nothing = NOTHING._replace(plain=(0, 1_000_000))
+    nothing = NOTHING._replace(plain=(0, 0, 1_000_000))
     known = drawn(plot.probability({"a": flagged, "b": counted, "c": nothing}))
     first = "between 0 and 3.69e-06"
     assert words(known) == [f"{first}\n1e-09  UNRELIABLE", f"{first}\nUNRELIABLE", first]

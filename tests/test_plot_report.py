@@ -62,7 +62,7 @@ def test_what_must_not_be_believed_says_so_and_why():
     assert " ".join(words).count("or so") == 30
     assert max(map(len, words)) < 130
     plt.close(figure)
-    figure = plot.report(made(probability=doubt._replace(plain=(2, 30_000))), nominal=0)
+    figure = plot.report(made(probability=doubt._replace(plain=(2, 0, 30_000))), nominal=0)
     words = said(figure)
     assert "between 8.07e-06 and 0.000241" in words and "doubtful" in words
     assert words.index("at 0.95: 2 of 30000 plain draws fail") < words.index("doubtful")

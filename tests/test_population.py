@@ -232,7 +232,7 @@ def test_two_ways_agree_and_their_answer_holds(two):
     assert "by distance" in two.method and "by width" in two.method
     assert "standard errors apart" in two.history[-1]
     assert two.evaluations <= 200_000 and isinstance(two.proposal, Sample)
-    failing, drawn = two.plain
+    failing, _, drawn = two.plain
     assert 0 < failing < drawn <= two.evaluations
     assert two.guaranteed[0] < truth < two.guaranteed[1]
 
@@ -271,7 +271,7 @@ def test_what_misleads_the_distance_is_not_missed_silently(key):
 def test_no_failure_leaves_what_plain_draws_guarantee(key):
     found = population(key, NEVER, 100_000, particles=256)
     assert np.isnan(found.mean) and not found.reliable and found.interval[0] == 0
-    assert found.interval[1] == pytest.approx(stats.beta.ppf(0.975, 1, found.plain[1]), rel=1e-3)
+    assert found.interval[1] == pytest.approx(stats.beta.ppf(0.975, 1, found.plain[-1]), rel=1e-3)
     assert str(found).index("between 0 and") < str(found).index("failures")
 
 
@@ -292,6 +292,22 @@ def test_invalid_episodes_are_told_and_never_failures(key):
     assert any("invalid" in w for w in found.warnings)
     assert (found.proposal.points[:, 1] <= 1).all()
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
+
+
+def test_invalid_episodes_may_all_be_failures_in_what_is_guaranteed(key):
+    """Of a system whose every number is NaN nothing is guaranteed; of one with a sixth of NaN and
+    no failure the upper end is above that sixth.
+    """
+    nowhere = population(key, limit_state(lambda u: u[0] * jnp.nan, 2), 20_000, particles=256)
+    (failing, invalid, drawn), p = nowhere.plain, nowhere.guaranteed
+    assert failing == 0 and 10_000 < invalid == drawn <= 20_000 and p == (0.0, 1.0)
+    words = f"between 0 and 1 at 0.95: 0 of {drawn} plain draws fail, and {drawn} are invalid"
+    assert words in str(nowhere)
+    gap = lambda u: jnp.where(u[1] > 1, jnp.nan, 99.0)
+    some = population(key, limit_state(gap, 2), 20_000, particles=256)
+    _, invalid, drawn = some.plain
+    upper = stats.beta.ppf(0.975, invalid + 1, drawn - invalid)
+    assert some.guaranteed == (0.0, pytest.approx(upper, rel=1e-9)) and upper > stats.norm.sf(1)
 
 
 def test_an_interruption_keeps_the_populations_that_are_done(key):

@@ -41,7 +41,7 @@ def test_what_populations_left_stays(plane, key):
     the model's own draws guarantee an interval.
     """
     assert isinstance(plane.proposal, Sample) and isinstance(plane.draws.source, Latent)
-    failing, drawn = plane.plain
+    failing, _, drawn = plane.plain
     assert failing <= drawn < plane.evaluations and plane.unseen > 0
     drawn = jast.estimate.failure_samples(key, PLANE, plane, 50, moves=1)
     assert bool(drawn.failures.failure.all())

@@ -208,8 +208,8 @@ def test_a_setting_may_be_called_as_a_column():
 
 def test_a_flagged_row_shows_what_plain_draws_guarantee_and_the_doubtful_number_behind():
     numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
-    good = Estimate("mine", *numbers, True, (), plain=(0, 1000))
-    bad = good._replace(reliable=False, warnings=("no",), plain=(0, 1_000_000))
+    good = Estimate("mine", *numbers, True, (), plain=(0, 0, 1000))
+    bad = good._replace(reliable=False, warnings=("no",), plain=(0, 0, 1_000_000))
     bare, none = bad._replace(plain=None), (None,) * 3
     head, *rows = str(Sweep({"gain": (1, 2, 3)}, (good, bad, bare), none, none, {})).splitlines()
     names = ["gain", "probability", "interval", "episodes", "doubtful", "note"]

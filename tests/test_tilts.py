@@ -230,7 +230,7 @@ def test_ruin(gambler):
     assert good(found, ruin_probability(0.4, 1, 15, 100), 0.02), str(found)
     assert found.evaluations <= BUDGET and any("tilts" in line for line in found.history)
     # those of the last draws that are the model's own fail as often as it does
-    (k, n), p = found.plain, ruin_probability(0.4, 1, 15, 100)
+    (k, _, n), p = found.plain, ruin_probability(0.4, 1, 15, 100)
     assert 0.09 * found.samples < n < 0.41 * found.samples and found.unseen is not None
     assert abs(k - n * p) < 4 * np.sqrt(n * p) and found.guaranteed[0] < p < found.guaranteed[1]
 

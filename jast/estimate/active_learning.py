@@ -37,7 +37,7 @@ class Learner:
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
-        self.steps, self.spent, self.plain, self.plain_failing = 0, 0, 0, 0
+        self.steps, self.spent, self.plain = 0, 0, (0, 0, 0)
         self.surrogate: Surrogate | None = None
         self.fitted: Gaussians | None = None
         self.pool: Pool | None = None
@@ -91,9 +91,9 @@ def learn(s: Learner) -> None:
     first = min(max(12, 2 * s.dimension), calls // 3)
     first = -(-first // s.batch) * s.batch
     wide = np.where(np.arange(first) % 2, 2.0, 1.0)[:, None]
-    s.plain = (first + 1) // 2  # draws of the model itself
-    failing, _ = s.call(wide * s.rng.standard_normal((first, s.dimension)))
-    s.plain_failing = int(failing[::2].sum())
+    failing, invalid = s.call(wide * s.rng.standard_normal((first, s.dimension)))
+    # draws of the model itself
+    s.plain = int(failing[::2].sum()), int(invalid[::2].sum()), (first + 1) // 2
     i = 0
     while True:
         s.fit(i % 4 == 0)

@@ -95,9 +95,9 @@ class Estimate(NamedTuple):
     """`jast.estimate.Draws`: the weighted draws, for `jast.estimate.exceedance`, `failure_times`
     and `events`; None where there are none
     """
-    plain: tuple[int, int] | None = None
-    """(failing, episodes) of the model's own draws, which know nothing of a proposal; None where
-    there were none
+    plain: tuple[int, int, int] | None = None
+    """(failing, invalid, episodes) of the model's own draws, which know nothing of a proposal; None
+    where there were none
     """
 
     @property
@@ -118,9 +118,13 @@ class Estimate(NamedTuple):
     @property
     def guaranteed(self) -> tuple[float, float] | None:
         """Clopper and Pearson's interval of ``plain`` at ``level``: no proposal can make it wrong.
-        None without plain draws.
+        Its upper end is that of invalid episodes that all fail. None without plain draws.
         """
-        return None if self.plain is None else clopper_pearson(*self.plain, self.level)
+        if self.plain is None:
+            return None
+        failing, invalid, n = self.plain
+        low, high = clopper_pearson(failing, n, self.level)
+        return low, clopper_pearson(failing + invalid, n, self.level)[1] if invalid else high
 
     def __str__(self) -> str:
         rows, low, high = [], *self.interval
@@ -195,8 +199,11 @@ def guarantee(p: Estimate) -> tuple[str, str] | None:
     """
     if p.reliable or p.plain is None:
         return None
-    (k, n), (low, high) = p.plain, p.guaranteed
-    return f"between {low:.3g} and {high:.3g}", f"at {p.level:.4g}: {k} of {n} plain draws fail"
+    (k, invalid, n), (low, high) = p.plain, p.guaranteed
+    counts = f"at {p.level:.4g}: {k} of {n} plain draws fail"
+    if invalid:
+        counts += f", and {invalid} are invalid"
+    return f"between {low:.3g} and {high:.3g}", counts
 
 
 def doubtful(p: Estimate) -> bool:
@@ -234,14 +241,14 @@ def estimate(
     proposal=None,
     history=None,
     control=0,
-    plain=(0, 0),
+    plain=(0, 0, 0),
 ):
     """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside,
     ``notes`` are remarks.
 
     ``groups``: lists of components that are one failure mode (default: each by itself).
-    ``control``: episodes that were the model's own draws. ``plain``: (failing, episodes) of such
-    draws beside those of ``sums``.
+    ``control``: episodes that were the model's own draws. ``plain``: (failing, invalid, episodes)
+    of such draws beside those of ``sums``.
     """
     level = checked_level(method, level)
     n, seen = sums.samples, sums.first > 0
@@ -273,7 +280,7 @@ def estimate(
     mean = math.exp(log_mean) if seen else math.nan
     if above > 1 + 4 * above * relative:
         found.append(f"the estimate is {above:.4g}, above 1: a density does not fit its samples")
-    k, drawn = (a + b for a, b in zip(sums.plain, plain, strict=True))
+    plain = tuple(a + b for a, b in zip(sums.plain, plain, strict=True))
     return Estimate(
         method=method,
         log_mean=log_mean,
@@ -298,7 +305,7 @@ def estimate(
         history=history,
         mode_intervals=mode_intervals,
         draws=sums.draws,
-        plain=(k, drawn) if drawn else None,
+        plain=plain if plain[-1] else None,
     )
 
 
@@ -341,7 +348,7 @@ def of_counts(
         history=history,
         mode_intervals=np.array([clopper_pearson(k, n, level)]) if k else None,
         draws=sums.draws,
-        plain=(k, n) if n else None,
+        plain=(k, sums.invalid, n) if n else None,
     )
 
 

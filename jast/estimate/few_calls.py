@@ -131,7 +131,7 @@ def _estimate(s, rounds, level):
     doubted = float((share**2 / sizes) @ [r.doubted for r in rounds])
     sampled = float(share @ [r.sampled for r in rounds])
     error = math.sqrt(max(seen, doubted) + sampled)
-    unseen = -math.log1p(-level) / s.plain
+    unseen = -math.log1p(-level) / s.plain[-1]
     found = []
     if s.spent < s.budget:
         found.append(f"interrupted after {s.spent} of {s.budget} calls")
@@ -175,7 +175,7 @@ def _estimate(s, rounds, level):
         unseen=unseen,
         proposal=as_latent([(1.0, s.pool.mixture)], s.dtype),
         history=tuple(s.history),
-        plain=(s.plain_failing, s.plain),
+        plain=s.plain,
     )
 
 

@@ -43,7 +43,7 @@ def of_populations(
         warnings=(*reasons, *found.warnings),
         history=tuple(s.history),
         proposal=sample,
-        plain=(int(s.plain[0]), int(s.plain[2])),
+        plain=tuple(map(int, s.plain)),
     )
     return or_rough(found)
 

@@ -66,7 +66,7 @@ class Seeker:
         self.lost = 0.0  # a share that the proposal may have lost
         self.asked = 0.0  # what the guard last saw of it, before it was taken in
         self.coarse = []  # what is wrong with the system's floats
-        self.plain = 0, 0  # failing ones and all of its draws of the model
+        self.plain = 0, 0, 0  # failing ones, invalid ones and all of its draws of the model
 
     def next_key(self):
         words = self.root.integers(2**32, size=2, dtype=np.uint32)
@@ -142,7 +142,7 @@ def _from_near(s):
         return False
     s.q = s.near
     s.anchors = s.centres()
-    b, own = _drawn(s, s.q), 0.0
+    (b, _), own = _drawn(s, s.q), 0.0
     if b.failure.any():
         s.batches.append(b)
         own = _own(s)
@@ -161,16 +161,16 @@ def _from_near(s):
 
 def _look(s):
     """A batch of the model itself."""
-    b = _drawn(s, s.model())
+    b, invalid = _drawn(s, s.model())
     s.batches.append(b)
-    s.plain = int(b.failure.sum()), s.batch
+    s.plain = int(b.failure.sum()), int(invalid.sum()), s.batch
     s.note(f"draws of the model: {b.failure.sum()} fail", s.batch)
 
 
 def _drawn(s, q):
-    """A `Batch` of ``q``."""
+    """A `Batch` of ``q``, and which of its episodes are invalid [n]."""
     z, o, log_w, _ = drawn(s.sim, q, *numbers(s.rng, s.batch, s.dimension, s.dtype))
-    return Batch(q, z, o.used, o.failure, log_w, {})
+    return Batch(q, z, o.used, o.failure, log_w, {}), o.invalid
 
 
 def _refine(s, most):
@@ -179,7 +179,7 @@ def _refine(s, most):
     """
     before, stalls, limit = 0.0, 0, s.spent + most * s.batch
     while s.spent < limit:
-        b = _drawn(s, s.q)
+        b, _ = _drawn(s, s.q)
         if not b.failure.any():
             s.note("batch: no failure", s.batch)
             return

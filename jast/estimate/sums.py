@@ -43,8 +43,8 @@ class Sums(NamedTuple):
     keep: int
     draws: Any = None
     """`jast.estimate.draws.Draws` of the traces that have a miss distance"""
-    plain: tuple[int, int] = (0, 0)
-    """(failing, episodes) of those that are known to be the model's own draws"""
+    plain: tuple[int, int, int] = (0, 0, 0)
+    """(failing, invalid, episodes) of those that are known to be the model's own draws"""
 
 
 def nothing(samples):
@@ -112,7 +112,8 @@ def add(total, traces, plain=None):
         draws=draws.add(total.draws, traces),
         plain=(
             total.plain[0] + int(np.asarray(traces.failure)[plain].sum()),
-            total.plain[1] + int(plain.sum()),
+            total.plain[1] + int(np.asarray(traces.invalid)[plain].sum()),
+            total.plain[2] + int(plain.sum()),
         ),
     )
 

@@ -390,8 +390,9 @@ class _Work:
 
     def beside_nominal(self, p):
         """The `Estimate` ``p`` with the nominal draws among its plain ones, which they are too."""
-        k, n = p.plain or (0, 0)
-        return p._replace(plain=(k + self.nominal.failing, n + self.nominal.episodes))
+        drawn, nominal = p.plain or (0, 0, 0), self.nominal
+        own = nominal.failing, nominal.invalid, nominal.episodes
+        return p._replace(plain=tuple(a + b for a, b in zip(drawn, own, strict=True)))
 
     def take(self, q):
         """Failures that the estimate's proposal draws, where the search found none."""

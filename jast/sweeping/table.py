@@ -243,7 +243,7 @@ def _row(result, error, a):
         if doubtful(estimate):
             cells["doubtful"] = cells["probability"]
         low, high = estimate.guaranteed
-        cells["probability"] = "{} of {} fail".format(*estimate.plain)
+        cells["probability"] = f"{estimate.plain[0]} of {estimate.plain[-1]} fail"
         cells["interval"] = f"[{low:.4g}, {high:.4g}]"
     found = result.failures if isinstance(result, Report) else None
     best = result.best if isinstance(result, SearchResult) else found.best if found else None
