@@ -114,6 +114,20 @@ def test_an_interruption_of_the_draws_leaves_the_populations(key, monkeypatch):
     assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
 
 
+def test_an_interruption_of_the_pilot_is_the_end_of_the_draws(key, monkeypatch):
+    drawn, calls = population_weights.estimated, []
+
+    def partly(*args, **more):
+        calls.append(1)
+        found = drawn(*args, **more)
+        return found._replace(samples=found.samples // 2)
+
+    monkeypatch.setattr(population_weights, "estimated", partly)
+    found = population(key, PLANE, 300_000)
+    assert len(calls) == 1 and "importance" not in found.method
+    assert not found.reliable and "interrupted" in found.warnings[0]
+
+
 def test_the_first_population_by_width_costs_as_much_as_it_may(key):
     """In 400 numbers the way from width 2 to 1 has some 24 widths; the guess of their number is
     right to a fifth.
