@@ -44,9 +44,9 @@ PILOT = 8
 FINITE = 0.5
 """Pareto shape of weights above which they have no variance (Vehtari and others 2024)."""
 SURELY = 2.0
-"""Standard errors that the shape of a pilot is above `FINITE` where its weights are left. Of sums of
-ten numbers, which Gaussians serve, pilots say .51 to .60 by chance, one error above; of the follower
-in `benchmarks.time_to_answer`, which they do not, .6 to .75, two to five."""
+"""Standard errors that the shape of a pilot is above `FINITE` where its weights are left. Of sums
+of ten numbers, which Gaussians serve, pilots say .51 to .60 by chance, one error above; of the
+follower in `benchmarks.time_to_answer`, which they do not, .6 to .75, two to five."""
 
 
 class Promise(NamedTuple):
