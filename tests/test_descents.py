@@ -467,14 +467,14 @@ def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
         asked.append(budget)
         return known
 
-    def sought(key, seeker, *_):
+    def sought(wanted):
         asked.append("proposal")
         return known
 
     known = jast.estimate.monte_carlo(key, walk1d(), 2000)
     near = population(key, SIDES, 40_000, particles=256)
     monkeypatch.setattr(adaptive, "by_populations", by_populations)
-    monkeypatch.setattr(adaptive, "_sought", sought)
+    monkeypatch.setattr(adaptive, "by_proposal", sought)
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e6)
     failures = jast.failures.collect(
         SIDES, jast.rewards.likelihood(SIDES), episodes_of(SIDES, near.proposal.points[:10])

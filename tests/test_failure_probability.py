@@ -2,7 +2,6 @@
 is made of, and failures as they would happen.
 """
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -21,23 +20,23 @@ from benchmarks.limit_states import walk_probability
 from jast import distributions as D
 from jast import limit_state as L
 from jast.estimate import (
-    adaptive,
+    adapt,
     adaptive_cross_entropy,
+    by_proposal,
     failure_probability,
     failure_samples,
-    first_proposal,
-    guard,
-    next_proposal,
-    seek,
+    gaussian_start,
     subset_simulation,
     trace_proposal,
 )
 from jast.estimate.adaptive import LEAST
-from jast.estimate.batches import Batch, drawn, log_ratio, numbers
+from jast.estimate.batches import numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.estimate import ROUGH, or_rough
+from jast.estimate.gaussian_family import GaussianFamily, defended
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
 from jast.estimate.populations import cool, explore, settled
+from jast.estimate.search_state import begun
 from jast.simulators import landing, limit_state
 
 norm = scipy.stats.norm
@@ -162,7 +161,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
 
 def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
     """Then subset simulation answers, flagged, and its guarantee is the first batch's."""
-    monkeypatch.setattr(adaptive, "_astray", lambda s, n: True)
+    monkeypatch.setattr(by_proposal.Search, "enough", property(lambda s: False))
     found = failure_probability(key, planes(4.0), BUDGET)
     assert "subset simulation" in str(found.warnings) and found.plain == (0, 0, BUDGET // 25)
     lines = str(found).splitlines()
@@ -273,15 +272,15 @@ def test_interrupts_keep_whole_chunks(two):
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, jax.errors.JaxRuntimeError])
 def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
-    fit, fits = seek.refitted, []
+    fit, fits = adapt.refitted, []
 
-    def interrupted(s):
-        fits.append(s.spent)
+    def interrupted(family, state):
+        fits.append(state.spent + family.batch)
         if len(fits) == 2:
             raise raised("INTERNAL: CpuCallback error: KeyboardInterrupt: ")
-        return fit(s)
+        return fit(family, state)
 
-    monkeypatch.setattr(seek, "refitted", interrupted)
+    monkeypatch.setattr(adapt, "refitted", interrupted)
     found = failure_probability(jax.random.key(5), planes(4.0, 4.5), BUDGET)
     [why] = [w for w in found.warnings if "interrupted" in w]
     assert why.startswith(f"interrupted after {fits[1]} of {BUDGET} evaluations")
@@ -305,125 +304,12 @@ def test_interrupted_before_any_batch_there_is_nothing(monkeypatch):
         def stop(*_, error=error):
             raise error
 
-        monkeypatch.setattr(seek, "_look", stop)
+        monkeypatch.setattr(by_proposal, "looked", stop)
         with pytest.raises(KeyboardInterrupt):
             failure_probability(jax.random.key(5), planes(4.0), BUDGET)
-    monkeypatch.setattr(seek, "_look", lambda *_: 1 / 0)
+    monkeypatch.setattr(by_proposal, "looked", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         failure_probability(jax.random.key(5), planes(4.0), BUDGET)
-
-
-def test_shares_beyond_the_whole_are_in_words():
-    said = [guard._share(v) for v in (0.034, 0.3, 1.0, 14.25, 1.4539e13)]
-    assert said == ["3% of", "30% of", "1 times", "14 times", "far more than"]
-
-
-def test_the_guard_looks_for_failures_away_from_the_known_modes(key, monkeypatch):
-    """Its first population may go a part of the way to a known mode: to where the log density ratio
-    of a unit Gaussian there is .3 of its log probability; with |mean|^2 / 2 for that, to .65.
-    """
-
-    class Seen(Exception):
-        pass
-
-    def explore(key, sim, size, covered, least, most):
-        raise Seen(covered)
-
-    monkeypatch.setattr(guard, "explore", explore)
-    s = seek.Seeker(key, planes(4.0), BUDGET)
-    mean = np.full(4, 2.0)
-    s.add(unit(mean[None]))
-    s.log_mean = -mean @ mean / 2
-    with pytest.raises(Seen) as seen:
-        guard.guarded(s, 0, 1)
-    q, threshold = seen.value.args[0]
-    ratios = log_ratio(q, np.array([0.0, 0.6, 0.7, 1.0])[:, None] * mean, np.full(4, 4))
-    assert (ratios > threshold).tolist() == [False, False, True, True]
-
-
-def test_forgotten_failures_are_a_reason_that_names_no_share(key, monkeypatch):
-    """Nobody knows what they weigh."""
-    s = at_the_guard(key, planes(4.0, FAR), 1.0)
-    s.seeds, s.spent = np.full((1, 4), 2.0), BUDGET * 0.6
-    lost = 0.0, np.full((3, 4), -2.0), np.full(3, 4)
-    monkeypatch.setattr(guard, "_forgotten", lambda s: [lost])
-    assert guard.guarded(s, 0, 0)
-    assert s.reasons == ["the proposal hardly draws some failures that wide noise led to"]
-
-
-def at_the_guard(key, sim, *shares):
-    """A `Seeker` with a batch of a proposal: unit Gaussians at the nearest failures of `planes` up
-    and down, by these shares.
-    """
-    s = seek.Seeker(key, sim, BUDGET)
-    s.q = as_latent([(w, unit(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))], s.dtype)
-    z, o, log_w, _ = jax.device_get(drawn(sim, s.q, *numbers(key, 20_000, 4, s.dtype)))
-    s.batches = [Batch(s.q, z, o.used, o.failure, log_w.astype(np.float64))]
-    w = np.exp(s.batches[0].log_weight[o.failure])
-    s.log_mean = float(np.log(w.sum() / 20_000))
-    return s
-
-
-def test_the_guard_takes_a_lost_mode_into_the_proposal(key):
-    """In its last round, after which nothing can be mended, it is a reason against the estimate."""
-    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
-    down = np.full((1, 4), -2.0), np.array([4], np.int32)
-    assert guard._bare(s, *down).all()
-    assert not guard.guarded(s, 1, 2) and not s.reasons
-    assert not guard._bare(s, *down).any()
-    # it is as likely as what is known: each of two populations gives it half of the proposal
-    of_down = np.asarray(s.q.means).sum(axis=1) < 0
-    assert 0.5 < np.exp(np.asarray(s.q.log_weights, float))[of_down].sum() < 0.9
-    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
-    assert guard.guarded(s, 2, 2)
-    assert len(s.reasons) == 1 and "failures that the proposal hardly draws" in s.reasons[0]
-
-
-@pytest.mark.parametrize("down, shares", [(FAR, (1.0,)), (4.0, (0.5, 0.5)), (4.0, (0.995, 0.005))])
-def test_the_guard_is_content_where_nothing_was_lost(down, shares, key):
-    """One mode; two; and a second one that the proposal draws seldom, but often enough for its
-    batch to know what is there.
-    """
-    s = at_the_guard(key, planes(4.0, down), *shares)
-    assert guard.guarded(s, 1, 2) and not s.reasons
-
-
-def test_a_share_counts_as_lost_where_no_batch_could_have_drawn(key):
-    """The batch of 20,000 is of the upper mode alone. It meets that one, so what it saw there,
-    .02, speaks against a population's .04; of the lower mode it knows nothing, however much it saw
-    elsewhere. Below twice what is tolerated nothing is lost, above twice what was seen it is.
-    """
-    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
-    at = lambda mean: (np.full((3, 4), mean), np.full(3, 4, np.int32))
-    up, down = at(2.0), at(-2.0)
-    assert not guard._lost(s, 0.04, *up, 0.02)
-    assert guard._lost(s, 0.04, *down, 0.02)
-    assert not guard._lost(s, 2 * guard.LOST, *down, 0.02)
-    assert guard._lost(s, 0.06, *up, 0.02)
-
-
-@pytest.mark.parametrize("mean, against", [(2.0, 0), (-2.0, 1)])
-def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
-    mean, against, key, monkeypatch
-):
-    """A population that tells of nine tenths of the probability, in a place that the batch has
-    drawn thousands of points of, is wrong about the share: a population of few independent points
-    often is. Where the batch has no point it is a reason.
-    """
-    s = at_the_guard(key, planes(4.0, 4.0), 1.0)
-    points, used = np.full((50, 4), mean), np.full(50, 4)
-    p = SimpleNamespace(
-        complete=True,
-        reached=True,
-        log_mean=s.log_mean + np.log(0.9),
-        points=points,
-        used=used,
-        evaluations=0,
-    )
-    monkeypatch.setattr(guard, "explore", lambda *a, **k: p)
-    monkeypatch.setattr(guard, "_bare", lambda s, points, used: np.full(len(points), True))
-    assert guard.guarded(s, 2, 2)
-    assert len(s.reasons) == against
 
 
 def test_subset_simulation(key):
@@ -849,7 +735,7 @@ def test_samples_without_a_failure(key, proposal):
 def test_the_shares_of_a_defended_proposal_are_those_of_a_mixture(rare, values):
     """Its wide copies and, unless failures are rare, a share of the model, which sum to 1."""
     g = Gaussians(np.ones(1), np.zeros((1, 2)), np.array([values]), np.eye(2)[None])
-    parts = next_proposal.defended(g, 0.0, rare)
+    parts = defended(g, 0.0, rare)
     assert np.isclose(sum(share for share, _ in parts), 1.0)
     assert len(parts) == 1 + (min(values) < 1) + (not rare)
 
@@ -895,13 +781,10 @@ def test_a_proposal_that_lost_failures_is_given_up(key, monkeypatch):
     not believed.
     """
 
-    def lost(s, i, last):
-        s.lost = 9.0
-        s.reasons.append("lost")
-        return True
-
-    monkeypatch.setattr(seek, "guarded", lost)
-    monkeypatch.setattr(adaptive, "TILTS", 1.0)  # which serve here
+    lost = lambda f, state: state._replace(missing=9.0, reasons=("lost",))
+    monkeypatch.setattr(by_proposal, "audited", lost)
+    gaussians = (by_proposal._gaussians,)
+    monkeypatch.setattr(by_proposal, "_ways", lambda asked: gaussians)  # tilts serve here
     plain = failure_probability(key, planes(1.5), BUDGET)
     assert plain.reliable and plain.chernoff is not None
     assert plain.interval[0] < norm.sf(1.5) < plain.interval[1]
@@ -949,8 +832,8 @@ def test_no_mode_is_lost_in_silence_with_few_evaluations(family, seed):
 def test_mirror_images_of_failures(key):
     """Of two planes the other one is found a tenth farther out, not where it is out of reach."""
     for down, lifts in ((4.4, [1.1]), (8.0, [])):
-        s = seek.Seeker(key, planes(4.0, down), BUDGET)
-        s.anchors = np.full((1, 4), 2.001)
-        points, evaluations = first_proposal._mirrored(s)
-        assert evaluations == len(first_proposal.LIFTS) and len(points) == len(lifts)
-        assert np.allclose(points, [-lift * s.anchors[0] for lift in lifts] or points)
+        f = GaussianFamily(planes(4.0, down), BUDGET, begun(key))
+        anchors = np.full((1, 4), 2.001)
+        points, evaluations = gaussian_start._mirrored(f, anchors)
+        assert evaluations == len(gaussian_start.LIFTS) and len(points) == len(lifts)
+        assert np.allclose(points, [-lift * anchors[0] for lift in lifts] or points)

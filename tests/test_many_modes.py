@@ -11,14 +11,13 @@ from jax.tree_util import Partial
 from benchmarks.markov_systems import CASES
 from jast import limit_state as L
 from jast.estimate import failure_probability, monte_carlo, populations
-from jast.estimate.batches import Batch
 from jast.estimate.design_points import explained
 from jast.estimate.diagnostics import thin_modes
-from jast.estimate.first_proposal import explored
+from jast.estimate.gaussian_family import GaussianFamily, _sparse
+from jast.estimate.gaussian_start import explored
 from jast.estimate.gaussians import _greatest, held, to_anchors
-from jast.estimate.next_proposal import _sparse
 from jast.estimate.populations import Chain, cool, edges
-from jast.estimate.seek import Seeker
+from jast.estimate.search_state import State, begun
 from jast.simulators import limit_state
 
 FLOAT = jnp.zeros(()).dtype
@@ -120,7 +119,8 @@ def test_a_proposal_holds_as_many_components_as_memory_allows(key):
     for d, most, directions in ((2, 256, 125), (300, 186, 92), (400, 104, 51), (1000, 40, 19)):
         assert held(d) == most
         np.testing.assert_array_equal(_greatest(rising, d), np.arange(299, 299 - most, -1))
-        assert Seeker(key, limit_state(_sum, d), 100_000).points == directions
+        f = GaussianFamily(limit_state(_sum, d), 100_000, begun(key))
+        assert f.directions == directions
     assert _greatest(np.array([0.0, 2.0, 0.0]), 2).tolist() == [1]
 
 
@@ -129,13 +129,14 @@ def test_a_sparse_proposal_differs_from_the_model_in_the_numbers_that_matter(key
     in the others, and it is narrower in its own alone.
     """
     d = 18
-    s = Seeker(key, limit_state(_sum, d), 100_000)
-    s.anchors, s.rare = 4.0 * np.eye(d), True
+    f = GaussianFamily(limit_state(_sum, d), 100_000, begun(key))
+    anchors = 4.0 * np.eye(d)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(d * 50, d))
     mine = np.repeat(np.arange(d), 50)
     points[np.arange(len(points)), mine] = 4 + rng.exponential(0.22, size=len(points))
-    q = _sparse(s, points, np.zeros(len(points)), s.anchors)
+    state = State(anchors=anchors, log_weight=np.zeros(len(points)))
+    q = _sparse(f, state, points, anchors)
     own = np.argmax(np.asarray(q.means), axis=1)
     narrow = np.asarray([f[i, i] < 0.9 for f, i in zip(q.factors, own, strict=True)])
     assert len(q.means) == 2 * d and narrow.sum() == d
@@ -150,16 +151,9 @@ def test_all_of_sixty_turned_modes_are_found(key):
     """48 descents from draws of the model come to 33 of 60 equal modes; those from failures that
     these do not explain to nearly all others.
     """
-    s = Seeker(key, CASES["series 60, turned"][0](), 100_000)
-    s.batches = [_no_failures()]
-    explored(s, True)
-    near = s.anchors[np.linalg.norm(s.anchors, axis=1) < 5.1]
-    assert len(near) >= 57
-
-
-def _no_failures():
-    none = np.zeros(1)
-    return Batch(None, none[:, None], none.astype(int), none.astype(bool), none, {})
+    f = GaussianFamily(CASES["series 60, turned"][0](), 100_000, begun(key))
+    found = explored(f, State(), None, True).anchors
+    assert (np.linalg.norm(found, axis=1) < 5.1).sum() >= 57
 
 
 @pytest.mark.parametrize("name", ["2 of 10", "series 60"])

@@ -18,6 +18,7 @@ from benchmarks.stress_systems import latch
 from jast import distributions as D
 from jast.distributions.parts import parts
 from jast.estimate import failure_probability, failure_samples
+from jast.estimate.adapt import adapted
 from jast.estimate.markov_tilts import (
     assembled,
     log_weight,
@@ -28,8 +29,12 @@ from jast.estimate.markov_tilts import (
     stacked,
 )
 from jast.estimate.recorded_tilts import recorded
+from jast.estimate.search_settings import SETTINGS
+from jast.estimate.search_state import State, begun
+from jast.estimate.tilt_family import Mixture, TiltFamily
 from jast.estimate.tilt_fit import as_tilts, fit, frame_of, ratios, steps_of
-from jast.estimate.tilt_search import TiltSeeker, seek_tilts
+from jast.estimate.tilt_start import led_down
+from jast.limit_state import normal_numbers
 from jast.simulators import autoregression, ruin
 
 BUDGET = 10_000
@@ -151,8 +156,8 @@ def test_recorded_episodes_play_again(mixed, key):
     """Their categories to the bit, rare ones too; numbers, ends and distances up to rounding."""
     e = jax.vmap(jast.rollout, (0, None))(jax.random.split(key, 300), mixed)
     z = recorded(mixed, e._replace(states=None))
-    q = TiltSeeker(key, mixed, 1)
-    o, log_q, trace = of_the_model(mixed, q.tilts(q.mixture), z)
+    f = TiltFamily(mixed, 10_000, begun(key))
+    o, log_q, trace = of_the_model(mixed, f.on_device(f.untilted()), z)
     np.testing.assert_array_equal(o.length, e.length)
     np.testing.assert_array_equal(o.failure, e.failure)
     np.testing.assert_allclose(o.distance, e.distance, atol=1e-5)
@@ -171,38 +176,37 @@ def test_weights_average_to_one(mixed, key, gates):
     rollout.
     """
     n = 4000
-    s = TiltSeeker(jax.random.key(1), mixed, 500, gates)
-    pilot = s.draw()
-    frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(500))
+    f = TiltFamily(mixed, 10_000, begun(jax.random.key(1)), gates)
+    pilot = f.play(f.untilted()).points
+    frame = frame_of(f.about, *pilot, np.ones(500))
+    dtype = normal_numbers(mixed)
     rng = np.random.default_rng(0)
-    one = jax.tree.map(lambda a: 0.15 * rng.standard_normal(np.shape(a)), s.model)
+    one = jax.tree.map(lambda a: 0.15 * rng.standard_normal(np.shape(a)), f.model)
     one = one._replace(floor=-np.inf)
     if gates == 1:
         one.first.scales[:], one.steps.scales[:] = 0, 0
-    tilts = [s.model, one, s.model._replace(floor=np.log(0.3))]
-    q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, s.dtype)
-    drawn = numbers(key, n, shape(mixed), mixed.horizon, s.dtype)
+    tilts = [f.model, one, f.model._replace(floor=np.log(0.3))]
+    q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, dtype)
+    drawn = numbers(key, n, shape(mixed), mixed.horizon, dtype)
     o, ratio, trace = jax.device_get(played(mixed, q, *drawn))
     log_w, shares = log_weight(q, ratio)
     w = np.exp(np.asarray(log_w, np.float64))
     assert abs(w.mean() - 1) < 4 * w.std() / np.sqrt(n) and w.std() > 0.1
     assert not o.invalid.any() and np.isclose(np.exp(shares).sum(axis=1), 1, atol=1e-4).all()
-    on_host = ratios(tilts, steps_of(s.about, frame, trace, o.length), n)
+    on_host = ratios(tilts, steps_of(f.about, frame, trace, o.length), n)
     np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
 
 
 def test_a_known_tilt_is_found(mixed):
     """Traces of one tilt, of equal weights, give its means and odds back."""
-    s = TiltSeeker(jax.random.key(2), mixed, 4000)
-    pilot = s.draw()
-    frame = frame_of(s.about, pilot.trace, pilot.length, np.ones(4000))
-    one = jax.tree.map(np.copy, s.model)
+    f = TiltFamily(mixed, 200_000, begun(jax.random.key(2)))
+    frame = frame_of(f.about, *f.play(f.untilted()).points, np.ones(4000))
+    one = jax.tree.map(np.copy, f.model)
     one.steps.means[0], one.steps.means[1] = 0.8, 0.3
     one.steps.shifts[0, 0, 1] = 1.5
-    s.mixture = ([s.model, one], [0.001, 0.999], frame)
-    b = s.draw()
-    rows = steps_of(s.about, frame, b.trace, b.length)
-    found = fit(rows, np.ones(4000), 4000.0, s.model)
+    b = f.play(Mixture([f.model, one], [0.001, 0.999], frame))
+    rows = steps_of(f.about, frame, *b.points)
+    found = fit(rows, np.ones(4000), 4000.0, f.model)
     x = rows[1].x
     means = x @ (found.steps.means - one.steps.means)[:, 0, 0, 0]
     odds = x @ (found.steps.shifts - one.steps.shifts)[: x.shape[1], 0] @ [-1, 1, 0]
@@ -282,15 +286,16 @@ def test_several_gaussians_serve_where_one_does_not():
     effective draws a draw.
     """
     sim = autoregression(0.4, 5.5)
-    t = TiltSeeker(jax.random.key(0), sim, 1000)
-    seek_tilts(t, 9000)
-    one, spent = t.promised, t.spent
-    assert t.gates == 1 and one < 0.04
-    t.gated(3, spent + 6000)
-    assert t.gates == 3 and t.promised > 0.04 and spent < t.spent <= spent + 6000
+    f = TiltFamily(sim, 20_000, begun(jax.random.key(0)))
+    one = adapted(f, led_down(f, State(), 9000), SETTINGS.refits, 9000)
+    assert one.promised < 0.04
+    f = f._replace(gates=3)
+    start = one._replace(q=f.refit(one)["refitted"])
+    three = adapted(f, start, SETTINGS.refits, one.spent + 6000)
+    assert three.promised > 0.04 and one.spent < three.spent <= one.spent + 6000
     truth = autoregression_probability(0.4, 5.5, 100)
     # by all batches, of some 300 effective draws
-    assert abs(np.exp(t.log_mean) / truth - 1) < 0.25
+    assert abs(np.exp(three.log_mean) / truth - 1) < 0.25
 
 
 @pytest.mark.parametrize("choice", [False, True])

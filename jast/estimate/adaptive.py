@@ -4,37 +4,26 @@ methods beside it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import jax
-import numpy as np
 
 from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
-from jast._jax import was_interrupted
 from jast.checkpoints import stored
-from jast.estimate import budgets, diagnostics, few_calls, sums, tilt_estimate, tilt_guard
-from jast.estimate.batches import balanced
-from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import Estimate, estimate, of_counts, or_rough
-from jast.estimate.gaussian_estimate import estimated
-from jast.estimate.gaussians import effective, together
-from jast.estimate.importance_sampling import Traces, chunks, importance
+from jast.estimate import budgets, few_calls
+from jast.estimate.by_proposal import Asked, by_proposal
+from jast.estimate.estimate import Estimate, or_rough
+from jast.estimate.importance_sampling import importance
 from jast.estimate.multilevel import failure_proposal
-from jast.estimate.plain import of_points
 from jast.estimate.population import by_populations
 from jast.estimate.redrawn import fits
 from jast.estimate.sample import Sample
-from jast.estimate.seek import Seeker, seek
-from jast.estimate.subset import by_levels
 from jast.intervals import checked_level
 from jast.journal import kept
 from jast.results import asked
-from jast.rounding import rounded
-from jast.watch import Watch
 
 if TYPE_CHECKING:
     import chex
@@ -46,19 +35,6 @@ if TYPE_CHECKING:
 __all__ = ["adaptive_cross_entropy", "failure_probability"]
 
 NAME, LEAST = "failure_probability", 5000
-SEEN, LOST = 100, 2.0
-"""Failures of the model from which plain draws tell a probability; what may be lost, as a multiple
-of what was found, from which the proposal is given up.
-"""
-ASTRAY = "no proposal was found that draws failures in proportion to their probability"
-TILTS, POOR, PLENTY = 0.2, 0.05, 500
-"""Of the budget, what must be left for tilts to be tried after Gaussians; effective draws of a draw
-below which they are, and of all that are left at which they are not.
-"""
-EXACT, MODEL = 0.01, (0.1, 0.4)
-"""Relative standard error beyond which draws serve better as the model's own; their least and
-greatest share of the last part.
-"""
 
 
 def failure_probability(
@@ -194,151 +170,9 @@ def failure_probability(
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             ways, watched = ways._replace(store=store), (progress, callback)
-            s = Seeker(key, sim, budget, known, similar)
-            s.recorded = None if failures is None else failures.episodes
-            found = or_rough(_sought(key, s, gradients, level, watched, ways))
+            given = bool(gradients), failures, similar, level, watched, ways
+            found = or_rough(by_proposal(Asked(name, key, sim, budget, *given)))
     return found._replace(settings=settings)
-
-
-def _sought(key, s, gradients, level, watched, ways):
-    """The `Estimate` by a proposal that the `Seeker` ``s`` seeks within the budget; ``watched``:
-    progress and callback.
-    """
-    if (coarse := rounded(s.sim)) is not None:
-        s.coarse.append(coarse)
-    try:
-        t = tilt_estimate.first(s)
-        if t is None or not t.serves(tilt_estimate.SERVES) or not _enough(s, t):
-            t = _beside_gaussians(s, t, gradients)
-        return _with_the_rest(key, s, t, level, watched, ways)
-    except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
-        if not was_interrupted(error):
-            raise
-        if not s.batches:
-            raise KeyboardInterrupt from error
-        return _of_the_search(s, level)
-
-
-def _beside_gaussians(s, t, gradients):
-    """Seek Gaussians: the `TiltSeeker` that serves better than these and than plain draws, else
-    None; ``t``: one that has been sought.
-    """
-    tried = [t]
-
-    def instead(s):
-        if tried[0] is not None or not _poor(s, tilt_estimate.SERVES) or _plain_is_better(s):
-            return False
-        tried[0] = tilt_estimate.after(s)
-        return tried[0].serves(tilt_estimate.SERVES)
-
-    seek(s, gradients, instead)
-    n, [t], known = s.budget - s.spent, tried, s.log_mean is not None
-    better = known and _plain_is_better(s)
-    if t is None and (_astray(s, n) or _poor(s, POOR)) and n > TILTS * s.budget and not better:
-        t = tilt_estimate.after(s)
-    gaussian = 0.0 if not known or max(s.lost, s.asked) > LOST else _promised(s, 1)
-    return t if t is not None and t.serves(gaussian) else None
-
-
-def _with_the_rest(key, s, t, level, watched, ways):
-    """The `Estimate` of what is left of the budget, by the proposal that was found: that of the
-    `TiltSeeker` ``t`` where there is one.
-    """
-    if t is not None and _enough(s, t):
-        tilt_guard.guarded(s, t)
-        n = s.budget - s.spent
-        share, watch = _of_the_model(t.promised * n), Watch(NAME, n, "episode", *watched)
-        return tilt_estimate.estimated(key, s, t, share, level, watch, ways)
-    # a search of many parts may have spent all
-    sim, n = s.sim, max(s.budget - s.spent, s.batch)
-    lanes = s.batch
-    about = dict(level=level, reasons=[*s.coarse, *s.reasons], history=tuple(s.history))
-    astray, log_p = _astray(s, n), _about(s)
-    enough = math.exp(min(log_p, 0.0)) * n >= SEEN
-    if astray and not enough:
-        found = by_levels(key, sim, n, log_p, level, about["reasons"] or [ASTRAY])
-        if found is not None:
-            return found._replace(
-                episodes=s.spent + found.episodes,
-                history=(*about["history"], *found.history),
-                plain=s.plain,
-            )
-    if s.log_mean is None or (astray and enough) or _plain_is_better(s):
-        watch = Watch(NAME, n, "episode", *watched)
-        total, notes, lost = chunks(of_points, (key, sim, lanes, n), lanes, watch, ways)
-        about["reasons"] = [*s.coarse, *lost]  # the others are about the proposal
-        found = of_counts(
-            NAME, total, notes=notes, evaluations=s.spent + total.samples, proposal=s.q, **about
-        )
-        return found._replace(draws=drawn_by(found.draws, key, lanes, "model"))
-    share = _of_the_model(_promised(s, n))
-    watch = Watch(NAME, n, "episode", *watched)
-    about |= dict(spent=s.spent, plain=s.plain, share=share, drawn=s.batch)
-    q = together(s.q, s.model(), share)
-    return estimated(key, sim, q, lanes, watch, ways, **about)._replace(proposal=s.q)
-
-
-def _enough(s, t):
-    """Whether what is left of the budget tells the probability by the `TiltSeeker` ``t``."""
-    return t.promised * (s.budget - s.spent) > diagnostics.ESS
-
-
-def _about(s):
-    """The log probability, roughly; -inf where no failure was seen."""
-    if s.log_mean is not None:
-        return s.log_mean
-    return max((p.log_mean for p in s.populations if p.reached), default=-math.inf)
-
-
-def _astray(s, n):
-    """Whether ``n`` draws of the proposal would not tell the probability."""
-    if s.log_mean is None or s.lost > LOST:
-        return True
-    return _promised(s, n) < diagnostics.ESS
-
-
-def _promised(s, n):
-    """The effective sample size of ``n`` draws of the proposal, by its last batch."""
-    b = s.batches[-1]
-    return effective(b.log_weight[b.failure]) / len(b.z) * n
-
-
-def _poor(s, share):
-    """Whether draws of the proposal have less than ``share`` effective ones each, and all that are
-    left of the budget less than `PLENTY`.
-    """
-    return _promised(s, 1) < share and _promised(s, s.budget - s.spent) < PLENTY
-
-
-def _of_the_model(promised):
-    """The share of the last draws, of ``promised`` effective ones, that are the model's own: as
-    great as leaves a standard error of `EXACT`. They bound what nothing led to.
-    """
-    return float(np.clip(1 - 1 / (EXACT**2 * promised), *MODEL))
-
-
-def _of_the_search(s, level):
-    """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
-    log_w, failing = balanced(s.batches)
-    rows = len(failing)
-    log_weights = np.full(rows, -np.inf)
-    log_weights[failing] = log_w
-    none = np.zeros(rows)
-    seen = Traces(log_weights, none[:, None], failing, none.astype(bool), none.astype(int))
-    against = (
-        f"interrupted after {s.spent} of {s.budget} evaluations: the estimate uses the same"
-        " episodes that chose the proposal"
-    )
-    return estimate(
-        NAME,
-        sums.add(sums.nothing(rows), seen),
-        level=level,
-        reasons=[*s.coarse, against],
-        evaluations=s.spent,
-        proposal=s.q,
-        history=tuple(s.history),
-        plain=s.plain,
-    )
 
 
 def adaptive_cross_entropy(
@@ -388,12 +222,3 @@ def adaptive_cross_entropy(
         warnings=(*against, *result.warnings, words),
         history=tuple(str(found).splitlines()),
     )
-
-
-def _plain_is_better(s):
-    """Whether counting failures of the model has less variance than weighing those of the
-    proposal.
-    """
-    b, p = s.batches[-1], min(math.exp(s.log_mean), 1.0)
-    w = np.where(b.failure, np.exp(np.where(b.failure, b.log_weight - s.log_mean, 0)), 0)
-    return p > 0 and (w**2).mean() - w.mean() ** 2 >= (1 - p) / p

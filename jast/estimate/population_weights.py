@@ -18,10 +18,10 @@ from jast.counter import generator
 from jast.estimate.agreement import Answer, Kind
 from jast.estimate.batches import log_ratio
 from jast.estimate.estimate import Estimate
-from jast.estimate.gaussian_estimate import estimated
+from jast.estimate.final_draws import estimated
+from jast.estimate.gaussian_family import defended
 from jast.estimate.gaussians import as_latent, fit
 from jast.estimate.importance_sampling import even
-from jast.estimate.next_proposal import defended
 from jast.estimate.particles import LANES
 from jast.estimate.population_search import Search
 from jast.estimate.sample import sample_of

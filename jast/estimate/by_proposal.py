@@ -1,0 +1,254 @@
+"""A failure probability by a proposal that is found within the budget: explore, adapt, audit, draw.
+
+Two families of proposals are tried, mixtures of Gaussians and tilts of each step. They differ in
+where they begin, and in how they are fitted; the search is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jast import limit_state as latent
+from jast._jax import was_interrupted
+from jast.estimate import diagnostics, sums
+from jast.estimate.adapt import adapted
+from jast.estimate.audit import audited
+from jast.estimate.draws import drawn_by
+from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.final_draws import estimated
+from jast.estimate.gaussian_family import GaussianFamily
+from jast.estimate.gaussian_start import explored, looked
+from jast.estimate.importance_sampling import Traces, chunks
+from jast.estimate.markov_tilts import Tilts, shape
+from jast.estimate.plain import of_points
+from jast.estimate.search_settings import SETTINGS
+from jast.estimate.search_state import Family, State, begun, serves
+from jast.estimate.subset import by_levels
+from jast.estimate.tilt_family import TiltFamily
+from jast.estimate.tilt_start import cooled, given, led_down, with_given
+from jast.failures import Failures
+from jast.incidents import hosted
+from jast.rounding import rounded
+from jast.simulator import Simulator
+from jast.units import HERE, Ways
+from jast.watch import Watch
+
+__all__ = ["by_proposal"]
+
+ASTRAY = "no proposal was found that draws failures in proportion to their probability"
+
+
+TILTS_FIRST = 30
+"""Steps from which tilts are tried before Gaussians."""
+FIRST, SECOND = 0.35, 0.3
+"""Share of the budget, or of what is left of it, that a search for tilts has."""
+GATES = 3
+"""Gaussians that a normal number is drawn from one of, where a single one does not serve."""
+GATED = 0.25
+"""Share of the budget that the search for them has."""
+SINGLE = 0.1
+"""Effective draws of a draw with which a single one serves."""
+WITH_GIVEN = 0.5
+"""How much longer a search for tilts may be where failures came with the call."""
+SEEN = 100
+"""Failures of the model from which plain draws tell a probability."""
+EXACT = 0.01
+"""Relative standard error beyond which draws serve better as the model's own."""
+OF_THE_MODEL = 0.1, 0.4
+"""Least and greatest share of the last draws that are the model's own."""
+
+
+class Asked(NamedTuple):
+    """What a call asks for."""
+
+    name: str
+    key: jax.Array
+    sim: Simulator
+    budget: int
+    gradients: bool = True
+    failures: Failures | None = None
+    near: Any = None
+    """The proposal of a similar system"""
+    level: float = 0.95
+    watched: tuple[bool, Any] = (False, None)
+    """progress and callback"""
+    ways: Ways = HERE
+
+
+class Search(NamedTuple):
+    """A family of proposals, and what its search knows."""
+
+    family: Family
+    state: State
+
+    @property
+    def worth(self) -> float:
+        """Effective draws of a draw; 0 where plain draws or no draws serve better."""
+        lost = self.state.missing > SETTINGS.lost
+        return 0.0 if lost or not serves(self.state, 0.0) else self.state.promised
+
+    @property
+    def enough(self) -> bool:
+        """Whether what is left of the budget tells the probability by the proposal."""
+        return self.worth * (self.family.budget - self.state.spent) > diagnostics.ESS
+
+
+def by_proposal(asked: Asked) -> Estimate:
+    """The `Estimate` of a call."""
+    chance, coarse = begun(asked.key), rounded(asked.sim)
+    against = [] if coarse is None else [coarse]
+    try:
+        return _drawn(asked, _sought(asked, chance), against)
+    except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+        if not was_interrupted(error):
+            raise
+        if not chance.latest:
+            raise KeyboardInterrupt from error
+        return _of_the_search(asked, chance.latest[-1], against)
+
+
+def _sought(asked, chance):
+    """The `Search` that serves best, audited."""
+    best, state = None, State()
+    for explore in _ways(asked):
+        search = explore(asked, chance, state.carried())
+        state = search.state
+        if best is not None:
+            best = best._replace(state=best.state.after(state))
+        if best is None or search.worth > best.worth:
+            best = search
+        if best.enough and serves(best.state, SETTINGS.serves):
+            best = _audited(best)
+            state = best.state
+            if best.enough:
+                return best
+        if math.exp(min(state.log_mean, 0.0)) > SETTINGS.serves:
+            return best  # plain draws serve
+    return _audited(best) if best.enough else best
+
+
+def _ways(asked):
+    """The searches, in the order in which they are tried."""
+    about = shape(asked.sim)
+    long = about.choices or about.choices0 or asked.sim.horizon >= TILTS_FIRST
+    if long or isinstance(asked.near, Tilts):
+        return _tilts, _gaussians
+    return _gaussians, _more_tilts
+
+
+def _gaussians(asked, chance, state):
+    """The `Search` for Gaussians."""
+    f = GaussianFamily(asked.sim, asked.budget, chance)
+    end = state.spent + SETTINGS.refits_end * (asked.budget - state.spent)
+    state = looked(f, state)
+    if isinstance(asked.near, latent.Latent):
+        start = state._replace(q=asked.near, anchors=f.centres(asked.near))
+        if serves(near := _from_near(f, start), SETTINGS.near_fitted):
+            return Search(f, near)
+        state = near._replace(q=None, anchors=None)
+    known = None if asked.failures is None else latent.normal_of(asked.sim, asked.failures.episodes)
+    state = explored(f, state, known, asked.gradients and not hosted(asked.sim))
+    if state.q is not None:
+        state = adapted(f, state, SETTINGS.refits, end)
+    return Search(f, state)
+
+
+def _tilts(asked, chance, state):
+    """The `Search` for tilts."""
+    f = TiltFamily(asked.sim, asked.budget, chance)
+    if isinstance(asked.near, Tilts):
+        fitting, q = f.near(asked.near)
+        if serves(near := _from_near(fitting, state._replace(q=q)), SETTINGS.serves):
+            return Search(fitting, near)
+        state = near.carried()
+    return _down_to_tilts(f, asked, state, state.spent + FIRST * asked.budget)
+
+
+def _more_tilts(asked, chance, state):
+    """The `Search` for tilts of several Gaussians, with a part of what is left."""
+    f = TiltFamily(asked.sim, asked.budget, chance, GATES)
+    return _down_to_tilts(f, asked, state, state.spent + SECOND * (asked.budget - state.spent))
+
+
+def _down_to_tilts(f, asked, state, end):
+    if asked.failures is not None:
+        state = given(f, state, asked.failures.episodes)
+    state = led_down(f, state, end)
+    if state.q is not None:
+        state = adapted(f, state, SETTINGS.refits, end)
+        if f.gates == 1 and f.about.normals and state.promised < SINGLE:
+            f, before = f._replace(gates=GATES), state.spent
+            state = state._replace(q=f.refit(state)["refitted"])
+            state = adapted(f, state, SETTINGS.refits, before + GATED * asked.budget)
+            end += state.spent - before
+    return Search(*with_given(f, state, end + WITH_GIVEN * FIRST * asked.budget))
+
+
+def _from_near(f, state):
+    """The state after a batch of a similar system's proposal, and where it does not serve as it is
+    after some refits.
+    """
+    state = adapted(f, state.noted("proposal of a similar system"), 1, math.inf)
+    if state.log_mean == -math.inf or serves(state, SETTINGS.near_serves):
+        return state
+    return adapted(f, state, SETTINGS.near_refits, math.inf)
+
+
+def _audited(search):
+    """The `Search` after the audits of its proposal."""
+    f, state = search
+    return Search(f, audited(f, cooled(f, state) if isinstance(f, TiltFamily) else state))
+
+
+def _drawn(asked, search, against):
+    """The `Estimate` of what is left of the budget; ``against``: reasons from outside."""
+    f, state = search
+    name, key, sim = asked.name, asked.key, asked.sim
+    n = max(asked.budget - state.spent, f.batch)  # a search of many parts may have spent all
+    about = dict(level=asked.level, history=state.history)
+    watch = Watch(name, n, "episode", *asked.watched)
+    log_p = max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf)
+    often = math.exp(min(log_p, 0.0)) * n >= SEEN
+    if not search.enough and not often and log_p > -math.inf:
+        reasons = [*against, *state.reasons] or [ASTRAY]
+        found = by_levels(key, sim, n, log_p, asked.level, reasons)
+        if found is not None:
+            spent, history = state.spent + found.episodes, (*state.history, *found.history)
+            return found._replace(episodes=spent, history=history, plain=state.plain)
+    if search.enough or search.worth and not often:
+        share = float(np.clip(1 - 1 / (EXACT**2 * state.promised * n), *OF_THE_MODEL))
+        about |= dict(spent=state.spent, plain=state.plain, drawn=state.plain[2], share=share)
+        q, reasons = f.with_model(state.q, share), [*against, *state.reasons]
+        found = estimated(key, sim, q, f.batch, watch, asked.ways, reasons=reasons, **about)
+        return found._replace(proposal=f.on_device(state.q))
+    total, notes, lost = chunks(of_points, (key, sim, f.batch, n), f.batch, watch, asked.ways)
+    spent, reasons = state.spent + total.samples, [*against, *lost]  # others are about the proposal
+    found = of_counts(name, total, notes=notes, reasons=reasons, evaluations=spent, **about)
+    return found._replace(draws=drawn_by(found.draws, key, f.batch, "model"))
+
+
+def _of_the_search(asked, state, against):
+    """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
+    rows = np.arange(state.size)
+    failing = rows < len(state.log_weight)
+    log_weights = np.full(len(rows), -np.inf)
+    log_weights[failing] = state.log_weight
+    none = np.zeros(len(rows))
+    seen = Traces(log_weights, none[:, None], failing, none.astype(bool), none.astype(int))
+    said = (
+        f"interrupted after {state.spent} of {asked.budget} evaluations: the estimate uses the same"
+        " episodes that chose the proposal"
+    )
+    return estimate(
+        asked.name,
+        sums.add(sums.nothing(len(rows)), seen),
+        level=asked.level,
+        reasons=[*against, said],
+        evaluations=state.spent,
+        history=state.history,
+        plain=state.plain,
+    )

@@ -1,0 +1,152 @@
+"""The estimate by draws of a proposal, a mixture of Gaussians or tilts, and its failure modes: the
+groups of Gaussians that lie in the same direction; of tilts all but the model.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jast import limit_state as latent
+from jast.counter import generator
+from jast.estimate import batches, diagnostics, markov_tilts
+from jast.estimate.batches import of_chunk, picks
+from jast.estimate.draws import drawn_by
+from jast.estimate.estimate import Estimate, estimate
+from jast.estimate.importance_sampling import Traces, chunks
+from jast.estimate.markov_tilts import Tilts
+from jast.simulator import Simulator
+from jast.units import Ways
+from jast.watch import Watch
+
+__all__ = ["estimated"]
+
+APART = 0.6
+"""Cosine of the angle between two means below which they are two modes."""
+
+
+def estimated(
+    key: jax.Array,
+    sim: Simulator,
+    q: latent.Latent | Tilts,
+    lanes: int,
+    watch: Watch,
+    ways: Ways,
+    *,
+    spent: int,
+    reasons: Sequence[str],
+    share: float = 0.0,
+    drawn: int = 0,
+    **about: Any,
+) -> Estimate:
+    """The `Estimate` of as many draws of ``q`` as ``watch`` has, ``lanes`` at a time, after
+    ``spent`` evaluations. A ``share`` of them are the model's own, of which ``drawn`` stand beside
+    them; ``about``: of `jast.estimate.estimate.estimate`.
+    """
+    modes, model = _modes(q), _model(q)
+    plain = lambda i: model[latent.component(q, picks(key, i, lanes, q.log_weights.dtype))]
+    shared = key, sim, q, _members(modes, len(model)), lanes, watch.total
+    total, notes, lost = chunks(_traces, shared, lanes, watch, ways, plain)
+    central = [i for i, mode in enumerate(modes) if _central(q)[mode].all()]
+    found = estimate(
+        watch.name,
+        total,
+        notes=notes,
+        evaluations=spent + total.samples,
+        groups=_groups(len(modes), central, total) if total.first > 0 else [],
+        proposal=q,
+        reasons=[*reasons, *lost],
+        control=int(share * total.samples) + drawn,
+        **about,
+    )
+    return found._replace(draws=drawn_by(found.draws, key, lanes, q))
+
+
+def _model(q):
+    """Which components [K] of ``q`` are the model itself."""
+    if isinstance(q, Tilts):
+        return np.arange(len(q.log_weights)) == 0
+    return latent.of_the_model(q)
+
+
+def _central(q):
+    """Which components [K] lie where the model does."""
+    return _model(q) if isinstance(q, Tilts) else ~np.asarray(q.means).any(axis=1)
+
+
+def _modes(q):
+    """Groups of the components that are used: lists of numbers."""
+    if isinstance(q, Tilts):
+        return [[0], list(range(1, int(np.isfinite(q.log_weights).sum())))]
+    return _by_direction(q)
+
+
+def _members(modes, components):
+    """[K, K] the mode of each component, as 0 and 1; of those that are not used the last place."""
+    owner = np.full(components, components - 1)
+    for i, mode in enumerate(modes):
+        owner[mode] = i
+    return np.eye(components)[owner]
+
+
+def _groups(modes, central, total):
+    """So many modes as `estimate` has them, by number; what the ``central`` ones carry, in which
+    the model's own draws lie, is a mode of its own where it matters, and else counts with the
+    greatest.
+    """
+    share = lambda i: total.by_component[i] / total.first
+    plain = [i for i in central if share(i) < diagnostics.MATTERS]
+    others = sorted((i for i in range(modes) if i not in plain), key=share)
+    groups = [[i] for i in others]
+    return [*groups[:-1], [*groups[-1], *plain]] if groups else [[i] for i in range(modes)]
+
+
+def _by_direction(q):
+    """Groups of the components whose means point the same way: failure modes, as lists of
+    numbers.
+    """
+    means, left, out = (
+        np.asarray(q.means, np.float64),
+        list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))),
+        [],
+    )
+    ways = latent.unit(means)
+    while left:
+        group, grown = {left[0]}, True
+        while grown:
+            new = {
+                j
+                for j in left
+                if j not in group and max(float(ways[i] @ ways[j]) for i in group) > APART
+            }
+            group, grown = group | new, bool(new)
+        out.append(sorted(group))
+        left = [i for i in left if i not in group]
+    return out
+
+
+def _traces(shared, i, post):
+    """`Traces` of chunk ``i`` of ``q``; ``members`` [K, K]: of which modes the shares are."""
+    key, sim, q, members, lanes, samples = shared
+    n = min(lanes, samples - i * lanes)
+    drawn = _of_tilts if isinstance(q, Tilts) else _of_gaussians
+    o, log_w, shares = drawn(key, sim, q, i, n, lanes)
+    with np.errstate(divide="ignore"):
+        shares = np.log(np.exp(shares) @ members)
+    return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
+
+
+def _of_gaussians(key, sim, q, i, n, lanes):
+    """(`Outcomes`, log p - log q, log shares [n, K]) of the first ``n`` draws of chunk ``i``."""
+    return batches.drawn(sim, q, *of_chunk(key, i, n, q))[1:]
+
+
+def _of_tilts(key, sim, q, i, n, lanes):
+    """The same of tilts."""
+    about, dtype = markov_tilts.shape(sim), latent.normal_numbers(sim)
+    drawn = markov_tilts.numbers(generator(key, 2, i), lanes, about, sim.horizon, dtype)
+    u, first, noise = drawn
+    some = u[:n], tuple(a[:n] for a in first), tuple(a[:, :n] for a in noise)
+    o, ratio, _ = markov_tilts.played(sim, q, *some)
+    return o, *markov_tilts.log_weight(q, ratio)

@@ -1,0 +1,129 @@
+"""The audit of a proposal: what it hardly draws is taken in, or said."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_failure_probability import FAR, planes
+
+from jast.estimate import audit
+from jast.estimate.audit import Missing, audited, uncovered
+from jast.estimate.gaussian_family import GaussianFamily, Points
+from jast.estimate.gaussians import as_latent, unit
+from jast.estimate.search_settings import SETTINGS
+from jast.estimate.search_state import State, begun, taken
+
+BUDGET = 500_000  # a batch is 20,000 episodes
+
+
+def at(mean, n=1):
+    """Points at ``mean`` in each of four numbers."""
+    return Points(np.full((n, 4), mean), np.full(n, 4, np.int32))
+
+
+def searched(key, sim, *shares):
+    """A family, and a search with a batch of a proposal: unit Gaussians at the nearest failures of
+    `planes` up and down, by these shares.
+    """
+    f = GaussianFamily(sim, BUDGET, begun(key))
+    centres = [(w, unit(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))]
+    state = taken(f, State(spent=BUDGET // 5), f.draw(as_latent(centres, f.dtype)))
+    return f, state
+
+
+@pytest.fixture
+def last(monkeypatch):
+    """One audit, after which nothing can be mended."""
+    monkeypatch.setattr(audit, "SETTINGS", SETTINGS._replace(audits=1))
+
+
+def test_a_lost_mode_is_taken_into_the_proposal(key):
+    """It is as likely as what is known: half of the draws go there in the end."""
+    f, state = searched(key, planes(4.0, 4.0), 1.0)
+    assert uncovered(f, state, at(-2.0)).all()
+    state = audited(f, state)
+    assert not state.reasons and not uncovered(f, state, at(-2.0)).any()
+    of_down = np.asarray(state.q.means).sum(axis=1) < 0
+    assert 0.3 < np.exp(np.asarray(state.q.log_weights, float))[of_down].sum() < 0.7
+
+
+def test_what_the_last_audit_finds_is_a_reason(key, last):
+    f, state = searched(key, planes(4.0, 4.0), 1.0)
+    state = audited(f, state)
+    assert len(state.reasons) == 1 and state.missing > SETTINGS.tolerated
+    assert "failures that the proposal hardly draws" in state.reasons[0]
+
+
+@pytest.mark.parametrize("down, shares", [(FAR, (1.0,)), (4.0, (0.5, 0.5)), (4.0, (0.995, 0.005))])
+def test_nothing_is_said_where_nothing_was_lost(down, shares, key):
+    """One mode; two; and a second one that the proposal draws seldom, but often enough for its
+    batch to know what is there.
+    """
+    f, state = searched(key, planes(4.0, down), *shares)
+    assert not audited(f, state).reasons
+
+
+def test_a_share_is_missing_where_no_batch_could_have_drawn(key):
+    """The batch of 20,000 is of the upper mode alone: it meets that one, and knows it better than a
+    population does; of the lower mode it knows nothing, however much it saw elsewhere.
+    """
+    f, state = searched(key, planes(4.0, 4.0), 1.0)
+    unmet = lambda share, mean: audit._unmet(f, state, Missing(share, at(mean, 3)))
+    assert unmet(0.04, 2.0) < 1e-3 and unmet(0.9, 2.0) < 1e-3
+    assert unmet(0.04, -2.0) == pytest.approx(0.04, rel=0.01) and unmet(0.0, -2.0) == 0
+
+
+@pytest.mark.parametrize("mean, against", [(2.0, 0), (-2.0, 1)])
+def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
+    mean, against, key, last, monkeypatch
+):
+    """A population that tells of nine tenths of the probability, in a place that the batch has
+    drawn thousands of points of, is wrong about the share: a population of few independent points
+    often is. Where the batch has no point it is a reason.
+    """
+    f, state = searched(key, planes(4.0, 4.0), 1.0)
+    found = SimpleNamespace(
+        complete=True,
+        reached=True,
+        log_mean=state.log_mean + np.log(0.9),
+        points=at(mean, 50).z,
+        used=at(mean, 50).used,
+        evaluations=0,
+    )
+    monkeypatch.setattr(audit, "explore", lambda *a, **k: found)
+    monkeypatch.setattr(audit, "uncovered", lambda f, state, points: np.full(len(points.z), True))
+    assert len(audited(f, state).reasons) == against
+
+
+def test_failures_of_wide_noise_that_are_not_covered_name_no_share(key, last, monkeypatch):
+    """Nobody knows what they weigh. Two may be chance, three are a reason."""
+    f, state = searched(key, planes(4.0, FAR), 1.0)
+    monkeypatch.setattr(audit, "_elsewhere", lambda f, state: (state, None))
+    for n, reasons in ((2, ()), (3, (audit.FORGOTTEN,))):
+        monkeypatch.setattr(audit, "_settled", lambda f, state, n=n: (state, at(-2.0, n)))
+        assert audited(f, state).reasons == reasons
+
+
+def test_a_budget_too_small_for_an_audit_is_said(key):
+    f, state = searched(key, planes(4.0), 1.0)
+    state = audited(f, state._replace(spent=int(0.849 * BUDGET)))
+    assert state.reasons == (audit.UNFINISHED,)
+
+
+def test_what_few_draws_tell_of_a_thin_part_is_said(key):
+    """Failures that the proposal never draws: thousands of draws of an earlier one know their
+    probability, a single one does not.
+    """
+    f, state = searched(key, planes(4.0), 1.0)
+    q = as_latent([(1.0, unit(np.full((1, 4), -2.0)))], f.dtype)
+    state = audit._thin(f, state._replace(q=q))
+    assert not state.reasons
+    few = state.log_weight.copy()
+    few[1:] = few[0] - 20
+    [reason] = audit._thin(f, state._replace(log_weight=few)).reasons
+    assert reason == "100% of the probability found lies where the proposal hardly draws"
+
+
+def test_shares_beyond_the_whole_are_in_words():
+    said = [audit._in_words(v) for v in (0.034, 0.3, 1.0, 14.25, 1.4539e13)]
+    assert said == ["3% of", "30% of", "1 times", "14 times", "far more than"]
