@@ -21,20 +21,18 @@ def at(mean, n=1):
     return Points(np.full((n, 4), mean), np.full(n, 4, np.int32))
 
 
-def searched(key, sim, *shares):
+def searched(key, sim, *shares, settings=SETTINGS):
     """A family, and a search with a batch of a proposal: unit Gaussians at the nearest failures of
     `planes` up and down, by these shares.
     """
-    f = GaussianFamily(sim, BUDGET, begun(key))
+    f = GaussianFamily(sim, BUDGET, begun(key), settings)
     centres = [(w, unit(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))]
     state = taken(f, State(spent=BUDGET // 5), f.draw(as_latent(centres, f.dtype)))
     return f, state
 
 
-@pytest.fixture
-def last(monkeypatch):
-    """One audit, after which nothing can be mended."""
-    monkeypatch.setattr(audit, "SETTINGS", SETTINGS._replace(audits=1))
+LAST = SETTINGS._replace(audits=1)
+"""One audit, after which nothing can be mended."""
 
 
 def test_a_lost_mode_is_taken_into_the_proposal(key):
@@ -47,8 +45,8 @@ def test_a_lost_mode_is_taken_into_the_proposal(key):
     assert 0.3 < np.exp(np.asarray(state.q.log_weights, float))[of_down].sum() < 0.7
 
 
-def test_what_the_last_audit_finds_is_a_reason(key, last):
-    f, state = searched(key, planes(4.0, 4.0), 1.0)
+def test_what_the_last_audit_finds_is_a_reason(key):
+    f, state = searched(key, planes(4.0, 4.0), 1.0, settings=LAST)
     state = audited(f, state)
     assert len(state.reasons) == 1 and state.missing > SETTINGS.tolerated
     assert "failures that the proposal hardly draws" in state.reasons[0]
@@ -75,13 +73,13 @@ def test_a_share_is_missing_where_no_batch_could_have_drawn(key):
 
 @pytest.mark.parametrize("mean, against", [(2.0, 0), (-2.0, 1)])
 def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
-    mean, against, key, last, monkeypatch
+    mean, against, key, monkeypatch
 ):
     """A population that tells of nine tenths of the probability, in a place that the batch has
     drawn thousands of points of, is wrong about the share: a population of few independent points
     often is. Where the batch has no point it is a reason.
     """
-    f, state = searched(key, planes(4.0, 4.0), 1.0)
+    f, state = searched(key, planes(4.0, 4.0), 1.0, settings=LAST)
     found = SimpleNamespace(
         complete=True,
         reached=True,
@@ -95,9 +93,9 @@ def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
     assert len(audited(f, state).reasons) == against
 
 
-def test_failures_of_wide_noise_that_are_not_covered_name_no_share(key, last, monkeypatch):
+def test_failures_of_wide_noise_that_are_not_covered_name_no_share(key, monkeypatch):
     """Nobody knows what they weigh. Two may be chance, three are a reason."""
-    f, state = searched(key, planes(4.0, FAR), 1.0)
+    f, state = searched(key, planes(4.0, FAR), 1.0, settings=LAST)
     monkeypatch.setattr(audit, "_elsewhere", lambda f, state: (state, None))
     for n, reasons in ((2, ()), (3, (audit.FORGOTTEN,))):
         monkeypatch.setattr(audit, "_settled", lambda f, state, n=n: (state, at(-2.0, n)))

@@ -176,7 +176,7 @@ def test_weights_average_to_one(mixed, key, gates):
     rollout.
     """
     n = 4000
-    f = TiltFamily(mixed, 10_000, begun(jax.random.key(1)), gates)
+    f = TiltFamily(mixed, 10_000, begun(jax.random.key(1)), gates=gates)
     pilot = f.play(f.untilted()).points
     frame = frame_of(f.about, *pilot, np.ones(500))
     dtype = normal_numbers(mixed)

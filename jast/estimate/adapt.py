@@ -5,7 +5,6 @@ better (de Boer, Kroese, Mannor and Rubinstein 2005).
 from __future__ import annotations
 
 from jast.estimate.gaussians import effective
-from jast.estimate.search_settings import SETTINGS
 from jast.estimate.search_state import Family, State, log_ratios, promise, taken, weight_of
 
 __all__ = ["adapted", "refitted"]
@@ -30,9 +29,9 @@ def adapted(family: Family, state: State, times: int, end: float) -> State:
             f" ESS {effective(state.log_weight):.4g}; next: {name}",
             batch.size,
         )
-        stalls = 0 if own > SETTINGS.gain * best else stalls + 1
-        enough = own > SETTINGS.enough * batch.size
-        if stalls and (enough or stalls == SETTINGS.stalls):
+        stalls = 0 if own > family.settings.gain * best else stalls + 1
+        enough = own > family.settings.enough * batch.size
+        if stalls and (enough or stalls == family.settings.stalls):
             break
         best = max(own, best)
     return state

@@ -11,7 +11,6 @@ import numpy as np
 
 from jast.estimate.adapt import adapted
 from jast.estimate.populations import LAST, QUANTILE, explore, settled
-from jast.estimate.search_settings import SETTINGS
 from jast.estimate.search_state import Family, State, log_ratios
 
 __all__ = ["audited", "met", "uncovered"]
@@ -34,8 +33,8 @@ def audited(family: Family, state: State) -> State:
     and audited again; what the last one finds becomes a reason against the estimate.
     """
     state, cooled = _settled(family, state)
-    end = SETTINGS.search_ends * family.budget
-    for left in reversed(range(SETTINGS.audits)):
+    end = family.settings.search_ends * family.budget
+    for left in reversed(range(family.settings.audits)):
         state = state._replace(reasons=())  # what is still wrong is said again
         state, missing = _missing(family, state, cooled)
         if not missing:
@@ -43,9 +42,9 @@ def audited(family: Family, state: State) -> State:
         if not left or state.spent + 2 * family.batch > end:
             return _reported(state, missing)
         for m in missing:
-            share = SETTINGS.unknown if math.isnan(m.share) else m.share
+            share = family.settings.unknown if math.isnan(m.share) else m.share
             state = family.absorbed(state, m.points, share)
-        state = adapted(family, state, SETTINGS.batches_after_audit, end)
+        state = adapted(family, state, family.settings.refits_of_audit, end)
     return _thin(family, state)
 
 
@@ -65,20 +64,22 @@ def _least(family, state):
     `covered` times the mean one, and where the draws that are left would meet too few of a part of
     the probability that matters (`thin`).
     """
-    draws = SETTINGS.thin * (family.budget - state.spent) / SETTINGS.met
-    return -state.log_mean - math.log(max(SETTINGS.covered, draws))
+    draws = family.settings.thin * (family.budget - state.spent) / family.settings.met
+    return -state.log_mean - math.log(max(family.settings.covered, draws))
 
 
 def _settled(family, state):
     """The failures that wide noise led to as the model has them, after Markov moves; None where
     there are none.
     """
-    most = int(SETTINGS.settling * family.budget)
-    z = None if state.cooled is None else state.cooled[: max(most // SETTINGS.moves, 1)]
+    most = int(family.settings.settling * family.budget)
+    z = None if state.cooled is None else state.cooled[: max(most // family.settings.moves, 1)]
     if z is None or not len(z):
         return state, None
     key, everywhere = family.chance.next_key(), family.left_out(state.q, math.inf)
-    people, chain = settled(key, family.sim, z, SETTINGS.moves, covered=everywhere, most=most)
+    people, chain = settled(
+        key, family.sim, z, family.settings.moves, covered=everywhere, most=most
+    )
     rows = people.score == -np.inf
     state = state.noted(f"audit: {len(z)} failures of wide noise moved", chain.evaluations)
     return family.points_of(state, people.z[rows], people.used[rows])
@@ -95,11 +96,11 @@ def _missing(family, state, cooled):
         rows = uncovered(family, state, points)
         missing.append(Missing(share * rows.mean(), family.rows(points, rows)))
         state = state.noted(f"audit: {share:.2%} of the probability, {rows.mean():.0%} not covered")
-    missing = [m for m in missing if _unmet(family, state, m) > SETTINGS.tolerated]
+    missing = [m for m in missing if _unmet(family, state, m) > family.settings.tolerated]
     if cooled is not None:
         rows = uncovered(family, state, cooled) & ~met(family, state, cooled)
         state = state.noted(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
-        if rows.sum() > max(SETTINGS.stray * len(rows), SETTINGS.few):
+        if rows.sum() > max(family.settings.stray * len(rows), family.settings.stray_least):
             missing.append(Missing(math.nan, family.rows(cooled, rows)))
     return state, missing
 
@@ -108,16 +109,16 @@ def _elsewhere(family, state):
     """A population down the levels of the miss distance that is kept out of what the proposal
     covers: (its probability as a multiple of what the proposal found, `Explored`), or None.
     """
-    least = state.log_mean + math.log(SETTINGS.tolerated / 2)
-    room = SETTINGS.search_ends * family.budget - state.spent
-    room = min(SETTINGS.audit_share * family.budget, room)
+    least = state.log_mean + math.log(family.settings.tolerated / 2)
+    room = family.settings.search_ends * family.budget - state.spent
+    room = min(family.settings.audit_share * family.budget, room)
     # as many points as can afford the levels down to there
     size = int(room / (least / math.log(QUANTILE) + LAST + 4))
-    size = min(size, max(family.budget // 200, SETTINGS.fewest))
-    if size < SETTINGS.fewest:
+    size = min(size, max(family.budget // 200, family.settings.fewest))
+    if size < family.settings.fewest:
         return state.against(UNFINISHED), None
     key, outside = family.chance.next_key(), family.left_out(state.q, _least(family, state))
-    most = int(SETTINGS.ties * room)
+    most = int(family.settings.ties * room)
     p = explore(key, family.sim, size, covered=outside, least=least, most=most)
     state = state.noted(f"audit: a population of {size}", p.evaluations)
     if not p.complete:
@@ -156,7 +157,7 @@ def _thin(family, state):
     w = np.exp(state.log_weight - state.log_weight.max())
     share = w[rows].sum() / w.sum()
     met = w[rows].sum() ** 2 / (w[rows] ** 2).sum() if rows.any() else 0.0
-    if share <= SETTINGS.thin or met >= SETTINGS.known:
+    if share <= family.settings.thin or met >= family.settings.known:
         return state
     return state.against(
         f"{share:.0%} of the probability found lies where the proposal hardly draws"

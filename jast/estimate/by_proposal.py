@@ -25,7 +25,7 @@ from jast.estimate.gaussian_start import explored, looked
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.plain import of_points
-from jast.estimate.search_settings import SETTINGS
+from jast.estimate.search_settings import SETTINGS, SearchSettings
 from jast.estimate.search_state import Family, State, begun, serves
 from jast.estimate.subset import by_levels
 from jast.estimate.tilt_family import TiltFamily
@@ -40,26 +40,6 @@ from jast.watch import Watch
 __all__ = ["by_proposal"]
 
 ASTRAY = "no proposal was found that draws failures in proportion to their probability"
-
-
-TILTS_FIRST = 30
-"""Steps from which tilts are tried before Gaussians."""
-FIRST, SECOND = 0.35, 0.3
-"""Share of the budget, or of what is left of it, that a search for tilts has."""
-GATES = 3
-"""Gaussians that a normal number is drawn from one of, where a single one does not serve."""
-GATED = 0.25
-"""Share of the budget that the search for them has."""
-SINGLE = 0.1
-"""Effective draws of a draw with which a single one serves."""
-WITH_GIVEN = 0.5
-"""How much longer a search for tilts may be where failures came with the call."""
-SEEN = 100
-"""Failures of the model from which plain draws tell a probability."""
-EXACT = 0.01
-"""Relative standard error beyond which draws serve better as the model's own."""
-OF_THE_MODEL = 0.1, 0.4
-"""Least and greatest share of the last draws that are the model's own."""
 
 
 class Asked(NamedTuple):
@@ -77,6 +57,7 @@ class Asked(NamedTuple):
     watched: tuple[bool, Any] = (False, None)
     """progress and callback"""
     ways: Ways = HERE
+    settings: SearchSettings = SETTINGS
 
 
 class Search(NamedTuple):
@@ -88,7 +69,7 @@ class Search(NamedTuple):
     @property
     def worth(self) -> float:
         """Effective draws of a draw; 0 where plain draws or no draws serve better."""
-        lost = self.state.missing > SETTINGS.lost
+        lost = self.state.missing > self.family.settings.lost
         return 0.0 if lost or not serves(self.state, 0.0) else self.state.promised
 
     @property
@@ -121,12 +102,12 @@ def _sought(asked, chance):
             best = best._replace(state=best.state.after(state))
         if best is None or search.worth > best.worth:
             best = search
-        if best.enough and serves(best.state, SETTINGS.serves):
+        if best.enough and serves(best.state, asked.settings.serves):
             best = _audited(best)
             state = best.state
             if best.enough:
                 return best
-        if math.exp(min(state.log_mean, 0.0)) > SETTINGS.serves:
+        if math.exp(min(state.log_mean, 0.0)) > asked.settings.serves:
             return best  # plain draws serve
     return _audited(best) if best.enough else best
 
@@ -134,7 +115,7 @@ def _sought(asked, chance):
 def _ways(asked):
     """The searches, in the order in which they are tried."""
     about = shape(asked.sim)
-    long = about.choices or about.choices0 or asked.sim.horizon >= TILTS_FIRST
+    long = about.choices or about.choices0 or asked.sim.horizon >= asked.settings.tilts_first
     if long or isinstance(asked.near, Tilts):
         return _tilts, _gaussians
     return _gaussians, _more_tilts
@@ -142,50 +123,52 @@ def _ways(asked):
 
 def _gaussians(asked, chance, state):
     """The `Search` for Gaussians."""
-    f = GaussianFamily(asked.sim, asked.budget, chance)
-    end = state.spent + SETTINGS.refits_end * (asked.budget - state.spent)
+    f = GaussianFamily(asked.sim, asked.budget, chance, asked.settings)
+    end = state.spent + asked.settings.refits_end * (asked.budget - state.spent)
     state = looked(f, state)
     if isinstance(asked.near, latent.Latent):
         start = state._replace(q=asked.near, anchors=f.centres(asked.near))
-        if serves(near := _from_near(f, start), SETTINGS.near_fitted):
+        if serves(near := _from_near(f, start), asked.settings.near_fitted):
             return Search(f, near)
         state = near._replace(q=None, anchors=None)
     known = None if asked.failures is None else latent.normal_of(asked.sim, asked.failures.episodes)
     state = explored(f, state, known, asked.gradients and not hosted(asked.sim))
     if state.q is not None:
-        state = adapted(f, state, SETTINGS.refits, end)
+        state = adapted(f, state, asked.settings.refits, end)
     return Search(f, state)
 
 
 def _tilts(asked, chance, state):
     """The `Search` for tilts."""
-    f = TiltFamily(asked.sim, asked.budget, chance)
+    f = TiltFamily(asked.sim, asked.budget, chance, asked.settings)
     if isinstance(asked.near, Tilts):
         fitting, q = f.near(asked.near)
-        if serves(near := _from_near(fitting, state._replace(q=q)), SETTINGS.serves):
+        if serves(near := _from_near(fitting, state._replace(q=q)), asked.settings.serves):
             return Search(fitting, near)
         state = near.carried()
-    return _down_to_tilts(f, asked, state, state.spent + FIRST * asked.budget)
+    return _down_to_tilts(f, asked, state, state.spent + asked.settings.tilts_share * asked.budget)
 
 
 def _more_tilts(asked, chance, state):
     """The `Search` for tilts of several Gaussians, with a part of what is left."""
-    f = TiltFamily(asked.sim, asked.budget, chance, GATES)
-    return _down_to_tilts(f, asked, state, state.spent + SECOND * (asked.budget - state.spent))
+    f = TiltFamily(asked.sim, asked.budget, chance, asked.settings, asked.settings.gates)
+    share = asked.settings.tilts_after * (asked.budget - state.spent)
+    return _down_to_tilts(f, asked, state, state.spent + share)
 
 
 def _down_to_tilts(f, asked, state, end):
+    s = asked.settings
     if asked.failures is not None:
         state = given(f, state, asked.failures.episodes)
     state = led_down(f, state, end)
     if state.q is not None:
-        state = adapted(f, state, SETTINGS.refits, end)
-        if f.gates == 1 and f.about.normals and state.promised < SINGLE:
-            f, before = f._replace(gates=GATES), state.spent
+        state = adapted(f, state, asked.settings.refits, end)
+        if f.gates == 1 and f.about.normals and state.promised < s.single_serves:
+            f, before = f._replace(gates=s.gates), state.spent
             state = state._replace(q=f.refit(state)["refitted"])
-            state = adapted(f, state, SETTINGS.refits, before + GATED * asked.budget)
+            state = adapted(f, state, asked.settings.refits, before + s.gates_share * asked.budget)
             end += state.spent - before
-    return Search(*with_given(f, state, end + WITH_GIVEN * FIRST * asked.budget))
+    return Search(*with_given(f, state, end + s.given_share * asked.budget))
 
 
 def _from_near(f, state):
@@ -193,9 +176,9 @@ def _from_near(f, state):
     after some refits.
     """
     state = adapted(f, state.noted("proposal of a similar system"), 1, math.inf)
-    if state.log_mean == -math.inf or serves(state, SETTINGS.near_serves):
+    if state.log_mean == -math.inf or serves(state, f.settings.near_serves):
         return state
-    return adapted(f, state, SETTINGS.near_refits, math.inf)
+    return adapted(f, state, f.settings.near_refits, math.inf)
 
 
 def _audited(search):
@@ -212,7 +195,7 @@ def _drawn(asked, search, against):
     about = dict(level=asked.level, history=state.history)
     watch = Watch(name, n, "episode", *asked.watched)
     log_p = max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf)
-    often = math.exp(min(log_p, 0.0)) * n >= SEEN
+    often = math.exp(min(log_p, 0.0)) * n >= asked.settings.plain_failures
     if not search.enough and not often and log_p > -math.inf:
         reasons = [*against, *state.reasons] or [ASTRAY]
         found = by_levels(key, sim, n, log_p, asked.level, reasons)
@@ -220,7 +203,10 @@ def _drawn(asked, search, against):
             spent, history = state.spent + found.episodes, (*state.history, *found.history)
             return found._replace(episodes=spent, history=history, plain=state.plain)
     if search.enough or search.worth and not often:
-        share = float(np.clip(1 - 1 / (EXACT**2 * state.promised * n), *OF_THE_MODEL))
+        s = asked.settings
+        share = float(
+            np.clip(1 - 1 / (s.exact**2 * state.promised * n), s.of_the_model, s.of_the_model_most)
+        )
         about |= dict(spent=state.spent, plain=state.plain, drawn=state.plain[2], share=share)
         q, reasons = f.with_model(state.q, share), [*against, *state.reasons]
         found = estimated(key, sim, q, f.batch, watch, asked.ways, reasons=reasons, **about)

@@ -26,32 +26,14 @@ from jast.estimate.gaussians import (
     together,
     unit,
 )
+from jast.estimate.search_settings import SETTINGS, SearchSettings
 from jast.estimate.search_state import Batch, Chance, State
 
-__all__ = ["MANY", "GaussianFamily", "Points", "defended"]
+__all__ = ["GaussianFamily", "Points", "defended"]
 
-WIDE, MODEL = 0.2, 0.1
-"""Shares of a proposal: components whose covariances are nowhere narrower than the model's, so that
-no weight is without variance; where failures are not rare the model itself.
-"""
-RARE, FEW, NOTHING = math.log(1e-4), 20, 1e-6
-MANY = 16
-"""Directions above which each has too few failures for a covariance of all numbers."""
-NUMBERS, SPREAD, SEEN = 4, 3.0, 5.0
-"""Numbers, at most, that a direction of many is fitted in; failures that the model's variance and,
-in its share, each direction is as good as.
-"""
-LEAST, MINOR = 0.05, 0.2
-"""Share of the draws that a direction has at least, and all of those together: what a few failures
-tell of its mass is mostly too little.
-"""
-NARROWEST = 0.3
-"""Of the model's, the least variance of what is taken into a proposal."""
-CHAINS, POINTS, HELD = (8, 128), 16, 0.05
-"""The least and the greatest number of chains of cooled noise; directions that a proposal can hold
-at the least, where many chains may lead to more; the share, over the number of directions, above
-which a component counts as one of them.
-"""
+
+NOTHING = 1e-6
+"""Mass of a mode that is rounding alone."""
 
 
 class Points(NamedTuple):
@@ -69,6 +51,7 @@ class GaussianFamily(NamedTuple):
     sim: Any
     budget: int
     chance: Chance
+    settings: SearchSettings = SETTINGS
     name: str = "Gaussians"
 
     @property
@@ -89,12 +72,13 @@ class GaussianFamily(NamedTuple):
     @property
     def chains(self) -> int:
         """Markov chains that the budget affords."""
-        return int(np.clip(self.budget // 800, *CHAINS))
+        s = self.settings
+        return int(np.clip(self.budget // s.chain_of, s.chains_least, s.chains))
 
     @property
     def directions(self) -> int:
         """That a proposal can hold, each by two components, beside the model."""
-        return max(min(self.chains, (held(self.dimension) - 1) // 2), POINTS)
+        return max(min(self.chains, (held(self.dimension) - 1) // 2), self.settings.dense)
 
     def model(self) -> latent.Latent:
         """The model itself as a proposal."""
@@ -135,12 +119,14 @@ class GaussianFamily(NamedTuple):
         """The proposal with a mixture fitted to ``points``, which carry ``share`` of what it
         found.
         """
-        g = self.of_population(points)
-        return self.added(state, g, min(max(share / (1 + share), 0.15), 0.85), rare(state))
+        g, least = self.of_population(points), self.settings.unknown
+        return self.added(
+            state, g, min(max(share / (1 + share), least), 1 - least), rare(self, state)
+        )
 
     def added(self, state: State, g: Gaussians, share: float | None, rare: bool) -> State:
         """The proposal with the `Gaussians` ``g`` for ``share`` of it; None: in place of it."""
-        new = as_latent(defended(g, NARROWEST, rare), self.dtype)
+        new = as_latent(defended(g, self.settings.narrowest, rare, self.settings), self.dtype)
         return state._replace(q=new if share is None else together(state.q, new, share))
 
     def of_population(self, points: Points) -> Gaussians:
@@ -161,7 +147,9 @@ class GaussianFamily(NamedTuple):
 
     def centres(self, q: latent.Latent) -> np.ndarray:
         """The distinct means of a proposal [m, D]."""
-        heavy = np.asarray(q.log_weights) > math.log(HELD / self.directions)
+        heavy = np.asarray(q.log_weights) > math.log(
+            self.settings.direction_least / self.directions
+        )
         return distinct(np.asarray(q.means, np.float64)[heavy], self.directions)
 
     def refit(self, state: State) -> dict[str, latent.Latent]:
@@ -169,12 +157,14 @@ class GaussianFamily(NamedTuple):
         log_w, centres = state.log_weight, self.centres(state.q)
         points = self.filled(Points(*map(np.concatenate, zip(*(b.points for b in state.batches)))))
         owner = nearest(points, centres)
-        many = np.bincount(owner, minlength=len(centres)) >= FEW
+        many = np.bincount(owner, minlength=len(centres)) >= self.settings.direction_failures
         owner = nearest(points, centres[many]) if many.any() else np.zeros_like(owner)
         choices = {}
-        if len(centres) <= MANY or effective(log_w) > FEW * self.dimension * len(centres):
+        few = self.settings.direction_failures
+        dense = len(centres) <= self.settings.dense
+        if dense or effective(log_w) > few * self.dimension * len(centres):
             choices["modes"] = _by_owner(self, state, points, owner)
-        if len(centres) > MANY:
+        if len(centres) > self.settings.dense:
             choices["sparse"] = _sparse(self, state, points, centres)
         if "modes" not in choices or owner.any():
             choices["one"] = _by_owner(self, state, points, np.zeros_like(owner))
@@ -182,9 +172,11 @@ class GaussianFamily(NamedTuple):
         return choices
 
 
-def rare(state: State) -> bool:
+def rare(family: GaussianFamily, state: State) -> bool:
     """Whether failures are, as far as anything tells."""
-    return max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf) < RARE
+    return max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf) < math.log(
+        family.settings.rare
+    )
 
 
 def _sphere(f, points, log_w):
@@ -201,7 +193,8 @@ def _by_owner(f, state, points, owner):
     """A `Latent`: Gaussians fitted to the points of each owner apart."""
     log_w, owners = state.log_weight, np.unique(owner)
     parts, w = [], np.exp(log_w - log_w.max())
-    least = min(LEAST, MINOR / len(owners))
+    s = f.settings
+    least = min(s.direction_least, s.directions_least / len(owners))
     for i in owners:
         rows = np.flatnonzero(owner == i)
         mass = w[rows].sum() / w.sum()
@@ -209,14 +202,14 @@ def _by_owner(f, state, points, owner):
             continue
         # few great weights would make a mixture fit their own noise: a power below 1 of them leads
         # the same way, in more batches
-        power = tempered(log_w[rows], min(max(200, 5 * f.dimension), 0.5 * len(rows)))
+        power = tempered(log_w[rows], min(max(s.tempered, 5 * f.dimension), 0.5 * len(rows)))
         v = np.exp(power * (log_w[rows] - log_w[rows].max()))
         g = fit(
             f.chance.rng,
             points[rows],
             v / v.sum(),
             v.sum() ** 2 / (v**2).sum(),
-            limit=max(MANY // len(owners), 2),
+            limit=max(s.dense // len(owners), 2),
             anchors=state.anchors,
         )
         parts.append(g._replace(weights=g.weights * max(mass, least)))
@@ -224,7 +217,7 @@ def _by_owner(f, state, points, owner):
         defended(
             Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))),
             0.0,
-            rare(state),
+            rare(f, state),
         ),
         f.dtype,
     )
@@ -245,7 +238,7 @@ def _sparse(f, state, points, centres):
         v, n = np.exp(own - own.max()), effective(own)
         v /= v.sum()
         on = state.anchors[of[i]] != 0
-        if 0 < on.sum() <= NUMBERS:
+        if 0 < on.sum() <= f.settings.sparse:
             means[i] = 0.0
             means[i, on] = to_anchors(v @ z[:, on], n, state.anchors[of[i], on][None])
             spread = v @ (z[:, on] - means[i, on]) ** 2
@@ -254,27 +247,28 @@ def _sparse(f, state, points, centres):
             vectors[i] = np.linalg.qr(means[i][:, None], mode="complete").Q
             on = np.arange(f.dimension) == 0
             spread = v @ ((z - means[i]) @ vectors[i, :, on].T) ** 2
-        values[i, on] = (n * spread + SPREAD) / (n + SPREAD)
-    g = Gaussians(_masses(masses, effective(log_w)), means, values, vectors)
-    return as_latent(defended(g, 0.0, rare(state)), f.dtype)
+        prior = f.settings.prior
+        values[i, on] = (n * spread + prior) / (n + prior)
+    g = Gaussians(_masses(masses, effective(log_w), f.settings.prior_share), means, values, vectors)
+    return as_latent(defended(g, 0.0, rare(f, state)), f.dtype)
 
 
-def _masses(mass, n):
+def _masses(mass, n, prior):
     """Shares of modes that weigh ``mass`` [m] by ``n`` effective draws: as if each had been met by
-    `SEEN` more.
+    ``prior`` more.
     """
     m = len(mass)
-    return (n * mass / mass.sum() + SEEN) / (n + m * SEEN)
+    return (n * mass / mass.sum() + prior) / (n + m * prior)
 
 
-def defended(g, low, rare):
+def defended(g, low, rare, settings=SETTINGS):
     """[(share, Gaussians), ...]: ``g``, its wide copies, and where failures are not rare the
     model.
     """
-    d, model = g.means.shape[1], 0.0 if rare else MODEL
-    wide = g._replace(values=np.maximum(g.values, 1.0))
+    d, model = g.means.shape[1], 0.0 if rare else settings.model
+    wide, wide_share = g._replace(values=np.maximum(g.values, 1.0)), settings.defensive
     parts = (
-        [(1 - WIDE - model, g._replace(values=np.maximum(g.values, low))), (WIDE, wide)]
+        [(1 - wide_share - model, g._replace(values=np.maximum(g.values, low))), (wide_share, wide)]
         if (g.values < 1).any()
         else [(1 - model, g)]
     )

@@ -16,22 +16,6 @@ from jast.judge import judged
 
 __all__ = ["explored", "looked"]
 
-STARTS, TRIED, WIDER = (4, 48), 12, (4, 12)
-"""Descents of a round; those that are tried before others; draws of wider noise for each of them,
-in a first round and in others.
-"""
-ENOUGH, COOLED, LATE, RESTS = 36, 0.2, 0.3, 18
-"""Failures that wide noise is cooled to at the least; the share of the budget at which cooling
-ends, and at which descents do; the share that is spent in all, above which cooling looks for no
-more than that least number; and how often a failure is tried without some of its numbers.
-"""
-ALONE, MET, ENDLESS, SLOW, NEW = 0.03, 3, 0.5, 0.85, 0.25
-"""When the search for more directions ends. `ALONE`: where at most this part of the failures lies
-in a direction of its own, or is explained by nothing known; or `MET` of them. `ENDLESS`: where more
-than this part is alone even so, as more chains would not change it. `SLOW`: where a round of
-descents leaves more than this part unexplained of what was before it. `NEW`: where less than this
-part of its descents come to new points.
-"""
 LIFTS = 1.0, 1.05, 1.1, 1.2
 """How much farther out than a failure its mirror image is looked for."""
 
@@ -49,6 +33,7 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
     they all found no failure. ``known`` [m, D]: failures that came with the call.
     """
     parts, anchors = [], np.zeros((0, f.dimension))
+    least = f.settings.anchor_least
 
     def around(state, name, points, evaluations):
         nonlocal anchors
@@ -57,7 +42,9 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
         if len(points):
             anchors = np.concatenate([anchors, points])
             # those farther out may be what leads to more, but many of them are no more than a few
-            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + min(0.05, 0.8 / len(points))
+            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + min(
+                least, 16 * least / len(points)
+            )
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return state.noted(f"{name}: {len(points)} points{ends}", evaluations)
 
@@ -77,7 +64,7 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
     if not len(anchors):
         state, parts = _population(f, state)
     for i, g in enumerate(parts, 1):
-        state = f.added(state, g, None if i == 1 else 1 / i, rare(state))
+        state = f.added(state, g, None if i == 1 else 1 / i, rare(f, state))
     return state
 
 
@@ -101,7 +88,12 @@ def _descended(f):
     from the edges of failures under wider noise that those found do not explain, for as long as
     these lead to others and fewer and fewer are left.
     """
-    n, first, left = int(np.clip(f.budget // 2000, *STARTS)), True, math.inf
+    s = f.settings
+    n, first, left = (
+        int(np.clip(f.budget // s.descent_of, s.descents_least, s.descents)),
+        True,
+        math.inf,
+    )
     points, evaluations = np.zeros((0, f.dimension)), 0
 
     def go(starts):
@@ -111,29 +103,35 @@ def _descended(f):
         evaluations += found.evaluations
         return likely(points).sum() - before
 
-    if go(f.chance.rng.standard_normal((min(n, TRIED), f.dimension))) and n > TRIED:
-        go(f.chance.rng.standard_normal((n - TRIED, f.dimension)))
-    while len(points) and evaluations < COOLED * f.budget:
-        safe, fails, paid = edges(f.chance.next_key(), f.sim, WIDER[0 if first else 1] * n)
+    if (
+        go(f.chance.rng.standard_normal((min(n, s.descents_tried), f.dimension)))
+        and n > s.descents_tried
+    ):
+        go(f.chance.rng.standard_normal((n - s.descents_tried, f.dimension)))
+    while len(points) and evaluations < s.cooled_share * f.budget:
+        safe, fails, paid = edges(
+            f.chance.next_key(), f.sim, (s.wide_first if first else s.wide) * n
+        )
         evaluations += paid
         rest = ~explained(fails, points)
-        if not len(rest) or not ALONE < rest.mean() < SLOW * left:
+        if not len(rest) or not s.alone < rest.mean() < s.slow * left:
             break
         left, first = math.inf if first else rest.mean(), False
-        if go(safe[rest][:n]) < NEW * min(rest.sum(), n):
+        if go(safe[rest][:n]) < s.new * min(rest.sum(), n):
             break
     return points, evaluations
 
 
 def _cooled(f, anchors, spent):
     """Failures [n, D] by noise that is wide first and then cooled, and evaluations. Chains are
-    started again, first from failures that those found do not explain, where more than `ALONE` of
+    started again, first from failures that those found do not explain, where more than `alone` of
     them end in a direction that no other one has: so much of what they may lead to is still to be
     met (Good 1953).
     """
+    s = f.settings
     known, evaluations, given = anchors, 0, len(anchors)
-    while evaluations < COOLED * f.budget:
-        cold = cool(f.chance.next_key(), f.sim, f.chains, known=known, rests=RESTS)
+    while evaluations < s.cooled_share * f.budget:
+        cold = cool(f.chance.next_key(), f.sim, f.chains, known=known, rests=s.rests)
         used = np.arange(f.dimension)[None] < cold.used[:, None]
         known = np.concatenate([known, np.where(used, cold.points, 0.0)])
         evaluations += cold.evaluations
@@ -141,10 +139,12 @@ def _cooled(f, anchors, spent):
         if not found:
             break
         owner = nearest(known, distinct(known, len(known)))
-        count = likely(known)[given:] | (found < ENOUGH)
+        count = likely(known)[given:] | (found < s.cooled_least)
         alone = (np.bincount(owner) == 1)[owner[given:]][count].sum() / max(count.sum(), 1)
-        late = found >= ENOUGH and (alone > ENDLESS or spent + evaluations > LATE * f.budget)
-        if late or alone <= max(ALONE, MET / found):
+        late = found >= s.cooled_least and (
+            alone > s.endless or spent + evaluations > s.cooled_late * f.budget
+        )
+        if late or alone <= max(s.alone, s.alone_met / found):
             break
     return known[given:], evaluations
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from jast.counter import generator
 from jast.estimate.gaussians import effective
+from jast.estimate.search_settings import SearchSettings
 from jast.simulator import Simulator
 
 __all__ = ["Batch", "Chance", "Family", "State", "begun", "serves", "taken"]
@@ -122,6 +123,7 @@ class Family(Protocol):
     batch: int
     """Episodes of a batch"""
     chance: Chance
+    settings: SearchSettings
 
     def draw(self, q: Any) -> Batch:
         """A `Batch` of the proposal ``q``."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from jast.estimate.gaussians import effective, tempered
 from jast.estimate.markov_tilts import Shape, Tilts, Trace, features, of_the_model, played, shape
-from jast.estimate.search_settings import SETTINGS
+from jast.estimate.search_settings import SETTINGS, SearchSettings
 from jast.estimate.search_state import Batch, Chance, State
 from jast.estimate.tilt_fit import (
     Tilt,
@@ -30,18 +30,10 @@ from jast.estimate.tilt_fit import (
 from jast.limit_state import normal_numbers
 from jast.simulator import Simulator
 
-__all__ = ["MODEL", "Mixture", "Play", "Points", "TiltFamily", "of_level"]
+__all__ = ["Mixture", "Play", "Points", "TiltFamily", "of_level"]
 
 COMPONENTS = (3, 5, 9)
 """How many a mixture is made up to, so that programs are compiled once."""
-MODEL = 0.1
-"""Share of the model in a mixture."""
-WIDE = 0.2
-"""Share of the tilts that go half of the way."""
-HALF = 0.75
-"""Of the way, how far these go."""
-LEAST = 0.1
-"""Share of a group of failures, at the least."""
 HELD = 2e7
 """Numbers of a batch that are held."""
 
@@ -80,6 +72,7 @@ class TiltFamily(NamedTuple):
     sim: Simulator
     budget: int
     chance: Chance
+    settings: SearchSettings = SETTINGS
     gates: int = 1
     """Gaussians that a normal number is drawn from one of"""
     widest: int = COMPONENTS[1]
@@ -112,8 +105,8 @@ class TiltFamily(NamedTuple):
     def near(self, q: Tilts) -> tuple[TiltFamily, Mixture]:
         """The proposal of a similar system, and the family that it is of."""
         tilts, weights, frame = of_tilts(q)
-        weights = weights * (1 - MODEL) / weights[1:].sum()
-        weights[0] = MODEL
+        weights = weights * (1 - self.settings.model) / weights[1:].sum()
+        weights[0] = self.settings.model
         return self._replace(gates=q.steps.means.shape[-1]), Mixture(tilts, list(weights), frame)
 
     def on_device(self, q: Mixture) -> Tilts:
@@ -217,16 +210,17 @@ class TiltFamily(NamedTuple):
         w, model = np.exp(log_w - log_w.max()), self.model
         frame = frame_of(self.about, *points, np.sqrt(w))
         rows = steps_of(self.about, frame, *points)
-        masses = np.maximum(w @ of / w.sum(), LEAST)
-        tilts, weights = [model], [MODEL]
+        s = self.settings
+        masses = np.maximum(w @ of / w.sum(), s.group_least)
+        tilts, weights = [model], [s.model]
         for part, mass in zip(of.T, masses / masses.sum(), strict=True):
             with np.errstate(divide="ignore"):
                 own = np.maximum(log_w + np.log(part), log_w.max() - 500)
-            power = tempered(own, min(200, 0.3 * part.sum()))
+            power = tempered(own, min(s.tempered, 0.3 * part.sum()))
             v = np.exp(power * (own - own.max()))
             one = fit(rows, v, effective(power * own), model)
-            tilts += [one, scaled(one, HALF)]
-            weights += [mass * (1 - MODEL - WIDE), mass * WIDE]
+            tilts += [one, scaled(one, s.halfway)]
+            weights += [mass * (1 - s.model - s.defensive), mass * s.defensive]
         return Mixture(tilts, weights, frame)
 
 
@@ -235,7 +229,7 @@ def of_level(family: TiltFamily, q: Mixture, p: Play, level: float) -> Batch:
     `kept`, evenly counted.
     """
     near = np.flatnonzero(p.score <= level)
-    rows = near[: SETTINGS.kept]
+    rows = near[: family.settings.kept]
     size = len(p.score) * len(rows) // max(len(near), 1) if len(near) else len(p.score)
     return Batch(q, family.rows(p.points, rows), p.log_weight[rows], size, p.invalid)
 

@@ -19,26 +19,10 @@ from jast.estimate.design_points import distinct
 from jast.estimate.gaussians import effective
 from jast.estimate.populations import cool, settled
 from jast.estimate.recorded_tilts import recorded
-from jast.estimate.search_settings import SETTINGS
 from jast.estimate.search_state import State, taken
 from jast.estimate.tilt_family import Mixture, Points, TiltFamily, of_level
 
 __all__ = ["cooled", "given", "led_down", "with_given"]
-
-ELITE = 0.1
-"""Share of a batch that comes to the next level."""
-FEW = 10
-"""Episodes below the last level, of fewer than which no level is made."""
-PLENTY = 50
-"""Failures of a batch from which tilts are fitted to failures alone."""
-RARE = (2.0, 0.25)
-"""Probability that rare choices are raised to: so many an episode, at most so much a step."""
-CHAINS = (8, 24)
-"""Failures that wide noise leads to."""
-GIVEN = 0.05
-"""How many of the failures that came with the call are looked at, of the budget."""
-PLACES = 2
-"""How many of those that the tilts hardly draw get a tilt of their own."""
 
 
 class Given(NamedTuple):
@@ -55,12 +39,12 @@ def led_down(f: TiltFamily, state: State, end: float) -> State:
     """
     q, level = f.untilted(), math.inf
     if f.about.choices or f.about.choices0:
-        floor = math.log(min(RARE[0] / f.sim.horizon, RARE[1]))
+        floor = math.log(min(f.settings.raised / f.sim.horizon, f.settings.raised_most))
         q = Mixture([f.model, f.model._replace(floor=floor)], [0.5, 0.5], q.frame)
     while state.spent + f.batch <= end:
         play = f.play(q)
         state = state._replace(spent=state.spent + f.batch)
-        below = _next(play.score, level)
+        below = _next(f.settings, play.score, level)
         if below is None:
             return state.noted(f"tilts: no episode below {level:.3g}")
         level = min(below, level)
@@ -80,16 +64,20 @@ def led_down(f: TiltFamily, state: State, end: float) -> State:
     return state
 
 
-def _next(score, last):
+def _next(s, score, last):
     """The next level; None where there is none below the ``last``."""
     ranked = np.sort(score)
-    new = ranked[max(int(ELITE * len(score)) - 1, 0)]
+    new = ranked[max(int(s.elite * len(score)) - 1, 0)]
     failing = int((score == -np.inf).sum())
-    if failing >= PLENTY and last > -np.inf and failing > ELITE / 2 * len(score):
+    if failing >= s.failures and last > -np.inf and failing > s.elite / 2 * len(score):
         return -np.inf
     if new >= last and last > -np.inf:  # no further by the quantile: what is nearest
         below = ranked[ranked < last]
-        return None if len(below) < FEW else below[min(len(below) - 1, int(ELITE * len(score)))]
+        return (
+            None
+            if len(below) < s.elite_least
+            else below[min(len(below) - 1, int(s.elite * len(score)))]
+        )
     return new
 
 
@@ -106,7 +94,8 @@ def cooled(f: TiltFamily, state: State) -> State:
     """The state with failures that wide noise leads to: the levels of the miss distance may all
     have been on the way to one failure mode.
     """
-    chains = int(np.clip(f.budget // 800, *CHAINS))
+    s = f.settings
+    chains = int(np.clip(f.budget // s.chain_of, s.chains_least, s.chains_of_tilts))
     everywhere = f.left_out(f.untilted(), math.inf)
     cold = cool(f.chance.next_key(), f.sim, chains, covered=everywhere)
     state = state.noted(f"cooling: {len(cold.points)} points", cold.evaluations)
@@ -117,7 +106,7 @@ def given(f: TiltFamily, state: State, episodes: Any) -> State:
     """The state with the failures that came with the call, as far as they fail again."""
     if episodes is None or not (n := len(episodes.length)):
         return state
-    rows = np.unique(np.linspace(0, n - 1, min(n, int(GIVEN * f.budget))).astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, int(f.settings.given * f.budget))).astype(int))
     z = recorded(f.sim, jax.tree.map(lambda a: a[rows], episodes))
     state, found = _failing(f, state, z)
     state = state.noted(f"failures given: {len(found.z)} of {len(z)} fail again")
@@ -131,25 +120,29 @@ def with_given(f: TiltFamily, state: State, end: float) -> tuple[TiltFamily, Sta
     if state.given is None:
         return f, state
     if state.q is None:
-        state, found = _around(f, state, np.repeat(distinct(state.given.z, 1), CHAINS[0], axis=0))
+        state, found = _around(
+            f, state, np.repeat(distinct(state.given.z, 1), f.settings.chains_least, axis=0)
+        )
         q = f.fitted(found.points, np.zeros(len(found.z)))
-        state = adapted(f, state._replace(q=q), SETTINGS.refits, end)
+        state = adapted(f, state._replace(q=q), f.settings.refits, end)
         if not state.batches:
             return f, state._replace(q=None)
     if not (rows := uncovered(f, state, state.given.points)).any():
         return f, state
-    state, found = _around(f, state, distinct(state.given.z[rows], CHAINS[1]))
+    state, found = _around(f, state, distinct(state.given.z[rows], f.settings.chains_of_tilts))
     state, done = state._replace(given=found), []
-    for _ in range(PLACES):
+    for _ in range(f.settings.places):
         rows = np.setdiff1d(np.flatnonzero(uncovered(f, state, state.given.points)), done)
         if not len(rows) or end - state.spent < f.batch:
             break
         done.append(rows[0])
         state = state.noted(f"failures given: {len(rows)} of {len(state.given.z)} not covered")
-        state, lead = _around(f, state, np.repeat(state.given.z[rows[:1]], CHAINS[0], axis=0))
+        state, lead = _around(
+            f, state, np.repeat(state.given.z[rows[:1]], f.settings.chains_least, axis=0)
+        )
         f = f._replace(widest=f.widest + 2)
         state = f.absorbed(state, lead.points, 1.0)
-        state = adapted(f, state, SETTINGS.batches_after_audit, end)
+        state = adapted(f, state, f.settings.refits_of_audit, end)
     return f, state
 
 
@@ -158,7 +151,7 @@ def _around(f, state, z):
     model has them.
     """
     everywhere = f.left_out(f.untilted(), math.inf)
-    people, chain = settled(f.chance.next_key(), f.sim, z, SETTINGS.moves, covered=everywhere)
+    people, chain = settled(f.chance.next_key(), f.sim, z, f.settings.moves, covered=everywhere)
     places = len(np.unique(z, axis=0))
     state = state.noted(f"failures given: around {places} of them", chain.evaluations)
     return _failing(f, state, people.z)
