@@ -61,18 +61,18 @@ def failure_probability(
     same key with that budget gives the same bits. The others, and calls with ``failures`` or
     ``near``, are answered by a proposal that this function finds itself.
 
-    An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). Design
-    points come from gradients of the miss distance, from noise that is wide first and then cooled,
-    from the mirror images of what these found, and from a population of subset simulation where
-    gradients did not help and no ``failures`` came with the call; up to 128 directions are kept,
-    fewer of more than 250 numbers. Mixtures of Gaussians are fitted to the weighted failures of a
-    few batches. A guard, a population that is kept out of what the proposal covers, looks for lost
-    failure modes; what it finds is taken in, or else the estimate is UNRELIABLE. Systems of 30
-    steps or more, or whose disturbances hold choices (Bernoulli, Categorical), are first tried with
-    tilts: each step's own disturbance is tilted by the state and the time, choices by their odds,
-    and the tilts are fitted by cross-entropy; a normal number comes from one of three Gaussians
-    where a single one serves badly. Others are tried with tilts where the Gaussians promise few
-    effective draws.
+    An episode is a point of normal numbers (x_t is the quantile of p(x | s) at Phi(z_t)). The
+    search explores, adapts, audits. It explores by gradients of the miss distance, by noise that is
+    wide first and then cooled, and by the mirror images of what these found; by a population of
+    subset simulation where none of them found a failure. Mixtures of Gaussians are fitted to the
+    weighted failures of a few batches, for as long as they get better; up to 128 directions are
+    kept, fewer of more than 250 numbers. The audit, a population that is kept out of what the
+    proposal covers, looks for lost failure modes; what it finds is taken in, or else the estimate
+    is UNRELIABLE. Systems of 30 steps or more, or whose disturbances hold choices (Bernoulli,
+    Categorical), are first tried with tilts: each step's own disturbance is tilted by the state and
+    the time, choices by their odds, and the tilts are fitted by cross-entropy; a normal number
+    comes from one of three Gaussians where a single one serves badly. Others are tried with tilts
+    where the Gaussians promise few effective draws.
 
     What is left of the budget, about half, is drawn from the proposal as it then stands. The
     estimate and its interval come from these episodes alone. A tenth of them or more, up to two
@@ -111,7 +111,7 @@ def failure_probability(
             Tilts take in two modes that they hardly draw; where others are left, or these could not
             be learned, the estimate is UNRELIABLE.
         near: the `Estimate` of a similar system, such as the neighbour in a sweep. Its proposal,
-            fitted to two or three batches, takes the place of the search where it serves; the guard
+            fitted to two or three batches, takes the place of the search where it serves; the audit
             and the last draws stay. One without a proposal that fits changes nothing.
         gradients: differentiate the miss distance. Where its gradients lead nowhere, nothing
             depends on them.

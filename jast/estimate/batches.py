@@ -1,9 +1,8 @@
-"""Batches of a search: points drawn from a proposal, and their weights by the proposals of all
-batches. Only the system runs on the device, in one program whatever the number of points.
+"""Points drawn from a mixture of Gaussians, and their densities. Only the system runs on the
+device, in one program whatever the number of points.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,46 +13,6 @@ from jast.estimate.gaussians import log_sum
 from jast.judge import judged, lanes_of
 
 __all__ = ["drawn", "numbers"]
-
-
-class Batch(NamedTuple):
-    """Points drawn from one proposal. On the host."""
-
-    q: latent.Latent
-    z: np.ndarray
-    used: np.ndarray
-    failure: np.ndarray
-    log_weight: np.ndarray
-    known: Any = None
-    """dict of number of a batch -> (its proposal, log q - log p of the failing points by it)"""
-
-
-def balanced(batches):
-    """Log weights of the failing points of all ``batches``, p over the mean of their proposals (the
-    balance heuristic), and which points those are.
-    """
-    failing = np.concatenate([b.failure for b in batches])
-    logs = np.stack([over_batches(c.q, batches, i) for i, c in enumerate(batches)])
-    top = logs.max(axis=0)
-    return -top - np.log(np.exp(logs - top).mean(axis=0)), failing
-
-
-def over_batches(q, batches, number=None):
-    """log q - log p of the failing points of all ``batches``; ``number``: of the batch that ``q``
-    drew, whose answers are kept.
-    """
-    return np.concatenate([_of_batch(q, b, number) for b in batches])
-
-
-def _of_batch(q, b, number):
-    if b.q is q:
-        return -b.log_weight[b.failure]
-    if number is None or b.known is None:
-        return log_ratio(q, b.z[b.failure], b.used[b.failure])
-    kept = b.known.get(number)
-    if kept is None or kept[0] is not q:
-        kept = b.known[number] = q, log_ratio(q, b.z[b.failure], b.used[b.failure])
-    return kept[1]
 
 
 def log_ratio(q, z, used):

@@ -42,9 +42,7 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
         if len(points):
             anchors = np.concatenate([anchors, points])
             # those farther out may be what leads to more, but many of them are no more than a few
-            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + min(
-                least, 16 * least / len(points)
-            )
+            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + least * min(1, 16 / len(points))
             parts.append(unit(points)._replace(weights=weights / weights.sum()))
         return state.noted(f"{name}: {len(points)} points{ends}", evaluations)
 
