@@ -56,11 +56,12 @@ def main(argv=None):
     parser.add_argument("--seeds", type=int, help="problems of each family (3)")
     parser.add_argument("--budget", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=830_000, help="number of the first problem")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY")
     parser.add_argument("--only", nargs="+", choices=SETTINGS._fields, metavar="NUMBER")
     args = parser.parse_args(argv)
     seeds = args.seeds or size(args, 3, 1, 1)
     names = args.only or size(args, SETTINGS._fields, ("covered", "enough"), ("covered",))
-    families = size(args, list(FAMILIES), ["two_sided", "branches"], ["two_sided"])
+    families = args.families or size(args, list(FAMILIES), ["two_sided", "branches"], ["walks"])
     first = args.first
     problems = [(first + i, draw(f, first + i)) for i in range(seeds) for f in families]
     base = answers(SETTINGS, problems, args.budget)
