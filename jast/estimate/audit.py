@@ -40,12 +40,12 @@ def audited(family: Family, state: State) -> State:
         if not missing:
             break
         if not left or state.spent + 2 * family.batch > end:
-            return _reported(state, missing)
+            return _given(family, _reported(state, missing))
         for m in missing:
             share = family.settings.unknown if math.isnan(m.share) else m.share
             state = family.absorbed(state, m.points, share)
         state = adapted(family, state, family.settings.refits_of_audit, end)
-    return _thin(family, state)
+    return _given(family, _thin(family, state))
 
 
 def uncovered(family: Family, state: State, points: Any) -> np.ndarray:
@@ -94,8 +94,9 @@ def _missing(family, state, cooled):
     for share, p in candidates:
         state, points = family.points_of(state, p.points, p.used)
         rows = uncovered(family, state, points)
-        missing.append(Missing(share * rows.mean(), family.rows(points, rows)))
-        state = state.noted(f"audit: {share:.2%} of the probability, {rows.mean():.0%} not covered")
+        part = rows.sum() / max(len(rows), 1)
+        missing.append(Missing(share * part, family.rows(points, rows)))
+        state = state.noted(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
     missing = [m for m in missing if _unmet(family, state, m) > family.settings.tolerated]
     if cooled is not None:
         rows = uncovered(family, state, cooled) & ~met(family, state, cooled)
@@ -162,6 +163,18 @@ def _thin(family, state):
     return state.against(
         f"{share:.0%} of the probability found lies where the proposal hardly draws"
     )
+
+
+def _given(family, state):
+    """The state with a reason where failures that came with the call are hardly drawn."""
+    if state.given is None:
+        return state
+    points = state.given.points
+    missed = int((uncovered(family, state, points) & ~met(family, state, points)).sum())
+    if not missed:
+        return state
+    number = len(state.given.z)
+    return state.against(f"the proposal hardly draws near {missed} of {number} failures given")
 
 
 def _in_words(share):

@@ -1,7 +1,7 @@
 """Proposals that are mixtures of Gaussians over the normal numbers of an episode.
 
 They are fitted by cross-entropy to the failures of all batches: one mixture for all, one with parts
-for each mode, Gaussians that differ from the model in a few numbers, or a sphere.
+for each mode, or Gaussians that differ from the model in a few numbers.
 """
 
 from __future__ import annotations
@@ -168,7 +168,6 @@ class GaussianFamily(NamedTuple):
             choices["sparse"] = _sparse(self, state, points, centres)
         if "modes" not in choices or owner.any():
             choices["one"] = _by_owner(self, state, points, np.zeros_like(owner))
-        choices["all around"] = _sphere(self, points, log_w)
         return choices
 
 
@@ -177,16 +176,6 @@ def rare(family: GaussianFamily, state: State) -> bool:
     return max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf) < math.log(
         family.settings.rare
     )
-
-
-def _sphere(f, points, log_w):
-    """A `Latent`: failures in all directions. No number of Gaussians elsewhere covers a sphere in
-    many dimensions.
-    """
-    w = np.exp(log_w - log_w.max())
-    spread = (w @ (points**2).mean(axis=1)) / w.sum()
-    g = unit(np.zeros((1, f.dimension)))
-    return as_latent([(1.0, g._replace(values=np.full((1, f.dimension), spread)))], f.dtype)
 
 
 def _by_owner(f, state, points, owner):
