@@ -40,6 +40,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "reference": ["--trees", "1"],
     "reliability": "--seeds 1 --budget 2000 --cases parallel --methods subset form_16".split(),
     "scale": ["--smoke"],
+    "search_settings": ["--smoke"],
     "stress": ["--smoke"],
     "sweep": ["--smoke"],
     "table1_seeds": ["--smoke"],

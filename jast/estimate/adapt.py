@@ -20,17 +20,18 @@ def adapted(family: Family, state: State, times: int, end: float) -> State:
             break
         batch = family.draw(q)
         if not len(batch.log_weight):
-            return state.noted(f"{family.name}: no failure", batch.size)
-        share, own = len(batch.log_weight) / batch.size, weight_of(batch)
+            return taken(family, state, batch).noted(f"{family.name}: no failure", family.batch)
+        share, ess = len(batch.log_weight) / batch.size, weight_of(batch)
         state = taken(family, state, batch)
         state, q, name = refitted(family, state)
         state = state.noted(
-            f"{family.name}: {share:.1%} fail, ESS {own:.4g}; of all: log p {state.log_mean:.3f},"
+            f"{family.name}: {share:.1%} fail, ESS {ess:.4g}; of all: log p {state.log_mean:.3f},"
             f" ESS {effective(state.log_weight):.4g}; next: {name}",
-            batch.size,
+            family.batch,
         )
+        own = ess / batch.size  # of long episodes a batch keeps some alone
         stalls = 0 if own > family.settings.gain * best else stalls + 1
-        enough = own > family.settings.enough * batch.size
+        enough = own > family.settings.enough
         if stalls and (enough or stalls == family.settings.stalls):
             break
         best = max(own, best)

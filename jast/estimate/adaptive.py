@@ -170,7 +170,7 @@ def failure_probability(
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
             ways, watched = ways._replace(store=store), (progress, callback)
-            given = bool(gradients), failures, similar, level, watched, ways
+            given = bool(gradients), failures, known, similar, level, watched, ways
             found = or_rough(by_proposal(Asked(name, key, sim, budget, *given)))
     return found._replace(settings=settings)
 

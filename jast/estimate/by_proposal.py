@@ -51,6 +51,8 @@ class Asked(NamedTuple):
     budget: int
     gradients: bool = True
     failures: Failures | None = None
+    known: Any = None
+    """[m, D] their normal numbers"""
     near: Any = None
     """The proposal of a similar system"""
     level: float = 0.95
@@ -73,6 +75,12 @@ class Search(NamedTuple):
         return 0.0 if lost or not serves(self.state, 0.0) else self.state.promised
 
     @property
+    def log_p(self) -> float:
+        """Of the probability, roughly; -inf where no failure was seen."""
+        known = [p.log_mean for p in self.state.populations]
+        return max(self.state.log_mean, *known, -math.inf)
+
+    @property
     def enough(self) -> bool:
         """Whether what is left of the budget tells the probability by the proposal."""
         return self.worth * (self.family.budget - self.state.spent) > diagnostics.ESS
@@ -89,18 +97,20 @@ def by_proposal(asked: Asked) -> Estimate:
             raise
         if not chance.latest:
             raise KeyboardInterrupt from error
-        return _of_the_search(asked, chance.latest[-1], against)
+        return _of_the_search(asked, Search(*chance.latest[-1]), against)
 
 
 def _sought(asked, chance):
     """The `Search` that serves best, audited."""
     best, state = None, State()
     for explore in _ways(asked):
+        if asked.budget - state.spent < asked.settings.another * asked.budget:
+            break
         search = explore(asked, chance, state.carried())
         state = search.state
         if best is not None:
             best = best._replace(state=best.state.after(state))
-        if best is None or search.worth > best.worth:
+        if best is None or (search.worth, search.log_p) > (best.worth, best.log_p):
             best = search
         if best.enough and serves(best.state, asked.settings.serves):
             best = _audited(best)
@@ -114,11 +124,16 @@ def _sought(asked, chance):
 
 def _ways(asked):
     """The searches, in the order in which they are tried."""
-    about = shape(asked.sim)
-    long = about.choices or about.choices0 or asked.sim.horizon >= asked.settings.tilts_first
-    if long or isinstance(asked.near, Tilts):
+    if _long(asked):
         return _tilts, _gaussians
-    return _gaussians, _more_tilts
+    near = (_tilts,) if isinstance(asked.near, Tilts) else ()
+    return *near, _gaussians, _more_tilts
+
+
+def _long(asked):
+    """Whether the system has many steps, or choices: tilts are then tried first."""
+    about = shape(asked.sim)
+    return about.choices or about.choices0 or asked.sim.horizon >= asked.settings.tilts_first
 
 
 def _gaussians(asked, chance, state):
@@ -131,9 +146,9 @@ def _gaussians(asked, chance, state):
         if serves(near := _from_near(f, start), asked.settings.near_fitted):
             return Search(f, near)
         state = near._replace(q=None, anchors=None)
-    known = None if asked.failures is None else latent.normal_of(asked.sim, asked.failures.episodes)
-    state = explored(f, state, known, asked.gradients and not hosted(asked.sim))
+    state = explored(f, state, asked.known, asked.gradients and not hosted(asked.sim))
     if state.q is not None:
+        end = max(end, state.spent + 2 * f.batch)  # what was found is drawn, however dear it was
         state = adapted(f, state, asked.settings.refits, end)
     return Search(f, state)
 
@@ -142,10 +157,13 @@ def _tilts(asked, chance, state):
     """The `Search` for tilts."""
     f = TiltFamily(asked.sim, asked.budget, chance, asked.settings)
     if isinstance(asked.near, Tilts):
+        state = _with_failures(f, asked, state)
         fitting, q = f.near(asked.near)
         if serves(near := _from_near(fitting, state._replace(q=q)), asked.settings.serves):
-            return Search(fitting, near)
-        state = near.carried()
+            return Search(*with_given(fitting, near, near.spent + _for_given(asked)))
+        state = near.carried()._replace(given=state.given)
+        if not _long(asked):
+            return Search(f, state)
     return _down_to_tilts(f, asked, state, state.spent + asked.settings.tilts_share * asked.budget)
 
 
@@ -158,9 +176,7 @@ def _more_tilts(asked, chance, state):
 
 def _down_to_tilts(f, asked, state, end):
     s = asked.settings
-    if asked.failures is not None:
-        state = given(f, state, asked.failures.episodes)
-    state = led_down(f, state, end)
+    state = led_down(f, _with_failures(f, asked, state), end)
     if state.q is not None:
         state = adapted(f, state, asked.settings.refits, end)
         if f.gates == 1 and f.about.normals and state.promised < s.single_serves:
@@ -168,7 +184,19 @@ def _down_to_tilts(f, asked, state, end):
             state = state._replace(q=f.refit(state)["refitted"])
             state = adapted(f, state, asked.settings.refits, before + s.gates_share * asked.budget)
             end += state.spent - before
-    return Search(*with_given(f, state, end + s.given_share * asked.budget))
+    return Search(*with_given(f, state, end + _for_given(asked)))
+
+
+def _with_failures(f, asked, state):
+    """The state with the failures that came with the call."""
+    if asked.failures is None or state.given is not None:
+        return state
+    return given(f, state, asked.failures.episodes)
+
+
+def _for_given(asked):
+    """Evaluations that they may cost."""
+    return asked.settings.given_share * asked.budget
 
 
 def _from_near(f, state):
@@ -176,7 +204,7 @@ def _from_near(f, state):
     after some refits.
     """
     state = adapted(f, state.noted("proposal of a similar system"), 1, math.inf)
-    if state.log_mean == -math.inf or serves(state, f.settings.near_serves):
+    if not len(state.batches[-1].log_weight) or serves(state, f.settings.near_serves):
         return state
     return adapted(f, state, f.settings.near_refits, math.inf)
 
@@ -194,7 +222,7 @@ def _drawn(asked, search, against):
     n = max(asked.budget - state.spent, f.batch)  # a search of many parts may have spent all
     about = dict(level=asked.level, history=state.history)
     watch = Watch(name, n, "episode", *asked.watched)
-    log_p = max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf)
+    log_p = search.log_p
     often = math.exp(min(log_p, 0.0)) * n >= asked.settings.plain_failures
     if not search.enough and not often and log_p > -math.inf:
         reasons = [*against, *state.reasons] or [ASTRAY]
@@ -208,18 +236,20 @@ def _drawn(asked, search, against):
             np.clip(1 - 1 / (s.exact**2 * state.promised * n), s.of_the_model, s.of_the_model_most)
         )
         about |= dict(spent=state.spent, plain=state.plain, drawn=state.plain[2], share=share)
-        q, reasons = f.with_model(state.q, share), [*against, *state.reasons]
+        q = f.with_model(state.q, share)
+        reasons = [*against, *state.reasons, *(() if search.enough else (ASTRAY,))]
         found = estimated(key, sim, q, f.batch, watch, asked.ways, reasons=reasons, **about)
         return found._replace(proposal=f.on_device(state.q))
     total, notes, lost = chunks(of_points, (key, sim, f.batch, n), f.batch, watch, asked.ways)
     spent, reasons = state.spent + total.samples, [*against, *lost]  # others are about the proposal
-    found = of_counts(name, total, notes=notes, reasons=reasons, evaluations=spent, **about)
+    about |= dict(evaluations=spent, proposal=_proposal(search))
+    found = of_counts(name, total, notes=notes, reasons=reasons, **about)
     return found._replace(draws=drawn_by(found.draws, key, f.batch, "model"))
 
 
-def _of_the_search(asked, state, against):
+def _of_the_search(asked, search, against):
     """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
-    rows = np.arange(state.size)
+    state, rows = search.state, np.arange(search.state.size)
     failing = rows < len(state.log_weight)
     log_weights = np.full(len(rows), -np.inf)
     log_weights[failing] = state.log_weight
@@ -235,6 +265,13 @@ def _of_the_search(asked, state, against):
         level=asked.level,
         reasons=[*against, said],
         evaluations=state.spent,
+        proposal=_proposal(search),
         history=state.history,
         plain=state.plain,
     )
+
+
+def _proposal(search):
+    """What an `Estimate` keeps of a search."""
+    f, state = search
+    return None if state.q is None else f.on_device(state.q)

@@ -207,6 +207,7 @@ def _by_owner(f, state, points, owner):
             Gaussians(*(np.concatenate(each) for each in zip(*parts, strict=True))),
             0.0,
             rare(f, state),
+            f.settings,
         ),
         f.dtype,
     )
@@ -220,26 +221,27 @@ def _sparse(f, state, points, centres):
     log_w, owner = state.log_weight, nearest(points, centres)
     means, masses = centres.copy(), np.zeros(len(centres))
     values, vectors = np.ones_like(centres), np.repeat(np.eye(f.dimension)[None], len(centres), 0)
-    of = nearest(centres, state.anchors)
+    anchors = state.anchors if len(state.anchors) else centres
+    of = nearest(centres, anchors)
     for i in np.unique(owner):
         own, z = log_w[owner == i], points[owner == i]
         masses[i] = np.exp(own - log_w.max()).sum()
         v, n = np.exp(own - own.max()), effective(own)
         v /= v.sum()
-        on = state.anchors[of[i]] != 0
+        on = anchors[of[i]] != 0
         if 0 < on.sum() <= f.settings.sparse:
             means[i] = 0.0
-            means[i, on] = to_anchors(v @ z[:, on], n, state.anchors[of[i], on][None])
+            means[i, on] = to_anchors(v @ z[:, on], n, anchors[of[i], on][None])
             spread = v @ (z[:, on] - means[i, on]) ** 2
         else:
-            means[i] = to_anchors(v @ z, n, state.anchors)
+            means[i] = to_anchors(v @ z, n, anchors)
             vectors[i] = np.linalg.qr(means[i][:, None], mode="complete").Q
             on = np.arange(f.dimension) == 0
             spread = v @ ((z - means[i]) @ vectors[i, :, on].T) ** 2
         prior = f.settings.prior
         values[i, on] = (n * spread + prior) / (n + prior)
     g = Gaussians(_masses(masses, effective(log_w), f.settings.prior_share), means, values, vectors)
-    return as_latent(defended(g, 0.0, rare(f, state)), f.dtype)
+    return as_latent(defended(g, 0.0, rare(f, state), f.settings), f.dtype)
 
 
 def _masses(mass, n, prior):

@@ -25,7 +25,9 @@ def looked(f: GaussianFamily, state: State) -> State:
     batch = f.draw(f.model())
     failing = len(batch.log_weight)
     state = taken(f, state, batch)._replace(q=None, plain=(failing, batch.invalid, batch.size))
-    return state.noted(f"draws of the model: {failing} fail", batch.size)
+    state = state.noted(f"draws of the model: {failing} fail", batch.size)
+    f.chance.latest[:] = [(f, state)]
+    return state
 
 
 def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradients: bool) -> State:
@@ -33,7 +35,7 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
     they all found no failure. ``known`` [m, D]: failures that came with the call.
     """
     parts, anchors = [], np.zeros((0, f.dimension))
-    least = f.settings.anchor_least
+    least, room = f.settings.anchor_least, f.settings.cooled_share * (f.budget - state.spent)
 
     def around(state, name, points, evaluations):
         nonlocal anchors
@@ -52,8 +54,8 @@ def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradient
         own = f.filled(state.batches[0].points)
         state = around(state, "draws of the model", distinct(own, f.directions), 0)
     if gradients:
-        state = around(state, "design points by gradients", *_descended(f))
-    points, evaluations = _cooled(f, anchors, state.spent)
+        state = around(state, "design points by gradients", *_descended(f, room))
+    points, evaluations = _cooled(f, anchors, state.spent, room)
     near = distinct(points, f.directions)
     state = around(state, "design points by cooling", near, evaluations)
     if len(anchors):
@@ -70,7 +72,7 @@ def _population(f, state):
     """The state with a population that goes down the levels of the miss distance, and a list of the
     `Gaussians` that are fitted to it.
     """
-    size, most = max(f.budget // 100, 100), int(0.4 * f.budget)
+    size, most = max(f.budget // 100, 100), int(0.4 * (f.budget - state.spent))
     p = explore(f.chance.next_key(), f.sim, size, most=most)
     state = state.noted(
         f"subset simulation: {len(p.levels)} levels, log p {p.log_mean:.2f}", p.evaluations
@@ -81,7 +83,7 @@ def _population(f, state):
     return state, [f.of_population(Points(p.points, p.used))]
 
 
-def _descended(f):
+def _descended(f, room):
     """Distinct design points [m, D] by gradients, and evaluations: from draws of the model, then
     from the edges of failures under wider noise that those found do not explain, for as long as
     these lead to others and fewer and fewer are left.
@@ -106,7 +108,7 @@ def _descended(f):
         and n > s.descents_tried
     ):
         go(f.chance.rng.standard_normal((n - s.descents_tried, f.dimension)))
-    while len(points) and evaluations < s.cooled_share * f.budget:
+    while len(points) and evaluations < room:
         safe, fails, paid = edges(
             f.chance.next_key(), f.sim, (s.wide_first if first else s.wide) * n
         )
@@ -120,7 +122,7 @@ def _descended(f):
     return points, evaluations
 
 
-def _cooled(f, anchors, spent):
+def _cooled(f, anchors, spent, room):
     """Failures [n, D] by noise that is wide first and then cooled, and evaluations. Chains are
     started again, first from failures that those found do not explain, where more than `alone` of
     them end in a direction that no other one has: so much of what they may lead to is still to be
@@ -128,7 +130,7 @@ def _cooled(f, anchors, spent):
     """
     s = f.settings
     known, evaluations, given = anchors, 0, len(anchors)
-    while evaluations < s.cooled_share * f.budget:
+    while evaluations < room:
         cold = cool(f.chance.next_key(), f.sim, f.chains, known=known, rests=s.rests)
         used = np.arange(f.dimension)[None] < cold.used[:, None]
         known = np.concatenate([known, np.where(used, cold.points, 0.0)])

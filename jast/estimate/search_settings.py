@@ -27,6 +27,8 @@ class SearchSettings(NamedTuple):
     """Effective draws of a draw with which a single one serves."""
     serves: float = 0.02
     """Effective draws of a draw with which no other family is tried."""
+    another: float = 0.2
+    """What must be left where another family is tried."""
     near_serves: float = 0.2
     """The same for one batch of a neighbour's proposal, which is then taken as it is."""
     near_fitted: float = 0.05

@@ -97,8 +97,8 @@ class Chance(NamedTuple):
 
     root: np.random.Generator
     rng: np.random.Generator
-    latest: list[State]
-    """The last state of the search, for an interruption; empty before its first batch"""
+    latest: list[tuple[Family, State]]
+    """The family and the state after the last batch, for an interruption"""
 
     def next_key(self) -> jax.Array:
         """A key for a population."""
@@ -175,7 +175,7 @@ def taken(family: Family, state: State, batch: Batch) -> State:
         promised = [promise(new, r) for r in over]
         best = int(np.argmax(promised))
         new = new._replace(q=batches[best].q, promised=promised[best])
-    family.chance.latest[:] = [new._replace(spent=state.spent + batch.size)]
+    family.chance.latest[:] = [(family, new._replace(spent=state.spent + family.batch))]
     return new
 
 

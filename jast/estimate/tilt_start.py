@@ -94,12 +94,16 @@ def cooled(f: TiltFamily, state: State) -> State:
     """The state with failures that wide noise leads to: the levels of the miss distance may all
     have been on the way to one failure mode.
     """
-    s = f.settings
-    chains = int(np.clip(f.budget // s.chain_of, s.chains_least, s.chains_of_tilts))
     everywhere = f.left_out(f.untilted(), math.inf)
-    cold = cool(f.chance.next_key(), f.sim, chains, covered=everywhere)
+    cold = cool(f.chance.next_key(), f.sim, _chains(f), covered=everywhere)
     state = state.noted(f"cooling: {len(cold.points)} points", cold.evaluations)
     return state._replace(cooled=np.asarray(cold.points))
+
+
+def _chains(f):
+    """Markov chains that the budget affords."""
+    s = f.settings
+    return int(np.clip(f.budget // s.chain_of, s.chains_least, s.chains_of_tilts))
 
 
 def given(f: TiltFamily, state: State, episodes: Any) -> State:
@@ -125,11 +129,11 @@ def with_given(f: TiltFamily, state: State, end: float) -> tuple[TiltFamily, Sta
         )
         q = f.fitted(found.points, np.zeros(len(found.z)))
         state = adapted(f, state._replace(q=q), f.settings.refits, end)
-        if not state.batches:
+        if state.log_mean == -math.inf:
             return f, state._replace(q=None)
     if not (rows := uncovered(f, state, state.given.points)).any():
         return f, state
-    state, found = _around(f, state, distinct(state.given.z[rows], f.settings.chains_of_tilts))
+    state, found = _around(f, state, distinct(state.given.z[rows], _chains(f)))
     state, done = state._replace(given=found), []
     for _ in range(f.settings.places):
         rows = np.setdiff1d(np.flatnonzero(uncovered(f, state, state.given.points)), done)
