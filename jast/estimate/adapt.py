@@ -5,7 +5,7 @@ better (de Boer, Kroese, Mannor and Rubinstein 2005).
 from __future__ import annotations
 
 from jast.estimate.gaussians import effective
-from jast.estimate.search_state import Family, State, log_ratios, promise, taken, weight_of
+from jast.estimate.search_state import Family, State, log_ratios, promise, taken
 
 __all__ = ["adapted", "refitted"]
 
@@ -21,7 +21,7 @@ def adapted(family: Family, state: State, times: int, end: float) -> State:
         batch = family.draw(q)
         if not len(batch.log_weight):
             return taken(family, state, batch).noted(f"{family.name}: no failure", family.batch)
-        share, ess = len(batch.log_weight) / batch.size, weight_of(batch)
+        share, ess = len(batch.log_weight) / batch.size, effective(batch.log_weight)
         state = taken(family, state, batch)
         state, q, name = refitted(family, state)
         state = state.noted(

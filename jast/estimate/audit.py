@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast.estimate.adapt import adapted
+from jast.estimate.gaussians import effective
 from jast.estimate.populations import LAST, QUANTILE, explore, settled
-from jast.estimate.search_state import Family, State, log_ratios
+from jast.estimate.search_state import Family, State, log_ratios, mixed_ratio
 
-__all__ = ["audited", "met", "uncovered"]
+__all__ = ["audited", "uncovered"]
 
 FORGOTTEN = "the proposal hardly draws some failures that wide noise led to"
 UNFINISHED = "the budget ran out before the search for lost failure modes was over"
@@ -53,10 +54,9 @@ def uncovered(family: Family, state: State, points: Any) -> np.ndarray:
     return family.log_ratio(state.q, points) < _least(family, state)
 
 
-def met(family: Family, state: State, points: Any) -> np.ndarray:
+def _met(family, state, points):
     """Which of the ``points`` the batches of the search, all together, cover [m]."""
-    each = [family.log_ratio(b.q, points) + math.log(b.size / state.size) for b in state.batches]
-    return np.logaddexp.reduce(each) >= _least(family, state)
+    return mixed_ratio(family, state, points) >= _least(family, state)
 
 
 def _least(family, state):
@@ -99,7 +99,7 @@ def _missing(family, state, cooled):
         state = state.noted(f"audit: {share:.2%} of the probability, {part:.0%} not covered")
     missing = [m for m in missing if _unmet(family, state, m) > family.settings.tolerated]
     if cooled is not None:
-        rows = uncovered(family, state, cooled) & ~met(family, state, cooled)
+        rows = uncovered(family, state, cooled) & ~_met(family, state, cooled)
         state = state.noted(f"audit: {rows.sum()} of {len(rows)} failures moved not covered")
         if rows.sum() > max(family.settings.stray * len(rows), family.settings.stray_least):
             missing.append(Missing(math.nan, family.rows(cooled, rows)))
@@ -134,8 +134,8 @@ def _unmet(family, state, missing):
     """
     if not missing.share:
         return 0.0
-    each = [family.log_ratio(b.q, missing.points) + math.log(b.size) for b in state.batches]
-    expected = missing.share * np.exp(np.logaddexp.reduce(each) + state.log_mean)
+    ratio = mixed_ratio(family, state, missing.points)
+    expected = missing.share * state.size * np.exp(ratio + state.log_mean)
     return missing.share * np.exp(-expected).mean()
 
 
@@ -157,8 +157,7 @@ def _thin(family, state):
     rows = log_ratios(family, state.q, state.batches) < _least(family, state)
     w = np.exp(state.log_weight - state.log_weight.max())
     share = w[rows].sum() / w.sum()
-    met = w[rows].sum() ** 2 / (w[rows] ** 2).sum() if rows.any() else 0.0
-    if share <= family.settings.thin or met >= family.settings.known:
+    if share <= family.settings.thin or effective(state.log_weight[rows]) >= family.settings.known:
         return state
     return state.against(
         f"{share:.0%} of the probability found lies where the proposal hardly draws"
@@ -170,7 +169,7 @@ def _given(family, state):
     if state.given is None:
         return state
     points = state.given.points
-    missed = int((uncovered(family, state, points) & ~met(family, state, points)).sum())
+    missed = int((uncovered(family, state, points) & ~_met(family, state, points)).sum())
     if not missed:
         return state
     number = len(state.given.z)

@@ -75,12 +75,6 @@ class Search(NamedTuple):
         return 0.0 if lost or not serves(self.state, 0.0) else self.state.promised
 
     @property
-    def log_p(self) -> float:
-        """Of the probability, roughly; -inf where no failure was seen."""
-        known = [p.log_mean for p in self.state.populations]
-        return max(self.state.log_mean, *known, -math.inf)
-
-    @property
     def enough(self) -> bool:
         """Whether what is left of the budget tells the probability by the proposal."""
         return self.worth * (self.family.budget - self.state.spent) > diagnostics.ESS
@@ -110,7 +104,7 @@ def _sought(asked, chance):
         state = search.state
         if best is not None:
             best = best._replace(state=best.state.after(state))
-        if best is None or (search.worth, search.log_p) > (best.worth, best.log_p):
+        if best is None or (search.worth, search.state.log_p) > (best.worth, best.state.log_p):
             best = search
         if best.enough and serves(best.state, asked.settings.serves):
             best = _audited(best)
@@ -222,7 +216,7 @@ def _drawn(asked, search, against):
     n = max(asked.budget - state.spent, f.batch)  # a search of many parts may have spent all
     about = dict(level=asked.level, history=state.history)
     watch = Watch(name, n, "episode", *asked.watched)
-    log_p = search.log_p
+    log_p = state.log_p
     often = math.exp(min(log_p, 0.0)) * n >= asked.settings.plain_failures
     if not search.enough and not often and log_p > -math.inf:
         reasons = [*against, *state.reasons] or [ASTRAY]

@@ -111,9 +111,11 @@ class GaussianFamily(NamedTuple):
         """The same, of which the model has so great a ``share``."""
         return together(q, self.model(), share)
 
-    def left_out(self, q: latent.Latent, threshold: float) -> tuple[latent.Latent, float]:
-        """What keeps populations out of where log q - log p is above the ``threshold``."""
-        return q, threshold
+    def left_out(self, q: latent.Latent, threshold: float) -> tuple[latent.Latent, float] | None:
+        """What keeps populations out of where log q - log p is above the ``threshold``; None, which
+        costs no densities, for one that is infinite.
+        """
+        return None if threshold == math.inf else (q, threshold)
 
     def absorbed(self, state: State, points: Points, share: float) -> State:
         """The proposal with a mixture fitted to ``points``, which carry ``share`` of what it
@@ -173,9 +175,7 @@ class GaussianFamily(NamedTuple):
 
 def rare(family: GaussianFamily, state: State) -> bool:
     """Whether failures are, as far as anything tells."""
-    return max(state.log_mean, *(p.log_mean for p in state.populations), -math.inf) < math.log(
-        family.settings.rare
-    )
+    return state.log_p < math.log(family.settings.rare)
 
 
 def _by_owner(f, state, points, owner):

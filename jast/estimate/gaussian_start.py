@@ -89,11 +89,8 @@ def _descended(f, room):
     these lead to others and fewer and fewer are left.
     """
     s = f.settings
-    n, first, left = (
-        int(np.clip(f.budget // s.descent_of, s.descents_least, s.descents)),
-        True,
-        math.inf,
-    )
+    n = int(np.clip(f.budget // s.descent_of, s.descents_least, s.descents))
+    first, left = True, math.inf
     points, evaluations = np.zeros((0, f.dimension)), 0
 
     def go(starts):

@@ -16,11 +16,21 @@ import jax
 import numpy as np
 
 from jast.counter import generator
-from jast.estimate.gaussians import effective
 from jast.estimate.search_settings import SearchSettings
 from jast.simulator import Simulator
 
-__all__ = ["Batch", "Chance", "Family", "State", "begun", "serves", "taken"]
+__all__ = [
+    "Batch",
+    "Chance",
+    "Family",
+    "State",
+    "begun",
+    "log_ratios",
+    "mixed_ratio",
+    "promise",
+    "serves",
+    "taken",
+]
 
 
 class Batch(NamedTuple):
@@ -73,6 +83,11 @@ class State(NamedTuple):
     def size(self) -> int:
         """Episodes of all batches."""
         return sum(b.size for b in self.batches)
+
+    @property
+    def log_p(self) -> float:
+        """Of the probability, as far as anything tells; -inf where no failure was seen."""
+        return max(self.log_mean, *(p.log_mean for p in self.populations), -math.inf)
 
     def noted(self, text: str, evaluations: int = 0) -> State:
         """The same with a line of history, and what it cost."""
@@ -193,6 +208,12 @@ def log_ratios(family: Family, q: Any, batches: Sequence[Batch]) -> np.ndarray:
     return np.concatenate([of(b) for b in batches])
 
 
+def mixed_ratio(family: Family, state: State, points: Any) -> np.ndarray:
+    """log q - log p [m] of ``points``, q being all batches together."""
+    each = [family.log_ratio(b.q, points) + math.log(b.size / state.size) for b in state.batches]
+    return np.logaddexp.reduce(each)
+
+
 def serves(state: State, least: float) -> bool:
     """Whether a draw of the proposal has more effective ones than ``least``, and than one of the
     model has.
@@ -200,8 +221,3 @@ def serves(state: State, least: float) -> bool:
     plain = math.exp(min(state.log_mean, 0.0))
     # the batch of the model itself promises as much as it has
     return state.q is not None and state.promised > max(least, 1.01 * plain)
-
-
-def weight_of(batch: Batch) -> float:
-    """The effective sample size of a batch."""
-    return effective(batch.log_weight) if len(batch.log_weight) else 0.0

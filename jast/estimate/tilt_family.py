@@ -230,7 +230,7 @@ def of_level(family: TiltFamily, q: Mixture, p: Play, level: float) -> Batch:
     """
     near = np.flatnonzero(p.score <= level)
     rows = near[: family.settings.kept]
-    size = len(p.score) * len(rows) // max(len(near), 1) if len(near) else len(p.score)
+    size = len(p.score) * len(rows) // len(near) if len(near) else len(p.score)
     return Batch(q, family.rows(p.points, rows), p.log_weight[rows], size, p.invalid)
 
 
