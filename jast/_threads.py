@@ -9,6 +9,8 @@ from typing import Any
 
 import jax
 
+from jast._jax import briefly, is_brief
+
 SETTINGS = {
     "jax_enable_x64": jax.enable_x64,
     "jax_default_device": jax.default_device,
@@ -16,13 +18,15 @@ SETTINGS = {
     "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
     "jax_numpy_rank_promotion": jax.numpy_rank_promotion,
     "jax_debug_nans": jax.debug_nans,
+    "brief": briefly,
 }
-"""What ``with`` statements set, which JAX keeps for each thread apart."""
+"""What ``with`` statements set, which JAX, and Python, keep for each thread apart."""
 
 
 def settings() -> dict[str, Any]:
     """`SETTINGS` as they are in this thread."""
-    return {name: getattr(jax.config, name) for name in SETTINGS}
+    of_jax = {name: getattr(jax.config, name) for name in SETTINGS if name != "brief"}
+    return of_jax | {"brief": is_brief()}
 
 
 @contextlib.contextmanager

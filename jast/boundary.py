@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
+from jast._jax import jit
 from jast.episode import played
 from jast.limit_state import outcome, policy_of
 from jast.rewards import log_likelihood
@@ -50,7 +51,7 @@ class Descents(NamedTuple):
     """int32: those of the others."""
 
 
-@jax.jit
+@jit
 def descents(sim: Simulator, starts: jax.Array) -> Descents:
     """`Descents` of ``sim`` from the points ``starts`` [n, D]."""
     return jax.vmap(partial(_one, sim))(starts)

@@ -15,7 +15,7 @@ from jax import lax
 from jast import distributions as D
 from jast import results, rewards
 from jast._checks import random_key
-from jast._jax import is_traced
+from jast._jax import is_traced, quick
 from jast.outline import outline
 from jast.policy import Policy, nominal_policy
 from jast.progress import advance, begin, conclude
@@ -103,7 +103,7 @@ def rollout(
     return play_back(sim, reward, episode.x0, episode.disturbances, episode.length)
 
 
-@jax.jit
+@quick
 def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Callable) -> Episode:
     policy = nominal_policy(sim) if policy is None else policy
     keys = jax.random.split(key, sim.horizon + 1)
@@ -171,7 +171,7 @@ def replay(
     return play_back(sim, rewards.as_pytree(reward), x0, padded(disturbances, sim.horizon), steps)
 
 
-@jax.jit
+@quick
 def play_back(
     sim: Simulator, reward: Callable, x0: Any, disturbances: Any, steps: jax.Array
 ) -> Episode:

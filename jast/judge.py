@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 
 from jast import limit_state as latent
+from jast._jax import jit
 from jast.incidents import hosted
 from jast.journal import answered
 from jast.simulator import Simulator
@@ -54,7 +55,7 @@ def lanes_of(d: int) -> int:
     return max(min(LANES, HELD // max(d, 1) // BLOCK * BLOCK), BLOCK)
 
 
-@jax.jit
+@jit
 def _in_blocks(sim, z, n):
     """`Outcomes` of the first ``n`` of ``z``; of the others what is left of their blocks."""
     run = jax.vmap(partial(latent.outcome, sim))

@@ -18,7 +18,7 @@ from jax import lax
 
 from jast import actions as choices
 from jast import distributions as D
-from jast._jax import quick
+from jast._jax import jit, quick
 from jast.contract import contract
 from jast.cross_entropy.sequences import player
 from jast.distributions.numbers import unflat
@@ -160,7 +160,7 @@ def _used(sim, steps):
     return count(about.x0) + steps * count(about.x)
 
 
-@jax.jit
+@jit
 def outcomes(sim, z):
     """`Outcomes` [n] of ``z`` [n, D]."""
     return jax.vmap(lambda z: outcome(sim, z))(z)
@@ -262,7 +262,7 @@ def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
     )
 
 
-@partial(jax.jit, static_argnums=2)
+@partial(jit, static_argnums=2)
 def latents(sim, recorded, of_start):
     """The latents ([K, ...], [K, T, ...]) of recorded (x0, disturbances, lengths), 0 after the end
     of each.

@@ -12,6 +12,7 @@ import jax
 from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
+from jast._jax import briefly
 from jast.checkpoints import stored
 from jast.estimate import budgets, few_calls
 from jast.estimate.by_proposal import Asked, by_proposal
@@ -162,8 +163,9 @@ def failure_probability(
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
     ways = units.ways(name, executor, devices)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
-    with stored(name, checkpoint, key, **about) as store, kept(store):
-        if alone and budgets.cheap(sim, budget):
+    few = not budgets.cheap(sim, budget)
+    with stored(name, checkpoint, key, **about) as store, kept(store), briefly(few):
+        if alone and not few:
             ways, watched = ways._replace(store=store), (progress, callback)
             found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
         elif budget < LEAST:

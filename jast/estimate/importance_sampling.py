@@ -21,6 +21,7 @@ from jax.scipy.special import logsumexp
 from jast import distributions as D
 from jast import results, units
 from jast._checks import random_key, whole
+from jast._jax import jit
 from jast.checkpoints import stored
 from jast.contract import contract
 from jast.episode import rollout
@@ -237,7 +238,7 @@ def of_policies(shared, i, post):
     return traces(jax.random.fold_in(key, i), *about)
 
 
-@partial(jax.jit, static_argnames=("n", "to_horizon"))
+@partial(jit, static_argnames=("n", "to_horizon"))
 def traces(key, sim, proposal, n, to_horizon=False):
     """`log_weights` without its checks."""
     return jax.vmap(lambda k: one_trace(k, sim, proposal, to_horizon))(jax.random.split(key, n))
@@ -309,7 +310,7 @@ def component(key, proposal):
     return jax.tree.map(lambda a: a[k], proposal.policies), for_start, for_steps
 
 
-@partial(jax.jit, static_argnames="n")
+@partial(jit, static_argnames="n")
 def played(key, sim, proposal, n):
     """``n`` episodes drawn from ``proposal``, with their disturbances but without states, and their
     log weights to the end of each.
@@ -340,7 +341,7 @@ def played(key, sim, proposal, n):
     return jax.vmap(one)(jax.random.split(key, n))
 
 
-@partial(jax.jit, static_argnums=3)
+@partial(jit, static_argnums=3)
 def _probe(key, sim, proposal, n):
     drawn = nominal_policy(sim)
     return jax.vmap(lambda k: one_trace(k, sim, proposal, False, drawn))(jax.random.split(key, n))

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp, ndtr
 
+from jast._jax import jit
 from jast.counter import generator
 from jast.distributions.parts import Parts, parts
 from jast.estimate.gaussians import log_sum
@@ -333,7 +334,7 @@ def _in_lanes(sim, n, run, given):
     return Outcomes(*rows[:size]), rows[size], Trace(*rows[size + 1 :], *of_steps)
 
 
-@jax.jit
+@jit
 def _played(sim, q, u, first, noise):
     edges = jnp.cumsum(jnp.exp(q.log_weights))
     live = jnp.sum(jnp.isfinite(q.log_weights))
@@ -417,7 +418,7 @@ def of_the_model(sim, q, z):
     return _in_lanes(sim, len(z), run, (q, z))
 
 
-@jax.jit
+@jit
 def _of_the_model(sim, q, z):
     about, n = shape(sim), len(z)
     a, b = about.normals0, about.choices0

@@ -19,6 +19,7 @@ from jast import actions as choices
 from jast import distributions as D
 from jast import results
 from jast._checks import random_key, real, whole
+from jast._jax import jit
 from jast.contract import contract
 from jast.cross_entropy import sequences
 from jast.episode import rollout
@@ -169,7 +170,7 @@ def failure_proposal(
     return _search(key, sim, settings, _tilts_start(sim), samples, iterations)
 
 
-@partial(jax.jit, static_argnums=(3, 4, 5))
+@partial(jit, static_argnums=(3, 4, 5))
 def _search(key, sim, settings, tilt_start, samples, iterations):
     like = outline(sim)
     first = (

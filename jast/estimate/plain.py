@@ -13,6 +13,7 @@ from jax import lax
 
 from jast import units
 from jast._checks import random_key, whole
+from jast._jax import jit
 from jast.checkpoints import stored
 from jast.contract import contract
 from jast.crude import outcome
@@ -136,7 +137,7 @@ def _of_keys(shared, i, post):
     return Traces(none, none[:, None], failure, invalid, length, distance)
 
 
-@partial(jax.jit, static_argnames="size")
+@partial(jit, static_argnames="size")
 def _played(key, sim, n, size):
     """(failure, invalid, length, distance) [LANES] of the first ``n`` episodes of a chunk, ``size``
     of them side by side; of the others what is left of their blocks.

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 
+from jast._jax import quick
 from jast.distributions.parts import Parts, parts
 from jast.episode import Episode, play_back
 from jast.estimate.markov_tilts import dimension, shape, stacked, starts
@@ -38,7 +39,7 @@ def recorded(sim: Simulator, given: Episode) -> np.ndarray:
     return in_lanes(AT_ONCE, partial(_recorded, sim), *about).astype(normal_numbers(sim))
 
 
-@jax.jit
+@quick
 def _recorded(sim, x0, disturbances, length):
     def one(x0, x, length):
         e = play_back(sim, log_likelihood, x0, x, length)

@@ -7,6 +7,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast import limit_state as latent
+from jast._jax import jit
 from jast.counter import generator
 from jast.distributions.parts import parts
 from jast.episode import rollout
@@ -99,7 +100,7 @@ def failing(sim: Any, draws: Draws, most: int) -> tuple[np.ndarray, np.ndarray, 
     return np.concatenate(out), log_w, length, spent
 
 
-@jax.jit
+@jit
 def _episodes(sim, trace):
     """The `jast.Episode` of each of these traces, without states."""
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jast import distributions as D
 from jast import rewards
+from jast._jax import jit
 from jast.episode import Episode, play_back
 from jast.failures import Failures, identity
 from jast.incidents import hosted
@@ -118,7 +119,7 @@ def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Wh
     return Whole(e.x0, x, e.length, s, n)
 
 
-@jax.jit
+@jit
 def _played_on(sim: Simulator, key: Any, at: Any, x0: Any, x: Any, length: Any) -> Any:
     def one(at, x0, x, length):
         e = play_back(sim, rewards.STANDARD, x0, x, length)

@@ -10,6 +10,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import rewards
+from jast._jax import jit
 from jast.episode import Episode, play_back, rollout
 from jast.incidents import hosted
 from jast.pytrees import in_lanes
@@ -29,7 +30,7 @@ def ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
     return jax.tree.map(lambda a: a[~e.failure], e)
 
 
-@jax.jit
+@jit
 def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
     one = lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None)
     return jax.vmap(one)(at)
@@ -48,7 +49,7 @@ def observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.nda
     return seen.astype(float)
 
 
-@jax.jit
+@jit
 def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
     def one(x0, x, length):
         states = play_back(sim, rewards.STANDARD, x0, x, length).states

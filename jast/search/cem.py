@@ -18,6 +18,7 @@ from jax import lax
 
 from jast import _checks, units
 from jast import actions as choices
+from jast._jax import jit
 from jast.checkpoints import stored
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
@@ -231,7 +232,7 @@ def cem(
     return found._replace(incidents=since(before, incidents(sim)))
 
 
-@partial(jax.jit, static_argnums=5)
+@partial(jit, static_argnums=5)
 def _iteration(keys, sim, reward, actions, real, plan, carry, begin):
     """One iteration of all trees, from episode number ``begin`` on: ((`Pool`, proposals of x0 and
     x), `E.Tally`, best reward [trees], `Trials`).

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import _checks
-from jast._jax import is_traced, is_tracing
+from jast._jax import is_traced, is_tracing, jit
 from jast._threads import apart
 from jast.incidents import hosted, incidents, since
 from jast.limit_state import check, normal_numbers, outcome, played
@@ -176,7 +176,7 @@ class _Work:
         return _Found(pool, found.failing + failing, counts, (*found.moments, moment))
 
 
-@jax.jit
+@jit
 def _judged(sim: Simulator, u: jax.Array) -> Any:
     """`Outcomes` [n] of the levels ``u`` [n, D]."""
     return jax.vmap(partial(outcome, sim))(_normal(u))

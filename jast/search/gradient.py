@@ -12,7 +12,7 @@ import numpy as np
 
 from jast import _checks
 from jast import boundary as B
-from jast._jax import is_traced, is_tracing
+from jast._jax import is_traced, is_tracing, jit
 from jast.episode import Episode, play_back
 from jast.incidents import hosted
 from jast.limit_state import check, dimension, normal_numbers, played
@@ -180,7 +180,7 @@ class _Search:
         )
 
 
-@jax.jit
+@jit
 def _scored(sim, reward, e: Episode) -> Episode:
     play = lambda x0, x, n: play_back(sim, reward, x0, x, n)._replace(states=None)
     return jax.vmap(play)(e.x0, e.disturbances, e.length)

@@ -15,6 +15,7 @@ from jax import lax
 
 from jast import actions as choices
 from jast import units
+from jast._jax import jit, quick
 from jast.checkpoints import stored
 from jast.counter import tree_keys
 from jast.incidents import hosted, incidents, merged, since
@@ -265,7 +266,7 @@ def _nothing(sim, top):
     return Found(np.zeros((), bool), lowest, zero, lows, none, none.astype(np.uint32), none)
 
 
-@partial(jax.jit, static_argnames="lanes")
+@partial(jit, static_argnames="lanes")
 def _chunk(key, sim, reward, actions, found, begin, end, lanes):
     """Episodes ``begin`` .. ``end - 1``, a block of lanes at a time: (`Found`, `Tally`)."""
 
@@ -282,7 +283,7 @@ def _chunk(key, sim, reward, actions, found, begin, end, lanes):
     return found, counted
 
 
-@partial(jax.jit, static_argnames="lanes")
+@partial(jit, static_argnames="lanes")
 def _block(key, sim, reward, actions, found, begin, end, lanes):
     """Those of episodes ``begin`` .. ``end - 1`` that fit in the lanes: (`Found`, `Tally`,
     `Played`).
@@ -301,7 +302,7 @@ def _play(key, sim, reward, actions, number, live, **how):
     return E.play(sim, reward, keys, draw_start, draw, live, **how)
 
 
-@jax.jit
+@quick
 def _rebuild(key, sim, reward, actions, number):
     """The episodes of these numbers [m], with their disturbances."""
     return _play(

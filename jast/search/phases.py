@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast._jax import jit
 from jast.outline import outline
 from jast.search import cells as C
 from jast.search import kept as K
@@ -44,7 +45,7 @@ class Traces(NamedTuple):
     reward: Any
 
 
-@partial(jax.jit, static_argnames="plan")
+@partial(jit, static_argnames="plan")
 def explore(key, sim, reward, cell, plan, cells, kept, begin, end):
     """Runs ``begin`` .. ``end - 1`` that explore: ((`Cells`, `Kept`), `E.Tally`)."""
     draw, draw_start = R.explore(sim)
@@ -92,7 +93,7 @@ def explore(key, sim, reward, cell, plan, cells, kept, begin, end):
     return _blocks(block, plan, begin, end, (cells, kept))
 
 
-@partial(jax.jit, static_argnames="plan")
+@partial(jit, static_argnames="plan")
 def backward(key, sim, reward, plan, kept, traces, begin, end, since, whole):
     """Runs ``begin`` .. ``end - 1`` that go on from states of ``traces``, ever earlier ones, as
     many as ``whole`` before they are at the start: ((`Kept`, `Traces`), `E.Tally`).

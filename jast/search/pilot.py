@@ -15,7 +15,7 @@ from jax import lax
 
 from jast import actions as choices
 from jast import failures as archive
-from jast._jax import is_tracing
+from jast._jax import is_tracing, jit
 from jast._threads import apart
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
@@ -68,7 +68,7 @@ def fly(sim: Simulator, density: str, widen: str) -> Pilot:
     return apart(lambda: jax.block_until_ready(run())) if host and not is_tracing() else run()
 
 
-@partial(jax.jit, static_argnames=("density", "widths", "blind", "lanes"))
+@partial(jit, static_argnames=("density", "widths", "blind", "lanes"))
 def _fly(sim: Simulator, density: str, widths: int, blind: bool, lanes: int) -> Pilot:
     key, like = tree_keys(jax.random.key(0), 1)[0], outline(sim)
     reward = LogLikelihood(density)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 
 from jast import distributions as D
+from jast._jax import jit
 from jast.distributions.numbers import unflat
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import proposed
@@ -46,7 +47,7 @@ class Chains(NamedTuple):
     """[L - 1] share of the exchanges with the next width, of late."""
 
 
-@partial(jax.jit, static_argnames="lanes")
+@partial(jit, static_argnames="lanes")
 def look(key, sim, reward, lanes, kept, begin, end, width):
     """Draws of noise of this width: ((`Kept`, (z, used, failing, distance) of the lanes),
     `E.Tally`).
@@ -59,7 +60,7 @@ def look(key, sim, reward, lanes, kept, begin, end, width):
     return (kept, (z, *_state(sim, played, live))), E.tally(played, live, number)
 
 
-@jax.jit
+@jit
 def walk(key, sim, reward, kept, chains, widths, begin, end):
     """Moves of all chains, and after each round exchanges, until ``end``: ((`Kept`, `Chains`),
     `E.Tally`).

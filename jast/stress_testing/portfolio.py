@@ -12,6 +12,7 @@ import numpy as np
 
 from jast import _checks, units
 from jast import limit_state as latent
+from jast._jax import briefly
 from jast.checkpoints import stored
 from jast.contract import check
 from jast.crude import BRIEF, nominal
@@ -144,6 +145,7 @@ def stress(
     with (
         stored(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
         kept(store),
+        briefly(not budgets.cheap(sim, budget)),
         Watch(name, budget, "sim", progress, callback) as watch,
     ):
         work = _Work(key, sim, budget, top, watch, ways._replace(store=store), checkpoint)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from jast import units
-from jast._jax import custom_vmap
+from jast._jax import custom_vmap, jit
 from jast.counter import COUNTER, tree_keys
 from jast.episode import Episode, play_back
 from jast.memory import size
@@ -74,37 +74,37 @@ class Harvest(NamedTuple):
     """`Branches`, where the plan asks for them."""
 
 
-@functools.partial(jax.jit, static_argnames=("simulations", "memoize", "pages", "record"))
+@functools.partial(jit, static_argnames=("simulations", "memoize", "pages", "record"))
 def _make(problem, keys, simulations, memoize, pages=None, record=False):
     return make(problem, _shared(problem), keys, simulations, memoize, pages, record)
 
 
-@functools.partial(jax.jit, static_argnames=("memoize",), donate_argnames=("tree",))
+@functools.partial(jit, static_argnames=("memoize",), donate_argnames=("tree",))
 def _grow(problem, tree, begin_at, end_at, memoize):
     return simulate.grow(problem, _shared(problem), tree, begin_at, end_at, memoize)
 
 
-@functools.partial(jax.jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
+@functools.partial(jit, static_argnames=("children", "memoize"), donate_argnames=("tree",))
 def _prune(problem, tree, children, memoize):
     return prune(problem, _shared(problem), tree, children, memoize)
 
 
-@functools.partial(jax.jit, static_argnames=("children", "memoize"))
+@functools.partial(jit, static_argnames=("children", "memoize"))
 def _recounted(problem, tree, roots, children, memoize):
     return recounted(problem, tree, roots, children, memoize)
 
 
-@functools.partial(jax.jit, static_argnames=("children",))
+@functools.partial(jit, static_argnames=("children",))
 def _edges(problem, tree, children):
     return edges_of(problem, _shared(problem), tree, children)
 
 
-@functools.partial(jax.jit, static_argnames=("children",))
+@functools.partial(jit, static_argnames=("children",))
 def _branches(problem, tree, children):
     return branches_of(problem, _shared(problem), tree, children)
 
 
-@functools.partial(jax.jit, static_argnames=("memoize",))
+@functools.partial(jit, static_argnames=("memoize",))
 def _rebuild(problem, tree, lane, i, memoize):
     return rebuild(problem, _shared(problem), tree, lane, i, memoize)
 
