@@ -182,9 +182,15 @@ def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
     if len(heads.length) == 1:
         return np.zeros(len(episodes.length), int)
     of_modes = centred(sim)
-    there, best = (normal_of(of_modes, each) for each in (episodes, heads))
-    cosines = [unit(there) @ unit(best).T]
-    ends = np.asarray(episodes.length)
-    for head, end in zip(best, heads.length, strict=True):
-        cosines.append(unit(moved_in_time(of_modes, there, end - ends)) @ unit(head))
+    place = lambda e: (normal_of(of_modes, e), np.asarray(e.length))
+    return pointing(sim, *place(episodes), *place(heads))
+
+
+def pointing(
+    sim: Simulator, points: np.ndarray, ends: np.ndarray, heads: np.ndarray, last: np.ndarray
+) -> np.ndarray:
+    """The same of ``points`` [n, D] that end after ``ends`` [n] steps, and of ``heads`` [k, D]."""
+    cosines = [unit(points) @ unit(heads).T]
+    for head, end in zip(heads, last, strict=True):
+        cosines.append(unit(moved_in_time(sim, points, end - ends)) @ unit(head))
     return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)
