@@ -11,6 +11,7 @@ import numpy as np
 from jast import results
 from jast.episode import Episode, replay
 from jast.failures import Failures
+from jast.frames import dataframe
 from jast.limit_state import normal_of, unit
 from jast.rewards import likelihood
 from jast.search.centred import centred
@@ -80,6 +81,25 @@ class Modes(tuple):
     def _asdict(self) -> dict[str, Any]:
         """For files."""
         return dict(items=tuple(self), evaluations=self.evaluations)
+
+    def to_dataframe(self) -> Any:
+        """The modes as a table of pandas (the extra ``tables``): of the likeliest failure of each
+        ``log_prob_from_mode``, ``log_prob``, ``distance`` and ``length``, then ``members``,
+        ``share``, ``share_low`` and ``share_high``.
+
+        Returns:
+            The ``pandas.DataFrame``; its index is ``mode``, from 1.
+
+        Raises:
+            ImportError: where pandas is not installed.
+        """
+        of = lambda name: [np.asarray(getattr(m.failure, name)).item() for m in self]
+        columns = [("mode", np.arange(1, len(self) + 1)), ("log_prob_from_mode", of("reward"))]
+        columns += [(name, of(name)) for name in ("log_prob", "distance", "length")]
+        columns += [("members", [m.members for m in self]), ("share", [m.share for m in self])]
+        for i, end in enumerate(("share_low", "share_high")):
+            columns.append((end, [m.share_interval[i] for m in self]))
+        return dataframe(columns, ["mode"])
 
     def __str__(self) -> str:
         if not self:
