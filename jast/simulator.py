@@ -11,6 +11,7 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.distributions import Fixed
+from jast.distributions.containers import accepted
 
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
@@ -34,6 +35,11 @@ def ravel(state):
     floats = [a.dtype for a in leaves if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.zeros(()).dtype
     return jnp.concatenate([a.astype(dtype) for a in leaves]) if leaves else jnp.zeros((0,), dtype)
+
+
+def translating(function, *state):
+    """The distribution that ``function`` returns, one of scipy.stats or of NumPyro as jast's."""
+    return accepted(function(*state))
 
 
 @results.shown()
@@ -102,10 +108,11 @@ class Simulator:
             value = getattr(self, f.name)
             if f.metadata.get("static"):
                 continue
-            if isinstance(value, Partial):
-                continue
             if callable(value):
-                object.__setattr__(self, f.name, Partial(value))
+                value = value if isinstance(value, Partial) else Partial(value)
+                if f.name in ("disturbance", "start") and value.func is not translating:
+                    value = Partial(translating, value)
+                object.__setattr__(self, f.name, value)
             elif value is None or isinstance(value, str | int | float | tuple | list | dict):
                 raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:
