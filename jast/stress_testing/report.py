@@ -89,6 +89,11 @@ class Report(NamedTuple):
         lines += [*_work(self), "", advice(self)]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        from jast.page.notebook import cell
+
+        return cell(self)
+
     def html(
         self,
         path: PathLike,
