@@ -92,13 +92,13 @@ class Eigenfailures(NamedTuple):
             f" lie between {low:.2f} and {high:.2f}; the mean failure: {_outcome(self.middle)}"
         )
         lines.append(
-            f"{'':>2} {'nats':>7} {'variance':>8} {'shift':>6} {'at -1':>17} {'at +1':>17}"
+            f"{'':>2} {'nats':>7} {'variance':>8} {'shift':>6} {'at -1':>24} {'at +1':>24}"
         )
         for k, direction in enumerate(self.directions):
             at = [_outcome(jax.tree.map(lambda a, k=k: a[k], e)) for e in (self.minus, self.plus)]
             lines.append(
                 f"{k + 1:2d} {self.nats[k]:7.3f} {self.variances[k]:8.3f} {self.shifts[k]:6.2f}"
-                f" {at[0]:>17} {at[1]:>17}"
+                f" {at[0]:>24} {at[1]:>24}"
             )
             first = np.argsort(-np.abs(direction), kind="stable")[:SHOWN]
             parts = (f"{self.names[i]} {direction[i]:+.2f} at {self.steps[i]}" for i in first)
