@@ -8,6 +8,8 @@ populations and plain draws use it, and its statistics are tested; other estimat
 own key.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,6 +82,7 @@ def coin(key):
     return (jax.random.key_data(key)[..., 1] & 1).astype(bool)
 
 
+@partial(jax.jit, static_argnums=1)
 def tree_keys(key, n):
     """``n`` counter keys, one a tree, from the user's ``key`` (consumed); the key of tree k does
     not depend on ``n``.

@@ -4,6 +4,7 @@ A choice has a normal number here too: that of the middle of the interval of uni
 `chosen` gives to its category. As rare categories lie near 0, floats tell them all apart.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from jast.distributions.parts import Parts, parts
 from jast.episode import Episode, play_back
 from jast.estimate.markov_tilts import dimension, shape, stacked, starts
 from jast.limit_state import normal_numbers
+from jast.pytrees import in_lanes
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
@@ -22,6 +24,8 @@ __all__ = ["recorded"]
 
 FAR = 37.0
 """The normal number of a value at the end of a support, whose own is infinite."""
+AT_ONCE = 64
+"""Episodes that one program, of one shape, looks at."""
 
 
 def recorded(sim: Simulator, given: Episode) -> np.ndarray:
@@ -30,8 +34,8 @@ def recorded(sim: Simulator, given: Episode) -> np.ndarray:
     """
     if not len(given.length):
         return np.zeros((0, dimension(shape(sim), sim.horizon)), normal_numbers(sim))
-    z = _recorded(sim, given.x0, given.disturbances, jnp.asarray(given.length))
-    return np.asarray(z.astype(normal_numbers(sim)))
+    about = given.x0, given.disturbances, given.length
+    return in_lanes(AT_ONCE, partial(_recorded, sim), *about).astype(normal_numbers(sim))
 
 
 @jax.jit

@@ -145,9 +145,8 @@ def ppo(
     widen = settings.widening("ppo", widen)
     n, n0 = sizes(sim, "ppo")
     (m,) = outline(sim).observation
-    looked_at = max(min(LOOKED_AT, lanes * (plan.nominal + plan.around)), lanes)
     shape, pace = (
-        E.Shape(m, n, n0, hidden, components, dense, lanes, batch, looked_at),
+        E.Shape(m, n, n0, hidden, components, dense, lanes, batch, max(LOOKED_AT, lanes)),
         (steps, epochs),
     )
     about = dict(

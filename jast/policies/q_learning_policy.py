@@ -138,8 +138,7 @@ def q_learning(
     cell, rows = _cells(cells, cell, m, sim.horizon)
     kept = f"a table of {rows} cells and {values}^{n} values of the disturbance"
     require("q_learning", 8 * rows * values**n, kept, "use fewer cells or values")
-    looked_at = max(min(LOOKED_AT, lanes * (plan.nominal + plan.around)), lanes)
-    shape = E.Shape(m, n, n0, (), 1, False, lanes, 0, looked_at)
+    shape = E.Shape(m, n, n0, (), 1, False, lanes, 0, max(LOOKED_AT, lanes))
     about = dict(
         sim=sim,
         shape=shape,
@@ -157,7 +156,7 @@ def q_learning(
     for_first, for_steps, for_start = jax.random.split(key, 3)
     rates = jax.tree.map(jnp.float32, rates)
     apply = T.lookup(cell, sim.horizon)
-    begin = lambda: E.first(for_first, sim, shape, T.learner(rows, T.actions(n, values, reach), m))
+    begin = lambda: T.first(for_first, sim, shape, rows, T.actions(n, values, reach))
     look = lambda training, steps: E.look(for_steps, sim, shape, apply, training, steps)
     run = lambda training, steps: jax.block_until_ready(
         T.stretch(for_steps, sim, shape, cell, rates, training, steps)

@@ -26,9 +26,9 @@ __all__ = [
     "Rates",
     "Table",
     "actions",
+    "first",
     "given",
     "grid",
-    "learner",
     "lookup",
     "spread",
     "stretch",
@@ -59,15 +59,18 @@ class Learner(NamedTuple):
     """-inf: nothing is paid for chance."""
 
 
-def learner(cells: int, actions: np.ndarray, m: int) -> Learner:
-    """A `Learner` that has learned nothing, for ``m`` numbers seen."""
+@functools.partial(jax.jit, static_argnames=("shape", "cells"))
+def first(
+    key: jax.Array, sim: Simulator, shape: E.Shape, cells: int, actions: np.ndarray
+) -> E.Training:
+    """A `Training` of a `Learner` that has learned nothing, before its first step."""
     table = Table(
         jnp.zeros((cells, len(actions)), jnp.float32),
         jnp.asarray(actions),
-        jnp.zeros((m,), jnp.float32),
-        jnp.ones((m,), jnp.float32),
+        jnp.zeros((shape.m,), jnp.float32),
+        jnp.ones((shape.m,), jnp.float32),
     )
-    return Learner(table, jnp.full((), -jnp.inf, jnp.float32))
+    return E.first(key, sim, shape, Learner(table, jnp.full((), -jnp.inf, jnp.float32)))
 
 
 def actions(n: int, values: int, reach: float) -> np.ndarray:
@@ -125,11 +128,11 @@ def spread(training: E.Training, ranges: np.ndarray | None) -> E.Training:
     """``training`` after the exploration: its grid has the ``ranges`` [m, 2], or those that were
     seen, and what is seen is no longer normalised.
     """
-    seen = training.buffer.seen[: int(training.stored)]
+    seen = np.asarray(training.buffer.seen)[: int(training.stored)]
     if ranges is None:  # where nothing was seen that can be learned from, any will do
-        seen = np.asarray(seen) if len(seen) else np.zeros((1, seen.shape[1]))
+        seen = seen if len(seen) else np.zeros((1, seen.shape[1]))
         ranges = np.stack([np.min(seen, axis=0), np.max(seen, axis=0)], axis=1)
-    low, high = jnp.asarray(ranges, jnp.float32).T
+    low, high = np.asarray(ranges, np.float32).T
     same = Moments(*(jnp.asarray(a) for a in Moments.empty(len(low))))
     table = training.learner.actor._replace(low=low, high=high)
     return training._replace(

@@ -42,6 +42,7 @@ class Cells(NamedTuple):
     """[S] bool: the slot holds a state."""
 
 
+@partial(jax.jit, static_argnums=1)
 def empty(sim: Simulator, slots: int) -> Cells:
     """No state yet."""
     about = outline(sim)

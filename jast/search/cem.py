@@ -337,6 +337,7 @@ def _merge(pool, new):
     )
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def _nothing(sim, plan, trees, k, width, around=()):
     """An empty `Pool` and the first proposals, of every tree."""
     about = outline(sim)

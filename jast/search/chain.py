@@ -125,7 +125,7 @@ def chain(
         name=name,
     )
     if chains is not None:
-        share = lambda a: [round(float(v), 4) for v in a]
+        share = lambda a: np.round(np.asarray(a, float), 4).tolist()
         settings |= dict(
             widths=share(widths), accepted=share(chains.accepted), swapped=share(chains.swapped)
         )
@@ -161,14 +161,14 @@ class _Search:
         return (kept, chains, widths, looks), counted, K.best_of(kept), None
 
     def _enough(self, looks):
-        share = lambda look: float(look[1][2].mean())
+        share = lambda look: float(np.asarray(look[1][2]).mean())
         return len(looks) == len(WIDTHS) or (looks and share(looks[-1]) >= FAILING)
 
     def _begun(self, looks):
         """The chains and their widths: of the failures at the width that has most of them, up to
         the first that has enough; else of the nearest draws.
         """
-        shares = [float(look[2].mean()) for _, look in looks]
+        shares = [float(np.asarray(look[2]).mean()) for _, look in looks]
         i = int(np.argmax(shares)) if max(shares) > 0 else [w for w, _ in looks].index(LOST)
         widest, (z, used, failing, distance) = looks[i]
         rank = np.where(np.asarray(failing), -np.inf, np.asarray(distance))
@@ -179,7 +179,6 @@ class _Search:
         rows = order[(np.arange(levels)[:, None] + levels * np.arange(chains)[None]) % known]
         real = z.dtype
         widths = np.geomspace(max(widest, 1.0), self.narrowest, levels)
-        none = jnp.zeros(levels, real)
-        scale = jnp.full(levels, 0.5, real)
-        state = jax.tree.map(lambda a: a[rows], (z, used, failing, distance))
-        return T.Chains(*state, scale, none, none[1:]), jnp.asarray(widths, real)
+        none, scale = np.zeros(levels, real), np.full(levels, 0.5, real)
+        state = jax.tree.map(lambda a: np.asarray(a)[rows], (z, used, failing, distance))
+        return T.Chains(*state, scale, none, none[1:]), widths.astype(real)

@@ -23,7 +23,7 @@ from jast._threads import apart
 from jast.incidents import hosted, incidents, since
 from jast.limit_state import check, normal_numbers, outcome, played
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count, in_lanes
 from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 __all__ = ["falsify"]
 
+AT_ONCE = 64
+"""Failures whose normal numbers one program, of one shape, makes."""
 TAIL = 3e-5
 """Probability beyond what is taken for an end of a disturbance's range."""
 FRESH, POOL = 30, 10
@@ -158,7 +160,7 @@ class _Work:
         rows, first = (np.stack(a) for a in zip(*signals, strict=True))
         u = np.concatenate([first, rows.reshape(n, -1)], axis=1)
         lanes = np.pad(u, ((0, self.batch - n), (0, 0)), mode="edge")
-        ask = lambda: jax.device_get(_judged(self.sim, jnp.asarray(lanes, self.dtype)))
+        ask = lambda: jax.device_get(_judged(self.sim, lanes.astype(self.dtype)))
         o = jax.tree.map(lambda a: a[:n], apart(ask) if hosted(self.sim) else ask())
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
         new = score, rows, first, o.length
@@ -180,6 +182,7 @@ def _judged(sim: Simulator, u: jax.Array) -> Any:
     return jax.vmap(partial(outcome, sim))(_normal(u))
 
 
+@jax.jit
 def _normal(u: jax.Array) -> jax.Array:
     return jax.scipy.special.ndtri(jnp.clip(u, TAIL, 1 - TAIL))
 
@@ -232,7 +235,8 @@ def _result(sim: Simulator, found: _Found, settings: dict, top: int) -> SearchRe
     points = [u for _, u in found.failing] or [
         np.concatenate([pool.first[0], pool.rows[0].ravel()])
     ]
-    e = played(sim, _normal(jnp.asarray(np.stack(points), normal_numbers(sim))))
+    points = np.stack(points).astype(normal_numbers(sim))
+    e = played(sim, in_lanes(AT_ONCE, _normal, points))
     numbers = [i for i, _ in found.failing]
     failing = jax.tree.map(lambda a: a[: len(numbers)], e)
     ends, best, failures = zip(*found.moments, strict=True)

@@ -14,7 +14,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jast import _checks, memory
@@ -176,8 +175,8 @@ class _Search:
         that, make failures likelier.
         """
         cells, kept, traces, since = carry
-        ends = jnp.asarray(begin, jnp.int32), jnp.asarray(end, jnp.int32)
-        if traces is None and begin >= self.until and bool(kept.episode.failure[0]):
+        ends = np.int32(begin), np.int32(end)
+        if traces is None and begin >= self.until and np.asarray(kept.episode.failure)[0]:
             traces, since = self._traces(kept), begin
         if traces is None:
             (cells, kept), counted = P.explore(
@@ -185,7 +184,7 @@ class _Search:
             )
         else:
             whole = max(1.0, BACK * (self.episodes - since))
-            schedule = (jnp.asarray(v, kept.value.dtype) for v in (since, whole))
+            schedule = np.array([since, whole], kept.value.dtype)
             (kept, traces), counted = P.backward(
                 self.key, self.sim, self.reward, self.plan, kept, traces, *ends, *schedule
             )
@@ -195,13 +194,13 @@ class _Search:
         """The likeliest failure, then by turns the one that ends least like those and the next
         likeliest.
         """
-        value, mark, failing = jax.device_get((kept.value, kept.mark, kept.episode.failure))
-        n = int((failing & (value > -np.inf)).sum())
+        e, value, mark = jax.device_get((kept.episode, kept.value, kept.mark))
+        n = int((e.failure & (value > -np.inf)).sum())
         mark = (mark[:n] - mark[:n].mean(axis=0)) / np.maximum(mark[:n].std(axis=0), 1e-6)
         rows, left = [0], list(range(1, n))
         while left and len(rows) < self.plan.traces:
             far = np.abs(mark[left][:, None] - mark[rows][None]).sum(axis=2).min(axis=1)
             rows.append(left.pop(int(np.argmax(far)) if len(rows) % 2 else 0))
-        rows = jnp.asarray(np.resize(rows, self.plan.traces))
-        e = jax.tree.map(lambda a: a[rows], kept.episode)
+        rows = np.resize(rows, self.plan.traces)
+        e = jax.tree.map(lambda a: a[rows], e)
         return P.Traces(e.x0, e.disturbances, e.length, e.reward)

@@ -4,6 +4,7 @@ the likeliest failures (`jast.boundary`, `jast.search.refine`).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
@@ -15,6 +16,7 @@ from jast._jax import is_traced, is_tracing
 from jast.episode import Episode, play_back
 from jast.incidents import hosted
 from jast.limit_state import check, dimension, normal_numbers, played
+from jast.pytrees import in_lanes
 from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["gradient"]
 
+AT_ONCE = 32
+"""Failures that one program, of one shape, plays again."""
 GRADIENT = 4
 """Evaluations that one with its gradient is counted as."""
 SHARE = 2.0
@@ -155,7 +159,7 @@ class _Search:
 
     def _scored(self, e):
         """The episodes, with log p relative to the mode as their reward."""
-        return jax.device_get(_scored(self.sim, self.reward, e))
+        return in_lanes(AT_ONCE, partial(_scored, self.sim, self.reward), e)
 
     def _best(self, found):
         failing, nearest, _ = found

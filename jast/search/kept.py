@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jast import rewards
 from jast.episode import Episode
@@ -42,10 +43,12 @@ def likelihood(sim: Simulator) -> rewards.Standard:
 
 
 def none(sim: Simulator, k: int, mark: Any = ()) -> Kept:
-    """No episode yet. ``mark``: of one, shapes and dtypes."""
-    episode, whole = E.blank(sim, k), jnp.zeros(k, jnp.int32)
-    mark = jax.tree.map(lambda s: jnp.zeros((k, *s.shape), s.dtype), mark)
-    return Kept(episode, episode.reward, whole.astype(jnp.uint32), whole, whole, mark)
+    """No episode yet. ``mark``: of one, shapes and dtypes. On the host."""
+    zeros = lambda tree: jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), tree)
+    episode, whole = zeros(jax.eval_shape(lambda: E.blank(sim, k))), np.zeros(k, np.int32)
+    episode = episode._replace(distance=episode.distance + np.inf, reward=episode.reward - np.inf)
+    mark = jax.tree.map(lambda s: np.zeros((k, *s.shape), s.dtype), mark)
+    return Kept(episode, episode.reward, whole.astype(np.uint32), whole, whole, mark)
 
 
 def merged(kept: Kept, played: E.Played, live: Any, number: Any, mark: Any = ()) -> Kept:
@@ -63,6 +66,7 @@ def merged(kept: Kept, played: E.Played, live: Any, number: Any, mark: Any = ())
     return taken._replace(value=jnp.where(places < n, taken.value, -jnp.inf), count=counts)
 
 
+@jax.jit
 def best_of(kept: Kept) -> jax.Array:
     """The reward of the best episode: [1], as of one tree."""
     return jnp.where(kept.value[:1] > -jnp.inf, kept.episode.reward[:1], -jnp.inf)

@@ -168,10 +168,9 @@ def monte_carlo(
         )
     found, noted = ran.state
     log = E.logged(noted, units.note("episodes", ran, noted.tally.episodes, episodes))
-    rebuilt = _rebuild(
-        key, sim, reward, actions, jnp.concatenate([found.number[None], found.top_number])
-    )
-    found, rebuilt = jax.device_get((found, rebuilt))
+    found = jax.device_get(found)
+    numbers = np.concatenate([found.number[None], found.top_number])
+    rebuilt = jax.device_get(_rebuild(key, sim, reward, actions, numbers))
     n = int((found.top_reward > -jnp.inf).sum())
     best, candidates = (
         jax.tree.map(lambda a: a[0], rebuilt),
@@ -260,17 +259,10 @@ def _picked(places, reward, number, tag):
 
 
 def _nothing(sim, top):
-    zero, lowest = jnp.zeros((), jnp.int32), jnp.asarray(-jnp.inf, outline(sim).dtype)
-    none = jnp.zeros((top,), jnp.int32)
-    return Found(
-        jnp.zeros((), bool),
-        lowest,
-        zero,
-        jnp.full((top,), lowest),
-        none,
-        none.astype(jnp.uint32),
-        none,
-    )
+    zero, lowest = np.zeros((), np.int32), np.asarray(-np.inf, outline(sim).dtype)
+    none = np.zeros(top, np.int32)
+    lows = np.full(top, lowest)
+    return Found(np.zeros((), bool), lowest, zero, lows, none, none.astype(np.uint32), none)
 
 
 @partial(jax.jit, static_argnames="lanes")

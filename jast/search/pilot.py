@@ -188,6 +188,7 @@ def _best(sim: Simulator, reward: Any, episodes: Episode) -> Episode:
     return play_back(sim, reward, x0, x, length)
 
 
+@jax.jit
 def _better(a: Episode, b: Episode) -> Episode:
     """The one that failed, or else has the higher reward; ``b`` where they are equal."""
     first = (a.failure & ~b.failure) | ((a.failure == b.failure) & (a.reward > b.reward))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jast import units
 from jast._jax import is_traced
@@ -271,9 +272,10 @@ def grow_rounds(
     """
     problem, school, sim = job.problem, job.school, job.problem.sim
     chunk = max(1, min(job.plan.simulations, HOST_CHUNK if hosted(sim) else CHUNK))
-    keys, ran = tree_keys(key, job.trees), units.Ran((), 0)
+    words = np.asarray(jax.random.key_data(tree_keys(key, job.trees)))
+    ran = units.Ran((), 0)
     for first in range(0, job.trees, job.at_once):
-        own = keys[first : first + job.at_once]
+        own = words[first : first + job.at_once]
         turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * top), first)
         try:
             new = grow_all(turn, watch, ways, threads)

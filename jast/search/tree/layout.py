@@ -197,9 +197,8 @@ def widths(simulations, k, alpha):
         bound = jnp.floor(k * n.astype(jnp.float32) ** alpha * (1 + 4e-7)).astype(jnp.int32) + 1
         return jnp.minimum(n, bound)
     n = np.arange(simulations + 2)
-    return jnp.asarray(
-        np.minimum(n, np.floor(float(k) * n ** float(alpha) * (1 + 1e-14)) + 1), jnp.int32
-    )
+    bound = np.floor(float(k) * n ** float(alpha) * (1 + 1e-14)) + 1
+    return np.minimum(n, bound).astype(np.int32)
 
 
 def levels(sim: Simulator) -> int:

@@ -13,7 +13,7 @@ from jax import lax
 
 from jast import units
 from jast._jax import custom_vmap
-from jast.counter import tree_keys
+from jast.counter import COUNTER, tree_keys
 from jast.episode import Episode, play_back
 from jast.memory import size
 from jast.places import Post, Task
@@ -128,8 +128,8 @@ class Round(NamedTuple):
     """What the groups of a round of trees have in common."""
 
     problem: Any
-    keys: Any
-    """[trees] of the round."""
+    words: Any
+    """[trees, 2] uint32: those of the counter keys of the round; on the host."""
     plan: Plan
     lanes: int
     """Trees of a group."""
@@ -146,7 +146,7 @@ def grow_all(turn: Round, watch: Watch, ways: units.Ways, threads: int) -> units
     in the order of the keys. ``watch`` counts simulations; an interruption ends all trees at their
     next chunk.
     """
-    trees, lanes = turn.keys.shape[0], turn.lanes
+    trees, lanes = len(turn.words), turn.lanes
     each = turn.plan.prunes * turn.plan.simulations
     return units.run(
         Task(_one_group, turn, lambda: _like(turn)),
@@ -164,7 +164,7 @@ def grow_all(turn: Round, watch: Watch, ways: units.Ways, threads: int) -> units
 def _like(turn: Round) -> Harvest:
     """The shapes of what `_one_group` returns."""
     problem, _, plan = turn[:3]
-    keys = turn.keys[np.zeros(turn.lanes, int)]
+    keys = _keys(turn, np.zeros(turn.lanes, int))
     simulations = plan.prunes * plan.simulations
     tree = _make.eval_shape(problem, keys, simulations, plan.memoize, plan.pages, plan.record)
     _, roots = _prune.eval_shape(problem, tree, plan.children, plan.memoize)
@@ -184,10 +184,14 @@ def _like(turn: Round) -> Harvest:
     )
 
 
+def _keys(turn: Round, rows: np.ndarray) -> jax.Array:
+    return jax.random.wrap_key_data(turn.words[rows], impl=COUNTER)
+
+
 def _one_group(turn: Round, number: int, post: Post) -> Harvest:
-    problem, keys, plan, lanes, chunk, candidates, before = turn
-    group = np.arange(number * lanes, min((number + 1) * lanes, keys.shape[0]))
-    keys, group = keys[np.resize(group, lanes)], group + before
+    problem, words, plan, lanes, chunk, candidates, before = turn
+    group = np.arange(number * lanes, min((number + 1) * lanes, len(words)))
+    keys, group = _keys(turn, np.resize(group, lanes)), group + before
     tree = _make(
         problem, keys, plan.prunes * plan.simulations, plan.memoize, plan.pages, plan.record
     )
@@ -203,7 +207,7 @@ def _one_group(turn: Round, number: int, post: Post) -> Harvest:
                 break
         tree, roots = _prune(problem, tree, plan.children, plan.memoize)
         turns.append(jax.device_get(roots))
-        if post.stopped() or not bool(jnp.any(tree.alive)):
+        if post.stopped() or not np.asarray(tree.alive).any():
             break
     log, outcome, steps = (
         np.asarray(a)[..., : len(group)] for a in (tree.log, tree.outcome, tree.steps)
@@ -217,7 +221,7 @@ def _one_group(turn: Round, number: int, post: Post) -> Harvest:
         np.resize(i, wanted).astype(np.int32),
         plan.memoize,
     )
-    found = jax.device_get(jax.tree.map(lambda a: a[: len(lane)], found))
+    found = jax.tree.map(lambda a: a[: len(lane)], jax.device_get(found))
     roots = jax.tree.map(
         lambda *rows: np.stack([*rows, *[np.zeros_like(rows[0])] * (plan.prunes - len(rows))]),
         *turns,
@@ -225,8 +229,8 @@ def _one_group(turn: Round, number: int, post: Post) -> Harvest:
     if plan.recount:
         roots = jax.device_get(_recounted(problem, tree, roots, plan.children, plan.memoize))
     roots = jax.tree.map(lambda a: a[:, : len(group)], roots)
-    kept = lambda of: jax.device_get(
-        jax.tree.map(lambda a: a[:, : len(group)], of(problem, tree, plan.children))
+    kept = lambda of: jax.tree.map(
+        lambda a: a[:, : len(group)], jax.device_get(of(problem, tree, plan.children))
     )
     edges = kept(_edges) if plan.edges else ()
     branches = kept(_branches) if plan.branches else ()

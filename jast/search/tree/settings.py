@@ -69,5 +69,7 @@ def problem_of(
         focused=is_traced(focus) or focus != 1,
         **{name: chosen[name] for name in SWITCHES},
     )
-    settings = Settings(jnp.asarray(exploration, jnp.float32), widths(total, *chosen["widening"]))
-    return jax.tree.map(jnp.asarray, Problem(sim, reward, choice, settings))
+    table = widths(total, *chosen["widening"])
+    settings = Settings(jnp.asarray(exploration, jnp.float32), ())
+    made = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, settings))
+    return made._replace(settings=settings._replace(widths=table))

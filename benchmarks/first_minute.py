@@ -1,0 +1,175 @@
+"""What a first call costs: ``python -m benchmarks.first_minute [--json] [--quick | --smoke]
+[--systems NAME ...]``.
+
+Each system has a process of its own, without a cache of compiled programs, that makes one call four
+times: the first, the same again, with another key, and with another budget. Of each: CPU seconds,
+seconds of the clock, programs that were compiled, seconds that tracing, lowering and compiling
+took, and how many of the programs contain the user's ``step``. Then the CPU time of importing jast
+over that of importing JAX, and the first and the second ``python -m jast``, from an empty cache.
+Systems of other people's libraries are left out where the library is not installed.
+"""
+
+import argparse
+import dataclasses
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+
+import jast  # noqa: E402
+from benchmarks.sizes import options, size  # noqa: E402
+from jast.distributions import Normal  # noqa: E402
+
+__all__ = ["SYSTEMS", "calls"]
+
+MARK = "the_users_step"
+"""Stands in the text of each program that contains the step."""
+TIMES = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
+IMPORTS = 5
+"""Fresh processes, of which the quickest counts."""
+
+
+def lane() -> jast.Simulator:
+    """The car of the README."""
+
+    def step(car, gust):
+        offset, speed = car
+        speed = 0.8 * speed - 0.3 * offset + 0.1 * gust
+        return jnp.stack([offset + speed, speed])
+
+    off = lambda car: jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)
+    return jast.Simulator(
+        init=lambda x0: jnp.zeros(2),
+        step=step,
+        disturbance=lambda car: Normal(0.0, 1.0),
+        evaluate=lambda car: (jnp.abs(car[0]) >= 1.4, off(car)),
+        horizon=30,
+    )
+
+
+def plane() -> jast.Simulator:
+    """A plane in twenty numbers: P = Phi(-4.75) = 1.02e-6."""
+    return jast.simulators.limit_state(lambda z: 4.75 - jnp.sum(z) / jnp.sqrt(20.0), 20)
+
+
+STRESS, PROBABILITY = jast.stress, jast.estimate.failure_probability
+SYSTEMS: dict[str, tuple[Callable, Callable, tuple, str]] = {
+    "lane": (lane, STRESS, (None, 1_000_000), ""),
+    "ferry": (jast.simulators.ferry, STRESS, (None, 100_000), ""),
+    "plane of 20 numbers": (plane, PROBABILITY, (100_000, 150_000), ""),
+}
+"""Name -> simulator, call, its budget and another one, and the library that it is made of."""
+
+
+def calls(make: Callable, call: Callable, budgets: tuple) -> list[dict[str, float]]:
+    """What each of the four calls takes, in this process."""
+    sim = make()
+    named = jax.named_scope(MARK)(sim.step)
+    sim = dataclasses.replace(sim, step=lambda s, x: named(s, x))
+    one, other = jax.random.split(jax.random.key(0))
+    budget, another = budgets
+    rows, events = [], []
+    heard = lambda event, seconds, **_: events.append((event.rsplit("/", 1)[1], seconds))
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    with tempfile.TemporaryDirectory() as folder:
+        for key, evaluations in ((one, budget), (one, budget), (other, budget), (one, another)):
+            events.clear()
+            texts = Path(tempfile.mkdtemp(dir=folder))
+            jax.config.update("jax_dump_ir_to", str(texts))
+            cpu, wall = time.process_time(), time.perf_counter()
+            call(key, sim, evaluations)
+            cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+            rows.append(
+                {
+                    "cpu_s": cpu,
+                    "wall_s": wall,
+                    "programs": sum(event == TIMES[-1] for event, _ in events),
+                    "compilation_s": sum(s for event, s in events if event in TIMES),
+                    "with_step": sum(MARK in text.read_text() for text in texts.iterdir()),
+                }
+            )
+    return rows
+
+
+def in_its_own_process(name: str, smoke: bool) -> list[dict[str, float]]:
+    """`calls` of a system, in a fresh process without a cache of compiled programs."""
+    command = [sys.executable, "-m", "benchmarks.first_minute", "--call", name]
+    env = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "0"}
+    said = subprocess.run(
+        command + ["--smoke"] * smoke, check=True, capture_output=True, text=True, env=env
+    )
+    return json.loads(said.stdout.splitlines()[-1])
+
+
+def importing(what: str, times: int) -> float:
+    """CPU seconds of a fresh process that imports ``what``."""
+    code = f"import {what}, time; print(time.process_time())"
+    command = [sys.executable, "-c", code]
+    run = partial(subprocess.run, command, check=True, capture_output=True, text=True)
+    return min(float(run().stdout) for _ in range(times))
+
+
+def command_line(arguments: list[str]) -> list[float]:
+    """Seconds of the clock of the first and the second ``python -m jast``."""
+    with tempfile.TemporaryDirectory() as folder:
+        kept = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/programs"}
+        command = [sys.executable, "-m", "jast", *arguments, "--output", f"{folder}/out"]
+        seconds = []
+        for _ in range(2):
+            begin = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True, env=os.environ | kept)
+            seconds.append(time.perf_counter() - begin)
+    return seconds
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    options(parser, "lane and plane, without the command line")
+    parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS))
+    parser.add_argument("--call", choices=list(SYSTEMS), help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    if args.call:
+        make, call, budgets, _ = SYSTEMS[args.call]
+        print(json.dumps(calls(make, call, (2000, 3000) if args.smoke else budgets)))
+        return
+    few = [name for name in SYSTEMS if name in ("lane", "plane of 20 numbers")]
+    names = args.systems or size(args, list(SYSTEMS), few, few[-1:])
+    absent = lambda name: SYSTEMS[name][3] and not importlib.util.find_spec(SYSTEMS[name][3])
+    results = {
+        name: None if absent(name) else in_its_own_process(name, args.smoke) for name in names
+    }
+    times = size(args, IMPORTS, IMPORTS, 1)
+    results["import jast / import jax"] = importing("jast", times) / importing("jax", times)
+    if not (args.quick or args.smoke):
+        results["python -m jast"] = command_line([])
+    if args.json:
+        print(json.dumps(results))
+        return
+    print(f"{'call':32}{'CPU s':>8}{'wall s':>8}{'programs':>10}{'compile s':>11}{'step in':>9}")
+    for name in names:
+        which = ("first", "again", "another key", "another budget")
+        for kind, row in zip(which, results[name] or (), strict=False):
+            cpu, wall, programs, compilation, steps = row.values()
+            label = f"{name}, {kind}"
+            print(f"{label:32}{cpu:8.1f}{wall:8.1f}{programs:10}{compilation:11.1f}{steps:9}")
+        if results[name] is None:
+            print(f"{name:32}{SYSTEMS[name][3]} is not installed")
+    print(f"import jast / import jax: {results['import jast / import jax']:.2f}")
+    if "python -m jast" in results:
+        first, second = results["python -m jast"]
+        print(f"python -m jast: {first:.1f} s, then {second:.1f} s")
+
+
+if __name__ == "__main__":
+    main()
