@@ -188,8 +188,6 @@ def _words(value: Any) -> str:
             return f"{value.item():.6g}" if value.dtype.kind == "f" else str(value.item())
         return f"{value.dtype.name}{list(value.shape)}"
     if isinstance(value, Partial):
-        while value.args and isinstance(value.args[0], Partial):  # what it wraps says more
-            value = value.args[0]
         bound = "(...)" if value.args or value.keywords else ""
         return f"{getattr(value.func, '__name__', type(value.func).__name__)}{bound}"
     if _is_record(value):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import update_wrapper
 from typing import TYPE_CHECKING
 
 import jax
@@ -37,9 +38,26 @@ def ravel(state):
     return jnp.concatenate([a.astype(dtype) for a in leaves]) if leaves else jnp.zeros((0,), dtype)
 
 
-def translating(function, *state):
-    """The distribution that ``function`` returns, one of scipy.stats or of NumPyro as jast's."""
-    return accepted(function(*state))
+class Translating:
+    """A function whose distributions of scipy.stats or NumPyro are jast's; equal where it is."""
+
+    def __init__(self, function):
+        update_wrapper(self, function, updated=())
+
+    def __call__(self, *args, **settings):
+        return accepted(self.__wrapped__(*args, **settings))
+
+    def __eq__(self, other):
+        return isinstance(other, Translating) and self.__wrapped__ == other.__wrapped__
+
+    def __hash__(self):
+        return hash(self.__wrapped__)
+
+
+def translating(f):
+    """The `Translating` function of ``f`` as a Partial with the arguments that ``f`` binds."""
+    f = f if isinstance(f, Partial) else Partial(f)
+    return Partial(Translating(f.func), *f.args, **f.keywords)
 
 
 @results.shown()
@@ -110,8 +128,8 @@ class Simulator:
                 continue
             if callable(value):
                 value = value if isinstance(value, Partial) else Partial(value)
-                if f.name in ("disturbance", "start") and value.func is not translating:
-                    value = Partial(translating, value)
+                if f.name in ("disturbance", "start") and type(value.func) is not Translating:
+                    value = translating(value)
                 object.__setattr__(self, f.name, value)
             elif value is None or isinstance(value, str | int | float | tuple | list | dict):
                 raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast._checks import real, whole
@@ -476,7 +475,7 @@ def _start(start):
             f"{NAME}: start must be a distribution, or a function () -> distribution, received"
             f" {start!r}"
         )
-    return Partial(translating, start if isinstance(start, Partial) else Partial(start))
+    return translating(start)
 
 
 def _is_run(system, random, episodic):
