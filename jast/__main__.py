@@ -228,7 +228,7 @@ def _explained(options, sim, report):
     if not (report.modes and about.disturbance.quantile and about.start.quantile):
         return ()
     budget = min(report.settings["budget"], PORTFOLIO) // 10
-    found = cards(jax.random.key(options.seed), sim, report.modes, budget)
+    found = cards(jax.random.key(options.seed), sim, report, budget)
     print(f"{found[0][0]}\n")
     return found
 

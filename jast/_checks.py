@@ -2,6 +2,7 @@
 expected and what came.
 """
 
+import importlib
 import operator
 from typing import Any
 
@@ -10,6 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._jax import is_traced
+
+
+def library(function: str, module: str, extra: str) -> Any:
+    """The ``module`` of an ``extra`` of pyproject.toml; ImportError where that is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise ImportError(f"{function} needs {name}: pip install 'jast[{extra}]'") from error
 
 
 def random_key(function: str, key: Any) -> None:

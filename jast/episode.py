@@ -64,6 +64,27 @@ class Episode(NamedTuple):
     states: chex.ArrayTree | None = None
     """[horizon + 1, ...]: s_0 .. s_length in the first rows, or None where they were not kept."""
 
+    def to_xarray(self) -> Any:
+        """One episode, or a batch, as an xarray Dataset that arviz reads (the extra ``tables``).
+
+        Dimensions are ``chain`` (one), ``draw`` (the episodes) and ``step``, from 0 to the horizon;
+        those of arrays come after them. Variables are ``x`` (that of step t led to state t; a
+        disturbance of several arrays has one for each, as "x.gust"), ``x0`` where the start is
+        random, ``state`` where states were kept, likewise, and ``log_prob``, ``distance``,
+        ``reward``, ``failure`` and ``length``. What an episode did not come to is NaN, and whole
+        numbers of disturbances and states are floats.
+
+        Returns:
+            The ``xarray.Dataset``.
+
+        Raises:
+            ImportError: where xarray is not installed.
+            ValueError: for more than one leading axis.
+        """
+        from jast.frames import dataset
+
+        return dataset(self)
+
 
 def rollout(
     key: chex.PRNGKey,

@@ -22,9 +22,10 @@ from jast import files, results
 from jast._doors import listed
 from jast.archive import arrays_of, check_part, describe, named
 from jast.episode import Episode, replay
+from jast.frames import dataframe
 from jast.outline import outline
 from jast.simulator import Simulator
-from jast.tables import from_json, to_csv, to_numpy
+from jast.tables import by_step, from_json, to_csv, to_numpy
 
 if TYPE_CHECKING:
     import chex
@@ -92,6 +93,28 @@ class Failures:
         return replace(self, **changes)
 
     _replace = replace
+
+    def to_dataframe(self, steps: bool = False) -> Any:
+        """The archive as a table of pandas (the extra ``tables``), by falling reward.
+
+        Args:
+            steps: one row for each step of each failure, as `jast.failures.to_csv` writes them,
+                with the numbers of the disturbances; else one for each failure, with its
+                ``reward``, ``log_prob``, ``distance``, ``length``, ``counts``, ``tree`` and
+                ``simulation``.
+
+        Returns:
+            The ``pandas.DataFrame``; its index is ``failure``, from 1, or (``failure``, ``step``).
+
+        Raises:
+            ImportError: where pandas is not installed.
+        """
+        if steps:
+            return dataframe(by_step(self).items(), ["failure", "step"])
+        e, rows = self.episodes, [("failure", np.arange(1, len(self) + 1))]
+        rows += [(name, getattr(e, name)) for name in ("reward", "log_prob", "distance", "length")]
+        rows += [(name, getattr(self, name)) for name in ("counts", "tree", "simulation")]
+        return dataframe(rows, ["failure"])
 
     @property
     def size(self) -> int:

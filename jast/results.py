@@ -41,9 +41,9 @@ def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
     """A class decorator: objects print, and a repr is short whatever they hold.
 
     Where the class has a ``__str__`` of its own, the repr is its first lines; else it names the
-    fields. ``_repr_html_`` is a table of the fields, for notebooks. Objects that went through a
-    transformation of JAX (traced, batched by `jax.vmap`, or with other leaves) print their fields
-    and the shape of the batch.
+    fields. ``_repr_html_``, for notebooks, is the class's own, else a table of the fields. Objects
+    that went through a transformation of JAX (traced, batched by `jax.vmap`, or with other leaves)
+    print their fields and the shape of the batch.
 
     Args:
         scalar: the name of a field that is one number in a single object, which tells a batch; with
@@ -52,7 +52,7 @@ def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
     """
 
     def decorate(cls: C) -> C:
-        own = cls.__dict__.get("__str__")
+        own, own_html = (cls.__dict__.get(name) for name in ("__str__", "_repr_html_"))
 
         def text(self: Any) -> str:
             if own is None:
@@ -73,7 +73,13 @@ def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
                 lines = [*lines[: LINES - 1], hidden]
             return "\n".join(lines)
 
-        cls.__str__, cls.__repr__, cls._repr_html_ = text, short, _html
+        def page(self: Any) -> str:
+            try:
+                return own_html(self)
+            except Exception:  # as in a repr
+                return _html(self)
+
+        cls.__str__, cls.__repr__, cls._repr_html_ = text, short, page if own_html else _html
         return cls
 
     return decorate

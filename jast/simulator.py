@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import update_wrapper
 from typing import TYPE_CHECKING
 
 import jax
@@ -11,6 +12,7 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.distributions import Fixed
+from jast.distributions.containers import accepted
 
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
@@ -34,6 +36,28 @@ def ravel(state):
     floats = [a.dtype for a in leaves if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.zeros(()).dtype
     return jnp.concatenate([a.astype(dtype) for a in leaves]) if leaves else jnp.zeros((0,), dtype)
+
+
+class Translating:
+    """A function whose distributions of scipy.stats or NumPyro are jast's; equal where it is."""
+
+    def __init__(self, function):
+        update_wrapper(self, function, updated=())
+
+    def __call__(self, *args, **settings):
+        return accepted(self.__wrapped__(*args, **settings))
+
+    def __eq__(self, other):
+        return isinstance(other, Translating) and self.__wrapped__ == other.__wrapped__
+
+    def __hash__(self):
+        return hash(self.__wrapped__)
+
+
+def translating(f):
+    """The `Translating` function of ``f`` as a Partial with the arguments that ``f`` binds."""
+    f = f if isinstance(f, Partial) else Partial(f)
+    return Partial(Translating(f.func), *f.args, **f.keywords)
 
 
 @results.shown()
@@ -102,10 +126,11 @@ class Simulator:
             value = getattr(self, f.name)
             if f.metadata.get("static"):
                 continue
-            if isinstance(value, Partial):
-                continue
             if callable(value):
-                object.__setattr__(self, f.name, Partial(value))
+                value = value if isinstance(value, Partial) else Partial(value)
+                if f.name in ("disturbance", "start") and type(value.func) is not Translating:
+                    value = translating(value)
+                object.__setattr__(self, f.name, value)
             elif value is None or isinstance(value, str | int | float | tuple | list | dict):
                 raise ValueError(f"Simulator: {f.name} must be a function, received {value!r}")
         if isinstance(self.horizon, bool) or not isinstance(self.horizon, int) or self.horizon < 1:

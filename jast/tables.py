@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,23 +87,27 @@ def to_csv(path: PathLike, failures: Any) -> None:
         ...         print(file.readline().strip())
         failure,step,x
     """
-    arrays = to_numpy(failures)
-    of_start = {k: v for k, v in arrays.items() if k == "x0" or k.startswith("x0.")}
-    of_steps = {k: v for k, v in arrays.items() if k == "x" or k.startswith("x.")}
-    columns = [_names(k, v.shape[1:]) for k, v in of_start.items()]
-    columns += [_names(k, v.shape[2:]) for k, v in of_steps.items()]
-    names = [name for each in columns for name in each]
-    blank = [""] * sum(len(_names(k, v.shape[2:])) for k, v in of_steps.items())
+    columns = by_step(failures)
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["failure", "step", *names])
-        for i in range(len(failures)):
-            first = [n for v in of_start.values() for n in _numbers(v[i])]
-            if first:
-                table.writerow([i + 1, 0, *first, *blank])
-            for t in range(int(arrays["length"][i])):
-                row = [n for v in of_steps.values() for n in _numbers(v[i, t])]
-                table.writerow([i + 1, t + 1, *[""] * len(first), *row])
+        table.writerow(columns)
+        table.writerows(zip(*columns.values(), strict=True))
+
+
+def by_step(failures: Any) -> dict[str, list]:
+    """The columns of `to_csv`: Python's numbers, None where a row has none."""
+    arrays = to_numpy(failures)
+    of = lambda root: [(k, v) for k, v in arrays.items() if k == root or k.startswith(f"{root}.")]
+    first, last = 0 if of("x0") else 1, arrays["length"]
+    at = [(i, t) for i in range(len(last)) for t in range(first, int(last[i]) + 1)]
+    columns: dict[str, list] = {"failure": [i + 1 for i, _ in at], "step": [t for _, t in at]}
+    for k, v in of("x0"):
+        for name, flat in _numbers(k, v, 1):
+            columns[name] = [None if t else flat[i].item() for i, t in at]
+    for k, v in of("x"):
+        for name, flat in _numbers(k, v, 2):
+            columns[name] = [flat[i, t - 1].item() if t else None for i, t in at]
+    return columns
 
 
 def from_json(path: PathLike, sim: Simulator) -> Episode:
@@ -151,10 +156,7 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
     return replay(sim, wholes[1], wholes[0])
 
 
-def _names(name: str, shape: tuple) -> list[str]:
-    places = (",".join(map(str, at)) for at in np.ndindex(shape))
-    return [f"{name}[{at}]" for at in places] if shape else [name]
-
-
-def _numbers(values: np.ndarray) -> list:
-    return np.asarray(values).reshape(-1).tolist()  # Python's: shortest text with all digits
+def _numbers(name: str, values: np.ndarray, lead: int) -> Iterator[tuple[str, np.ndarray]]:
+    """What each number of an array is called, and its values [...] over the ``lead`` first axes."""
+    for at in np.ndindex(values.shape[lead:]):
+        yield f"{name}[{','.join(map(str, at))}]" if at else name, values[(..., *at)]

@@ -93,12 +93,29 @@ def test_the_code_for_long_work_on_one_machine_runs(tmp_path):
 def test_code_that_needs_a_cluster_names_what_exists():
     """It is not run: it is Python, and its calls and their settings exist."""
     for block in scale()[1]:
-        for call in (n for n in ast.walk(ast.parse(block)) if isinstance(n, ast.Call)):
-            name = ast.unparse(call.func)
-            if name.startswith("jast."):
-                function = operator.attrgetter(name.removeprefix("jast."))(jast)
-                settings = {k.arg: None for k in call.keywords}
-                inspect.signature(function).bind(*call.args, **settings)
+        names_what_exists(block)
+
+
+def names_what_exists(code):
+    """Every function of jast that is called takes these arguments."""
+    for call in (n for n in ast.walk(ast.parse(code)) if isinstance(n, ast.Call)):
+        name = ast.unparse(call.func)
+        if re.fullmatch(r"jast[\w.]+", name):
+            function = operator.attrgetter(name.removeprefix("jast."))(jast)
+            settings = {k.arg: None for k in call.keywords}
+            signature, cut = inspect.signature(function), "(..." in ast.unparse(call)
+            (signature.bind_partial if cut else signature.bind)(*call.args, **settings)
+
+
+def test_the_calls_of_the_tables_exist():
+    """Of docs/choose.md and of the guides: functions by their names, calls with their arguments."""
+    for page in (ROOT / "docs/choose.md", *PAGES):
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+        for code in re.findall(r"`(jast\.[^`]+)`", text):
+            if code.endswith(")"):
+                names_what_exists(code)
+            elif re.fullmatch(r"[\w.]+", code) and not code.endswith("."):
+                operator.attrgetter(code.removeprefix("jast."))(jast)
 
 
 def test_every_room_has_a_page():

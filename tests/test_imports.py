@@ -8,7 +8,7 @@ import sys
 import pytest
 
 HEAVY = ["distrax", "tensorflow_probability", "flax", "optax", "chex", "matplotlib", "scipy"]
-HEAVY += ["sklearn", "tqdm", "loky"]
+HEAVY += ["sklearn", "tqdm", "loky", "pandas", "xarray", "numpyro"]
 LOADED = f"import sys; print([m for m in {HEAVY} if m in sys.modules])"
 
 

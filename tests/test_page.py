@@ -3,6 +3,8 @@ copied from a page replays. In a browser, where one is installed.
 """
 
 import json
+import sys
+from base64 import b64decode
 from types import SimpleNamespace
 
 import jax
@@ -233,3 +235,24 @@ def test_the_slider_moves_in_a_browser(page, tmp_path):
         and found["json"] == 3
         and found["play"] == "Stop"
     )
+
+
+def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
+    """Words are text, each mode has a small picture; without matplotlib there are the words."""
+    pytest.importorskip("matplotlib", reason="needs the extra `plot`")
+    whole = made()._repr_html_()
+    seen = Page(whole)
+    names = [tag for tag, _ in seen.tags]
+    assert names.count("img") == 2 and "script" not in names and len(whole) < 60_000
+    assert "2 ways to fail found" in whole and "75 % [70, 81]" in whole and "not estimated" in whole
+    for _, attributes in [t for t in seen.tags if t[0] == "img"]:
+        png = b64decode(attributes["src"].removeprefix("data:image/png;base64,"))
+        assert png.startswith(b"\x89PNG") and len(png) < 20_000
+    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
+    doubtful = made(probability=Estimate("mine", *numbers, False, (EVIL,)))._repr_html_()
+    assert "UNRELIABLE" in doubtful and "&lt;script&gt;fail()" in doubtful and EVIL not in doubtful
+    none = made(failures=jast.failures.empty(SIM), modes=Modes())._repr_html_()
+    assert "No failure was found in 14" in none and "<img" not in none
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    words = made()._repr_html_()
+    assert "<img" not in words and "Mode 2" in words and "75 % [70, 81]" in words

@@ -123,6 +123,9 @@ CALLS = {
     "explain.differential": Call(
         lambda k, b, _: explain.differential(k, FAILS, RARE, budget=b), 20_000, 22_000
     ),
+    "explain.eigenfailures": Call(
+        lambda k, b, g: explain.eigenfailures(k, FAILS, g[1], directions=b), 1, 3
+    ),
     "explain.indices": Call(
         lambda k, b, g: explain.indices(k, FAILS, g[1], draws=b), 10_000, 15_000
     ),

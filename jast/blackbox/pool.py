@@ -12,10 +12,12 @@ from concurrent.futures import FIRST_COMPLETED, wait
 
 import numpy as np
 
+from jast._checks import library
 from jast.blackbox import environment, programs, worker
 
 __all__ = ["Pool"]
 
+NEEDS = "jast.blackbox with workers >= 1"
 GRACE = 1.0
 """Seconds that a worker has beyond the time limits of its rows before it is killed."""
 START = 60.0
@@ -58,7 +60,7 @@ def packed(system, spec):
     """The system as bytes; this package's part of them by value, so that a worker need not import
     it. Raises ValueError for one that cannot be sent.
     """
-    cloudpickle = _imported("cloudpickle")
+    cloudpickle = library(NEEDS, "cloudpickle", "blackbox")
     own = [
         m
         for m in (worker, programs, environment)
@@ -79,15 +81,6 @@ def packed(system, spec):
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def _imported(name):
-    try:
-        return __import__(name)
-    except ImportError:
-        raise ImportError(
-            f"jast.blackbox needs {name} for workers >= 1: pip install 'jast[blackbox]'"
-        ) from None
-
-
 class Worker:
     """One process, started on first use and started anew after its end."""
 
@@ -97,7 +90,9 @@ class Worker:
     def start(self):
         """A future that is done when the process has the system."""
         if self.executor is None:
-            self.executor = _imported("loky").ProcessPoolExecutor(max_workers=1, timeout=None)
+            self.executor = library(NEEDS, "loky", "blackbox").ProcessPoolExecutor(
+                max_workers=1, timeout=None
+            )
             return self.executor.submit(pickle.loads, self.payload)
 
     def submit(self, function, *args):

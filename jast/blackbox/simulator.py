@@ -21,9 +21,10 @@ from jast.blackbox.judged import compare
 from jast.blackbox.pool import Pool, packed
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
 from jast.contract import OBSERVED
+from jast.distributions.containers import accepted
 from jast.distributions.kinds import Seeds
 from jast.incidents import sources
-from jast.simulator import Simulator, fixed
+from jast.simulator import Simulator, fixed, translating
 
 if TYPE_CHECKING:
     import chex
@@ -224,13 +225,13 @@ def from_python(
     random = bool(jax.tree.leaves(like0))
     run = _is_run(system, random, episodic)
     episodic = run if episodic is None else episodic
-    disturbance = D.seeds() if disturbance is None else disturbance
+    disturbance = D.seeds() if disturbance is None else accepted(disturbance)
     tells = likelihood or ("maybe" if isinstance(disturbance, Seeds) and not run else None)
     spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit, tells)
     runner = Pool(packed(system, spec), workers, spec) if workers else Runner(system, spec)
     size = 0 if run else _probed(runner, start, limited=observe is None)
 
-    constant = _is_distribution(disturbance)
+    constant = D.is_distribution(disturbance)
     if not (constant or callable(disturbance)):
         raise ValueError(
             f"{NAME}: disturbance must be a distribution, or a function state -> distribution,"
@@ -420,8 +421,8 @@ def _shape(disturbance, blank, like):
     )
 
     def value():
-        dist = disturbance(blank(like))
-        if not _is_distribution(dist):
+        dist = accepted(disturbance(blank(like)))
+        if not D.is_distribution(dist):
             raise TypeError(f"expected a distribution, received {dist!r}")
         return D.sample(dist, jax.random.key(0))
 
@@ -467,22 +468,14 @@ def _structure(name, like):
 
 
 def _start(start):
-    if _is_distribution(start):
+    if D.is_distribution(start := accepted(start)):
         return lambda: start
-    if not callable(start) or not _is_distribution(start()):
+    if not callable(start) or not D.is_distribution(accepted(start())):
         raise ValueError(
             f"{NAME}: start must be a distribution, or a function () -> distribution, received"
             f" {start!r}"
         )
-    return start
-
-
-def _is_distribution(d):
-    return (
-        not inspect.isclass(d)
-        and callable(getattr(d, "sample", None))
-        and callable(getattr(d, "log_prob", None))
-    )
+    return translating(start)
 
 
 def _is_run(system, random, episodic):

@@ -3,6 +3,8 @@
 A disturbance model returns any object with ``sample(seed=key)``, ``log_prob(x)`` and, where it
 exists, ``mode()``: those made here are light; distrax's are accepted wherever a distribution is,
 and each of its names is found here, too (``jast.distributions.Transformed``): it is loaded then.
+Frozen distributions of scipy.stats are taken as those of the same law here, where there is one, and
+NumPyro's likewise or by their own quantile functions.
 
 What a search and a proposal ask of a distribution (`quantile`, `cdf`, `from_normal`, `to_normal`,
 `mode`, `tilted`) stands in a table, one row a family: `register` adds a user's own.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, is_distribution, tree_map
+from jast.distributions.foreign import translated
 from jast.distributions.verbs import mode
 
 if TYPE_CHECKING:
@@ -155,9 +156,14 @@ def leaves(distributions: Any) -> list[Any]:
     return jax.tree.leaves(distributions, is_leaf=is_distribution)
 
 
+def accepted(d: Any) -> Any:
+    """``d``, one of scipy.stats or of NumPyro as jast has it."""
+    return d if isinstance(d, Distribution) else translated(d, Independent)
+
+
 def _accepted(d: Any) -> Any:
-    """``d``, one of tensorflow-probability as distrax sees it."""
-    if isinstance(d, Distribution):
+    """The same, one of tensorflow-probability as distrax sees it."""
+    if isinstance(d := accepted(d), Distribution):
         return d
     if type(d).__module__.partition(".")[0] != "tensorflow_probability":
         raise ValueError(f"expected a distribution, received {d!r}")

@@ -5,7 +5,7 @@ a user looks at.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,6 +24,7 @@ from jast.estimate.populations import settled
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, redrawn
 from jast.estimate.sample import Sample
+from jast.frames import dataset
 from jast.journal import answered, kept
 from jast.memory import require_episodes
 
@@ -64,6 +65,13 @@ class FailureSamples(NamedTuple):
     """Share of the last Markov moves that was accepted"""
     evaluations: int
     """Episodes simulated in all"""
+
+    def to_xarray(self) -> Any:
+        """The failures as `jast.Episode.to_xarray` has them; ``ess``, ``distinct`` and ``accepted``
+        are attributes. Copies of one failure are neighbours, apart by the Markov moves alone.
+        """
+        numbers = dict(ess=self.ess, distinct=self.distinct, accepted=self.accepted)
+        return dataset(self.failures, **numbers)
 
     @results.Former
     def episodes(self) -> Episode:

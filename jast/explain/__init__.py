@@ -5,6 +5,7 @@ from jast.explain.attribution import Attribution, attribution
 from jast.explain.cards import cards
 from jast.explain.criticality import Criticality, criticality
 from jast.explain.differential import differential, regression
+from jast.explain.eigenfailures import Eigenfailures, eigenfailures
 from jast.explain.indices import Index, Indices, indices
 from jast.explain.minimal import Minimal, minimal
 from jast.explain.monitor import Monitor, monitor
@@ -15,6 +16,7 @@ from jast.explain.trees import Rule
 __all__ = [
     "Attribution",
     "Criticality",
+    "Eigenfailures",
     "Index",
     "Indices",
     "Minimal",
@@ -26,6 +28,7 @@ __all__ = [
     "cards",
     "criticality",
     "differential",
+    "eigenfailures",
     "indices",
     "minimal",
     "monitor",

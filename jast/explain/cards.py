@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING, Any
 import jax
 
 from jast import _checks
+from jast.estimate.markov_tilts import Tilts
 from jast.explain.criticality import Criticality, criticality
+from jast.explain.eigenfailures import Eigenfailures, eigenfailures
 from jast.explain.minimal import Minimal, minimal
+from jast.incidents import hosted
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     import chex
+
+    from jast.stress_testing.report import Report
 
 __all__ = ["cards"]
 
@@ -23,21 +28,22 @@ MODES, LEAST = 4, 20
 
 
 def cards(
-    key: chex.PRNGKey, sim: Simulator, modes: Sequence[Mode], budget: int = 20_000
-) -> list[list[Minimal | Criticality]]:
-    """`minimal` and `criticality` of the likeliest failure of each of the first four ``modes``.
+    key: chex.PRNGKey, sim: Simulator, modes: Sequence[Mode] | Report, budget: int = 20_000
+) -> list[list[Minimal | Criticality | Eigenfailures]]:
+    """`minimal` and `criticality` of the likeliest failure of each of the first four ``modes``; of
+    those of a report also `eigenfailures`, where its estimate drew enough failures, and a black box
+    need not play them again.
 
-    ``report.html(path, explanations=jast.explain.cards(key, sim, report.modes))`` puts them on the
-    page.
+    ``report.html(path, explanations=jast.explain.cards(key, sim, report))`` puts them on the page.
 
     Args:
         key: consumed.
         sim: the simulator; its disturbances have quantile functions.
-        modes: as of `jast.stress` or `jast.search.modes`.
+        modes: a report of `jast.stress`, or modes as of `jast.search.modes`.
         budget: evaluations in all, nearly; a small one leaves `criticality` out.
 
     Returns:
-        For each mode what was found, in the order of ``modes``.
+        For each mode what was found, in their order.
 
     Raises:
         ValueError: as `minimal`.
@@ -53,14 +59,24 @@ def cards(
     name = "cards"
     _checks.random_key(name, key)
     budget = _checks.whole(name, "budget", budget, 1)
-    chosen: list[Any] = list(modes)[:MODES]
-    out: list[list[Minimal | Criticality]] = []
+    p: Any = getattr(modes, "probability", None)
+    chosen: list[Any] = list(getattr(modes, "modes", modes))[:MODES]
+    # tilts are told by playing their draws again
+    again = hosted(sim) and isinstance(getattr(p and p.draws, "source", None), Tilts)
+    out: list[list[Minimal | Criticality | Eigenfailures]] = []
     for i, mode in enumerate(chosen):
         each = budget // len(chosen)
-        found: list[Minimal | Criticality] = [minimal(sim, mode.failure, budget=each // 2)]
+        found: list[Minimal | Criticality | Eigenfailures] = [
+            minimal(sim, mode.failure, budget=each // 2)
+        ]
         draws = min(each // 2 // (int(mode.failure.length) + 1), 1000)
         if draws >= LEAST:
             own = jax.random.fold_in(key, i)
             found.append(criticality(own, sim, mode.failure, draws=draws))
+        if p is not None and p.draws is not None and not again:
+            try:
+                found.append(eigenfailures(key, sim, modes, i))
+            except ValueError:  # too few failures of this mode
+                pass
         out.append(found)
     return out

@@ -6,26 +6,19 @@ import math
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr, ndtri
 
 from jast import _checks, results
 from jast import limit_state as latent
 from jast.counter import generator
-from jast.distributions.spread import chances
-from jast.episode import replay
 from jast.estimate.answers import asked
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.estimate.redrawn import failing, numbers_of
+from jast.explain.drawn import drawn, placed
 from jast.explain.point import names, steps_of
 from jast.intervals import clopper_pearson, log_normal
 from jast.judge import Judge
-from jast.outline import outline
-from jast.pytrees import count
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -33,8 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Index", "Indices", "indices"]
 
-KEPT, LANES = 16_384, 1024
-"""Failing draws that are looked at, at most, and those whose choices are looked up at a time."""
+KEPT = 16_384
+"""Failing draws that are looked at, at most."""
 FEW = 100
 """Effective failures below which nothing is told."""
 WIDTH = 0.02
@@ -166,21 +159,9 @@ def indices(
     kept, level = asked(name, estimate, level)
     draws = _checks.whole(name, "draws", draws, 0)
     latent.check(name, sim)
-    if isinstance(kept.source, str) and kept.source != "model":
-        raise ValueError(
-            f"{name}: estimate must have drawn normal numbers, received one by {estimate.method}"
-            f" that drew by {kept.source}"
-        )
-    if not kept.failure.any():
-        raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if (of := numbers_of(kept.source)) not in (None, d := latent.dimension(sim)):
-        raise ValueError(
-            f"{name}: sim must be the simulator of the estimate, with {of} random numbers in an"
-            f" episode, received one with {d}"
-        )
     rng = generator(key)
-    z, log_w, length, spent = failing(sim, kept, KEPT)
-    z = _placed(sim, z, length, rng)
+    z, log_w, length, spent = drawn(name, sim, estimate, KEPT)
+    z = placed(sim, z, length, rng)
     w = np.exp(log_w - log_w.max())
     w /= w.sum()
     p, n_eff = float(estimate.mean), float(effective(log_w))
@@ -242,41 +223,3 @@ def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, np.ndarray]:
     pairs = 1 - w @ w
     gain = float(w @ others / pairs) if pairs > 0 else math.nan
     return gain, others / np.maximum(1 - w, 1e-12)
-
-
-def _placed(
-    sim: Simulator, z: np.ndarray, length: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """The points ``z`` [m, D] as drawn from p(z | failure): a whole number anywhere in the normal
-    numbers that give it, and numbers behind the end of an episode, which decided nothing, as the
-    model has them.
-    """
-    about = outline(sim)
-    whole = [np.issubdtype(leaf.dtype, np.integer) for leaf in jax.tree.leaves((about.x0, about.x))]
-    if any(whole):
-        chance = np.concatenate(
-            [
-                np.asarray(_chances(sim, np.resize(z[i : i + LANES], (LANES, z.shape[1]))))
-                for i in range(0, len(z), LANES)
-            ]
-        )[: len(z)]
-        u = np.asarray(ndtr(-np.abs(z)))
-        u = u + chance * (rng.random(z.shape) - 0.5)
-        moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)
-        z = np.where(chance > 0, moved, z)
-    used = count(about.x0) + length * count(about.x)
-    blank = np.arange(z.shape[1]) >= used[:, None]
-    return np.where(blank, rng.standard_normal(z.shape), z).astype(z.dtype)
-
-
-@jax.jit
-def _chances(sim: Simulator, z: jax.Array) -> jax.Array:
-    """[n, D]: the probability of each whole number of the episodes of ``z``, 0 of the others."""
-
-    def one(e: Any) -> tuple[Any, Any]:
-        states = jax.tree.map(lambda a: a[:-1], replay(sim, e).states)
-        steps = jax.vmap(lambda s, x: chances(sim.disturbance(s), x))(states, e.disturbances)
-        return chances(sim.start(), e.x0) if outline(sim).random_start else (), steps
-
-    first, steps = jax.vmap(one)(latent.episodes(sim, z))
-    return latent.flat(sim, first, steps)

@@ -1,9 +1,10 @@
 """What rules and monitors share: scikit-learn where it is installed, and episodes held out."""
 
-import importlib
 from typing import Any
 
 import numpy as np
+
+from jast._checks import library
 
 __all__ = ["learner", "parted"]
 
@@ -12,17 +13,8 @@ DISTINCT = 4
 
 
 def learner(function: str, module: str) -> Any:
-    """A module of scikit-learn.
-
-    Raises:
-        ImportError: where it is not installed.
-    """
-    try:
-        return importlib.import_module(f"sklearn.{module}")
-    except ImportError as error:
-        raise ImportError(
-            f"{function} learns with scikit-learn: pip install 'jast[explain]'"
-        ) from error
+    """A module of scikit-learn; ImportError where it is not installed."""
+    return library(function, f"sklearn.{module}", "explain")
 
 
 def parted(

@@ -102,6 +102,9 @@ function card(article) {
   if (mode.risk) {
     add("probability of failing from here (dashed: its interval)", [""], [mode.risk], mode.interval);
   }
+  (mode.directions || []).forEach((way) => way.panels.forEach((p) => traces.append(panel(
+    `${way.name}: ${p.name} (dashed: the mean failure)`, ["at -1", "at +1"], p.columns, p.quiet,
+    way.steps)[0])));
   if (mode.needed) traces.append(make("p", { class: "legend" }, "dots: disturbances that are needed"));
   if (mode.quiet) traces.append(make("p", { class: "legend" }, "dashed: the undisturbed system"));
 

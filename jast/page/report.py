@@ -94,16 +94,19 @@ def _several(explanation: Any) -> list:
 
 
 def _explained(explanations: list, steps: list[int]) -> dict:
-    """What the traces show of explanations: the probability of failing from each step (`risk`), and
-    the steps at which each disturbance is needed.
+    """What the traces show of explanations: the probability of failing from each step (`risk`), the
+    steps at which each disturbance is needed, and the directions of failures (`directions`).
     """
-    from jast.explain import Criticality, Minimal
+    from jast.explain import Criticality, Eigenfailures, Minimal
+    from jast.page.directions import directions
 
     found = {}
     for one in explanations:
         if isinstance(one, Criticality) and len(one.probability) == steps[-1] + 1:
             found["risk"] = short(one.probability[steps])
             found["interval"] = [short(end) for end in one.interval[steps].T]
+        if isinstance(one, Eigenfailures):
+            found["directions"] = directions(one)
         if isinstance(one, Minimal):
             every = list(range(1, steps[-1] + 1))
             found["needed"] = {

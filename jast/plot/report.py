@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from jast.fields import fields
+from jast.incidents import hosted
 from jast.outline import outline
 from jast.plot import style
 from jast.plot.general import spreads
@@ -42,6 +44,8 @@ LINE, MODE, PANEL = 0.185, 1.62, 1.02
 """Inches: of a line of words, of a failure mode, and of its panels."""
 MODES, EACH = 4, 12
 """Modes that are drawn, and failures of each."""
+DOTS, COLOURS = 80, 32
+"""To the inch, and different ones, in a notebook: a quarter of the bytes of all colours."""
 MOODS = {"good": style.GREEN, "bad": style.VERMILION, "unknown": style.GREY}
 
 
@@ -85,7 +89,7 @@ def report(
             f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
         )
     sim = report.sim if sim is None else sim
-    shown = [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
+    shown = _shown(report)
     told = belief(report.probability)
     left = _left(told)
     ours = "", "probability", "doubtful"
@@ -115,6 +119,32 @@ def report(
             page.words(MARGIN, line, color=style.GREY, fontsize=8.5)
             page.y += LINE
     return figure
+
+
+def pictures(report: Report) -> list[bytes]:
+    """The panels of each of the first modes, as `report` draws them: PNG files. Of a black box,
+    which would be called again, they have disturbances alone.
+    """
+    from matplotlib.figure import Figure  # one that pyplot does not keep
+    from PIL import Image  # comes with matplotlib
+
+    sim = None if report.sim is None or hosted(report.sim) else report.sim
+    shown, files = _shown(report), []
+    with style.styled():
+        owned = _played(report, sim, shown, None) if shown else None
+        for k, failure in enumerate(shown):
+            page = _Page(Figure(figsize=(WIDTH, MODE + 0.35)), MODE + 0.35)
+            page.y = 0.45
+            _mode(page, sim, owned, failure, k, None, legend=True)
+            page.figure.savefig(whole := io.BytesIO(), format="png", dpi=DOTS)
+            few = Image.open(whole).convert("RGB").quantize(COLOURS)
+            few.save(file := io.BytesIO(), format="png", optimize=True)
+            files.append(file.getvalue())
+    return files
+
+
+def _shown(report: Report) -> list[Episode]:
+    return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
 class _Page:
@@ -183,22 +213,33 @@ def _modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units:
     words = f"Failure modes{f' ({len(shown)} of {len(report.modes)})' if more > 0 else ''}"
     page.words(MARGIN, words, weight="bold", fontsize=10.5)
     page.y += 0.45
-    owned = None
-    if sim is not None:
-        g = _failures(report, sim, shown)
-        own, behind = lines(sim, g.episodes), nominal_lines("report", sim, nominal)
-        owned = g, own, behind, quiet_line(sim)
+    owned = _played(report, sim, shown, nominal)
     for k, failure in enumerate(shown):
         facts = "   ".join(f"{name} {value}" for name, value in mode_facts(report, k, failure))
-        colour, marker = style.look(k)
+        colour = style.look(k)[0]
         page.words(MARGIN, f"Mode {k + 1}", -0.12, weight="bold", fontsize=9, color=colour)
         page.words(MARGIN + 0.65, facts, -0.12, fontsize=8.5)
-        wide = 1.88 if owned else 5.0
-        if owned:
-            _traces(page, *owned, k, units, legend=k == 0)
-        x = MARGIN + 0.45 + (5.1 if owned else 0.0)
-        _pushes(page.axes(x, wide, PANEL, 0.2), sim, failure)
+        _mode(page, sim, owned, failure, k, units, legend=k == 0)
         page.y += MODE
+
+
+def _played(report: Any, sim: Any, shown: list, nominal: Any) -> tuple | None:
+    """What the traces of all modes need; None without a simulator."""
+    if sim is None:
+        return None
+    g = _failures(report, sim, shown)
+    own, behind = lines(sim, g.episodes), nominal_lines("report", sim, nominal)
+    return g, own, behind, quiet_line(sim)
+
+
+def _mode(
+    page: _Page, sim: Any, owned: tuple | None, failure: Any, k: int, units: Any, legend: bool
+) -> None:
+    """The panels of mode ``k``."""
+    if owned:
+        _traces(page, *owned, k, units, legend=legend)
+    x, wide = MARGIN + 0.45 + (5.1 if owned else 0.0), 1.88 if owned else 5.0
+    _pushes(page.axes(x, wide, PANEL, 0.2), sim, failure)
 
 
 def _failures(report: Any, sim: Any, shown: list) -> Given:

@@ -11,6 +11,7 @@ import numpy as np
 from jast import results
 from jast.episode import Episode, replay
 from jast.failures import Failures
+from jast.frames import dataframe
 from jast.limit_state import normal_of, unit
 from jast.rewards import likelihood
 from jast.search.centred import centred
@@ -80,6 +81,25 @@ class Modes(tuple):
     def _asdict(self) -> dict[str, Any]:
         """For files."""
         return dict(items=tuple(self), evaluations=self.evaluations)
+
+    def to_dataframe(self) -> Any:
+        """The modes as a table of pandas (the extra ``tables``): of the likeliest failure of each
+        ``log_prob_from_mode``, ``log_prob``, ``distance`` and ``length``, then ``members``,
+        ``share``, ``share_low`` and ``share_high``.
+
+        Returns:
+            The ``pandas.DataFrame``; its index is ``mode``, from 1.
+
+        Raises:
+            ImportError: where pandas is not installed.
+        """
+        of = lambda name: [np.asarray(getattr(m.failure, name)).item() for m in self]
+        columns = [("mode", np.arange(1, len(self) + 1)), ("log_prob_from_mode", of("reward"))]
+        columns += [(name, of(name)) for name in ("log_prob", "distance", "length")]
+        columns += [("members", [m.members for m in self]), ("share", [m.share for m in self])]
+        for i, end in enumerate(("share_low", "share_high")):
+            columns.append((end, [m.share_interval[i] for m in self]))
+        return dataframe(columns, ["mode"])
 
     def __str__(self) -> str:
         if not self:
@@ -182,9 +202,15 @@ def owners(sim: Simulator, episodes: Episode, heads: Episode) -> np.ndarray:
     if len(heads.length) == 1:
         return np.zeros(len(episodes.length), int)
     of_modes = centred(sim)
-    there, best = (normal_of(of_modes, each) for each in (episodes, heads))
-    cosines = [unit(there) @ unit(best).T]
-    ends = np.asarray(episodes.length)
-    for head, end in zip(best, heads.length, strict=True):
-        cosines.append(unit(moved_in_time(of_modes, there, end - ends)) @ unit(head))
+    place = lambda e: (normal_of(of_modes, e), np.asarray(e.length))
+    return pointing(sim, *place(episodes), *place(heads))
+
+
+def pointing(
+    sim: Simulator, points: np.ndarray, ends: np.ndarray, heads: np.ndarray, last: np.ndarray
+) -> np.ndarray:
+    """The same of ``points`` [n, D] that end after ``ends`` [n] steps, and of ``heads`` [k, D]."""
+    cosines = [unit(points) @ unit(heads).T]
+    for head, end in zip(heads, last, strict=True):
+        cosines.append(unit(moved_in_time(sim, points, end - ends)) @ unit(head))
     return np.argmax(np.maximum(cosines[0], np.stack(cosines[1:], axis=1)), axis=1)

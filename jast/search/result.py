@@ -12,6 +12,7 @@ import numpy as np
 from jast import results
 from jast.episode import Episode
 from jast.failures import Failures
+from jast.frames import dataframe
 from jast.search.refinement import Refined
 
 __all__ = ["History", "SearchResult", "Trials", "table"]
@@ -64,6 +65,22 @@ class Trials(NamedTuple):
     """bool: a failure that a tree came to again, which ``failure`` counts once; None in files of
     versions that did not keep it.
     """
+
+    def to_dataframe(self) -> Any:
+        """The episodes as a table of pandas (the extra ``tables``), tree after tree, with the
+        fields above as columns.
+
+        Returns:
+            The ``pandas.DataFrame``; its index is (``tree``, ``episode``), from 0.
+
+        Raises:
+            ImportError: where pandas is not installed.
+        """
+        n, trees = np.shape(self.reward)
+        columns = [("tree", np.repeat(np.arange(trees), n)), ("episode", np.tile(range(n), trees))]
+        kept = [(name, a) for name, a in self._asdict().items() if a is not None]
+        columns += [(name, np.asarray(a).T.reshape(-1)) for name, a in kept]
+        return dataframe(columns, ["tree", "episode"])
 
 
 @results.result("episodes")

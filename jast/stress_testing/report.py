@@ -89,6 +89,11 @@ class Report(NamedTuple):
         lines += [*_work(self), "", advice(self)]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        from jast.page.notebook import cell
+
+        return cell(self)
+
     def html(
         self,
         path: PathLike,
@@ -111,8 +116,8 @@ class Report(NamedTuple):
                 of the slider. Its state is a pytree of NumPy arrays.
             explanations: for the card of each mode, in their order: a result of `jast.explain`,
                 anything else whose ``str`` says something of it, a list of such things, or None.
-                `jast.explain.criticality` is drawn, too, and what `jast.explain.minimal` needs is
-                marked.
+                `jast.explain.criticality` and the directions of `jast.explain.eigenfailures` are
+                drawn, too, and what `jast.explain.minimal` needs is marked.
 
         Raises:
             ValueError: for ``draw`` without a simulator, a ``draw`` that returns no text or too

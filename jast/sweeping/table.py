@@ -15,6 +15,7 @@ from jast._checks import number
 from jast.crude import Nominal
 from jast.estimate import Estimate
 from jast.estimate.estimate import doubtful, guarantee
+from jast.frames import dataframe
 from jast.search import SearchResult
 from jast.stress_testing import Report
 
@@ -179,6 +180,28 @@ class Sweep(NamedTuple):
             )
         return Crossing(name, (at[0] + at[-1]) / 2, (left, right), level)
 
+    def to_dataframe(self) -> Any:
+        """The table as one of pandas (the extra ``tables``), a row for each system: the settings,
+        then ``probability``, ``interval_low``, ``interval_high``, ``reliable``, ``best_log_prob``
+        (that of the likeliest failure found, or of a search's best episode), ``episodes`` and
+        ``error``.
+
+        Returns:
+            The ``pandas.DataFrame``; its index is the number of the row, from 0.
+
+        Raises:
+            ImportError: where pandas is not installed.
+        """
+        best = [_best(r) for r in self.results]
+        (low, high), columns = self.interval.T, list(self.values.items())
+        columns += [("probability", self.probability), ("interval_low", low)]
+        columns += [("interval_high", high), ("reliable", self.reliable)]
+        columns.append(
+            ("best_log_prob", [math.nan if b is None else float(b.log_prob) for b in best])
+        )
+        columns.append(("episodes", [getattr(r, "episodes", None) or 0 for r in self.results]))
+        return dataframe([*columns, ("error", self.errors)], [])
+
     def plot(self, **how: Any) -> Any:
         """`jast.plot.sweep` of this: the probability of failure against the setting."""
         from jast.plot import sweep
@@ -245,9 +268,7 @@ def _row(result, error, a):
         low, high = estimate.guaranteed
         cells["probability"] = f"{estimate.plain[0]} of {estimate.plain[-1]} fail"
         cells["interval"] = f"[{low:.4g}, {high:.4g}]"
-    found = result.failures if isinstance(result, Report) else None
-    best = result.best if isinstance(result, SearchResult) else found.best if found else None
-    if best is not None:
+    if (best := _best(result)) is not None:
         cells["best log p"] = f"{float(best.log_prob):.6g}"
         cells["fails"] = "yes" if best.failure else "no"
     if (episodes := getattr(result, "episodes", None)) is not None:
@@ -257,6 +278,12 @@ def _row(result, error, a):
     if "probability" in cells and not a.reliable:
         cells[NOTE] = _against(result)
     return cells
+
+
+def _best(result):
+    """The best episode of a search or of a report; None of other results."""
+    found = result.failures if isinstance(result, Report) else None
+    return result.best if isinstance(result, SearchResult) else found.best if found else None
 
 
 def _against(result):

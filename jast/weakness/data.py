@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jast._checks import whole
+from jast._checks import library, whole
 from jast.weakness.result import Result
 
 if TYPE_CHECKING:
@@ -237,13 +237,7 @@ def digits() -> tuple[np.ndarray, np.ndarray]:
         >>> inputs.shape, labels.shape
         ((1797, 8, 8), (1797,))
     """
-    try:
-        from sklearn.datasets import load_digits
-    except ImportError as error:
-        raise ImportError(
-            "digits: the images come with scikit-learn: pip install 'jast[digits]'"
-        ) from error
-    bunch = load_digits()
+    bunch = library("digits", "sklearn.datasets", "digits").load_digits()
     return (bunch.images / 16).astype(np.float32), bunch.target.astype(np.int32)
 
 
