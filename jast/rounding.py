@@ -178,7 +178,7 @@ def _five(sim: Simulator, steps: int, keys: jax.Array) -> tuple[Any, ...]:
         states,
         [jnp.zeros_like(a[0]) for a in _floats(states)],
         jnp.full(5, jnp.inf, dtype),
-        jnp.zeros(5, bool),
+        jnp.broadcast_to(judged(state)[0] & (not sim.episodic), (5,)),
         [~no for _ in jax.tree.leaves(states)],
         no,
         _Way(start, jnp.zeros_like(start), jnp.zeros_like(start), no, jnp.int32(0)),
