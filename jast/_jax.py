@@ -88,38 +88,34 @@ def is_brief() -> bool:
 
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`jax.jit` for what simulates episodes, as many as a user pays for: compiled by `briefly`."""
-    whole = jax.jit(function, **options)
-
-    @functools.cache
-    def brief():
-        # not earlier: this asks for the devices
-        told = "xla_cpu_use_fusion_emitters" in os.environ.get("XLA_FLAGS", "")
-        if told or jax.default_backend() != "cpu":
-            return whole
-        return jax.jit(function, compiler_options=_BRIEFLY, **options)
-
-    def run(*args, **kwargs):
-        # inside of another program there are no options of its own
-        chosen = brief() if _BRIEF.get() and not is_tracing() else whole
-        return chosen(*args, **kwargs)
-
-    run.eval_shape, run.lower = whole.eval_shape, whole.lower
-    return functools.wraps(function)(run)
+    # flags for all programs may have said so already
+    told = "xla_cpu_use_fusion_emitters" in os.environ.get("XLA_FLAGS", "")
+    return _compiled(function, lambda: _BRIEF.get() and not told, _BRIEFLY, options)
 
 
 def quick(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.jit` for a program that runs once: on a CPU it is compiled without optimisation, in a
-    fraction of the time, and runs slower.
+    """`jax.jit` for a program that runs a few episodes: compiled without optimisation, in a
+    fraction of the time, and slower.
     """
+    return _compiled(function, lambda: True, _QUICKLY, {})
+
+
+def _compiled(function, wanted, how, options):
+    """`jax.jit` with the compiler's options ``how``, on a CPU, where they are ``wanted()``."""
+    whole = jax.jit(function, **options)
 
     @functools.cache
     def jitted():
         # not earlier: this asks for the devices
         cpu = jax.default_backend() == "cpu"
-        return jax.jit(function, compiler_options=_QUICKLY if cpu else None)
+        return jax.jit(function, compiler_options=how if cpu else None, **options)
 
-    # inside of another program there are no options of its own
-    run = lambda *args: (function if is_tracing() else jitted())(*args)
+    def run(*args, **kwargs):
+        # inside of another program there are no options of its own
+        own = wanted() and not is_tracing() and not is_traced(args, kwargs)
+        return (jitted() if own else whole)(*args, **kwargs)
+
+    run.eval_shape, run.lower = whole.eval_shape, whole.lower
     return functools.wraps(function)(run)
 
 

@@ -3,11 +3,12 @@
 Two halves. `contract` traces the functions, for structure, shapes and dtypes: cheap, and possible
 while the simulator holds tracers, so searches call it as they are traced. `check` also runs a
 handful of steps, for what only numbers show: NaN, densities of zero, randomness that is not a
-disturbance.
+disturbance. Then come the `jast.traps`.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING
 
@@ -22,8 +23,8 @@ from jast.actions import Quantiles, Samples, UniformBox, Wide
 from jast.incidents import incidents, since, sources
 from jast.memory import release
 from jast.outline import outline
-from jast.rounding import rounded
-from jast.simulator import Simulator
+from jast.simulator import Simulator, require_simulator
+from jast.traps import traps
 
 if TYPE_CHECKING:
     from jast.typing import Actions
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["check", "contract"]
 
 OBSERVED = 64
-"""The most numbers that ``observe`` may return."""
+"""The most numbers that ``observe`` may return to what looks at them."""
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
 LANES, STEPS, DRAWS = 32, 8, 64
 HINTS = {
@@ -42,6 +43,11 @@ HINTS = {
     "TracerArrayConversionError": " Use jax.numpy in place of numpy",
     "ConcretizationTypeError": " Use jax.numpy in place of float, int and math",
 }
+KEY = (
+    ". Noise from a key in the state is the same in every episode: draw it in disturbance or start,"
+    " which may also be the seed of a key (jast.distributions.seeds). To keep the key all the same,"
+    " hold jax.random.key_data(key) in the state, and use jax.random.wrap_key_data of it"
+)
 ACTIONS = {
     Samples: "actions.samples",
     Quantiles: "actions.quantiles",
@@ -56,8 +62,15 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     Runs 33 episodes of an episodic system, and the first steps of any other. Where ``sim`` holds
     tracers, or inside a transformation of JAX, only the traced half runs. Warns (UserWarning) where
     objects of `jast.blackbox` that are judged at the end only (``episodic=True``) failed on the way
-    in some of 16 more episodes, and where the floats of the state are too coarse for what a
-    disturbance does to it (`jast.rounding`, up to 48 episodes).
+    in some of 16 more episodes, and of what fits together and loses failures all the same (up to 80
+    episodes of at most 500 steps; not of a system on the host):
+
+     - the floats of the state are too coarse for what a disturbance does to it, or no disturbance
+       changes a number of the state;
+     - the state jumps back to its start, as of an environment that resets itself;
+     - the state holds a random key that no disturbance reaches;
+     - `jax.lax.stop_gradient` leaves the miss distance without a slope;
+     - the step is so large that it takes minutes to compile.
 
     Args:
         sim: the simulator.
@@ -78,7 +91,7 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
         >>> import jast
         >>> sim = jast.check(jast.simulators.walk1d(), jast.actions.wide(2.0))
     """
-    contract(sim, actions)
+    contract("check", sim, actions, observed=math.inf)
     if is_traced(sim, actions) or is_tracing():
         return sim
     before = incidents(sim)
@@ -91,8 +104,8 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     _densities(found)
     _numbers(found, since(before, incidents(sim)))
     _repeats(sim, found["x0"], found["x"], found["judged"])
-    if (coarse := rounded(sim)) is not None:
-        warnings.warn(f"check: step: {coarse}", UserWarning, stacklevel=2)
+    for words in traps(sim):
+        warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
     for source in sources(sim, "compare"):  # a black box that is judged at the end only
         source.compare(sim)
     if actions is not None and (share := found["actions"]) > 0.5:
@@ -108,25 +121,25 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
     return sim
 
 
-def contract(sim, actions=None, observed=True):
+def contract(function, sim, actions=None, observed=0):
     """The traced half of `check`: structure, shapes and dtypes of what the functions return;
     returns ``sim``, also under jit and vmap.
 
-    ``observed=False`` leaves out ``observe``, for what looks at no observation. Raises ValueError
-    naming the function at fault, in the order start, init, disturbance, evaluate, is_terminal,
-    observe, step, actions.
+    ``function`` is what the user called, and ``observed`` the most numbers of an observation that
+    it can use: 0 leaves out ``observe``, for what looks at none. Raises ValueError naming the
+    function at fault, in the order start, init, disturbance, evaluate, is_terminal, observe, step,
+    actions.
     """
-    if not isinstance(sim, Simulator):
-        raise ValueError(f"check: sim must be a jast.Simulator, received {type(sim).__name__}")
+    require_simulator(function, sim)
     for name in ("start", "init", "disturbance", "evaluate", "is_terminal", "observe", "step"):
         if not callable(getattr(sim, name)):
             raise ValueError(f"{name}: expected a function, received {getattr(sim, name)!r}")
     release()  # here, as whatever compiles much for a simulator comes by first
-    jax.eval_shape(lambda: _trace(sim, actions, observed))
+    jax.eval_shape(lambda: _trace(function, sim, actions, observed))
     return sim
 
 
-def _trace(sim, actions, observed):
+def _trace(function, sim, actions, observed):
     start = _call("start", sim.start)
     x0 = _draw("start", start)
     state = _arrays("init", _call("init", sim.init, x0))
@@ -152,10 +165,11 @@ def _trace(sim, actions, observed):
             or not jnp.issubdtype(jnp.result_type(seen), jnp.floating)
         ):
             raise ValueError(f"observe: returns {_kind(seen)}, expected a float vector")
-        if jnp.size(seen) > OBSERVED:
+        if jnp.size(seen) > observed:
             raise ValueError(
-                f"observe: returns {jnp.size(seen)} numbers, expected at most {OBSERVED}; pass"
-                " observe=, a function state -> float vector of those that matter"
+                f"observe: returns {jnp.size(seen)} numbers, of which {function} takes at most"
+                f" {observed}; pass the simulator observe=, a function state -> float vector of"
+                " those that matter"
             )
     _same("step: state", _arrays("step", _call("step", sim.step, state, x)), state, hint)
     if actions is not None:
@@ -193,8 +207,11 @@ def _draw(name, dist):
     )
     log_p = _call(f"{name}: log_prob", dist.log_prob, x)
     if isinstance(log_p, ARRAYS) and jnp.shape(log_p):
+        shape = jnp.shape(log_p)
         raise ValueError(
-            f"{name}: log_prob has shape {jnp.shape(log_p)}, expected (); wrap it in Independent"
+            f"{name}: log_prob has shape {shape}, expected (); wrap it in"
+            f" jast.distributions.Independent(d, {len(shape)}), whose number counts the axes that"
+            " are one disturbance together"
         )
     _scalar(f"{name}: log_prob", log_p, float)
     return x
@@ -211,12 +228,12 @@ def _arrays(name, tree):
     """``tree`` with leaves of explicit dtype; ValueError for a leaf that is not numbers."""
 
     def array(path, leaf):
-        if not isinstance(leaf, ARRAYS) or jnp.issubdtype(
-            jnp.result_type(leaf), jax.dtypes.extended
-        ):
+        numbers = isinstance(leaf, ARRAYS)
+        key = numbers and jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.extended)
+        if key or not numbers:
             raise ValueError(
                 f"{name}: leaf {_path(path)} is {_kind(leaf)}, expected an array of numbers or"
-                " booleans"
+                f" booleans{KEY * key}"
             )
         return lax.convert_element_type(leaf, jnp.result_type(leaf))
 

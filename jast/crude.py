@@ -157,7 +157,7 @@ def nominal(
         raise ValueError(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
-    contract(sim, observed=False)
+    contract("nominal", sim)
     ways = units.ways("nominal", executor, devices)
     asked, before = int(episodes), incidents(sim)
     about = outline(sim)

@@ -20,7 +20,7 @@ from jast.outline import outline
 from jast.policy import Policy, nominal_policy
 from jast.progress import advance, begin, conclude
 from jast.pytrees import clear, fitted, padded, select
-from jast.simulator import Simulator
+from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
     import chex
@@ -115,6 +115,7 @@ def rollout(
         ((30,), False)
     """
     random_key("rollout", key)
+    require_simulator("rollout", sim)
     reward = rewards.as_pytree(reward)
     episode = _rollout(key, sim, policy, reward)
     if is_traced(episode):
@@ -169,6 +170,7 @@ def replay(
         >>> bool(episode.failure), int(episode.length)
         (True, 5)
     """
+    require_simulator("replay", sim)
     length = None
     if isinstance(episode, Episode):
         disturbances, x0, length = episode.disturbances, episode.x0, episode.length

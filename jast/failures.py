@@ -131,7 +131,11 @@ class Failures:
         outside the archive.
         """
         if not self.size:
-            raise IndexError(f"there are no failures: no episodes held, received i = {i}")
+            raise IndexError(
+                f"no failure was found, so there is no episode {i}: try a larger budget, and a miss"
+                " distance that falls all the way to a failure; jast.check(sim) warns of what keeps"
+                " failures away"
+            )
         if not -self.size <= i < self.size:
             raise IndexError(
                 f"Failures.episode: i must be within the {self.size} episodes held, received {i}"

@@ -84,7 +84,7 @@ def check(function: str, sim: Simulator) -> None:
     """ValueError unless the simulator fits the contract and its disturbances have a quantile
     function.
     """
-    contract(sim, observed=False)
+    contract(function, sim)
     about = outline(sim)
     for name, offer in (("disturbance", about.disturbance), ("start", about.start)):
         if not offer.quantile:

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.tree_util import Partial
 
 __all__ = ["count"]
 
@@ -15,6 +17,42 @@ __all__ = ["count"]
 def strong(tree: Any) -> Any:
     """Arrays of explicit dtype: a weak type would change on its way through a step."""
     return jax.tree.map(lambda a: lax.convert_element_type(a, jnp.result_type(a)), tree)
+
+
+def traceable(function: Partial) -> Partial:
+    """``function`` itself, or where there are functions among the leaves of its arguments, the same
+    with these as a part of the function: JAX traces arguments, and a function cannot be traced.
+    """
+    bound = function.args, function.keywords
+    if not any(map(callable, jax.tree.leaves(bound))):
+        return function
+    kept = lambda which: jax.tree.map(lambda a: a if callable(a) == which else None, bound)
+    return Partial(_Beside(function.func, kept(True)), *kept(False))
+
+
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """A function, and the functions among the leaves of its arguments; equal where these are."""
+
+    function: Callable
+    static: Any
+    """(args, keywords) with None where JAX traces"""
+
+    def __call__(self, args: tuple, keywords: dict, *more: Any) -> Any:
+        whole = lambda a, b: b if a is None else a
+        bound, absent = (args, keywords), lambda a: a is None
+        args, keywords = jax.tree.map(whole, bound, self.static, is_leaf=absent)
+        return self.function(*args, *more, **keywords)
+
+    def _parts(self) -> tuple:
+        leaves, tree = jax.tree.flatten(self.static)
+        return self.function, *leaves, tree
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Beside) and self._parts() == other._parts()
+
+    def __hash__(self) -> int:
+        return hash(self._parts())
 
 
 def select(pred: Any, a: Any, b: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import update_wrapper
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,12 @@ from jax.tree_util import Partial
 from jast import results
 from jast.distributions import Fixed
 from jast.distributions.containers import accepted
+from jast.pytrees import traceable
 
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 
-__all__ = ["Simulator"]
+__all__ = ["Simulator", "require_simulator"]
 
 
 def fixed():
@@ -70,7 +71,8 @@ class Simulator:
     its disturbances. The functions are wrapped in `jax.tree_util.Partial`: arguments bound by a
     ``Partial`` are traced, so simulators that differ only in them share one compiled program, and
     `jax.vmap` over a batch of them is a parameter sweep. Plain functions and lambdas are static, by
-    identity: define them once.
+    identity: define them once. So are functions among the leaves of such an argument, as the
+    activation of a network of equinox.
 
     Three things end an episode, in this order: a failure, then ``is_terminal``, then the horizon.
     The miss distance of an episode is the least over s0..sT. In an ``episodic`` system it is that
@@ -117,7 +119,7 @@ class Simulator:
     is_terminal: IsTerminal = never
     """state -> bool: ends the episode before the horizon without being a failure."""
     observe: Observe = ravel
-    """state -> float vector, at most 64 numbers: what policies and networks see."""
+    """state -> float vector, at most 64 numbers for a policy: what policies and networks see."""
     episodic: bool = field(default=False, metadata=dict(static=True))
     """``evaluate`` means something only at the end of an episode; static."""
 
@@ -127,7 +129,7 @@ class Simulator:
             if f.metadata.get("static"):
                 continue
             if callable(value):
-                value = value if isinstance(value, Partial) else Partial(value)
+                value = traceable(value) if isinstance(value, Partial) else Partial(value)
                 if f.name in ("disturbance", "start") and type(value.func) is not Translating:
                     value = translating(value)
                 object.__setattr__(self, f.name, value)
@@ -141,3 +143,19 @@ class Simulator:
             raise ValueError(
                 f"Simulator: episodic must be True or False, received {self.episodic!r}"
             )
+
+
+def require_simulator(function: str, sim: Any) -> None:
+    """ValueError, with what to do, unless ``sim``, an argument of ``function``, is a simulator."""
+    if isinstance(sim, Simulator):
+        return
+    advice = ""
+    if callable(sim):
+        advice = (
+            ". Call it where it makes one; of a function of the disturbances of an episode,"
+            " jast.blackbox.from_python makes one, of one in JAX that is negative where it fails"
+            " jast.simulators.limit_state"
+        )
+    raise ValueError(
+        f"{function}: sim must be a jast.Simulator, received {type(sim).__name__}{advice}"
+    )

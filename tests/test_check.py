@@ -1,6 +1,7 @@
 import dataclasses
 import random
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +52,8 @@ SHAPES = {  # found by tracing
     ),
     "init of a key": (
         dict(init=lambda x0: jax.random.key(0)),
-        r"init: leaf .* is key<fry>\[\], expected an array",
+        r"init: leaf .* is key<fry>\[\], expected an array.* draw it in disturbance or start.*"
+        r" hold jax.random.key_data\(key\)",
     ),
     "disturbance raises": (dict(disturbance=explode), r"disturbance: raised RuntimeError"),
     "disturbance is a number": (
@@ -64,11 +66,11 @@ SHAPES = {  # found by tracing
     ),
     "log_prob is a vector": (
         dict(disturbance=lambda s: D.Normal(jnp.zeros(3), jnp.ones(3))),
-        r"disturbance: log_prob has shape \(3,\), expected \(\); wrap it in Independent",
+        r"disturbance: log_prob has shape \(3,\), expected \(\); wrap it in .*Independent\(d, 1\)",
     ),
-    "start log_prob is a vector": (
-        dict(start=lambda: D.Normal(jnp.zeros(2), jnp.ones(2))),
-        r"start: log_prob has shape \(2,\), expected \(\); wrap it",
+    "start log_prob is a matrix": (
+        dict(start=lambda: D.Normal(jnp.zeros((2, 3)), jnp.ones((2, 3)))),
+        r"start: log_prob has shape \(2, 3\), expected \(\); wrap it in .*Independent\(d, 2\)",
     ),
     "log_prob is a whole number": (
         dict(disturbance=lambda s: Bare(lambda x: jnp.int32(0))),
@@ -140,10 +142,6 @@ SHAPES = {  # found by tracing
         dict(observe=lambda s: jnp.zeros(3, jnp.int32)),
         r"observe: returns int32\[3\], expected a float vector",
     ),
-    "observe is long": (
-        dict(observe=lambda s: jnp.zeros(200)),
-        r"observe: returns 200 numbers, expected at most 64; pass observe=",
-    ),
     "step raises": (dict(step=explode), r"step: raised RuntimeError"),
     "step grows": (
         dict(
@@ -180,11 +178,19 @@ SHAPES = {  # found by tracing
 def test_shapes(name):
     changes, match = SHAPES[name]
     sim = line(**changes)
-    for function in (jast.check, contract):
+    with pytest.raises(ValueError, match=match):
+        jast.check(sim)
+    traced = lambda b: contract("f", line(**changes), observed=64) and b
+    for function in (traced, jax.jit(traced)):  # where a search is traced, too
         with pytest.raises(ValueError, match=match):
-            function(sim)
-    with pytest.raises(ValueError, match=match):  # where a search is traced, too
-        jax.jit(lambda b: contract(line(**changes)) and b)(1.0)
+            function(1.0)
+
+
+def test_a_long_observation_is_an_error_where_it_is_looked_at(key):
+    sim = line(observe=lambda s: jnp.zeros(200))
+    assert jast.check(sim) is sim
+    with pytest.raises(ValueError, match="200 numbers, of which sac takes at most 64; pass"):
+        jast.policies.sac(key, sim)
 
 
 NUMBERS = {  # found by running
@@ -249,7 +255,7 @@ class Shifted(D.Uniform):
 @pytest.mark.parametrize("name", NUMBERS)
 def test_numbers(name):
     changes, match = NUMBERS[name]
-    sim = contract(line(**changes))
+    sim = contract("f", line(**changes))
     with pytest.raises(ValueError, match=match):
         jast.check(sim)
 
@@ -262,8 +268,23 @@ def test_the_cause_is_kept():
 
 def test_what_is_no_simulator():
     for bad in (3, None, lambda: 0, walk1d):
-        with pytest.raises(ValueError, match="sim must be a jast.Simulator, received"):
+        with pytest.raises(ValueError, match="check: sim must be a jast.Simulator, received"):
             jast.check(bad)
+    key = jax.random.key(0)
+    for name, call in dict(
+        stress=jast.stress,
+        nominal=jast.nominal,
+        rollout=jast.rollout,
+        failure_probability=jast.estimate.failure_probability,
+        subset_simulation=jast.estimate.subset_simulation,
+        mcts=jast.search.mcts,
+        cem=jast.search.cem,
+        gradient=jast.search.gradient,
+        go_explore=jast.search.go_explore,
+        ppo=jast.policies.ppo,
+    ).items():
+        with pytest.raises(ValueError, match=f"{name}: sim must .* jast.blackbox.from_python"):
+            call(key, lambda x: x)
     with pytest.raises(ValueError, match="step must be a function, received None"):
         line(step=None)
     broken = dataclasses.replace(walk1d())
@@ -319,7 +340,7 @@ def test_actions():
     assert jast.check(ferry(), actions.uniform(-0.2, 1.2))  # a little wider does no harm
 
 
-@pytest.mark.parametrize("function", [jast.check, contract])
+@pytest.mark.parametrize("function", [jast.check, partial(contract, "f")])
 def test_action_shapes(function):
     with pytest.raises(
         ValueError,

@@ -97,7 +97,7 @@ def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "undisturbed" in text and "likeliest failure: " in text and "next: " in text
     page = (tmp_path / "out/report.html").read_text()
-    assert "found. The likeliest takes" in page and f"saved {tmp_path / 'out/report.html'}" in text
+    assert "The likeliest failure takes" in page and f"saved {tmp_path / 'out/report.html'}" in text
     report = jast.load(tmp_path / "out/report.npz")
     assert float(report.failures.best.reward) == pytest.approx(-4, abs=0.15)
     for place, words in (

@@ -72,3 +72,23 @@ def test_a_browser_shows_it(tmp_path):
     """
     found = browsed(f"<html><body>{first}{last}</body></html>", check, tmp_path)
     assert found == {"count": 4, "inside": True}
+
+
+@pytest.mark.parametrize("name, places", [("ferry", 2), ("colav", 2), ("pendulum", 1)])
+def test_what_moves_has_a_trail(name, places):
+    """From where it was first to where it is, through at most 60 places between."""
+    sim = getattr(simulators, name)()
+    e = jax.device_get(jast.rollout(jax.random.key(0), sim))
+    part = lambda rows: jax.tree.map(lambda a: a[rows], e.states)
+    last = int(e.length)
+    first, bare = simulators.draw(part(0), past=part(slice(0))), simulators.draw(part(last))
+    drawn = ElementTree.fromstring(simulators.draw(part(last), past=part(slice(last))))
+    trails = [
+        [place.split(",") for place in line.get("points").split()]
+        for line in drawn.iter("{http://www.w3.org/2000/svg}polyline")
+        if line.get("stroke-opacity") == "0.5"
+    ]
+    assert len(trails) == places and "stroke-opacity" not in bare
+    for trail in trails:
+        assert 2 < len(trail) <= 61
+        assert f'points="{",".join(trail[0])}"' in first  # there it has come no way yet

@@ -20,6 +20,7 @@ from jast.estimate.estimate import Estimate
 from jast.explain import Criticality, Minimal
 from jast.page import document, report, traces
 from jast.search.failure_modes import Modes
+from jast.stress_testing.words import about, runs
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,27 @@ def test_traces_have_the_fields_and_numbers_of_the_system(page):
     assert mode["quiet"][1] == [[1.0, 1.0, 1.0]] and mode["distance"][-1] == 0
     assert mode["x"][0]["name"] == EVIL and mode["x"][0]["columns"][0][0] == "NaN"
     assert mode["pictures"]["at"] == [0, 1, 2] and len(mode["pictures"]["fragments"]) == 3
+
+
+def test_the_headline_says_how_it_fails(page):
+    """And how many times less likely its disturbances are than the likeliest ones."""
+    best = made().failures.best
+    rare = float(f"{np.exp(-float(best.reward)):.2g}")
+    assert f"disturbances that are {rare:,.0f} times less likely than the likeliest ones" in page
+    end = 1 + best.disturbances[EVIL].sum()
+    assert f"speed is {end:.4g} (undisturbed 1)" in page
+
+
+@pytest.mark.parametrize(
+    "log10, words",
+    [(0.18, "1.5"), (1, "10"), (4.687, "49,000"), (8.999, "1,000,000,000"), (12.6, "10^13")],
+)
+def test_large_numbers_are_read_at_a_glance(log10, words):
+    assert about(log10) == words
+
+
+def test_a_share_of_the_runs():
+    assert runs(np.log10(0.25)) == "25 % of the runs" and runs(-2) == "one of 100 runs"
 
 
 def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):
@@ -152,6 +174,13 @@ def test_pictures_keep_to_their_room():
             traces.pictures("html", draw, states, steps, 200)
 
 
+def test_a_picture_may_have_a_trail():
+    states, steps = np.arange(6), list(range(6))
+    draw = lambda s, past=None: f"{past.tolist()} {s}"
+    found = traces.pictures("html", draw, states, steps, 999)["fragments"]
+    assert found[0] == "[] 0" and found[3] == "[0, 1, 2] 3"
+
+
 def test_a_report_from_a_file_has_a_page(tmp_path):
     """Without its simulator there are no states; with it all is as before."""
     whole = made(nominal=made().nominal._replace(undisturbed=None))
@@ -183,7 +212,11 @@ def test_the_verdict_says_whether_to_believe_it(tmp_path):
         "1e-05</p><p>95% interval 8e-06 to 2e-05</p><p class='badge good'>reliable": made(
             probability=p
         ),
-        "failures that nothing led to: below 0.02 at 95%": made(probability=p),
+        "below 0.02 at 95%: failures that nothing led to": made(probability=p),
+        "fails in 2 ways, in about one of 99,000 runs": made(probability=p),
+        "fails in 2 ways, in at most one of 100 runs": made(
+            probability=p._replace(reliable=False, plain=(0, 0, 367))
+        ),
         "UNRELIABLE: do not believe it<ul><li>&lt;/script": made(
             probability=p._replace(reliable=False)
         ),

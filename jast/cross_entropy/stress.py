@@ -150,7 +150,7 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
             "over: actions must be jast.actions.quantiles() or uniform(low, high), received"
             f" {actions!r}"
         )
-    contract(sim, observed=False)
+    contract("over", sim)
     about = outline(sim)
     box = isinstance(actions, choices.UniformBox)
     for name, offer, other in (
@@ -159,7 +159,7 @@ def over(sim: Simulator, *, reward: Reward | None = None, actions: Actions | Non
     ):
         if not offer.quantile and not (box and name == "disturbance"):
             raise ValueError(f"over: {name}: {offer.lacking} has no quantile function{other}")
-    contract(sim, actions, observed=False)
+    contract("over", sim, actions)
     density = about.density
     return Stress(sim, LogLikelihood(density) if reward is None else as_pytree(reward), actions)
 

@@ -87,7 +87,7 @@ def double_loop(
     if samples > LANES:
         raise ValueError(f"double_loop: samples must be at most {LANES}, received {samples!r}")
     level = checked_level("double_loop", level)
-    contract(sim, observed=False)
+    contract("double_loop", sim)
     proposal = as_proposal("double_loop", sim, proposal)
     if len(proposal.log_weights) > 1:
         raise ValueError(

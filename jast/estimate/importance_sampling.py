@@ -182,7 +182,7 @@ def importance(
     if mode not in ("default", "paper"):
         raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
     level = checked_level("importance", level)
-    contract(sim, observed=False)
+    contract("importance", sim)
     proposal = as_proposal("importance", sim, proposal)
     settings = asked("importance", key, samples=samples, mode=mode, level=level)
     whole_key = key

@@ -165,7 +165,7 @@ def failure_proposal(
         real("failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"),
         real("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
     )
-    contract(sim, observed=False)
+    contract("failure_proposal", sim)
     require_episodes("failure_proposal", sim, samples)
     return _search(key, sim, settings, _tilts_start(sim), samples, iterations)
 

@@ -93,7 +93,7 @@ def monte_carlo(
     random_key(name, key)
     samples = whole(name, "samples", samples)
     level = checked_level(name, level)
-    contract(sim, observed=False)
+    contract(name, sim)
     by_points = outline(sim).closed
     simulate = of_points if by_points else _of_keys
     lanes = lanes_of_points(sim) if by_points else LANES

@@ -103,7 +103,7 @@ def trace_proposal(
         (2,)
     """
     epsilon = _epsilon("trace_proposal", epsilon, mixing)
-    contract(sim, observed=False)
+    contract("trace_proposal", sim)
     recorded, tilt_start = _stacked(sim, episodes), tilt_start and outline(sim).random_start
     try:
         start, steps = latents(sim, recorded, tilt_start)
@@ -175,7 +175,7 @@ def policy_proposal(
         (1,)
     """
     epsilon = _epsilon("policy_proposal", epsilon, mixing)
-    contract(sim, observed=False)
+    contract("policy_proposal", sim)
     if not isinstance(policy, Policy):
         raise ValueError(
             f"policy_proposal: policy must be a jast.Policy, received {type(policy).__name__}"

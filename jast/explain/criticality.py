@@ -14,7 +14,7 @@ from jast.episode import Episode, played, replay
 from jast.intervals import checked_level, clopper_pearson
 from jast.pytrees import in_lanes, select
 from jast.rewards import log_likelihood
-from jast.simulator import Simulator
+from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
     import chex
@@ -108,6 +108,7 @@ def criticality(
     name = "criticality"
     _checks.random_key(name, key)
     draws, level = _checks.whole(name, "draws", draws, 1), checked_level(name, level)
+    require_simulator(name, sim)
     episode = replay(sim, episode)
     steps = int(episode.length)
     rows = np.repeat(np.arange(steps + 1, dtype=np.int32), draws)

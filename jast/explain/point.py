@@ -40,7 +40,7 @@ def given(name: str, sim: Simulator, episode: Episode) -> Given:
     if not isinstance(episode, Episode):
         raise ValueError(
             f"{name}: episode must be a jast.Episode (as of result.failures or jast.replay),"
-            f" received {type(episode).__name__}"
+            f" received {type(episode).__name__}{': no failure was found' * (episode is None)}"
         )
     if np.ndim(episode.failure):
         raise ValueError(

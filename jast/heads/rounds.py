@@ -91,7 +91,7 @@ def sizes(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
             ) from e
     about = outline(sim)
     if about.observation is None:
-        contract(sim)  # raises: it says what is wrong with observe
+        contract("forest", sim, observed=math.inf)  # raises: it says what is wrong with observe
     return math.prod(about.observation), count(about.x)
 
 

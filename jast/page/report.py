@@ -74,7 +74,7 @@ def write_report(
     told += [[]] * (len(failures) - len(told))
     data = {"modes": _data(report, failures, told, sim, draw)}
     body = [
-        _head(report),
+        _head(report, data["modes"]),
         _modes(report, failures, data["modes"], told, sim),
         _work(report),
         _settings(report),
@@ -142,17 +142,35 @@ def _title(report: Any) -> str:
     return f"jast: {words}"
 
 
-def _head(report: Any) -> str:
+def _head(report: Any, modes: list[dict]) -> str:
     """The verdict on one screen."""
     words, mood = headline(report)
     ours = "", "probability", "doubtful"
     known = [(name, value) for name, value in verdict(report) if name not in ours]
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
-        f"</h1></header>\n<main>\n<section id=verdict>{_probability(report.probability)}"
+        f"</h1>{_how(modes[0]) if modes else ''}</header>\n<main>\n<section id=verdict>"
+        f"{_probability(report.probability)}"
         f"{rows([*known, ('evaluations', f'{report.episodes:,}')])}"
         f"<p class=advice>{text(advice(report))}</p></section>"
     )
+
+
+def _how(mode: dict) -> str:
+    """How a failure ends: the three numbers of the state that are then farthest from what they are
+    undisturbed, as a share of where they have been.
+    """
+    found = []
+    for group, calm in zip(mode.get("states", ()), mode.get("quiet", ())):
+        for place, column, other in zip(group["entries"], group["columns"], calm):
+            (end, quiet), seen = (column[-1], other[-1]), np.array([*column, *other])
+            share = abs(end - quiet) / max(np.ptp(seen), 1e-300)
+            if np.isfinite(seen).all() and share > 0.1:
+                words = f"{group['name']}{place} is {end:.4g} (undisturbed {quiet:.4g})"
+                found.append((share, words))
+    found.sort(key=lambda one: -one[0])
+    words = ", ".join(words for _, words in found[:3])
+    return f"<p class=how>When it fails so, {text(words)}.</p>" if words else ""
 
 
 def _probability(p: Any) -> str:

@@ -2,6 +2,7 @@
 to the last bit.
 """
 
+import inspect
 from collections.abc import Callable
 from json import dumps
 from typing import Any
@@ -136,13 +137,14 @@ def exact(episode: Episode) -> dict:
 
 
 def pictures(
-    caller: str, draw: Callable[[Any], str], states: Any, steps: list[int], most: int
+    caller: str, draw: Callable[..., str], states: Any, steps: list[int], most: int
 ) -> dict:
     """What ``draw`` makes of the states of an episode.
 
     Args:
         caller: for messages.
-        draw: one state -> an SVG or HTML fragment.
+        draw: one state -> an SVG or HTML fragment; where it has an argument ``past``, that is the
+            states before, [t, ...].
         states: [T, ...].
         steps: at which there may be a picture.
         most: characters that all of them may take. Where they would take more there are fewer
@@ -155,10 +157,12 @@ def pictures(
         ValueError: where ``draw`` returns no text, or one picture is too long.
     """
     found: dict[int, str] = {}
+    trails = _takes_past(draw)
 
     def drawn(t: int) -> str:
         if t not in found:
-            found[t] = draw(jax.tree.map(lambda a: a[t], states))
+            past = {"past": jax.tree.map(lambda a: a[:t], states)} if trails else {}
+            found[t] = draw(jax.tree.map(lambda a: a[t], states), **past)
             if not isinstance(found[t], str):
                 raise ValueError(
                     f"{caller}: draw must return a str, an SVG or HTML fragment, received"
@@ -182,6 +186,13 @@ def pictures(
         count //= 2
     at = np.maximum(np.searchsorted(places, np.arange(len(steps)), side="right") - 1, 0)
     return {"fragments": fragments, "at": at.tolist()}
+
+
+def _takes_past(draw: Callable[..., str]) -> bool:
+    try:
+        return "past" in inspect.signature(draw).parameters
+    except ValueError:  # a builtin that does not tell
+        return False
 
 
 def _length(fragment: str) -> int:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
-from jast.contract import contract
+from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
@@ -115,7 +115,7 @@ def ppo(
         (30,)
     """
     random_key("ppo", key)
-    contract(sim)
+    contract("ppo", sim, observed=OBSERVED)
     if settings.auto(steps):
         steps = min(sim.horizon, LONGEST)
     counts = dict(episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps)

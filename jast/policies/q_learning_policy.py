@@ -14,7 +14,7 @@ import numpy as np
 
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
-from jast.contract import contract
+from jast.contract import OBSERVED, contract
 from jast.memory import require
 from jast.outline import outline
 from jast.policies import course, settings
@@ -113,7 +113,7 @@ def q_learning(
         (10,)
     """
     random_key("q_learning", key)
-    contract(sim)
+    contract("q_learning", sim, observed=OBSERVED)
     counts = dict(episodes=episodes, lanes=lanes)
     episodes, lanes = (whole("q_learning", name, value) for name, value in counts.items())
     values = whole("q_learning", "values", values, 2)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jast._checks import random_key, whole
 from jast.checkpoints import stored
-from jast.contract import contract
+from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import course, settings
@@ -131,7 +131,7 @@ def sac(
         (30,)
     """
     random_key("sac", key)
-    contract(sim)
+    contract("sac", sim, observed=OBSERVED)
     counts = dict(episodes=episodes, lanes=lanes, batch=batch, buffer=buffer, components=components)
     episodes, lanes, batch, buffer, components = (
         whole("sac", name, value) for name, value in counts.items()

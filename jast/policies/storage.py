@@ -13,7 +13,7 @@ import numpy as np
 
 from jast import files
 from jast.archive import arrays_of, check_array, named
-from jast.contract import contract
+from jast.contract import OBSERVED, contract
 from jast.heads.heads import Moments
 from jast.outline import outline
 from jast.policies import proximal
@@ -114,7 +114,7 @@ def whole(
             f"load: {path} holds a failure policy, which only its simulator can restore: load(path,"
             " sim)"
         )
-    contract(sim)
+    contract("load", sim, observed=OBSERVED)
     if header["horizon"] != sim.horizon:
         raise ValueError(
             f"load: {path} does not fit sim: its horizon is {header['horizon']}, expected"

@@ -32,6 +32,7 @@ from jast.search import proposals as P
 from jast.search.ending import ended, planned, usual
 from jast.search.pilot import joined
 from jast.search.prepare import default_actions, prepare
+from jast.simulator import require_simulator
 
 if TYPE_CHECKING:
     import chex
@@ -169,9 +170,10 @@ def cem(
     share = lambda name, value: _checks.real(
         "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
     )
+    require_simulator("cem", sim)
     require_episodes("cem", sim, samples * trees)
     real = Settings(share("smoothing", smoothing), share("floor", floor), share("fresh", fresh))
-    actions = default_actions(sim) if actions is None else actions
+    actions = default_actions("cem", sim) if actions is None else actions
     before = incidents(sim)
     counts = dict(samples=samples, elites=elites, iterations=iterations, trees=trees)
     reward, actions, settings, pilot = prepare(

@@ -30,7 +30,7 @@ from jast.search import lockstep as E
 from jast.search import phases as P
 from jast.search.ending import SHARE, ended, planned
 from jast.search.result import SearchResult
-from jast.simulator import Simulator
+from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
     import chex
@@ -109,6 +109,7 @@ def go_explore(
         True
     """
     name = "go_explore"
+    require_simulator(name, sim)
     episodes, top = E.whole(name, episodes=episodes, top=top)
     length = (
         max(1, -(-sim.horizon // 8)) if length is None else _checks.whole(name, "length", length)
@@ -120,7 +121,7 @@ def go_explore(
     _checks.random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
-    contract(sim, observed=False)
+    contract(name, sim)
     cell = None if cell is None else _cell(name, sim, cell)
     numbers = dict(episodes=episodes, length=min(length, sim.horizon), backward=backward)
     settings = planned(name, refine, sim, asked(name, key, **numbers), SHARE)

@@ -32,11 +32,11 @@ class Ready(NamedTuple):
     """The episodes that gave the scales; None where all were given."""
 
 
-def default_actions(sim: Simulator) -> choices.Wide | choices.Samples:
+def default_actions(function: str, sim: Simulator) -> choices.Wide | choices.Samples:
     """`jast.actions.wide` where a disturbance has a quantile function, else `samples`; ValueError
     where the simulator breaks its contract.
     """
-    contract(sim, observed=False)
+    contract(function, sim)
     return choices.wide() if outline(sim).disturbance.quantile else choices.samples()
 
 
@@ -54,7 +54,7 @@ def prepare(
     ``widen`` of `jast.search.pilot.fly`. ValueError unless `contract` holds.
     """
     random_key(function, key)
-    contract(sim, actions, observed=False)
+    contract(function, sim, actions)
     reward = rewards.lexicographic() if reward is None else reward
     reward, actions, pilot = _scaled(sim, reward, actions, widen)
     reward = rewards.as_pytree(reward)

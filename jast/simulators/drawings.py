@@ -5,7 +5,10 @@ shows beside its slider (``report.html(path, draw=jast.simulators.draw)``).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jast.simulators import svg
 from jast.simulators.colav.planner import SPEEDS
@@ -24,11 +27,16 @@ HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
 """Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
 
 
-def draw(state: chex.ArrayTree) -> str:
+TRAIL = 60
+"""Places of a trail, at most."""
+
+
+def draw(state: chex.ArrayTree, past: chex.ArrayTree | None = None) -> str:
     """One state of `ferry`, `colav` or `pendulum` as an SVG picture.
 
     Args:
         state: a `FerryState`, `ColavState` or `PendulumState` of scalars.
+        past: the states before it, [t, ...]: then what moves has a trail.
 
     Returns:
         The SVG element, as text.
@@ -44,19 +52,21 @@ def draw(state: chex.ArrayTree) -> str:
     """
     for kind, picture in DRAWN.items():
         if isinstance(state, kind):
-            return picture(state)
+            return picture(state, past)
     raise ValueError(
         f"draw: state must be one of {[kind.__name__ for kind in DRAWN]}, received a"
         f" {type(state).__name__}"
     )
 
 
-def _ferry(s: FerryState) -> str:
+def _ferry(s: FerryState, past: FerryState | None) -> str:
     plane = svg.Plane((-22.0, -8.0), (114.0, 112.0), 360)
     ferry, other = (float(s.ferry_x), float(s.ferry_y)), (float(s.x), float(s.y))
     gap = math.dist(ferry, other)
     return plane.picture(
         plane.line([(0.0, 50.0), (105.0, 50.0)], GREY, dash="4 4"),
+        *_trail(plane, past, lambda p: (p.ferry_x, p.ferry_y), ferry, BLUE),
+        *_trail(plane, past, lambda p: (p.x, p.y), other, VERMILION),
         plane.circle(ferry, COLLISION, BLUE, 0.2),
         plane.line([ferry, other], INK if gap < 4 * COLLISION else "#ccc", width=1),
         plane.shape(_placed(ferry, math.pi / 2), BLUE),
@@ -68,7 +78,7 @@ def _ferry(s: FerryState) -> str:
     )
 
 
-def _colav(s: ColavState) -> str:
+def _colav(s: ColavState, past: ColavState | None) -> str:
     plane = svg.Plane((-38.0, -6.0), (58.0, 112.0), 330)
     own, other, seen = s.pose, s.adversary.pose, s.track
     places = [(float(p.e), float(p.n)) for p in (own, other, seen)]
@@ -76,6 +86,10 @@ def _colav(s: ColavState) -> str:
     near = math.dist(*places[:2])
     return plane.picture(
         plane.line([(0.0, 0.0), (0.0, 100.0)], GREY, dash="4 4"),
+        *_trail(plane, past, lambda p: (p.pose.e, p.pose.n), places[0], BLUE),
+        *_trail(
+            plane, past, lambda p: (p.adversary.pose.e, p.adversary.pose.n), places[1], VERMILION
+        ),
         plane.line(places[1:], INK, width=1),
         plane.circle(places[0], TOUCH, BLUE, 0.4),
         plane.shape(_placed(places[0], float(own.psi)), BLUE),
@@ -89,7 +103,7 @@ def _colav(s: ColavState) -> str:
     )
 
 
-def _pendulum(s: PendulumState) -> str:
+def _pendulum(s: PendulumState, past: PendulumState | None) -> str:
     plane = svg.Plane((-1.3, -0.35), (1.3, 1.35), 330)
     theta, omega = float(s.theta), float(s.omega)
     at = lambda angle, r: (r * math.sin(angle), r * math.cos(angle))
@@ -98,12 +112,24 @@ def _pendulum(s: PendulumState) -> str:
     return plane.picture(
         plane.line([(-1.2, 0.0), (1.2, 0.0)], GREY),
         plane.line([(0.0, 0.0), (0.0, 1.15)], GREY, dash="4 4"),
+        *_trail(plane, past, lambda p: (np.sin(p.theta), np.cos(p.theta)), at(theta, 1.0), BLUE),
         plane.line([(0.0, 0.0), at(theta, 1.0)], INK, width=3),
         plane.circle(at(theta, 1.0), 0.07, BLUE),
         plane.line(ahead, VERMILION, width=2),
         plane.words((-1.25, -0.25), f"{math.degrees(theta):.1f} degrees", BLUE),
         plane.words((1.25, -0.25), f"{omega:.2f} rad/s", VERMILION, "end"),
     )
+
+
+def _trail(
+    plane: svg.Plane, past: Any, place: Callable[[Any], Any], now: svg.Place, colour: str
+) -> list[str]:
+    """The way to ``now`` of what is at ``place`` of each state."""
+    if past is None:
+        return []
+    before = np.stack(np.broadcast_arrays(*place(past)), -1)
+    rows = np.unique(np.linspace(0, len(before) - 1, min(len(before), TRAIL)).astype(int))
+    return [plane.line([*before[rows], now], colour, opacity=0.5)]
 
 
 def _placed(place: tuple[float, float], heading: float) -> list[tuple[float, float]]:

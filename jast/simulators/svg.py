@@ -31,9 +31,17 @@ class Plane(NamedTuple):
             f' font-family="sans-serif" font-size="13">{"".join(parts)}</svg>'
         )
 
-    def line(self, places: Iterable[Place], colour: str, width: float = 1.5, dash: str = "") -> str:
+    def line(
+        self,
+        places: Iterable[Place],
+        colour: str,
+        width: float = 1.5,
+        dash: str = "",
+        opacity: float = 1.0,
+    ) -> str:
         """A line through ``places``."""
         dashed = f' stroke-dasharray="{dash}"' if dash else ""
+        dashed += f' stroke-opacity="{opacity:g}"' if opacity < 1 else ""
         return (
             f'<polyline points="{self._points(places)}" fill="none" stroke="{colour}"'
             f' stroke-width="{width:g}"{dashed}/>'

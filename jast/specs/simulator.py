@@ -115,7 +115,7 @@ def under(
         raise ValueError(f"under: formula must be a jast.specs formula, received {formula!r}")
     if samples is not None and not callable(samples):
         raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
-    contract(sim, observed=False)
+    contract("under", sim)
     samples = samples if samples is None or isinstance(samples, Partial) else Partial(samples)
     about, dt = outline(sim), spacing("under", dt)
     watch = _Watch(sim, formula, samples, dt, 0)

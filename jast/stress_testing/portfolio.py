@@ -32,7 +32,7 @@ from jast.results import asked
 from jast.rewards import likelihood
 from jast.search.failure_modes import Mode, Modes, modes, spread
 from jast.search.refinement import refine
-from jast.simulator import Simulator
+from jast.simulator import Simulator, require_simulator
 from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points, onward
 from jast.stress_testing.report import Report, Tried
 from jast.stress_testing.shares import cost as shares_cost
@@ -133,6 +133,7 @@ def stress(
     if budget is not None:
         budget = _checks.whole(name, "budget", budget, LEAST)
     top = _checks.whole(name, "top", top, 1)
+    require_simulator(name, sim)
     check(sim)
     about = outline(sim)
     quantiles = about.start.quantile and about.disturbance.quantile

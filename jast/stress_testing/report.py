@@ -99,7 +99,7 @@ class Report(NamedTuple):
         path: PathLike,
         sim: Simulator | None = None,
         *,
-        draw: Callable[[Any], str] | None = None,
+        draw: Callable[..., str] | None = None,
         explanations: Sequence[Any] = (),
     ) -> None:
         """Write the report as one HTML file that needs no network and no Python, below 3 MB.
@@ -113,7 +113,8 @@ class Report(NamedTuple):
             sim: plays the failures again, for their states; default: the report's own. Without
                 one (a report from `jast.load`) the page shows disturbances alone.
             draw: one state -> an SVG or HTML fragment, which the page shows as it is, at the step
-                of the slider. Its state is a pytree of NumPy arrays.
+                of the slider. Its state is a pytree of NumPy arrays. Where it has an argument
+                ``past``, that is the states before, [t, ...]: for the trail of what moves.
             explanations: for the card of each mode, in their order: a result of `jast.explain`,
                 anything else whose ``str`` says something of it, a list of such things, or None.
                 `jast.explain.criticality` and the directions of `jast.explain.eigenfailures` are

@@ -1,12 +1,23 @@
 """What a report says, in words: its text, its page and its picture say the same."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast.estimate.estimate import doubtful, guarantee
 
-__all__ = ["Belief", "advice", "belief", "headline", "mode_facts", "verdict", "work"]
+__all__ = [
+    "Belief",
+    "about",
+    "advice",
+    "belief",
+    "headline",
+    "mode_facts",
+    "runs",
+    "verdict",
+    "work",
+]
 
 
 BELIEVE = "UNRELIABLE: believe plain draws only"
@@ -36,13 +47,39 @@ def headline(r: Any) -> tuple[str, str]:
         return "The system fails without any disturbance.", "bad"
     if not len(r.failures):
         return f"No failure was found in {r.episodes:,} evaluations.", "good"
-    e, ways = r.failures.best, f"{n} way{'s' * (n != 1)} to fail" if n else "A failure"
-    steps = int(e.length)
-    words = (
-        f"{ways} found. The likeliest takes {steps} step{'s' * (steps != 1)} and has log p"
-        f" {float(e.reward):.2f} relative to the mode of the disturbances."
-    )
-    return words, "bad"
+    e, ways = r.failures.best, f"in {n} way{'s' * (n != 1)}" if n else "now and then"
+    steps, known = int(e.length), f" and has log p {float(e.reward):.2f}"
+    if quiet is not None:
+        rare = about(-float(e.reward) / math.log(10))
+        known = f", by disturbances that are {rare} times less likely than the likeliest ones"
+    often = ", ".join(["", *filter(None, [_often(r.probability)])])
+    words = f"The system fails {ways}{often}. The likeliest failure takes {steps} step"
+    return f"{words}{'s' * (steps != 1)}{known}.", "bad"
+
+
+def _often(p: Any) -> str:
+    """In one of how many runs it fails, as far as is known; "" where nothing is."""
+    if p is None:
+        return ""
+    if p.reliable and not np.isnan(p.log_mean):
+        return f"in about {runs(p.log10_mean)}"
+    high = p.interval[1] if p.plain is None else p.guaranteed[1]
+    surely = np.isnan(p.log_mean) or p.plain is not None  # a doubtful interval is no bound
+    return f"in at most {runs(math.log10(high))}" if surely and 0 < high < 1 else ""
+
+
+def runs(log10_p: float) -> str:
+    """A probability as a share of the runs."""
+    p = 10**log10_p
+    return f"{100 * p:.2g} % of the runs" if p > 0.1 else f"one of {about(-log10_p)} runs"
+
+
+def about(log10: float) -> str:
+    """The number of this decimal logarithm, to two digits; a power of ten from 10^9 on."""
+    if log10 >= 9:
+        return f"10^{log10:.0f}"
+    number = float(f"{10**log10:.2g}")
+    return f"{number:,.0f}" if number >= 10 else f"{number:g}"
 
 
 def belief(p: Any) -> Belief:
@@ -61,7 +98,11 @@ def belief(p: Any) -> Belief:
     if not np.isnan(p.relative_error):
         facts.append(("relative standard error", f"{100 * p.relative_error:.3g} %"))
     if p.unseen is not None:
-        words = f"failures that nothing led to: below {p.unseen:.3g} at {p.level:.0%}"
+        words = (
+            f"below {p.unseen:.3g} at {p.level:.0%}: failures that nothing led to. No method"
+            " vouches for what it never met, so this is all that plain draws rule out; more of them"
+            " lower it. It is no doubt about the failures that were found"
+        )
         facts.append(("unseen", words))
     if p.reliable:
         facts += [("remark", words) for words in p.warnings]

@@ -87,7 +87,7 @@ def _works(sim):
     """Whether the functions of ``sim`` can be traced with its settings as arguments."""
 
     def trace(sim):
-        contract(sim, observed=False)
+        contract("sweep", sim)
 
     try:
         jax.eval_shape(trace, sim)

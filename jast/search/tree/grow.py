@@ -181,7 +181,7 @@ def plan(
         )
     published = chosen["mode"] in PUBLISHED
     if actions is None:
-        actions = samples() if published else default_actions(sim)
+        actions = samples() if published else default_actions(method, sim)
     if reward is None:
         reward = STANDARD if published else lexicographic()
     if exploration is None:

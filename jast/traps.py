@@ -1,0 +1,122 @@
+"""Traps: systems whose functions fit together, and whose failures are lost all the same."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+
+from jast import distributions as D
+from jast.incidents import hosted
+from jast.outline import outline
+from jast.pytrees import strong
+from jast.rounding import Looked, looked, words
+from jast.simulator import Simulator
+
+__all__ = ["traps"]
+
+EQUATIONS = 3000
+"""Of a step and evaluate, from which on they take minutes to compile. On two shared cores one
+program of 50 steps compiles in 4 to 14 CPU seconds for 3200 to 7000 of them (brax, mjx, two cars of
+ARCH-COMP), one with its gradient in 22 and 51 for 3200; `jast.stress` then compiles for 190 and 275
+seconds (an inverted pendulum of brax, the cars), for 63 with 700 (a transmission of ARCH-COMP).
+"""
+
+
+def traps(sim: Simulator) -> list[str]:
+    """What loses failures, or minutes, of a simulator that keeps its contract: a text each, which
+    names the function at fault. None for a system on the host. Runs 80 episodes at most.
+    """
+    if hosted(sim):
+        return []
+    seen, about = looked(sim), outline(sim)
+    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(about.state, about.x)
+    equations = list(_equations(program.jaxpr))
+    found = [f"step: {text}" for text in (words(seen), _jumps(seen)) if text is not None]
+    found += _keys(about.state, seen)
+    if seen.felt and any(e.primitive.name == "stop_gradient" for e in equations) and _level(sim):
+        found.append(
+            "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
+            " all ways from one to the other pass through jax.lax.stop_gradient, comparisons or"
+            " whole numbers, so that what follows gradients finds nothing; let them through (of a"
+            " gymnax environment: env.with_transition_gradients())"
+        )
+    if len(equations) > EQUATIONS:
+        found.append(
+            f"step: {len(equations):,} operations of JAX take minutes to compile, in each of"
+            " several programs; jast.cache() keeps these for the next process, and a lax.scan in"
+            " place of a loop of Python makes fewer"
+        )
+    return found
+
+
+def _jumps(seen: Looked) -> str | None:
+    if not seen.back:
+        return None
+    return (
+        f"the state jumps back to its start, as that of an environment which resets itself does, at"
+        f" step {seen.back} of one of 16 episodes: evaluate never sees the failure before; use the"
+        " step that does not reset (of gymnax step_env, of brax an environment without"
+        " AutoResetWrapper)"
+    )
+
+
+def _keys(state: Any, seen: Looked) -> Iterator[str]:
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    for (path, leaf), still in zip(leaves, seen.still, strict=True):
+        if leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)) and still:
+            yield (
+                f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
+                " random key that no disturbance reaches: the simulator's own noise is the same in"
+                " every episode. Draw this noise in disturbance, or make the seed a disturbance"
+                " (jast.distributions.seeds) and fold it into the key (jax.random.fold_in)"
+            )
+
+
+def _equations(program: Any) -> Iterator[Any]:
+    """Those of a jaxpr and of all in it; the body of a loop once."""
+    for equation in program.eqns:
+        yield equation
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from _equations(inner)
+
+
+def _level(sim: Simulator) -> bool:
+    """Whether the rules of derivatives alone say that the slopes of the miss distance by the floats
+    of the disturbances are 0. Nothing is run or compiled; False where there are no such rules.
+    """
+    leaves, tree = jax.tree.flatten(outline(sim).x)
+    smooth = [i for i, a in enumerate(leaves) if jnp.issubdtype(a.dtype, jnp.floating)]
+    found = []
+
+    @jax.custom_jvp
+    def heard(distance):
+        return distance
+
+    @partial(heard.defjvp, symbolic_zeros=True)
+    def _(distance, slope):
+        found.append(isinstance(slope[0], SymbolicZero))
+        return distance[0], jnp.zeros_like(distance[0])
+
+    def last(floats):
+        numbers = [jnp.zeros(a.shape, a.dtype) for a in leaves]
+        for i, number in zip(smooth, floats, strict=True):
+            numbers[i] = number
+        x = jax.tree.unflatten(tree, numbers)
+        state = strong(sim.init(D.sample(sim.start(), jax.random.key(0))))
+        # a loop follows what needs several steps to reach the distance
+        state, _ = lax.scan(lambda s, _: (strong(sim.step(s, x)), None), state, length=sim.horizon)
+        return heard(sim.evaluate(state)[1])
+
+    floats = [leaves[i] for i in smooth]
+    try:
+        jax.eval_shape(lambda a: jax.jvp(last, (a,), (a,)), floats)
+    except Exception:  # of a user's function: what has no derivative is told by who needs it
+        return False
+    return bool(smooth) and all(found)
