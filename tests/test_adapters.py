@@ -1,5 +1,6 @@
 """The doors of `jast.adapters`, on small environments with the interfaces of the libraries."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -394,3 +395,92 @@ class Wrapped:
 def test_what_is_refused(message):
     with pytest.raises(ValueError, match=message):
         WRONG[message]()
+
+
+SYSTEMS = "needs the extra `systems`"
+
+
+def library(*names):
+    """The modules."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return [pytest.importorskip(name, reason=SYSTEMS) for name in names]
+
+
+@pytest.fixture
+def theirs():
+    """Their own warnings and promotions, of dtypes and of ranks, are not ours."""
+    with warnings.catch_warnings(), jax.numpy_dtype_promotion("standard"):
+        with jax.numpy_rank_promotion("allow"):
+            warnings.simplefilter("ignore")
+            yield
+
+
+@pytest.mark.long
+def test_an_episode_of_gymnax_is_its_own_loop(key, theirs):
+    """Of the cart and its pole, with the noise seen; and the gradients are not zero."""
+    (theirs,) = library("gymnax")
+    env, params = theirs.make("CartPole-v1")
+    gains = jnp.array([0.1, 0.2, 1.0, 0.5])
+    act = lambda seen: jnp.where(seen @ gains > 0.0, 1.0, 0.0)
+    noise = Normal(jnp.zeros(4), 0.3)
+    sim = jast.check(gymnax(env, params, act, horizon=60, observation=noise))
+    episode = jast.rollout(key, sim)
+    states = jast.replay(sim, episode).states
+    seen, state = env.reset(jax.random.key(0), params)
+    step = jax.jit(env.step_env)
+    for t in range(int(episode.length)):
+        action = act(seen + episode.disturbances["observation"][t])
+        seen, state, _, done, _ = step(key, state, action, params)
+        np.testing.assert_allclose(states.observation[t + 1], seen, rtol=1e-5, atol=1e-6)
+    assert episode.failure == done
+
+    def angle(push):
+        pushed = gymnax(env, params, act, horizon=5, force=(Normal(0.0, 1.0), nudged))
+        return jast.replay(pushed, {"force": jnp.full(5, push)}).states.state.theta[5]
+
+    nudged = lambda state, x: state.replace(theta_dot=state.theta_dot + 0.01 * x)
+    assert jax.grad(angle)(0.0) > 0.0
+
+
+@pytest.mark.long
+def test_an_episode_of_brax_is_its_own_loop(key, theirs):
+    envs = library("brax.envs")[0]
+    env = envs.get_environment("inverted_pendulum", backend="spring")
+    gains = jnp.array([0.2, 3.0, 0.3, 0.6])
+    act = lambda seen: jnp.clip(seen @ gains, -1.0, 1.0)[None]
+    sim = brax(env, act, horizon=10, action=Normal(jnp.zeros(1), 0.2), seed=7)
+    episode = jast.rollout(key, sim)
+    states = jast.replay(sim, episode).states
+    state, step = env.reset(jax.random.key(7)), jax.jit(env.step)
+    for t in range(int(episode.length)):
+        state = step(state, act(state.obs) + episode.disturbances["action"][t])
+        np.testing.assert_allclose(states.observation[t + 1], state.obs, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="brax: env .*AutoResetWrapper of EpisodeWrapper"):
+        brax(envs.create("inverted_pendulum"), act, horizon=10, action=Normal(jnp.zeros(1), 0.2))
+
+
+BODY = """
+<mujoco><option timestep="0.02"/><worldbody>
+  <geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .3"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.long
+def test_an_episode_of_mjx_is_that_of_whole_data(key, theirs):
+    """A ball that falls on the ground, so that the solver's start matters, under a force."""
+    mujoco, theirs = library("mujoco", "mujoco.mjx")
+    model = theirs.put_model(mujoco.MjModel.from_xml_string(BODY))
+    data = theirs.make_data(model)
+    held = dict(controller=lambda seen: jnp.zeros(0), distance=lambda now: now.state.qpos[2] + 1)
+    force = Normal(jnp.zeros(6), jnp.full(6, 0.5))
+    sim = jast.check(mjx(model, data, horizon=30, force=force, **held))
+    episode = jast.rollout(key, sim)
+    states, step = jast.replay(sim, episode).states.state, jax.jit(theirs.step)
+    for t in range(30):
+        data = step(model, data.replace(qfrc_applied=episode.disturbances["force"][t]))
+        np.testing.assert_allclose(states.qpos[t + 1], data.qpos, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(states.qvel[t + 1], data.qvel, rtol=1e-3, atol=1e-4)
+    assert data.qpos[2] < 0.15

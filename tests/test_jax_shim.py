@@ -171,8 +171,8 @@ def test_a_key_implementation():
 
 
 def test_derivatives_go_through_stops():
-    """x ** 2 * 3 a, stopped in a program, a loop, a branch and at the end: the same numbers, and the
-    slope 6 a x in place of 0. Keys and numbers of Python go through.
+    """x ** 2 * 3 a, stopped in a program, a loop, a branch and at the end: the same numbers, and
+    the slope 6 a x in place of 0. Keys and numbers of Python go through.
     """
     stop = jax.lax.stop_gradient
     square = jax.jit(lambda x: stop(x) ** 2)
