@@ -376,10 +376,36 @@ WRONG = {
     "mjx: distance must be a function": lambda: body(distance=1.0),
     "mjx: sense must be a function": lambda: body(sense=1.0),
     "mjx: substeps must be a whole number of at least 1": lambda: body(substeps=0),
+    "gymnax: policy holds arrays, received Weights: .*eqx.partition": lambda: gymnax(
+        Drift(), Params(), Weights(), horizon=1, **NOISES["action"][1](1.0)
+    ),
+    r"leaf \[?.*state.* has dtype float32, expected int32": lambda: jast.check(
+        gymnax(Whole(), Params(), lambda seen: seen * 0.6, horizon=3, **ANY)
+    ),
     r"noise of shape \(\) cannot be added to float32\[1\]": lambda: jast.check(
         drift(observation=Normal(0.0, 1.0))
     ),
 }
+
+
+class Weights:
+    """Equal by its arrays, as a module of Equinox is."""
+
+    __hash__ = None
+
+    def __call__(self, seen):
+        return seen
+
+
+class Whole(Drift):
+    """Starts at 0, and goes on in floats."""
+
+    def reset(self, key, params):
+        seen, state = super().reset(key, params)
+        return seen, state._replace(x=jnp.zeros(1, int))
+
+    def step_env(self, key, state, action, params):
+        return super().step_env(key, state._replace(x=state.x.astype(float)), action, params)
 
 
 class Timed(NamedTuple):

@@ -17,6 +17,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast.adapters.kept import alike, keyed, numbers
 from jast.adapters.noise import Random, add, bound, model_of, random, replaced
 from jast.contract import OBSERVED
 from jast.simulator import Simulator, fixed, ravel
@@ -36,7 +37,7 @@ class Instant(NamedTuple):
     """
 
     state: Any
-    """The environment's own; typed keys in it as `Key`"""
+    """The environment's own; typed keys in it as their numbers"""
     observation: Any
     """What it shows, before the noise"""
     reward: Any
@@ -62,12 +63,6 @@ class Outcome(NamedTuple):
     terminated: Any
 
 
-class Key(NamedTuple):
-    """A typed random key as numbers, which is what a state may hold."""
-
-    data: Any
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Loop:
@@ -82,8 +77,7 @@ class _Loop:
     observe: Partial | None
     seed: Any
     drawn: str = field(metadata=dict(static=True))
-    """Whose seeds are: "episode", "step", or of neither
-    """
+    """What a seed is drawn for: an "episode", each "step", or nothing"""
 
 
 def simulator(
@@ -108,6 +102,11 @@ def simulator(
     for argument, value in functions.items():
         if not (callable(value) or value is None and argument != "policy"):
             raise ValueError(f"{name}: {argument} must be a function, received {value!r}")
+        if not isinstance(value, Partial) and not _has_hash(value):
+            raise ValueError(
+                f"{name}: {argument} holds arrays, received {type(value).__name__}: bind them,"
+                " jax.tree_util.Partial(function, arrays); of Equinox by eqx.partition"
+            )
     given = dict(observation=(observation, add), action=(action, add), force=(force, None))
     noise = {
         place: random(name, place, value, apply)
@@ -144,6 +143,14 @@ def simulator(
     )
 
 
+def _has_hash(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
+
+
 def _start(loop: _Loop) -> Any:
     parts = {} if loop.parameters is None else {"parameters": model_of(loop.parameters)}
     seeded = {"seed": D.seeds()} if loop.drawn else {}
@@ -157,8 +164,8 @@ def _init(loop: _Loop, x0: Any) -> Instant:
     first = _of(loop, parameters).reset(jax.random.key(seed))
     zero = jnp.zeros(())
     return Instant(
-        _numbers(first.state),
-        _numbers(first.observation),
+        numbers(first.state),
+        numbers(first.observation),
         zero,
         zero,
         jnp.asarray(first.terminated, bool),
@@ -174,11 +181,11 @@ def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
     own = jax.random.fold_in(jax.random.key(now.seed), now.time + 1)
     key = jax.random.key(x["seed"]) if loop.drawn == "step" else own
     system = _of(loop, now.parameters)
-    after = system.step(key, _keyed(now.state), action, lambda it: changed("force", it))
+    after = system.step(key, keyed(now.state), action, lambda it: changed("force", it))
     reward = jnp.asarray(after.reward, now.reward.dtype)
     return now._replace(
-        state=_alike(_numbers(after.state), now.state),
-        observation=_alike(_numbers(after.observation), now.observation),
+        state=alike(numbers(after.state), now.state),
+        observation=alike(numbers(after.observation), now.observation),
         reward=reward,
         total=now.total + reward,
         terminated=jnp.asarray(after.terminated, bool),
@@ -222,25 +229,3 @@ def _observe(loop: _Loop, now: Instant) -> jax.Array:
         return loop.observe(now)
     seen = ravel(now.observation)
     return seen if 0 < seen.size <= OBSERVED else ravel(now.time)
-
-
-def _numbers(tree: Any) -> Any:
-    """Arrays of ``tree``, with typed keys as `Key`."""
-
-    def number(a: Any) -> Any:
-        a = jnp.asarray(a)
-        typed = jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
-        return Key(jax.random.key_data(a)) if typed else a
-
-    return jax.tree.map(number, tree)
-
-
-def _keyed(tree: Any) -> Any:
-    """``tree`` as the environment knows it."""
-    made = lambda a: jax.random.wrap_key_data(a.data) if isinstance(a, Key) else a
-    return jax.tree.map(made, tree, is_leaf=lambda a: isinstance(a, Key))
-
-
-def _alike(tree: Any, like: Any) -> Any:
-    """``tree`` in the dtypes of ``like``: many environments return others than at the start."""
-    return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), tree, like)

@@ -29,6 +29,9 @@ def bound(function: Callable) -> Partial:
 
 
 def random(name: str, place: str, value: Any, apply: Callable | None) -> Random:
+    """What a user gave for ``place``: a distribution, whose draw ``apply`` takes, or
+    a pair (distribution, function).
+    """
     pair = isinstance(value, tuple) and len(value) == 2 and callable(value[1])
     model, apply = value if pair else (value, apply)
     if not (D.is_distribution(model) or callable(model)) or apply is None:
@@ -59,6 +62,7 @@ def add(place: Any, draw: Any) -> Any:
 
 
 def replaced(subject: Any, draw: Any) -> Any:
+    """``subject`` with the fields that ``draw`` names."""
     like = {k: jnp.asarray(getattr(subject, k)) for k in draw}
     return subject.replace(**{k: jnp.asarray(v, like[k].dtype) for k, v in draw.items()})
 
