@@ -68,7 +68,7 @@ def distance(now):
 
 def drift(env=None, gain=0.6, horizon=10, limit=3.0, **settings):
     settings = dict(distance=distance) | settings
-    params, policy = Params(limit=jnp.array(limit)), Partial(steer, jnp.asarray(gain))
+    params, policy = Params(jnp.array(1.1), jnp.array(limit)), Partial(steer, jnp.array(gain))
     return gymnax(env or Drift(), params, policy, horizon=horizon, **settings)
 
 
@@ -102,17 +102,21 @@ def test_the_probability_is_that_of_the_closed_loop(kind, key):
     within(monte_carlo(key, sim, SAMPLES), stats.norm.sf(1.0 / sd))
 
 
-def test_an_episode_is_that_of_a_loop_in_numpy(key):
-    noise = dict(observation=Normal(jnp.zeros(1), 0.5), action=Normal(jnp.zeros(1), 0.5))
-    sim = drift(**noise)
-    episode = jast.rollout(key, sim)
-    states = jast.replay(sim, episode).states
-    x, total, seen = 0.0, 0.0, episode.disturbances
+@pytest.mark.parametrize("wide", [False, True], ids=["float32", "float64"])
+def test_an_episode_is_that_of_a_loop_in_numpy(wide):
+    with jax.enable_x64(wide):
+        sd = jnp.full(1, 0.5)
+        sim = jast.check(drift(observation=Normal(sd * 0, sd), action=Normal(sd * 0, sd)))
+        episode = jast.rollout(jax.random.key(0), sim)
+        states = jax.device_get(jast.replay(sim, episode).states)
+        rows = jax.device_get(episode.disturbances)
+    x, total, close = 0.0, 0.0, dict(rtol=1e-13, atol=1e-13) if wide else dict(rtol=1e-5, atol=1e-6)
+    assert states.state.x.dtype == states.total.dtype == (np.float64 if wide else np.float32)
     for t in range(int(episode.length)):
-        x = 1.1 * x - 0.6 * (x + seen["observation"][t, 0]) + seen["action"][t, 0]
+        x = 1.1 * x - 0.6 * (x + rows["observation"][t, 0]) + rows["action"][t, 0]
         total -= abs(x)
-        np.testing.assert_allclose(states.state.x[t + 1], [x], rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(states.total[t + 1], total, rtol=1e-5)
+        np.testing.assert_allclose(states.state.x[t + 1], [x], **close)
+        np.testing.assert_allclose(states.total[t + 1], total, **close)
     assert states.time[int(episode.length)] == episode.length
 
 
