@@ -17,6 +17,7 @@ __all__ = [
     "Policy",
     "Simulator",
     "actions",
+    "adapters",
     "blackbox",
     "cache",
     "check",

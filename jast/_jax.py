@@ -9,6 +9,8 @@ of it is followed here, and ``tests/test_jax_shim.py`` says which part broke.
    own, `jax.interpreters`);
  - `custom_vmap`: a function that says itself what a batch of it is (`jax.custom_batching`);
  - `define_prng_impl`: a key implementation (`jax.extend.random`);
+ - `without_stops`: a function whose derivatives no `jax.lax.stop_gradient` stops (equations of a
+   jaxpr, `jax.extend.core`);
  - `reset_cache`: what makes a new folder of compiled programs count
    (`jax.experimental.compilation_cache`).
 
@@ -43,6 +45,7 @@ __all__ = [
     "quick",
     "reset_cache",
     "was_interrupted",
+    "without_stops",
 ]
 
 
@@ -220,6 +223,43 @@ def _lowered(ctx, *args, callback, shapes):
         **_NO_TOKEN,
     )
     return out
+
+
+def without_stops(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function`` of pytrees of arrays, with derivatives that go through what it wraps in
+    `jax.lax.stop_gradient`.
+    """
+    from jax.extend.core import jaxpr_as_fun  # here: jax.extend loads Pallas
+
+    @functools.wraps(function)
+    def through(*args: Any) -> Any:
+        traced, out = jax.make_jaxpr(function, return_shape=True)(*args)
+        values = jaxpr_as_fun(_unstopped(traced))(*map(jnp.asarray, jax.tree.leaves(args)))
+        return jax.tree.unflatten(jax.tree.structure(out), values)
+
+    return through
+
+
+def _unstopped(closed: Any) -> Any:
+    """A closed jaxpr without its equations of ``stop_gradient``, nor those inside of its loops."""
+
+    def inner(value: Any) -> Any:
+        if type(value) is tuple:  # of branches
+            return tuple(map(inner, value))
+        return _unstopped(value) if isinstance(value, type(closed)) else value
+
+    same, equations = {}, []
+    # literals, which have a value and no hash, stay
+    seen = lambda v: v if hasattr(v, "val") else same.get(v, v)
+    for equation in closed.jaxpr.eqns:
+        given = [seen(v) for v in equation.invars]
+        if equation.primitive.name == "stop_gradient":
+            same.update(zip(equation.outvars, given, strict=True))
+        else:
+            params = {name: inner(value) for name, value in equation.params.items()}
+            equations.append(equation.replace(invars=given, params=params))
+    outvars = [seen(v) for v in closed.jaxpr.outvars]
+    return closed.replace(jaxpr=closed.jaxpr.replace(eqns=equations, outvars=outvars))
 
 
 if TYPE_CHECKING:

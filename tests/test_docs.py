@@ -20,6 +20,13 @@ import jast
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "docs/start.md", *sorted((ROOT / "docs/guides").glob("*.md"))]
+SYSTEMS = ROOT / "docs/guides/environments.md"  # its examples stand alone, and need other libraries
+PAGES.remove(SYSTEMS)
+EXAMPLES = {
+    section.partition("\n")[0]: block
+    for section in SYSTEMS.read_text().split("\n## ")
+    for block in re.findall(r"```python\n(.*?)```", section, re.S)
+}
 ROOMS = [name for name in jast.__all__ if isinstance(getattr(jast, name), ModuleType)]
 
 
@@ -44,6 +51,16 @@ def test_the_code_of_a_page_runs(page, tmp_path):
     assert blocks
     (tmp_path / "page.py").write_text("\n".join(blocks))
     assert python("page.py", cwd=tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_of_a_system_runs_as_printed(name, tmp_path):
+    for line in EXAMPLES[name].splitlines():
+        if words := re.match(r"(?:import|from) (\w+)", line):
+            pytest.importorskip(words[1], reason="needs the extra `systems`")
+    (tmp_path / "example.py").write_text(EXAMPLES[name])
+    assert python("example.py", cwd=tmp_path)
 
 
 @pytest.mark.long

@@ -1,0 +1,143 @@
+"""Environments with ``reset(key) -> State`` and ``step(State, action) -> State``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jast.adapters.loop import Instant, Outcome, simulator
+from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import DistributionLike
+
+__all__ = ["brax"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Environment:
+    subject: Any = field(metadata=dict(static=True))
+    """The environment"""
+
+    def reset(self, key: Any) -> Outcome:
+        return _outcome(self.subject.reset(key))
+
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+        return _outcome(self.subject.step(push(state), action))
+
+
+def _outcome(state: Any) -> Outcome:
+    done = jnp.asarray(state.done)
+    # what counts steps says so when the time is over, which is no failure
+    late = state.info.get("truncation", 0.0) if isinstance(state.info, dict) else 0.0
+    return Outcome(state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool))
+
+
+def brax(
+    env: Any,
+    policy: Callable[[Any], Any],
+    *,
+    horizon: int,
+    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
+    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
+    force: tuple[Any, Callable[..., Any]] | None = None,
+    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    seed: int | Literal["episode"] = 0,
+    failure: Callable[[Instant], chex.Array] | None = None,
+    distance: Callable[[Instant], chex.Array] | None = None,
+    observe: Callable[[Instant], chex.Array] | None = None,
+) -> Simulator:
+    """A policy in an environment of brax or mujoco_playground: ``reset(key)`` and ``step(state,
+    action)`` return a state with ``obs``, ``reward``, ``done`` and ``info``.
+
+    Arguments that are not explained here are those of `gymnax`, with the same meaning. ``done`` is
+    a failure by default, but for the end of the time that ``info["truncation"]`` tells.
+
+    Args:
+        env: the environment, without a wrapper that starts anew by itself and so hides failures:
+            ``brax.envs.get_environment(name)``, or ``create(name, auto_reset=False)``.
+        policy: observation -> action. A policy of brax's training is ``lambda seen: act(seen,
+            key)[0]``.
+        horizon: steps of an episode.
+        observation: noise on what the policy sees, as in `gymnax`.
+        action: noise on the action.
+        force: a pair (distribution, function (state, draw) -> state): what happens to the whole
+            state before each step, such as a change of ``state.pipeline_state``.
+        parameters: a pair (distribution, function (env, draw) -> env), drawn once an episode. The
+            function gets a copy of the environment that it may change, such as ``env.sys``.
+        seed: of the key of ``reset``, from which an environment also draws later on: a number, or
+            "episode" for one drawn for each episode.
+        failure: `Instant` -> bool.
+        distance: `Instant` -> float.
+        observe: `Instant` -> float vector, 64 numbers at most.
+
+    Returns:
+        `Simulator`, whose states are `Instant`.
+
+    Raises:
+        ValueError: for an environment without these methods or one that starts anew by itself, an
+            argument of another kind, and where nothing is random.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from typing import Any, NamedTuple
+        >>> from jast.distributions import Normal
+        >>> class State(NamedTuple):  # as brax has them
+        ...     pipeline_state: Any
+        ...     obs: Any
+        ...     reward: Any
+        ...     done: Any
+        ...     info: dict
+        >>> class Drift:
+        ...     def reset(self, key):
+        ...         return State(jnp.zeros(1), jnp.zeros(1), 0.0, 0.0, {})
+        ...
+        ...     def step(self, state, action):
+        ...         x = 1.1 * state.pipeline_state + action
+        ...         return State(x, x, -jnp.abs(x[0]), jnp.where(jnp.abs(x[0]) > 1.0, 1.0, 0.0), {})
+        >>> sim = jast.adapters.brax(
+        ...     Drift(),
+        ...     policy=lambda seen: -0.5 * seen,
+        ...     horizon=20,
+        ...     action=Normal(jnp.zeros(1), 0.1),
+        ...     distance=lambda now: 1.0 - jnp.abs(now.observation[0]),
+        ... )
+        >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["action"].shape
+        (20, 1)
+    """
+    layer, kinds = env, []
+    while layer is not None:
+        kinds.append(type(layer).__name__)
+        layer = getattr(layer, "__dict__", {}).get("env")
+    again = [kind for kind in kinds if "AutoReset" in kind]
+    if again or not all(callable(getattr(env, name, None)) for name in ("reset", "step")):
+        raise ValueError(
+            "brax: env must be an environment with reset(key) and step(state, action), and without"
+            f" a wrapper that starts anew by itself, received {' of '.join(kinds)}"
+            + ("; brax.envs.get_environment(name) makes one" if again else "")
+        )
+    if seed == "step":
+        raise ValueError(
+            'brax: seed must be a whole number or "episode", received "step": step has no key'
+        )
+    return simulator(
+        "brax",
+        _Environment(env),
+        policy,
+        horizon,
+        observation=observation,
+        action=action,
+        force=force,
+        parameters=parameters,
+        seed=seed,
+        failure=failure,
+        distance=distance,
+        observe=observe,
+    )

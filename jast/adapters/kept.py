@@ -1,0 +1,46 @@
+"""What an environment returns as what a state of a `Simulator` may hold, and back."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+__all__ = ["alike", "keyed", "numbers"]
+
+
+class Key(NamedTuple):
+    """A typed random key as numbers, which is what a state may hold."""
+
+    data: Any
+
+
+def numbers(tree: Any) -> Any:
+    """Arrays of ``tree``, with typed keys as `Key`."""
+
+    def number(a: Any) -> Any:
+        a = jnp.asarray(a)
+        typed = jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
+        return Key(jax.random.key_data(a)) if typed else a
+
+    return jax.tree.map(number, tree)
+
+
+def keyed(tree: Any) -> Any:
+    """``tree`` as the environment knows it."""
+    made = lambda a: jax.random.wrap_key_data(a.data) if isinstance(a, Key) else a
+    return jax.tree.map(made, tree, is_leaf=lambda a: isinstance(a, Key))
+
+
+def alike(tree: Any, like: Any) -> Any:
+    """``tree`` in the dtypes of ``like``: many environments return others than at the start. Floats
+    never become whole numbers.
+    """
+
+    def cast(a: Any, b: jax.Array) -> jax.Array:
+        same = np.can_cast(jnp.asarray(a).dtype, b.dtype, "same_kind")
+        return jnp.asarray(a, b.dtype if same else None)
+
+    return jax.tree.map(cast, tree, like)

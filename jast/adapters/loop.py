@@ -1,0 +1,231 @@
+"""A policy in the loop with an environment, as a `Simulator`: what all doors have in common.
+
+A door gives a system: a pytree with ``reset(key) -> Outcome``, ``step(key, state, action, push) ->
+Outcome``, which calls ``push`` on what a force acts on, and ``subject``, which the ``parameters``
+that are drawn once an episode change.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jast import distributions as D
+from jast.adapters.kept import alike, keyed, numbers
+from jast.adapters.noise import Random, add, bound, model_of, random, replaced
+from jast.contract import OBSERVED
+from jast.simulator import Simulator, fixed, ravel
+
+__all__ = ["Instant", "Outcome", "simulator"]
+
+
+class Instant(NamedTuple):
+    """An environment after a step: the state of the simulators of `jast.adapters`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jast.adapters import Instant
+        >>> distance = lambda now: 0.2 - jnp.abs(now.observation[1])  # of a pole's angle
+        >>> round(float(distance(Instant((), jnp.array([0.0, 0.15]), 1.0, 5.0, False, 5, 0))), 2)
+        0.05
+    """
+
+    state: Any
+    """The environment's own; typed keys in it as their numbers"""
+    observation: Any
+    """What it shows, before the noise"""
+    reward: Any
+    """Of the last step; 0 at the start"""
+    total: Any
+    """The sum of the rewards so far"""
+    terminated: Any
+    """bool: the environment says that it has ended"""
+    time: Any
+    """int32: steps so far"""
+    seed: Any
+    """uint32: of the environment's own key"""
+    parameters: Any = ()
+    """What was drawn for the episode"""
+
+
+class Outcome(NamedTuple):
+    """What an environment answers."""
+
+    state: Any
+    observation: Any
+    reward: Any
+    terminated: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Loop:
+    """What is bound to the functions of the simulator: traced, but for ``drawn``."""
+
+    system: Any
+    policy: Partial
+    noise: dict[str, Random]
+    parameters: Random | None
+    failure: Partial | None
+    distance: Partial | None
+    observe: Partial | None
+    seed: Any
+    drawn: str = field(metadata=dict(static=True))
+    """What a seed is drawn for: an "episode", each "step", or nothing"""
+
+
+def simulator(
+    name: str,
+    system: Any,
+    policy: Any,
+    horizon: int,
+    *,
+    observation: Any = None,
+    action: Any = None,
+    force: Any = None,
+    parameters: Any = None,
+    seed: Any = None,
+    failure: Any = None,
+    distance: Any = None,
+    observe: Any = None,
+) -> Simulator:
+    """The `Simulator` of the door ``name``; arguments as `jast.adapters.gymnax` explains them.
+    ``seed=None``: of an environment that draws nothing.
+    """
+    functions = dict(policy=policy, failure=failure, distance=distance, observe=observe)
+    for argument, value in functions.items():
+        if not (callable(value) or value is None and argument != "policy"):
+            raise ValueError(f"{name}: {argument} must be a function, received {value!r}")
+        if not isinstance(value, Partial) and not _has_hash(value):
+            raise ValueError(
+                f"{name}: {argument} holds arrays, received {type(value).__name__}: bind them,"
+                " jax.tree_util.Partial(function, arrays); of Equinox by eqx.partition"
+            )
+    given = dict(observation=(observation, add), action=(action, add), force=(force, None))
+    noise = {
+        place: random(name, place, value, apply)
+        for place, (value, apply) in given.items()
+        if value is not None
+    }
+    if parameters is not None:
+        fields = isinstance(parameters, dict)  # of a dataclass, such as the params of gymnax
+        model = D.Joint(parameters) if fields else parameters
+        parameters = random(name, "parameters", model, replaced if fields else None)
+    drawn = seed if seed in ("episode", "step") else ""
+    if not (noise or parameters or drawn):
+        raise ValueError(
+            f"{name}: nothing is random: give observation=, action=, force= or parameters="
+            + ("" if seed is None else ', or seed="episode"')
+        )
+    if not drawn and seed is not None and (type(seed) is not int or not 0 <= seed < 2**32):
+        raise ValueError(
+            f'{name}: seed must be a whole number from 0 to 2**32 - 1, "episode" or "step",'
+            f" received {seed!r}"
+        )
+    number = np.uint32(0 if drawn or seed is None else seed)
+    functions = {k: v if v is None else bound(v) for k, v in functions.items()}
+    loop = _Loop(system, noise=noise, parameters=parameters, seed=number, drawn=drawn, **functions)
+    return Simulator(
+        init=Partial(_init, loop),
+        step=Partial(_step, loop),
+        disturbance=Partial(_disturbance, loop),
+        evaluate=Partial(_evaluate, loop),
+        horizon=horizon,
+        start=Partial(_start, loop) if parameters or drawn else fixed,
+        is_terminal=_terminated,
+        observe=Partial(_observe, loop),
+    )
+
+
+def _has_hash(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
+
+
+def _start(loop: _Loop) -> Any:
+    parts = {} if loop.parameters is None else {"parameters": model_of(loop.parameters)}
+    seeded = {"seed": D.seeds()} if loop.drawn else {}
+    return D.Joint(parts | seeded)
+
+
+def _init(loop: _Loop, x0: Any) -> Instant:
+    drawn = x0 or {}
+    seed = drawn.get("seed", jnp.asarray(loop.seed))
+    parameters = drawn.get("parameters", ())
+    first = _of(loop, parameters).reset(jax.random.key(seed))
+    zero = jnp.zeros(())
+    return Instant(
+        numbers(first.state),
+        numbers(first.observation),
+        zero,
+        zero,
+        jnp.asarray(first.terminated, bool),
+        jnp.int32(0),
+        seed,
+        parameters,
+    )
+
+
+def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
+    changed = lambda place, it: loop.noise[place].apply(it, x[place]) if place in loop.noise else it
+    action = changed("action", loop.policy(changed("observation", now.observation)))
+    own = jax.random.fold_in(jax.random.key(now.seed), now.time + 1)
+    key = jax.random.key(x["seed"]) if loop.drawn == "step" else own
+    system = _of(loop, now.parameters)
+    after = system.step(key, keyed(now.state), action, lambda it: changed("force", it))
+    reward = jnp.asarray(after.reward, now.reward.dtype)
+    return now._replace(
+        state=alike(numbers(after.state), now.state),
+        observation=alike(numbers(after.observation), now.observation),
+        reward=reward,
+        total=now.total + reward,
+        terminated=jnp.asarray(after.terminated, bool),
+        time=now.time + 1,
+    )
+
+
+def _of(loop: _Loop, parameters: Any) -> Any:
+    """The system of an episode with the ``parameters`` that were drawn for it."""
+    if loop.parameters is None:
+        return loop.system
+    subject = loop.parameters.apply(copy.copy(loop.system.subject), parameters)
+    return replace(loop.system, subject=subject)
+
+
+def _disturbance(loop: _Loop, now: Instant) -> Any:
+    parts = {place: model_of(random, now) for place, random in loop.noise.items()}
+    if loop.drawn == "step":
+        parts["seed"] = D.seeds()
+    # where all is decided at the start: a disturbance of no numbers
+    return D.Joint(parts) if parts else D.Independent(D.Normal(jnp.zeros(0), 1.0), 1)
+
+
+def _evaluate(loop: _Loop, now: Instant) -> tuple[jax.Array, jax.Array]:
+    distance = None if loop.distance is None else jnp.asarray(loop.distance(now))
+    failure = now.terminated if loop.failure is None else jnp.asarray(loop.failure(now))
+    if distance is None:
+        distance = jnp.where(failure, 0.0, 1.0)
+    floats = [a for a in jax.tree.leaves(now) if jnp.issubdtype(a.dtype, jnp.floating)]
+    broken = jnp.any(jnp.stack([jnp.any(jnp.isnan(a)) for a in floats]))
+    return failure, jnp.where(broken, jnp.nan, distance)
+
+
+def _terminated(now: Instant) -> jax.Array:
+    return now.terminated
+
+
+def _observe(loop: _Loop, now: Instant) -> jax.Array:
+    """The observation; how many steps there were where it has more numbers than a network sees."""
+    if loop.observe is not None:
+        return loop.observe(now)
+    seen = ravel(now.observation)
+    return seen if 0 < seen.size <= OBSERVED else ravel(now.time)
