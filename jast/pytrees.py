@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,12 @@ from jax import lax
 from jax.tree_util import Partial
 
 __all__ = ["count"]
+
+
+class Key(NamedTuple):
+    """A typed random key as numbers, which is what a state may hold."""
+
+    data: Any
 
 
 def strong(tree: Any) -> Any:

@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jast import distributions as D
 from jast.incidents import hosted
 from jast.outline import outline
-from jast.pytrees import strong
+from jast.pytrees import Key, strong
 from jast.rounding import Looked, looked, words
 from jast.simulator import Simulator
 
@@ -65,9 +65,10 @@ def _jumps(seen: Looked) -> str | None:
 
 
 def _keys(state: Any, seen: Looked) -> Iterator[str]:
-    leaves = jax.tree_util.tree_leaves_with_path(state)
+    own = lambda leaf: isinstance(leaf, Key)  # a user of `jast.adapters` says what is random
+    leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=own)
     for (path, leaf), still in zip(leaves, seen.still, strict=True):
-        if leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)) and still:
+        if not own(leaf) and leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)) and still:
             yield (
                 f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
                 " random key that no disturbance reaches: the simulator's own noise is the same in"

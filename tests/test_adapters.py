@@ -144,8 +144,8 @@ def test_gradients_go_through_what_the_environment_stops():
 
 
 def test_parameters_are_drawn_once_an_episode(key):
-    """x_1 is a uniform pole times the start of 1; and by a pair, by which the limit goes, too."""
-    start = (Normal(0.0, 1e-6), lambda state, x: state._replace(x=state.x * 0 + 1.0))
+    """x_1 is a uniform pole times a start near 1; and by a pair, by which the limit goes, too."""
+    start = (Normal(0.0, 1e-3), lambda state, x: state._replace(x=state.x * 0 + 1.0 + x))
     common = dict(gain=0.0, force=start, failure=lambda now: now.state.x[0] > 1.4)
     sim = jast.check(drift(parameters={"pole": Uniform(1.0, 1.5)}, **common))
     within(monte_carlo(key, sim, SAMPLES), 0.2)

@@ -10,7 +10,7 @@ import pytest
 
 import jast
 from benchmarks.stress_systems import CASES, PEDESTRIANS, pedestrians
-from jast.distributions import Normal, seeds
+from jast.distributions import Independent, Normal, seeds
 
 
 def walk(limit=4.0, **changes):
@@ -126,6 +126,22 @@ def test_a_system_that_fails_undisturbed_is_told_so(key):
         report = jast.stress(key, sim, 400)
     assert "FAILS" in str(report)
     assert float(report.failures.best.reward) == 0
+
+
+@pytest.mark.long
+def test_a_system_whose_start_alone_is_random(key):
+    """It fails where the start is beyond 2: P = Phi(-2), log p relative to the mode -2."""
+    sim = walk(
+        2.0,
+        start=lambda: Normal(0.0, 1.0),
+        init=lambda x0: x0,
+        step=lambda s, x: s,
+        disturbance=lambda s: Independent(Normal(jnp.zeros(0), 1.0), 1),
+    )
+    report = jast.stress(key, sim, 3000)
+    assert float(report.failures.best.reward) == pytest.approx(-2.0, abs=0.01)
+    truth, p = 0.0227501319, report.probability
+    assert abs(p.mean - truth) < 4 * p.relative_error * p.mean
 
 
 def test_seeds_of_unknown_density_make_one_mode(key):

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jast.pytrees import Key
+
 __all__ = ["alike", "keyed", "numbers"]
-
-
-class Key(NamedTuple):
-    """A typed random key as numbers, which is what a state may hold."""
-
-    data: Any
 
 
 def numbers(tree: Any) -> Any:

@@ -259,4 +259,4 @@ def _in_time(v, steps, fill, first, horizon):
     at = np.clip(t, 0, horizon - 1)
     moved = rows[np.arange(n)[:, None, None], at] * share[:, :, :, None]
     start = v[:, None, :first].repeat(steps.shape[1], axis=1)
-    return np.concatenate([start, moved.reshape(n, -1, d - first)], axis=2)
+    return np.concatenate([start, moved.reshape(*steps.shape, d - first)], axis=2)
