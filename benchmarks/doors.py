@@ -40,6 +40,12 @@ EXAMPLES = {
     for block in re.findall(r"```python\n(.*?)```", section, re.S)
 }
 """Heading in the guide -> the code under it."""
+HEADS = (
+    "| system, budget | truth (its standard error) | unflagged | rms error of these (of all)"
+    " | intervals that hold | CPU s: first, warm | plain draws in that time"
+    " | first failure: s of the clock (CPU) |\n|" + "---|" * 8,
+    "| you have | lines | of which the call that makes the simulator |\n|---|---|---|",
+)
 
 
 class Door(NamedTuple):
@@ -59,7 +65,7 @@ SYSTEMS = {
     "gymnax": Door("gymnax", 1_000_000, 20, 1.577e-3, 0.012, 2**18),
     "pendulum": Door("gymnax", 1_000_000, 20, 1.682e-4, 0.019, 2**20),
     "MJX": Door("mujoco.mjx", 20_000, 2, 9.956e-4, 0.062, 2**14),
-    "brax": Door("brax", 20_000, 2, 1.0, 0.0, 2**11),
+    "brax": Door("brax", 20_000, 2, 4.532e-2, 0.025, 2**11),
 }
 """Truths as ``python -m benchmarks.doors --truth`` printed them, with gymnax 1.0.1, brax 0.14.2 and
 mujoco-mjx 3.17.0.
@@ -159,38 +165,47 @@ def main(argv: list[str] | None = None) -> None:
         print(json.dumps(figures(name, int(budget), int(keys))))
         return
     names = args.systems or size(args, list(SYSTEMS), ["gymnax", "pendulum"], ["gymnax"])
+    names = [] if args.lines else names
     say = (lambda *_: None) if args.json else lambda *words: print(*words, flush=True)
-    report = {}
-    for name in [] if args.lines else names:
-        about = SYSTEMS[name]
-        if absent(name):
-            report[name] = None
-            say(f"{name}: {about.library} is not installed")
-        elif args.truth:
+    report: dict[str, Any] = dict.fromkeys(filter(absent, names))
+    for name in report:
+        say(f"{name} is left out: {SYSTEMS[name].library} is not installed")
+    names = [name for name in names if name not in report]
+    if args.truth:
+        for name in names:
             report[name] = truth(name)
             say("{}: {:.4g}, relative standard error {:.2g}".format(name, *report[name]))
-        else:
+    elif names:
+        say(HEADS[0])
+        for name in names:
+            about = SYSTEMS[name]
+            budget = size(args, about.budget, about.budget, 300_000)
             keys = args.seeds or size(args, about.keys, 2, 1)
-            report[name] = in_its_own_process(
-                name, size(args, about.budget, about.budget, 300_000), keys
-            )
-            say(_line(report[name]))
+            report[name] = in_its_own_process(name, budget, keys)
+            say(_row(report[name]))
     if not args.truth:
         report["lines"] = {name: lines(block) for name, block in EXAMPLES.items()}
-    for name, count in report.get("lines", {}).items():
-        say(f"{name}: {count['lines']} lines, of which {count['call']} make the simulator")
+        say(HEADS[1])
+        for name, count in report["lines"].items():
+            say(f"| {name} | {count['lines']} | {count['call']} |")
     if args.json:
         print(json.dumps(report))
 
 
-def _line(row):
-    from benchmarks.time_to_answer import line
-
-    cold = row["to_first_failure"]
-    return (
-        f"{line(row)}  first failure after {cold['wall_s']:.1f} s ({cold['cpu_s']:.1f} CPU s),"
-        f" {cold['simulations']} simulations"
+def _row(r):
+    percent = lambda share: "-" if share is None else f"{100 * share:.1f} %"
+    cold, warm = r["to_first_failure"], r["warm"]
+    cells = (
+        f"{r['system']}, {r['budget']:,}",
+        f"{r['truth']:.3g} ({percent(SYSTEMS[r['system']].error)})",
+        f"{r['reliable']} of {r['seeds']}",
+        f"{percent(r['rms'])} ({percent(r['rms_of_all'])})",
+        f"{r['held']} of {r['reliable']}",
+        f"{r['first']:.1f}, " + ("-" if warm is None else f"{warm:.1f}"),
+        percent(r["plain"]),
+        f"{cold['wall_s']:.1f} ({cold['cpu_s']:.1f})",
     )
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

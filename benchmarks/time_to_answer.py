@@ -31,7 +31,7 @@ from jast.judge import judged  # noqa: E402
 from jast.limit_state import dimension  # noqa: E402
 from jast.simulators import limit_state  # noqa: E402
 
-__all__ = ["SYSTEMS", "System", "line", "plain_draws", "row_of"]
+__all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
 
 
 class System(NamedTuple):
@@ -245,13 +245,12 @@ def main(argv: list[str] | None = None) -> None:
                 row["plain"] = plain_draws(SYSTEMS[name], row["warm"] or row["first"])
             rows.append(row)
             if not args.json:
-                print(line(row), flush=True)
+                print(_line(row), flush=True)
     if args.json:
         print(json.dumps(dict(seeds=seeds, rows=rows)))
 
 
-def line(r: dict[str, Any]) -> str:
-    """A row of figures, to be read."""
+def _line(r):
     percent = lambda v: "-" if v is None else f"{100 * v:.1f} %"
     warm = "-" if r["warm"] is None else f"{r['warm']:.1f}"
     plain = f"  plain draws {percent(r['plain'])}" if "plain" in r else ""
