@@ -31,16 +31,19 @@ from jast.judge import judged  # noqa: E402
 from jast.limit_state import dimension  # noqa: E402
 from jast.simulators import limit_state  # noqa: E402
 
-__all__ = ["SYSTEMS", "System"]
+__all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
 
 
 class System(NamedTuple):
-    """A simulator, the probability that it fails, and that one's relative standard error."""
+    """A simulator, the probability that it fails, and that one's relative standard error.
+    ``budget``: of each method, where it is not the one that follows from the measured rate.
+    """
 
     simulator: jast.Simulator
     truth: float
     error: float = 0.0
     group: str = "static"
+    budget: int | None = None
 
 
 def leaf(u):
@@ -139,9 +142,9 @@ def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if method == "stress":
-            found = jast.stress(key, about.simulator).probability
+            found = jast.stress(key, about.simulator, about.budget).probability
         elif method == "failure_probability":
-            found = jast.estimate.failure_probability(key, about.simulator)
+            found = jast.estimate.failure_probability(key, about.simulator, about.budget)
         else:
             found = _subset(about, seed)
     return found, time.process_time() - begun
@@ -177,9 +180,9 @@ def _subset(about, seed):
     return (math.log(p) if p > 0 else math.nan), error
 
 
-def row_of(name: str, method: str, seeds: int) -> dict[str, Any]:
+def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     """Figures of a method on a system over ``seeds`` keys."""
-    about, found, seconds = SYSTEMS[name], [], []
+    found, seconds = [], []
     for seed in range(seeds):
         one, spent = answers(method, about, seed)
         found.append(one)
@@ -215,9 +218,9 @@ def row_of(name: str, method: str, seeds: int) -> dict[str, Any]:
     )
 
 
-def plain_draws(name: str, seconds: float) -> float | None:
+def plain_draws(about: System, seconds: float) -> float | None:
     """The relative standard error of plain draws in so many CPU seconds."""
-    about, n = SYSTEMS[name], 2**15
+    n = 2**15
     count = lambda seed: jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
     count(0)
     begun = time.process_time()
@@ -237,9 +240,9 @@ def main(argv: list[str] | None = None) -> None:
     seeds, rows = args.seeds or size(args, 20, 2, 1), []
     for name in names:
         for method in methods:
-            row = row_of(name, method, seeds)
+            row = row_of(name, SYSTEMS[name], method, seeds)
             if method == "failure_probability":
-                row["plain"] = plain_draws(name, row["warm"] or row["first"])
+                row["plain"] = plain_draws(SYSTEMS[name], row["warm"] or row["first"])
             rows.append(row)
             if not args.json:
                 print(_line(row), flush=True)

@@ -25,6 +25,7 @@ SMALLEST = {  # beside each other what shares compiled programs
     "closed_loops": ["--smoke"],
     "colav": ["--smoke"],
     "cross_entropy": ["--smoke"],
+    "doors": ["--smoke"],
     "explain": ["--smoke"],
     "failure_samples": ["--smoke"],
     "fms": ["--smoke"],

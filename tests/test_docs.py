@@ -17,16 +17,12 @@ import pytest
 from doors import DOORS
 
 import jast
+from benchmarks.doors import EXAMPLES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "docs/start.md", *sorted((ROOT / "docs/guides").glob("*.md"))]
 SYSTEMS = ROOT / "docs/guides/environments.md"  # its examples stand alone, and need other libraries
 PAGES.remove(SYSTEMS)
-EXAMPLES = {
-    section.partition("\n")[0]: block
-    for section in SYSTEMS.read_text().split("\n## ")
-    for block in re.findall(r"```python\n(.*?)```", section, re.S)
-}
 ROOMS = [name for name in jast.__all__ if isinstance(getattr(jast, name), ModuleType)]
 
 
