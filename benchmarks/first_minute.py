@@ -28,6 +28,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import jast  # noqa: E402
+from benchmarks.doors import simulator  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
 
@@ -63,43 +64,14 @@ def plane() -> jast.Simulator:
     return jast.simulators.limit_state(lambda z: 4.75 - jnp.sum(z) / jnp.sqrt(20.0), 20)
 
 
-def gymnax() -> jast.Simulator:
-    """CartPole of gymnax, whose linear policy sees it through noise."""
-    import gymnax
-
-    env, params = gymnax.make("CartPole-v1")
-    gains = jnp.array([0.1, 0.2, 1.0, 0.5])
-    return jast.adapters.gymnax(
-        env,
-        params,
-        policy=lambda seen: jnp.where(seen @ gains > 0.0, 1, 0),
-        horizon=100,
-        observation=Normal(jnp.zeros(4), 0.14),
-        distance=lambda now: params.theta_threshold_radians - jnp.abs(now.state.theta),
-    )
-
-
-def brax() -> jast.Simulator:
-    """The inverted pendulum of brax, whose linear policy sees it through noise."""
-    from brax import envs
-
-    gains = jnp.array([0.2, 3.0, 0.3, 0.6])
-    return jast.adapters.brax(
-        envs.get_environment("inverted_pendulum", backend="spring"),
-        policy=lambda seen: jnp.clip(seen @ gains, -1.0, 1.0)[None],
-        horizon=50,
-        observation=Normal(jnp.zeros(4), 0.02),
-        distance=lambda now: 0.2 - jnp.abs(now.observation[1]),
-    )
-
-
 STRESS, PROBABILITY = jast.stress, jast.estimate.failure_probability
 SYSTEMS: dict[str, tuple[Callable, Callable, tuple, str]] = {
     "lane": (lane, STRESS, (None, 1_000_000), ""),
     "ferry": (jast.simulators.ferry, STRESS, (None, 100_000), ""),
     "plane of 20 numbers": (plane, PROBABILITY, (100_000, 150_000), ""),
-    "gymnax CartPole": (gymnax, STRESS, (20_000, 30_000), "gymnax"),
-    "brax inverted pendulum": (brax, STRESS, (5_000, 8_000), "brax"),
+    "gymnax CartPole": (partial(simulator, "gymnax"), STRESS, (20_000, 30_000), "gymnax"),
+    "MJX cart-pole": (partial(simulator, "MJX"), STRESS, (5_000, 8_000), "mujoco"),
+    "brax inverted pendulum": (partial(simulator, "brax"), STRESS, (5_000, 8_000), "brax"),
 }
 """Name -> simulator, call, its budget and another one, and the library that it is made of."""
 

@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 SMALLEST = {  # beside each other what shares compiled programs
     "ferry": ["--smoke"],
     "few_calls": ["--smoke"],
+    "first_minute": ["--smoke"],
     "table1": ["--table1", "--smoke"],
     "engine": ["--smoke"],
     "arch": ["--smoke"],
