@@ -277,7 +277,11 @@ def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
     seen = Page(whole)
     names = [tag for tag, _ in seen.tags]
     assert names.count("img") == 2 and "script" not in names and len(whole) < 60_000
-    assert "The system fails in 2 ways" in whole and "75 % [70, 81]" in whole and "not estimated" in whole
+    assert (
+        "The system fails in 2 ways" in whole
+        and "75 % [70, 81]" in whole
+        and "not estimated" in whole
+    )
     for _, attributes in [t for t in seen.tags if t[0] == "img"]:
         png = b64decode(attributes["src"].removeprefix("data:image/png;base64,"))
         assert png.startswith(b"\x89PNG") and len(png) < 20_000
