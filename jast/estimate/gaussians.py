@@ -320,5 +320,6 @@ def _log_joint(g, z):
 
 def log_sum(a):
     """log of the sums of exp(a) [n, K]: [n]."""
-    top = a.max(axis=1)
-    return top + np.log(np.exp(a - top[:, None]).sum(axis=1))
+    rows = np.ascontiguousarray(a.T)  # K is small: a maximum along it is many short ones
+    top = rows.max(axis=0)
+    return top + np.log(np.exp(rows - top).sum(axis=0))

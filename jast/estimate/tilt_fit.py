@@ -229,16 +229,15 @@ def _gated(x, z, w, gates, common):
 
 
 def _joint(x, z, means, log_g, scales):
-    m = x @ means
-    gap = (z[:, None] - m) / np.exp(scales)
-    return x @ log_g - scales + (z[:, None] ** 2 - gap**2) / 2
+    # [G, N] while it is computed: rows as short as G cost more than what is done with them
+    gap = (z - means.T @ x.T) / np.exp(scales)[:, None]
+    return (log_g.T @ x.T - scales[:, None] + (z**2 - gap**2) / 2).T
 
 
 def _parts(x, z, means, log_g, scales):
     """Which part [N, G] of each number is of which Gaussian."""
     joint = _joint(x, z, means, log_g, scales)
-    r = np.exp(joint - joint.max(axis=1, keepdims=True))
-    return r / r.sum(axis=1, keepdims=True)
+    return np.exp(joint - log_sum(joint)[:, None])
 
 
 def _lines(x, z, w, ridge):
@@ -268,8 +267,8 @@ def _logits(x, target, log_p, w, ridge, start=None):
         log_q = log_p + x @ out
         log_q = log_q - log_sum(log_q)[:, None]
         with np.errstate(invalid="ignore"):
-            each = np.where(target > 0, target * log_q, 0).sum(axis=1)
-        return w @ each - 0.5 * ridge @ (out**2).sum(axis=1), np.exp(log_q)
+            each = w @ np.where(target > 0, target * log_q, 0)
+        return each.sum() - 0.5 * ridge @ (out**2).sum(axis=1), np.exp(log_q)
 
     now, p = value(out)
     for _ in range(NEWTON if start is not None else ITERATIONS * (1 if len(others) == 1 else 2)):
