@@ -27,6 +27,7 @@ from jast.outline import outline
 from jast.places import Post, Task
 from jast.policy import undisturbed
 from jast.progress import Progress, advance, begin, conclude
+from jast.pytrees import clear
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -310,6 +311,8 @@ def outcome(key: Any, sim: Any, live: Any, reward: Callable) -> tuple[Progress, 
         x = D.sample(sim.disturbance(progress.state), jax.random.clone(keys[t + 1]))
         return advance(sim, reward, progress, x, t + 1 >= sim.horizon), t + 1
 
-    first = first._replace(done=first.done | ~jnp.asarray(live))
+    live = jnp.asarray(live)
+    # of a state of zeros no black box is asked, whatever the lanes beside it go on with
+    first = first._replace(done=first.done | ~live, state=clear(~live, first.state))
     last, steps = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
     return conclude(sim, reward, last, live), steps

@@ -276,6 +276,13 @@ def test_the_nominal_system():
     assert blackbox.calls(sim).episodes in (501, 502)
 
 
+def test_an_object_runs_no_nominal_episode_in_vain():
+    """Of 15 steps: 30 episodes, and the undisturbed one, which is begun and played."""
+    sim = box(blackboxes.Walk, 15, episodic=False)
+    jast.nominal(jax.random.key(0), sim, episodes=30)
+    assert blackbox.calls(sim).episodes <= 30 + 2
+
+
 def test_seeds_are_the_disturbance_of_a_system_of_unknown_density():
     sim = blackbox.from_python(lambda seeds: (False, float(seeds[1])), horizon=2)
     episode = jast.rollout(jax.random.key(0), sim)
