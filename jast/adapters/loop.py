@@ -22,7 +22,7 @@ from jast.adapters.noise import Random, add, bound, model_of, random, replaced
 from jast.contract import OBSERVED
 from jast.simulator import Simulator, fixed, ravel
 
-__all__ = ["Instant", "Outcome", "simulator"]
+__all__ = ["Instant", "Outcome", "bare", "simulator"]
 
 
 class Instant(NamedTuple):
@@ -141,6 +141,25 @@ def simulator(
         is_terminal=_terminated,
         observe=Partial(_observe, loop),
     )
+
+
+def bare(name: str, env: Any, start: str, step: str, *, seed: Any, hint: str = "") -> None:
+    """Refuses an ``env`` without methods of these signatures or with a wrapper that starts anew by
+    itself, and a seed a step where ``step`` takes no key.
+    """
+    layer, kinds = env, []
+    while layer is not None:
+        kinds.append(type(layer).__name__)
+        fields = getattr(layer, "__dict__", {})
+        layer = fields.get("env", fields.get("_env"))
+    again = any("AutoReset" in kind for kind in kinds)
+    if again or not all(callable(getattr(env, it.split("(")[0], None)) for it in (start, step)):
+        raise ValueError(
+            f"{name}: env must be an environment with {start} and {step}, and without a wrapper"
+            f" that starts anew by itself, received {' of '.join(kinds)}" + (hint if again else "")
+        )
+    if seed == "step" and "key" not in step:
+        raise ValueError(f'{name}: seed must be a whole number or "episode": {step} has no key')
 
 
 def _has_hash(value: Any) -> bool:
