@@ -12,8 +12,8 @@ from jax.tree_util import Partial
 from scipy import stats
 
 import jast
-from jast.adapters import brax, gymnax, mjx
-from jast.distributions import Bernoulli, Independent, Normal, Uniform
+from jast.adapters import brax, gymnax, jumanji, mjx, pgx
+from jast.distributions import Bernoulli, Categorical, Independent, Normal, Uniform
 from jast.estimate import monte_carlo
 
 SAMPLES = 20_000
@@ -302,6 +302,110 @@ def test_brax_by_parameters_and_a_force(key):
     assert env.pole == 1.1
 
 
+class Shown(NamedTuple):
+    x: Any
+    action_mask: Any
+
+
+class TimeStep(NamedTuple):
+    observation: Any
+    reward: Any
+    discount: Any
+    step_type: Any
+
+    def last(self):
+        return self.step_type == 2
+
+
+class Couple:
+    """As jumanji has them: x' = x + action, with rewards of two agents. The time is over after
+    eight steps; beyond 9, it terminates.
+    """
+
+    def reset(self, key):
+        state = {"x": jnp.zeros(1), "steps": 0, "key": key}
+        return state, self._timestep(state, 1.0, 0)
+
+    def step(self, state, action):
+        state = state | {"x": state["x"] + action, "steps": state["steps"] + 1}
+        fell = jnp.abs(state["x"][0]) > 9.0
+        last = fell | (state["steps"] >= 8)
+        return state, self._timestep(state, jnp.where(fell, 0.0, 1.0), jnp.where(last, 2, 1))
+
+    def _timestep(self, state, discount, kind):
+        seen = Shown(state["x"], jnp.ones(2, bool))
+        return TimeStep(seen, jnp.array([1.0, 2.0]), jnp.full(2, discount), jnp.int8(kind))
+
+
+def couple(env=None, **settings):
+    settings = dict(action=Normal(jnp.zeros(1), 1.0)) | settings
+    return jumanji(env or Couple(), lambda seen: -0.5 * seen.x, horizon=10, **settings)
+
+
+def test_jumanji_to_its_end(key):
+    """Ten steps of x' = .5 x + noise, though the time is over after eight."""
+    ending = dict(failure=lambda now: (now.time == 10) & (now.observation.x[0] > 1.0))
+    sim = jast.check(couple(distance=lambda now: 1 - now.observation.x[0], **ending))
+    within(monte_carlo(key, sim, SAMPLES), stats.norm.sf(1.0 / np.sqrt(np.sum(0.25 ** np.r_[:10]))))
+    failing = jast.replay(couple(), {"action": jnp.array([[1.0], [10.0], [0.0]])})
+    assert failing.failure and failing.length == 2
+    np.testing.assert_array_equal(failing.states.total[:3], [0.0, 3.0, 6.0])
+
+
+class Position(NamedTuple):
+    observation: Any
+    legal_action_mask: Any
+    current_player: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any = False
+
+
+class Nim:
+    """As pgx has them: one to three are taken of five, and who takes the last has lost. The key
+    decides who begins.
+    """
+
+    num_players = 2
+
+    def init(self, key):
+        begins = jax.random.bernoulli(key).astype(int)
+        return Position(jnp.int32(5), jnp.ones(3, bool), begins, jnp.zeros(2), False)
+
+    def step(self, state, action, key):
+        left, mover = state.observation - action - 1, state.current_player
+        over = left <= 0
+        rewards = jnp.where(over, jnp.where(jnp.arange(2) == mover, -1.0, 1.0), 0.0)
+        return Position(left, jnp.arange(3) < left, 1 - mover, rewards, over)
+
+
+def against_chance(env, first, horizon, **settings):
+    """A policy that makes the moves of player 0 against one who makes any legal move."""
+    other = lambda now: Categorical(probs=now.observation.legal_action_mask.astype(float))
+    filled = lambda action, draw: jnp.where(action < 0, draw, action)
+    policy = lambda seen: jnp.where(seen.current_player == 0, first(seen), -1)
+    return pgx(env, policy, horizon=horizon, action=(other, filled), **settings)
+
+
+def test_pgx_is_its_game_tree(key):
+    """Who takes one with 1, 2, 3, 4 left loses 1, 0, 1/2, 1/3, and 1/2 with 5; second, (1/3 + 1/2 +
+    0) / 3.
+    """
+    one = lambda seen: 0
+    sim = jast.check(against_chance(Nim(), one, 5, seed="episode"))
+    within(monte_carlo(key, sim, SAMPLES), (1 / 2 + 5 / 18) / 2)
+    begins = lambda seed: Nim().init(jax.random.key(seed)).current_player
+    seed = next(seed for seed in range(20) if begins(seed) == 0)
+    game = lambda env, *takes: jast.replay(
+        against_chance(env, one, 5, seed=seed), {"action": jnp.array(takes)}
+    )
+    assert game(Nim(), 0, 2).failure and game(Nim(), 0, 2).length == 3
+    won = game(Nim(), 0, 1, 0, 0)
+    assert won.length == 4 and not won.failure and won.states.reward[4] == 1.0
+    alone = type("Alone", (Nim,), {"num_players": 1})()
+    assert game(alone, 0, 1, 0, 0).failure  # of one, whatever its reward
+
+
 class Data(NamedTuple):
     qpos: Any = jnp.array([0.1])
     qvel: Any = jnp.zeros(1)
@@ -370,10 +474,16 @@ WRONG = {
     "gymnax: action must be a distribution, or a pair": lambda: drift(action=0.1),
     "AutoResetWrapper of Cart; brax.envs.get_env": lambda: cart(AutoResetWrapper(Cart())),
     "brax: env must be an environment with reset": lambda: cart(1.0),
+    "jumanji: env must be .*received AutoResetWrapper of Couple$": lambda: couple(
+        AutoResetWrapper(Couple())
+    ),
+    "pgx: env must be an environment with init.key. .*received Couple$": lambda: pgx(
+        Couple(), len, horizon=1
+    ),
     "received Episodes of AutoResetWrapper of Cart": lambda: cart(
         Episodes(AutoResetWrapper(Cart()))
     ),
-    'brax: seed .*received "step"': lambda: cart(seed="step"),
+    "brax: seed .*step.state, action. has no key": lambda: cart(seed="step"),
     "mjx: data must be .* without qpos": lambda: mjx(
         1.0, (), len, horizon=1, distance=len, step=len
     ),
@@ -488,6 +598,55 @@ def test_an_episode_of_brax_is_its_own_loop(key, theirs):
         np.testing.assert_allclose(states.observation[t + 1], state.obs, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="brax: env .*AutoResetWrapper of EpisodeWrapper"):
         brax(envs.create("inverted_pendulum"), act, horizon=10, action=Normal(jnp.zeros(1), 0.2))
+
+
+@pytest.mark.long
+def test_an_episode_of_jumanji_is_its_own_loop(key, theirs):
+    """Of the snake, which goes where it may and slips one time in ten."""
+    (theirs,) = library("jumanji")
+    env = theirs.make("Snake-v1")
+    act = lambda seen: jnp.argmax(seen.action_mask)
+    slipped = lambda action, slips: jnp.where(slips == 1, (action + 1) % 4, action)
+    sim = jast.check(
+        jumanji(env, act, horizon=60, action=(Bernoulli(probs=0.1), slipped), seed="episode")
+    )
+    episode = jast.search.monte_carlo(key, sim, episodes=20).failures[0]
+    states = jast.replay(sim, episode).states
+    (state, now), step = env.reset(jax.random.key(episode.x0["seed"])), jax.jit(env.step)
+    for t in range(int(episode.length)):
+        state, now = step(state, slipped(act(now.observation), episode.disturbances["action"][t]))
+        np.testing.assert_array_equal(states.observation.grid[t + 1], now.observation.grid)
+    assert now.last() and episode.failure
+    with pytest.raises(ValueError, match="jumanji: env .*AutoResetWrapper of Snake"):
+        wrapped = library("jumanji.wrappers")[0].AutoResetWrapper(env)
+        jumanji(wrapped, act, horizon=60, seed="episode")
+
+
+LINES = [(0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6)]
+
+
+def loses(board, mover):
+    """The probability that player 0 loses at noughts and crosses, who takes the first free place
+    while player 1 takes any.
+    """
+    if any(all(board[i] == 1 - mover for i in line) for line in LINES):
+        return float(mover == 0)
+    free = [i for i in range(9) if board[i] is None]
+    places = free[:1] if mover == 0 else free
+    after = [loses((*board[:i], mover, *board[i + 1 :]), 1 - mover) for i in places]
+    return np.mean(after) if after else 0.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("begins", [0, 1])
+def test_pgx_is_the_tree_of_noughts_and_crosses(begins, key, theirs):
+    (theirs,) = library("pgx")
+    env = theirs.make("tic_tac_toe")
+    first = lambda seen: jnp.argmax(seen.legal_action_mask)
+    starts = lambda seed: env.init(jax.random.key(seed)).current_player
+    seed = next(seed for seed in range(20) if starts(seed) == begins)
+    sim = jast.check(against_chance(env, first, 9, seed=seed))
+    within(monte_carlo(key, sim, SAMPLES), loses((None,) * 9, begins))
 
 
 BODY = """
