@@ -399,7 +399,7 @@ def test_pgx_is_its_game_tree(key):
     game = lambda env, *takes: jast.replay(
         against_chance(env, one, 5, seed=seed), {"action": jnp.array(takes)}
     )
-    assert game(Nim(), 0, 2).failure and game(Nim(), 0, 2).length == 3
+    assert game(Nim(), 0, 2, 0).failure and game(Nim(), 0, 2, 0).length == 3
     won = game(Nim(), 0, 1, 0, 0)
     assert won.length == 4 and not won.failure and won.states.reward[4] == 1.0
     alone = type("Alone", (Nim,), {"num_players": 1})()
