@@ -34,7 +34,7 @@ class _Environment:
         state, now = self.subject.step(push(state), action)
         # the end of the time, which is no failure, keeps a discount
         terminated = now.last() & jnp.all(jnp.asarray(now.discount) == 0)
-        return Outcome(state, now.observation, jnp.sum(now.reward), terminated)
+        return Outcome(state, now.observation, now.reward, terminated)
 
 
 def jumanji(

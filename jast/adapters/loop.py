@@ -41,7 +41,7 @@ class Instant(NamedTuple):
     observation: Any
     """What it shows, before the noise"""
     reward: Any
-    """Of the last step; 0 at the start"""
+    """Of the last step, the sum over agents; 0 at the start"""
     total: Any
     """The sum of the rewards so far"""
     terminated: Any
@@ -114,9 +114,9 @@ def simulator(
         if value is not None
     }
     if parameters is not None:
-        fields = isinstance(parameters, dict)  # of a dataclass, such as the params of gymnax
-        model = D.Joint(parameters) if fields else parameters
-        parameters = random(name, "parameters", model, replaced if fields else None)
+        # names are fields of a dataclass, such as the params of gymnax
+        fields = replaced if isinstance(parameters, dict) else None
+        parameters = random(name, "parameters", parameters, fields)
     drawn = seed if seed in ("episode", "step") else ""
     if not (noise or parameters or drawn):
         raise ValueError(
@@ -201,7 +201,8 @@ def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
     key = jax.random.key(x["seed"]) if loop.drawn == "step" else own
     system = _of(loop, now.parameters)
     after = system.step(key, keyed(now.state), action, lambda it: changed("force", it))
-    reward = jnp.asarray(after.reward, now.reward.dtype)
+    rewards = [jnp.sum(jnp.asarray(a)) for a in jax.tree.leaves(after.reward)]
+    reward = jnp.asarray(sum(rewards), now.reward.dtype)
     return now._replace(
         state=alike(numbers(after.state), now.state),
         observation=alike(numbers(after.observation), now.observation),
