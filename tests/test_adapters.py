@@ -1,6 +1,7 @@
 """The doors of `jast.adapters`, on small environments with the interfaces of the libraries."""
 
 import warnings
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -226,6 +227,40 @@ def test_what_is_observed(key):
     np.testing.assert_array_equal(sim.observe(last._replace(observation=jnp.zeros(81))), [1.0])
     told = gymnax(Picture(), Params(), observe=lambda now: now.state.x, **blind)
     np.testing.assert_array_equal(told.observe(last), [1.0])
+
+
+class Team:
+    """As JaxMARL has them: no params, and two agents by name; x' = x + action of each."""
+
+    max_steps = 99
+
+    def reset(self, key):
+        return self._seen(zero := jnp.zeros(2)), zero
+
+    def step_env(self, key, state, action):
+        state = state + jnp.stack([action["a"], action["b"]])
+        over = jnp.max(jnp.abs(state)) > 99.0
+        each = {"a": state[0], "b": 2 * state[1]}
+        return self._seen(state), state, each, {"a": over, "b": over, "__all__": over}, {}
+
+    def _seen(self, state):
+        return {"a": state[:1], "b": state[1:]}
+
+
+def team(**settings):
+    settings = dict(horizon=10) | settings
+    return gymnax(Team(), None, lambda seen: {k: -0.5 * v[0] for k, v in seen.items()}, **settings)
+
+
+def test_several_agents_without_params(key):
+    """Each is .5 x - .5 noise; the first of two ends above 1."""
+    noise = {"a": Normal(jnp.zeros(1), 1.0), "b": Independent(Normal(jnp.zeros(1), 1.0), 1)}
+    ends = dict(failure=lambda now: (now.time == 10) & (jnp.max(now.state) > 1.0))
+    sim = jast.check(team(observation=noise, **ends))
+    p = stats.norm.cdf(1.0 / (0.5 * np.sqrt(np.sum(0.25 ** np.arange(10.0)))))
+    within(monte_carlo(key, sim, SAMPLES), 1 - p**2)
+    rows = {"observation": {"a": jnp.array([[-2.0]]), "b": jnp.array([[-6.0]])}}
+    np.testing.assert_array_equal(jast.replay(sim, rows).states.reward[1], 1.0 + 2 * 3.0)
 
 
 class State(NamedTuple):
@@ -466,6 +501,11 @@ WRONG = {
     "horizon must be below params.max_steps_in_episode, which is 10": lambda: gymnax(
         Drift(), Timed(), len, horizon=10
     ),
+    "horizon must be below env.max_steps, which is 99": lambda: team(horizon=99),
+    "horizon must be below params.max_timesteps, which is 7": lambda: gymnax(
+        Drift(), Crafted(), len, horizon=8
+    ),
+    "brax: the physics are those of Warp, .*config_overrides": lambda: cart(Warped()),
     "gymnax: policy must be a function, received 1": lambda: gymnax(Drift(), 0, 1, horizon=1),
     'nothing is random: .*, or seed="episode"': drift,
     "mjx: nothing is random: give .*parameters=$": body,
@@ -524,6 +564,14 @@ class Whole(Drift):
 
 class Timed(NamedTuple):
     max_steps_in_episode: int = 10
+
+
+class Crafted(NamedTuple):
+    max_timesteps: int = 7
+
+
+class Warped(Cart):
+    mjx_model = SimpleNamespace(impl=SimpleNamespace(value="warp"))
 
 
 class Wrapped:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import jax
 import jax.numpy as jnp
 
+from jast.adapters.kept import without_warp
 from jast.adapters.loop import Instant, Outcome, bare, simulator
 from jast.simulator import Simulator
 
@@ -113,6 +114,8 @@ def brax(
         (20, 1)
     """
     hint = "; brax.envs.get_environment(name) makes one"
+    instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
+    without_warp("brax", getattr(env, "mjx_model", None), instead)
     bare("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
     return simulator(
         "brax",

@@ -114,9 +114,8 @@ def simulator(
         if value is not None
     }
     if parameters is not None:
-        # names are fields of a dataclass, such as the params of gymnax
-        fields = replaced if isinstance(parameters, dict) else None
-        parameters = random(name, "parameters", parameters, fields)
+        named = replaced if isinstance(parameters, dict) else None  # fields, as params of gymnax
+        parameters = random(name, "parameters", parameters, named)
     drawn = seed if seed in ("episode", "step") else ""
     if not (noise or parameters or drawn):
         raise ValueError(
