@@ -585,7 +585,7 @@ def test_what_is_refused(message):
         WRONG[message]()
 
 
-SYSTEMS = "needs the extra `systems`"
+SYSTEMS = "needs the extra `systems`, or jumanji and pgx"
 
 
 def library(*names):
