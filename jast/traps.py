@@ -46,9 +46,9 @@ def traps(sim: Simulator) -> list[str]:
         )
     if len(equations) > EQUATIONS:
         found.append(
-            f"step: {len(equations):,} operations of JAX take minutes to compile, in each of"
-            " several programs; jast.cache() keeps these for the next process, and a lax.scan in"
-            " place of a loop of Python makes fewer"
+            f"step: {len(equations):,} operations of JAX take minutes to compile, in the programs"
+            " of a search or an estimate together; jast.cache() keeps these for the next process,"
+            " and a lax.scan in place of a loop of Python makes fewer"
         )
     return found
 

@@ -1,6 +1,7 @@
 """The doors of `jast.adapters`, on small environments with the interfaces of the libraries."""
 
 import warnings
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +13,8 @@ from jax.tree_util import Partial
 from scipy import stats
 
 import jast
-from jast.adapters import brax, gymnax, mjx
-from jast.distributions import Bernoulli, Independent, Normal, Uniform
+from jast.adapters import brax, gymnax, jumanji, mjx, pgx
+from jast.distributions import Bernoulli, Categorical, Independent, Normal, Uniform
 from jast.estimate import monte_carlo
 
 SAMPLES = 20_000
@@ -228,6 +229,40 @@ def test_what_is_observed(key):
     np.testing.assert_array_equal(told.observe(last), [1.0])
 
 
+class Team:
+    """As JaxMARL has them: no params, and two agents by name; x' = x + action of each."""
+
+    max_steps = 99
+
+    def reset(self, key):
+        return self._seen(zero := jnp.zeros(2)), zero
+
+    def step_env(self, key, state, action):
+        state = state + jnp.stack([action["a"], action["b"]])
+        over = jnp.max(jnp.abs(state)) > 99.0
+        each = {"a": state[0], "b": 2 * state[1]}
+        return self._seen(state), state, each, {"a": over, "b": over, "__all__": over}, {}
+
+    def _seen(self, state):
+        return {"a": state[:1], "b": state[1:]}
+
+
+def team(**settings):
+    settings = dict(horizon=10) | settings
+    return gymnax(Team(), None, lambda seen: {k: -0.5 * v[0] for k, v in seen.items()}, **settings)
+
+
+def test_several_agents_without_params(key):
+    """Each is .5 x - .5 noise; the first of two ends above 1."""
+    noise = {"a": Normal(jnp.zeros(1), 1.0), "b": Independent(Normal(jnp.zeros(1), 1.0), 1)}
+    ends = dict(failure=lambda now: (now.time == 10) & (jnp.max(now.state) > 1.0))
+    sim = jast.check(team(observation=noise, **ends))
+    p = stats.norm.cdf(1.0 / (0.5 * np.sqrt(np.sum(0.25 ** np.arange(10.0)))))
+    within(monte_carlo(key, sim, SAMPLES), 1 - p**2)
+    rows = {"observation": {"a": jnp.array([[-2.0]]), "b": jnp.array([[-6.0]])}}
+    np.testing.assert_array_equal(jast.replay(sim, rows).states.reward[1], 1.0 + 2 * 3.0)
+
+
 class State(NamedTuple):
     pipeline_state: Any
     obs: Any
@@ -302,6 +337,110 @@ def test_brax_by_parameters_and_a_force(key):
     assert env.pole == 1.1
 
 
+class Shown(NamedTuple):
+    x: Any
+    action_mask: Any
+
+
+class TimeStep(NamedTuple):
+    observation: Any
+    reward: Any
+    discount: Any
+    step_type: Any
+
+    def last(self):
+        return self.step_type == 2
+
+
+class Couple:
+    """As jumanji has them: x' = x + action, with rewards of two agents. The time is over after
+    eight steps; beyond 9, it terminates.
+    """
+
+    def reset(self, key):
+        state = {"x": jnp.zeros(1), "steps": 0, "key": key}
+        return state, self._timestep(state, 1.0, 0)
+
+    def step(self, state, action):
+        state = state | {"x": state["x"] + action, "steps": state["steps"] + 1}
+        fell = jnp.abs(state["x"][0]) > 9.0
+        last = fell | (state["steps"] >= 8)
+        return state, self._timestep(state, jnp.where(fell, 0.0, 1.0), jnp.where(last, 2, 1))
+
+    def _timestep(self, state, discount, kind):
+        seen = Shown(state["x"], jnp.ones(2, bool))
+        return TimeStep(seen, jnp.array([1.0, 2.0]), jnp.full(2, discount), jnp.int8(kind))
+
+
+def couple(env=None, **settings):
+    settings = dict(action=Normal(jnp.zeros(1), 1.0)) | settings
+    return jumanji(env or Couple(), lambda seen: -0.5 * seen.x, horizon=10, **settings)
+
+
+def test_jumanji_to_its_end(key):
+    """Ten steps of x' = .5 x + noise, though the time is over after eight."""
+    ending = dict(failure=lambda now: (now.time == 10) & (now.observation.x[0] > 1.0))
+    sim = jast.check(couple(distance=lambda now: 1 - now.observation.x[0], **ending))
+    within(monte_carlo(key, sim, SAMPLES), stats.norm.sf(1.0 / np.sqrt(np.sum(0.25 ** np.r_[:10]))))
+    failing = jast.replay(couple(), {"action": jnp.array([[1.0], [10.0], [0.0]])})
+    assert failing.failure and failing.length == 2
+    np.testing.assert_array_equal(failing.states.total[:3], [0.0, 3.0, 6.0])
+
+
+class Position(NamedTuple):
+    observation: Any
+    legal_action_mask: Any
+    current_player: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any = False
+
+
+class Nim:
+    """As pgx has them: one to three are taken of five, and who takes the last has lost. The key
+    decides who begins.
+    """
+
+    num_players = 2
+
+    def init(self, key):
+        begins = jax.random.bernoulli(key).astype(int)
+        return Position(jnp.int32(5), jnp.ones(3, bool), begins, jnp.zeros(2), False)
+
+    def step(self, state, action, key):
+        left, mover = state.observation - action - 1, state.current_player
+        over = left <= 0
+        rewards = jnp.where(over, jnp.where(jnp.arange(2) == mover, -1.0, 1.0), 0.0)
+        return Position(left, jnp.arange(3) < left, 1 - mover, rewards, over)
+
+
+def against_chance(env, first, horizon, **settings):
+    """A policy that makes the moves of player 0 against one who makes any legal move."""
+    other = lambda now: Categorical(probs=now.observation.legal_action_mask.astype(float))
+    filled = lambda action, draw: jnp.where(action < 0, draw, action)
+    policy = lambda seen: jnp.where(seen.current_player == 0, first(seen), -1)
+    return pgx(env, policy, horizon=horizon, action=(other, filled), **settings)
+
+
+def test_pgx_is_its_game_tree(key):
+    """Who takes one with 1, 2, 3, 4 left loses 1, 0, 1/2, 1/3, and 1/2 with 5; second, (1/3 + 1/2 +
+    0) / 3.
+    """
+    one = lambda seen: 0
+    sim = jast.check(against_chance(Nim(), one, 5, seed="episode"))
+    within(monte_carlo(key, sim, SAMPLES), (1 / 2 + 5 / 18) / 2)
+    begins = lambda seed: Nim().init(jax.random.key(seed)).current_player
+    seed = next(seed for seed in range(20) if begins(seed) == 0)
+    game = lambda env, *takes: jast.replay(
+        against_chance(env, one, 5, seed=seed), {"action": jnp.array(takes)}
+    )
+    assert game(Nim(), 0, 2, 0).failure and game(Nim(), 0, 2, 0).length == 3
+    won = game(Nim(), 0, 1, 0, 0)
+    assert won.length == 4 and not won.failure and won.states.reward[4] == 1.0
+    alone = type("Alone", (Nim,), {"num_players": 1})()
+    assert game(alone, 0, 1, 0, 0).failure  # of one, whatever its reward
+
+
 class Data(NamedTuple):
     qpos: Any = jnp.array([0.1])
     qvel: Any = jnp.zeros(1)
@@ -362,6 +501,11 @@ WRONG = {
     "horizon must be below params.max_steps_in_episode, which is 10": lambda: gymnax(
         Drift(), Timed(), len, horizon=10
     ),
+    "horizon must be below env.max_steps, which is 99": lambda: team(horizon=99),
+    "horizon must be below params.max_timesteps, which is 7": lambda: gymnax(
+        Drift(), Crafted(), len, horizon=8
+    ),
+    "brax: the physics are those of Warp, .*config_overrides": lambda: cart(Warped()),
     "gymnax: policy must be a function, received 1": lambda: gymnax(Drift(), 0, 1, horizon=1),
     'nothing is random: .*, or seed="episode"': drift,
     "mjx: nothing is random: give .*parameters=$": body,
@@ -370,10 +514,16 @@ WRONG = {
     "gymnax: action must be a distribution, or a pair": lambda: drift(action=0.1),
     "AutoResetWrapper of Cart; brax.envs.get_env": lambda: cart(AutoResetWrapper(Cart())),
     "brax: env must be an environment with reset": lambda: cart(1.0),
+    "jumanji: env must be .*received AutoResetWrapper of Couple$": lambda: couple(
+        AutoResetWrapper(Couple())
+    ),
+    "pgx: env must be an environment with init.key. .*received Couple$": lambda: pgx(
+        Couple(), len, horizon=1
+    ),
     "received Episodes of AutoResetWrapper of Cart": lambda: cart(
         Episodes(AutoResetWrapper(Cart()))
     ),
-    'brax: seed .*received "step"': lambda: cart(seed="step"),
+    "brax: seed .*step.state, action. has no key": lambda: cart(seed="step"),
     "mjx: data must be .* without qpos": lambda: mjx(
         1.0, (), len, horizon=1, distance=len, step=len
     ),
@@ -416,6 +566,14 @@ class Timed(NamedTuple):
     max_steps_in_episode: int = 10
 
 
+class Crafted(NamedTuple):
+    max_timesteps: int = 7
+
+
+class Warped(Cart):
+    mjx_model = SimpleNamespace(impl=SimpleNamespace(value="warp"))
+
+
 class Wrapped:
     def __getattr__(self, name):
         return getattr(Drift(), name)
@@ -427,7 +585,7 @@ def test_what_is_refused(message):
         WRONG[message]()
 
 
-SYSTEMS = "needs the extra `systems`"
+SYSTEMS = "needs the extra `systems`, or jumanji and pgx"
 
 
 def library(*names):
@@ -488,6 +646,55 @@ def test_an_episode_of_brax_is_its_own_loop(key, theirs):
         np.testing.assert_allclose(states.observation[t + 1], state.obs, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="brax: env .*AutoResetWrapper of EpisodeWrapper"):
         brax(envs.create("inverted_pendulum"), act, horizon=10, action=Normal(jnp.zeros(1), 0.2))
+
+
+@pytest.mark.long
+def test_an_episode_of_jumanji_is_its_own_loop(key, theirs):
+    """Of the snake, which goes where it may and slips one time in ten."""
+    (theirs,) = library("jumanji")
+    env = theirs.make("Snake-v1")
+    act = lambda seen: jnp.argmax(seen.action_mask)
+    slipped = lambda action, slips: jnp.where(slips == 1, (action + 1) % 4, action)
+    sim = jast.check(
+        jumanji(env, act, horizon=60, action=(Bernoulli(probs=0.1), slipped), seed="episode")
+    )
+    episode = jast.search.monte_carlo(key, sim, episodes=20).failures[0]
+    states = jast.replay(sim, episode).states
+    (state, now), step = env.reset(jax.random.key(episode.x0["seed"])), jax.jit(env.step)
+    for t in range(int(episode.length)):
+        state, now = step(state, slipped(act(now.observation), episode.disturbances["action"][t]))
+        np.testing.assert_array_equal(states.observation.grid[t + 1], now.observation.grid)
+    assert now.last() and episode.failure
+    with pytest.raises(ValueError, match="jumanji: env .*AutoResetWrapper of Snake"):
+        wrapped = library("jumanji.wrappers")[0].AutoResetWrapper(env)
+        jumanji(wrapped, act, horizon=60, seed="episode")
+
+
+LINES = [(0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6)]
+
+
+def loses(board, mover):
+    """The probability that player 0 loses at noughts and crosses, who takes the first free place
+    while player 1 takes any.
+    """
+    if any(all(board[i] == 1 - mover for i in line) for line in LINES):
+        return float(mover == 0)
+    free = [i for i in range(9) if board[i] is None]
+    places = free[:1] if mover == 0 else free
+    after = [loses((*board[:i], mover, *board[i + 1 :]), 1 - mover) for i in places]
+    return np.mean(after) if after else 0.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("begins", [0, 1])
+def test_pgx_is_the_tree_of_noughts_and_crosses(begins, key, theirs):
+    (theirs,) = library("pgx")
+    env = theirs.make("tic_tac_toe")
+    first = lambda seen: jnp.argmax(seen.legal_action_mask)
+    starts = lambda seed: env.init(jax.random.key(seed)).current_player
+    seed = next(seed for seed in range(20) if starts(seed) == begins)
+    sim = jast.check(against_chance(env, first, 9, seed=seed))
+    within(monte_carlo(key, sim, SAMPLES), loses((None,) * 9, begins))
 
 
 BODY = """

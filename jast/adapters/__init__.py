@@ -6,7 +6,9 @@ A Gymnasium environment: `jast.blackbox.gymnasium_system`.
 
 from jast.adapters.brax import brax
 from jast.adapters.gymnax import gymnax
+from jast.adapters.jumanji import jumanji
 from jast.adapters.loop import Instant
 from jast.adapters.mjx import mjx
+from jast.adapters.pgx import pgx
 
-__all__ = ["Instant", "brax", "gymnax", "mjx"]
+__all__ = ["Instant", "brax", "gymnax", "jumanji", "mjx", "pgx"]

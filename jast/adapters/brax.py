@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.loop import Instant, Outcome, simulator
+from jast.adapters.kept import without_warp
+from jast.adapters.loop import Instant, Outcome, bare, simulator
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -112,21 +113,10 @@ def brax(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["action"].shape
         (20, 1)
     """
-    layer, kinds = env, []
-    while layer is not None:
-        kinds.append(type(layer).__name__)
-        layer = getattr(layer, "__dict__", {}).get("env")
-    again = [kind for kind in kinds if "AutoReset" in kind]
-    if again or not all(callable(getattr(env, name, None)) for name in ("reset", "step")):
-        raise ValueError(
-            "brax: env must be an environment with reset(key) and step(state, action), and without"
-            f" a wrapper that starts anew by itself, received {' of '.join(kinds)}"
-            + ("; brax.envs.get_environment(name) makes one" if again else "")
-        )
-    if seed == "step":
-        raise ValueError(
-            'brax: seed must be a whole number or "episode", received "step": step has no key'
-        )
+    hint = "; brax.envs.get_environment(name) makes one"
+    instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
+    without_warp("brax", getattr(env, "mjx_model", None), instead)
+    bare("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
     return simulator(
         "brax",
         _Environment(env),

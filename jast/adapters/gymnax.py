@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["gymnax"]
 
+# of gymnax, craftax and JaxMARL
+LIMITS = (("params", "max_steps_in_episode"), ("params", "max_timesteps"), ("env", "max_steps"))
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -28,13 +31,17 @@ class _Environment:
     """Its params"""
 
     def reset(self, key: Any) -> Outcome:
-        observation, state = self.env.reset(key, self.subject)
+        observation, state = self.env.reset(key, *self._given())
         return Outcome(state, observation, 0.0, False)
 
     def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
         step = without_stops(self.env.step_env)
-        observation, state, reward, done, _ = step(key, push(state), action, self.subject)
-        return Outcome(state, observation, reward, done)
+        observation, state, reward, done, _ = step(key, push(state), action, *self._given())
+        # of several agents: those of each by its name
+        return Outcome(state, observation, reward, done["__all__"] if type(done) is dict else done)
+
+    def _given(self) -> tuple[Any, ...]:
+        return () if self.subject is None else (self.subject,)
 
 
 def gymnax(
@@ -53,7 +60,7 @@ def gymnax(
     observe: Callable[[Instant], chex.Array] | None = None,
 ) -> Simulator:
     """A policy in an environment of gymnax, or of a library with the same ``reset(key, params)``
-    and ``step_env(key, state, action, params)``.
+    and ``step_env(key, state, action, params)``, such as craftax; JaxMARL has them without params.
 
     Uses ``step_env``, as ``step`` starts anew by itself and so hides failures. Derivatives go
     through what the environment wraps in ``stop_gradient``: gymnax does so with each state. An
@@ -66,8 +73,10 @@ def gymnax(
 
     Args:
         env: the environment, without wrappers.
-        params: its parameters; traced, so that others do not compile again.
-        policy: observation -> action. Bind what you want to sweep by `jax.tree_util.Partial`.
+        params: its parameters; traced, so that others do not compile again. None: its methods take
+            none.
+        policy: observation -> action; of several agents, all their observations -> all their
+            actions. Bind what you want to sweep by `jax.tree_util.Partial`.
         horizon: steps of an episode.
         observation: noise added to what the policy sees: a distribution of the shape of the
             observation, such as ``Normal(jnp.zeros(4), 0.1)``; or a pair (distribution, function
@@ -124,13 +133,13 @@ def gymnax(
             f" action, params), received {kind.__name__}"
             + ("; give the environment that it wraps" if wraps else "")
         )
-    limit = getattr(params, "max_steps_in_episode", None)
-    # before version 1.0, `done` of step_env says also that the time is over
-    if not (hasattr(env, "is_terminated") or limit is None or is_traced(limit)):
-        if horizon >= limit:
+    # but for gymnax 1.0, `done` of step_env says also that the time is over
+    for place, name in LIMITS if not hasattr(env, "is_terminated") else ():
+        limit = getattr(params if place == "params" else env, name, None)
+        if not (limit is None or is_traced(limit)) and horizon >= limit:
             raise ValueError(
-                f"gymnax: horizon must be below params.max_steps_in_episode, which is {limit}:"
-                f" there step_env says that it has terminated; received {horizon}"
+                f"gymnax: horizon must be below {place}.{name}, which is {limit}: there step_env"
+                f" says that it has terminated; received {horizon}"
             )
     return simulator(
         "gymnax",

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast.pytrees import Key
 
-__all__ = ["alike", "keyed", "numbers"]
+__all__ = ["alike", "keyed", "numbers", "without_warp"]
 
 
 def numbers(tree: Any) -> Any:
@@ -40,3 +40,12 @@ def alike(tree: Any, like: Any) -> Any:
         return jnp.asarray(a, b.dtype if same else None)
 
     return jax.tree.map(cast, tree, like)
+
+
+def without_warp(name: str, model: Any, instead: str) -> None:
+    """Refuses a model of MuJoCo whose data are shared by all episodes under `jax.vmap`."""
+    if getattr(getattr(model, "impl", None), "value", None) == "warp":
+        raise ValueError(
+            f"{name}: the physics are those of Warp, which keeps one memory for all episodes;"
+            f" expected those of JAX: {instead}"
+        )

@@ -22,7 +22,7 @@ from jast.adapters.noise import Random, add, bound, model_of, random, replaced
 from jast.contract import OBSERVED
 from jast.simulator import Simulator, fixed, ravel
 
-__all__ = ["Instant", "Outcome", "simulator"]
+__all__ = ["Instant", "Outcome", "bare", "simulator"]
 
 
 class Instant(NamedTuple):
@@ -41,7 +41,7 @@ class Instant(NamedTuple):
     observation: Any
     """What it shows, before the noise"""
     reward: Any
-    """Of the last step; 0 at the start"""
+    """Of the last step, the sum over agents; 0 at the start"""
     total: Any
     """The sum of the rewards so far"""
     terminated: Any
@@ -114,9 +114,8 @@ def simulator(
         if value is not None
     }
     if parameters is not None:
-        fields = isinstance(parameters, dict)  # of a dataclass, such as the params of gymnax
-        model = D.Joint(parameters) if fields else parameters
-        parameters = random(name, "parameters", model, replaced if fields else None)
+        named = replaced if isinstance(parameters, dict) else None  # fields, as params of gymnax
+        parameters = random(name, "parameters", parameters, named)
     drawn = seed if seed in ("episode", "step") else ""
     if not (noise or parameters or drawn):
         raise ValueError(
@@ -141,6 +140,25 @@ def simulator(
         is_terminal=_terminated,
         observe=Partial(_observe, loop),
     )
+
+
+def bare(name: str, env: Any, start: str, step: str, *, seed: Any, hint: str = "") -> None:
+    """Refuses an ``env`` without methods of these signatures or with a wrapper that starts anew by
+    itself, and a seed a step where ``step`` takes no key.
+    """
+    layer, kinds = env, []
+    while layer is not None:
+        kinds.append(type(layer).__name__)
+        fields = getattr(layer, "__dict__", {})
+        layer = fields.get("env", fields.get("_env"))
+    again = any("AutoReset" in kind for kind in kinds)
+    if again or not all(callable(getattr(env, it.split("(")[0], None)) for it in (start, step)):
+        raise ValueError(
+            f"{name}: env must be an environment with {start} and {step}, and without a wrapper"
+            f" that starts anew by itself, received {' of '.join(kinds)}" + (hint if again else "")
+        )
+    if seed == "step" and "key" not in step:
+        raise ValueError(f'{name}: seed must be a whole number or "episode": {step} has no key')
 
 
 def _has_hash(value: Any) -> bool:
@@ -182,7 +200,8 @@ def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
     key = jax.random.key(x["seed"]) if loop.drawn == "step" else own
     system = _of(loop, now.parameters)
     after = system.step(key, keyed(now.state), action, lambda it: changed("force", it))
-    reward = jnp.asarray(after.reward, now.reward.dtype)
+    rewards = [jnp.sum(jnp.asarray(a)) for a in jax.tree.leaves(after.reward)]
+    reward = jnp.asarray(sum(rewards), now.reward.dtype)
     return now._replace(
         state=alike(numbers(after.state), now.state),
         observation=alike(numbers(after.observation), now.observation),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._checks import whole
+from jast.adapters.kept import without_warp
 from jast.adapters.loop import Instant, Outcome, simulator
 from jast.adapters.noise import bound
 from jast.simulator import Simulator
@@ -134,6 +135,7 @@ def mjx(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["force"].shape
         (50, 1)
     """
+    without_warp("mjx", model, 'mjx.put_model(model, impl="jax")')
     if step is None:
         from mujoco.mjx import step
     if not callable(distance):

@@ -34,6 +34,8 @@ def random(name: str, place: str, value: Any, apply: Callable | None) -> Random:
     """
     pair = isinstance(value, tuple) and len(value) == 2 and callable(value[1])
     model, apply = value if pair else (value, apply)
+    if isinstance(model, dict):  # of names, such as those of agents
+        model = D.Joint({k: _whole(d) for k, d in model.items()})
     if not (D.is_distribution(model) or callable(model)) or apply is None:
         raise ValueError(
             f"{name}: {place} must be "
@@ -69,6 +71,11 @@ def replaced(subject: Any, draw: Any) -> Any:
 
 def model_of(random: Random, *now: Any) -> Any:
     """Its distribution, a batch as one value."""
-    d = random.model if D.is_distribution(random.model) else random.model(*now)
+    return _whole(random.model if D.is_distribution(random.model) else random.model(*now))
+
+
+def _whole(d: Any) -> Any:
+    if isinstance(d, D.Joint):
+        return D.Joint(jax.tree.map(_whole, d.distributions, is_leaf=D.is_distribution))
     batch = len(getattr(d, "batch_shape", ()))
     return D.Independent(d, batch) if batch else d

@@ -1,0 +1,123 @@
+"""Environments with ``reset(key)`` and ``step(state, action)`` that return (state, timestep)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.simulator import Simulator
+
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import DistributionLike
+
+__all__ = ["jumanji"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Environment:
+    subject: Any = field(metadata=dict(static=True))
+    """The environment"""
+
+    def reset(self, key: Any) -> Outcome:
+        state, first = self.subject.reset(key)
+        return Outcome(state, first.observation, 0.0, False)
+
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+        state, now = self.subject.step(push(state), action)
+        # the end of the time, which is no failure, keeps a discount
+        terminated = now.last() & jnp.all(jnp.asarray(now.discount) == 0)
+        return Outcome(state, now.observation, now.reward, terminated)
+
+
+def jumanji(
+    env: Any,
+    policy: Callable[[Any], Any],
+    *,
+    horizon: int,
+    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
+    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
+    force: tuple[Any, Callable[..., Any]] | None = None,
+    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    seed: int | Literal["episode"] = 0,
+    failure: Callable[[Instant], chex.Array] | None = None,
+    distance: Callable[[Instant], chex.Array] | None = None,
+    observe: Callable[[Instant], chex.Array] | None = None,
+) -> Simulator:
+    """A policy in an environment of jumanji, or another whose ``reset(key)`` and ``step(state,
+    action)`` return a state and a timestep with ``observation``, ``reward``, ``discount`` and
+    ``last()``.
+
+    Arguments are those of `brax`, with the same meaning. The environment has terminated where the
+    last timestep has no discount. Many do so also when a task is solved or the time is over: there,
+    say what a failure is. Rewards of several agents are added up.
+
+    Args:
+        env: the environment, without a wrapper that starts anew by itself: ``jumanji.make(name)``.
+        policy: observation, most often with fields such as ``seen.action_mask`` -> action.
+        horizon: steps of an episode.
+        observation: noise on what the policy sees, as in `gymnax`.
+        action: noise on the action.
+        force: a pair (distribution, function (state, draw) -> state).
+        parameters: a pair (distribution, function (env, draw) -> env), as in `brax`.
+        seed: of the key of ``reset``, from which an environment also draws later on.
+        failure: `Instant` -> bool.
+        distance: `Instant` -> float.
+        observe: `Instant` -> float vector, 64 numbers at most.
+
+    Returns:
+        `Simulator`, whose states are `Instant`.
+
+    Raises:
+        ValueError: for an environment without these methods or one that starts anew by itself, an
+            argument of another kind, and where nothing is random.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jast
+        >>> from typing import Any, NamedTuple
+        >>> from jast.distributions import Normal
+        >>> class TimeStep(NamedTuple):  # as jumanji has them
+        ...     observation: Any
+        ...     reward: Any = 0.0
+        ...     discount: Any = 1.0
+        ...     last: Any = lambda: False
+        >>> class Drift:
+        ...     def reset(self, key):
+        ...         return jnp.zeros(1), TimeStep(jnp.zeros(1))
+        ...
+        ...     def step(self, state, action):
+        ...         x = 1.1 * state + action
+        ...         ended = jnp.abs(x[0]) > 1.0
+        ...         return x, TimeStep(x, -jnp.abs(x[0]), jnp.where(ended, 0.0, 1.0), lambda: ended)
+        >>> sim = jast.adapters.jumanji(
+        ...     Drift(),
+        ...     policy=lambda seen: -0.5 * seen,
+        ...     horizon=20,
+        ...     action=Normal(jnp.zeros(1), 0.1),
+        ...     distance=lambda now: 1.0 - jnp.abs(now.observation[0]),
+        ... )
+        >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["action"].shape
+        (20, 1)
+    """
+    bare("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
+    return simulator(
+        "jumanji",
+        _Environment(env),
+        policy,
+        horizon,
+        observation=observation,
+        action=action,
+        force=force,
+        parameters=parameters,
+        seed=seed,
+        failure=failure,
+        distance=distance,
+        observe=observe,
+    )
