@@ -3,6 +3,7 @@
 Whoever needs to know asks `outline`, at any place and as often as it likes: JAX keeps the answer.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +15,7 @@ from jast import distributions as D
 from jast.pytrees import strong
 from jast.simulator import Simulator
 
-__all__ = ["Offer", "ask", "outline"]
+__all__ = ["Offer", "ask", "asked", "outline"]
 
 _static = dict(metadata=dict(static=True))
 
@@ -113,6 +114,24 @@ def ask(sim: Simulator, question: Callable[[Any, Any, Any], Any]) -> Any:
 
     jax.eval_shape(traced)
     return found[0]
+
+
+def asked(question: Callable[..., Any]) -> Callable[[Simulator], Any]:
+    """``question(sim, p(x0), state, p(x | state))``, a function of a module whose answer has a
+    hash, as a function of a simulator. It is traced once for each kind of simulator, as `outline`.
+    """
+
+    def traced(sim: Simulator) -> _Answer:
+        start, _, state, dist = _opened(sim)
+        return _Answer(question(sim, start, state, dist))
+
+    return functools.wraps(question)(lambda sim: jax.eval_shape(traced, sim).value)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Answer:
+    value: Any = field(**_static)
 
 
 def _opened(sim: Simulator) -> tuple[Any, Any, Any, Any]:

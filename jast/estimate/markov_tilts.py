@@ -24,7 +24,7 @@ from jast.estimate.gaussians import log_sum
 from jast.incidents import hosted
 from jast.journal import answered
 from jast.limit_state import Outcomes, normal_numbers
-from jast.outline import ask, outline
+from jast.outline import asked, outline
 from jast.progress import advance, begin, conclude
 from jast.pytrees import count
 from jast.rewards import likelihood
@@ -121,18 +121,15 @@ class Trace(NamedTuple):
     """[T, n, B, C] of all categories"""
 
 
-def shape(sim: Any) -> Shape:
-    """The `Shape` of ``sim``."""
-
-    def sizes(start: Any, state: Any, dist: Any) -> Shape:
-        a, b = parts(start), parts(dist)
-        return Shape(
-            *(a.normals, *stacked(a).shape, a.owners),
-            *(b.normals, *stacked(b).shape, b.owners),
-            len(look(sim, state)),
-        )
-
-    return ask(sim, sizes)
+@asked
+def shape(sim: Any, start: Any, state: Any, dist: Any) -> Shape:
+    """The `Shape` of a simulator."""
+    a, b = parts(start), parts(dist)
+    return Shape(
+        *(a.normals, *stacked(a).shape, a.owners),
+        *(b.normals, *stacked(b).shape, b.owners),
+        len(look(sim, state)),
+    )
 
 
 def stacked(p: Parts) -> jax.Array:
