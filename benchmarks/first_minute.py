@@ -1,5 +1,5 @@
 """What a first call costs: ``python -m benchmarks.first_minute [--json] [--quick | --smoke]
-[--systems NAME ...]``.
+[--systems NAME ...] [--ways]``.
 
 Each system has a process of its own, without a cache of compiled programs, that makes one call four
 times: the first, the same again, with another key, and with another budget. Of each: CPU seconds,
@@ -30,13 +30,16 @@ import jax.numpy as jnp  # noqa: E402
 import jast  # noqa: E402
 from benchmarks.doors import simulator  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
+from jast import _jax  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
+from jast.limit_state import dimension, outcome  # noqa: E402
 
 __all__ = ["SYSTEMS", "calls"]
 
 MARK = "the_users_step"
 """Stands in the text of each program that contains the step."""
 TIMES = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
+LANES, TIMES_PLAYED = 128, 10
 IMPORTS = 5
 """Fresh processes, of which the quickest counts."""
 
@@ -116,6 +119,27 @@ def in_its_own_process(name: str, smoke: bool) -> list[dict[str, float]]:
     return json.loads(said.stdout.splitlines()[-1])
 
 
+def ways(make: Callable) -> list[tuple[float, float]]:
+    """(CPU seconds to compile, microseconds an episode) of a program that plays `LANES` episodes
+    side by side: as JAX does, as `jast._jax` does briefly, and quickly.
+    """
+    sim = make()
+    z = jax.random.normal(jax.random.key(0), (LANES, dimension(sim)))
+    play = jax.jit(jax.vmap(lambda z: outcome(sim, z).distance)).lower(z)
+    rows = []
+    for how in ({}, _jax._BRIEFLY, _jax._QUICKLY):
+        begin = time.process_time()
+        run = play.compile(compiler_options=how)
+        compiled = time.process_time() - begin
+        jax.block_until_ready(run(z))
+        begin = time.process_time()
+        for _ in range(TIMES_PLAYED):
+            jax.block_until_ready(run(z))
+        seconds = (time.process_time() - begin) / (TIMES_PLAYED * LANES)
+        rows.append((compiled, seconds * 1e6))
+    return rows
+
+
 def importing(what: str, times: int) -> float:
     """CPU seconds of a fresh process that imports ``what``."""
     code = f"import {what}, time; print(time.process_time())"
@@ -141,6 +165,9 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     options(parser, "lane and plane, without the command line")
     parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS))
+    parser.add_argument(
+        "--ways", action="store_true", help="what each way of compiling costs and gives, alone"
+    )
     parser.add_argument("--call", choices=list(SYSTEMS), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.call:
@@ -150,6 +177,17 @@ def main(argv: list[str] | None = None) -> None:
     few = [name for name in SYSTEMS if name in ("lane", "plane of 20 numbers")]
     names = args.systems or size(args, list(SYSTEMS), few, few[-1:])
     absent = lambda name: SYSTEMS[name][3] and not importlib.util.find_spec(SYSTEMS[name][3])
+    if args.ways:
+        told = {name: ways(SYSTEMS[name][0]) for name in names if not absent(name)}
+        if args.json:
+            print(json.dumps(told))
+            return
+        print(
+            f"{'':32}{'as JAX does':>20}{'briefly':>20}{'quickly':>20}   compile s, us an episode"
+        )
+        for name, rows in told.items():
+            print(f"{name:32}" + "".join(f"{c:10.2f}{us:10.1f}" for c, us in rows))
+        return
     results = {
         name: None if absent(name) else in_its_own_process(name, args.smoke) for name in names
     }
