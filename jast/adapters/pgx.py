@@ -107,14 +107,17 @@ def pgx(
         ...
         ...     def step(self, state, action, key):
         ...         left, mover = state.observation - action - 1, state.current_player
-        ...         rewards = jnp.where(jnp.arange(2) == mover, -1.0, 1.0) * (left <= 0)
+        ...         lost = jnp.where(jnp.arange(2) == mover, -1.0, 1.0)
+        ...         rewards = jnp.where(left <= 0, lost, 0.0)
         ...         return State(left, jnp.arange(3) < left, 1 - mover, rewards, left <= 0)
         >>> sim = jast.adapters.pgx(
         ...     Nim(),
         ...     policy=lambda seen: jnp.where(seen.current_player == 0, 0, -1),  # takes one
         ...     horizon=5,
         ...     action=(
-        ...         lambda now: Categorical(probs=now.observation.legal_action_mask / 3),
+        ...         lambda now: Categorical(
+        ...             probs=jnp.where(now.observation.legal_action_mask, 1 / 3, 0.0)
+        ...         ),
         ...         lambda action, draw: jnp.where(action < 0, draw, action),
         ...     ),
         ... )
