@@ -25,14 +25,19 @@ def strong(tree: Any) -> Any:
     return jax.tree.map(lambda a: lax.convert_element_type(a, jnp.result_type(a)), tree)
 
 
+def bound(function: Callable) -> Partial:
+    """``function`` as a pytree of the arguments that it binds."""
+    return function if isinstance(function, Partial) else Partial(function)
+
+
 def traceable(function: Partial) -> Partial:
     """``function`` itself, or where there are functions among the leaves of its arguments, the same
     with these as a part of the function: JAX traces arguments, and a function cannot be traced.
     """
-    bound = function.args, function.keywords
-    if not any(map(callable, jax.tree.leaves(bound))):
+    given = function.args, function.keywords
+    if not any(map(callable, jax.tree.leaves(given))):
         return function
-    kept = lambda which: jax.tree.map(lambda a: a if callable(a) == which else None, bound)
+    kept = lambda which: jax.tree.map(lambda a: a if callable(a) == which else None, given)
     return Partial(_Beside(function.func, kept(True)), *kept(False))
 
 
@@ -46,8 +51,8 @@ class _Beside:
 
     def __call__(self, args: tuple, keywords: dict, *more: Any) -> Any:
         whole = lambda a, b: b if a is None else a
-        bound, absent = (args, keywords), lambda a: a is None
-        args, keywords = jax.tree.map(whole, bound, self.static, is_leaf=absent)
+        given, absent = (args, keywords), lambda a: a is None
+        args, keywords = jax.tree.map(whole, given, self.static, is_leaf=absent)
         return self.function(*args, *more, **keywords)
 
     def _parts(self) -> tuple:

@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from jast import results
 from jast.distributions import Fixed
 from jast.distributions.containers import accepted
-from jast.pytrees import traceable
+from jast.pytrees import bound, traceable
 
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
@@ -57,7 +57,7 @@ class Translating:
 
 def translating(f):
     """The `Translating` function of ``f`` as a Partial with the arguments that ``f`` binds."""
-    f = f if isinstance(f, Partial) else Partial(f)
+    f = bound(f)
     return Partial(Translating(f.func), *f.args, **f.keywords)
 
 
@@ -129,7 +129,7 @@ class Simulator:
             if f.metadata.get("static"):
                 continue
             if callable(value):
-                value = traceable(value) if isinstance(value, Partial) else Partial(value)
+                value = traceable(bound(value))
                 if f.name in ("disturbance", "start") and type(value.func) is not Translating:
                     value = translating(value)
                 object.__setattr__(self, f.name, value)

@@ -113,21 +113,9 @@ def brax(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["action"].shape
         (20, 1)
     """
+    given = dict(locals())
     hint = "; brax.envs.get_environment(name) makes one"
     instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
     without_warp("brax", getattr(env, "mjx_model", None), instead)
     bare("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
-    return simulator(
-        "brax",
-        _Environment(env),
-        policy,
-        horizon,
-        observation=observation,
-        action=action,
-        force=force,
-        parameters=parameters,
-        seed=seed,
-        failure=failure,
-        distance=distance,
-        observe=observe,
-    )
+    return simulator("brax", _Environment(given.pop("env")), **given)

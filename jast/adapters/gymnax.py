@@ -125,6 +125,7 @@ def gymnax(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["observation"].shape
         (20, 1)
     """
+    given = dict(locals())
     kind = type(env)
     if not (hasattr(kind, "step_env") and hasattr(kind, "reset")):
         wraps = hasattr(env, "step_env")
@@ -141,17 +142,4 @@ def gymnax(
                 f"gymnax: horizon must be below {place}.{name}, which is {limit}: there step_env"
                 f" says that it has terminated; received {horizon}"
             )
-    return simulator(
-        "gymnax",
-        _Environment(env, params),
-        policy,
-        horizon,
-        observation=observation,
-        action=action,
-        force=force,
-        parameters=parameters,
-        seed=seed,
-        failure=failure,
-        distance=distance,
-        observe=observe,
-    )
+    return simulator("gymnax", _Environment(given.pop("env"), given.pop("params")), **given)

@@ -106,18 +106,6 @@ def jumanji(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["action"].shape
         (20, 1)
     """
+    given = dict(locals())
     bare("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
-    return simulator(
-        "jumanji",
-        _Environment(env),
-        policy,
-        horizon,
-        observation=observation,
-        action=action,
-        force=force,
-        parameters=parameters,
-        seed=seed,
-        failure=failure,
-        distance=distance,
-        observe=observe,
-    )
+    return simulator("jumanji", _Environment(given.pop("env")), **given)

@@ -18,8 +18,9 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast.adapters.kept import alike, keyed, numbers
-from jast.adapters.noise import Random, add, bound, model_of, random, replaced
+from jast.adapters.noise import Random, add, model_of, random, replaced
 from jast.contract import OBSERVED
+from jast.pytrees import bound
 from jast.simulator import Simulator, fixed, ravel
 
 __all__ = ["Instant", "Outcome", "bare", "simulator"]
@@ -83,9 +84,9 @@ class _Loop:
 def simulator(
     name: str,
     system: Any,
+    *,
     policy: Any,
     horizon: int,
-    *,
     observation: Any = None,
     action: Any = None,
     force: Any = None,

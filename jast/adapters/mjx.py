@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from jast._checks import whole
 from jast.adapters.kept import without_warp
 from jast.adapters.loop import Instant, Outcome, simulator
-from jast.adapters.noise import bound
+from jast.pytrees import bound
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -154,8 +154,8 @@ def mjx(
     return simulator(
         "mjx",
         _Physics(model, data, bound(sense or _joints), step, whole("mjx", "substeps", substeps)),
-        controller,
-        horizon,
+        policy=controller,
+        horizon=horizon,
         observation=observation,
         action=action,
         force=force,

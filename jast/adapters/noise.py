@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
+from jast.pytrees import bound
 
-__all__ = ["Random", "add", "bound", "model_of", "random", "replaced"]
+__all__ = ["Random", "add", "model_of", "random", "replaced"]
 
 
 class Random(NamedTuple):
@@ -21,11 +22,6 @@ class Random(NamedTuple):
 
     model: Any
     apply: Partial
-
-
-def bound(function: Callable) -> Partial:
-    """``function`` as a pytree."""
-    return function if isinstance(function, Partial) else Partial(function)
 
 
 def random(name: str, place: str, value: Any, apply: Callable | None) -> Random:

@@ -124,23 +124,11 @@ def pgx(
         >>> jast.replay(jast.check(sim), {"action": jnp.array([0, 2, 0, 0, 0])}).failure.item()
         True
     """
+    given = dict(locals())
     bare("pgx", env, "init(key)", "step(state, action, key)", seed=seed)
     if failure is None and getattr(env, "num_players", 1) > 1:
-        failure = Partial(_lost)
-    return simulator(
-        "pgx",
-        _Environment(env),
-        policy,
-        horizon,
-        observation=observation,
-        action=action,
-        force=force,
-        parameters=parameters,
-        seed=seed,
-        failure=failure,
-        distance=distance,
-        observe=observe,
-    )
+        given["failure"] = Partial(_lost)
+    return simulator("pgx", _Environment(given.pop("env")), **given)
 
 
 def _lost(now: Instant) -> jax.Array:

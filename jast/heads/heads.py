@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from jast import results
 from jast.heads.networks import Head
+from jast.pytrees import bound
 
 if TYPE_CHECKING:
     import chex
@@ -118,7 +118,7 @@ class Heads:
         for name in ("policy", "value"):
             head = getattr(self, name)
             if isinstance(head, tuple) and len(head) == 2 and callable(head[1]):
-                apply = head[1] if isinstance(head[1], Partial) else Partial(head[1])
+                apply = bound(head[1])
                 object.__setattr__(self, name, Head(head[0], apply))
 
 

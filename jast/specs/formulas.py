@@ -13,7 +13,8 @@ from numbers import Real
 from typing import Any
 
 import jax
-from jax.tree_util import Partial
+
+from jast.pytrees import bound
 
 __all__ = [
     "Formula",
@@ -168,7 +169,7 @@ def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
         name = own if own.isidentifier() else "predicate"
     if not isinstance(name, str) or not name:
         raise ValueError(f"predicate: name must be a text, received {name!r}")
-    return Predicate(fn if isinstance(fn, Partial) else Partial(fn), name)
+    return Predicate(bound(fn), name)
 
 
 def always(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:
