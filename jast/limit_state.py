@@ -239,13 +239,15 @@ def policy_of(sim: Simulator, z: jax.Array) -> Policy:
 
 def played(sim: Simulator, z: np.ndarray) -> Episode:
     """The `jast.Episode` of each of ``z`` [n, D], without states. On the host."""
-    return _side_by_side(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
+    return side_by_side(sim, partial(episodes, sim), np.asarray(z, normal_numbers(sim)))
 
 
-def _side_by_side(sim, function, rows):
-    """``function`` of ``rows`` [n, ...]; a black box plays none twice."""
-    size = len(jax.tree.leaves(rows)[0]) if hosted(sim) else LANES
-    return in_lanes(size, function, rows)
+def side_by_side(sim: Simulator, function: Callable, *rows: Any, lanes: int = LANES) -> Any:
+    """``function`` of ``rows`` [n, ...], ``lanes`` at a time (`in_lanes`); a black box plays none
+    twice.
+    """
+    size = len(jax.tree.leaves(rows)[0]) if hosted(sim) else lanes
+    return in_lanes(size, function, *rows)
 
 
 def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
@@ -286,7 +288,7 @@ def normal_of(sim: Simulator, given: Episode) -> np.ndarray:
     if not len(given.length):
         return np.zeros((0, dimension(sim)), normal_numbers(sim))
     recorded = given.x0, given.disturbances, np.asarray(given.length)
-    return _side_by_side(sim, partial(_points, sim), recorded)
+    return side_by_side(sim, partial(_points, sim), recorded)
 
 
 @quick

@@ -18,6 +18,7 @@ import jast
 from jast import blackbox
 from jast.blackbox import worker
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
+from jast.estimate.recorded_tilts import recorded
 from jast.incidents import GROUPS, Log, incidents, since
 
 NORMAL = Normal(0.0, 1.0)
@@ -281,6 +282,17 @@ def test_an_object_runs_no_nominal_episode_in_vain():
     sim = box(blackboxes.Walk, 15, episodic=False)
     jast.nominal(jax.random.key(0), sim, episodes=30)
     assert blackbox.calls(sim).episodes <= 30 + 2
+
+
+def test_recorded_episodes_of_an_object_are_played_once_each(key):
+    """As the numbers that tilts play them by."""
+    sim = box(blackboxes.Walk, 4, episodic=False)
+    episodes = jax.vmap(lambda k: jast.rollout(k, sim))(jax.random.split(key, 3))
+    before = blackbox.calls(sim).rows
+    z = recorded(sim, episodes._replace(states=None))
+    assert z.shape == (3, 4) and blackbox.calls(sim).rows - before <= 3 * (1 + 4)
+    x = np.where(np.arange(4) < np.asarray(episodes.length)[:, None], episodes.disturbances, 0)
+    np.testing.assert_allclose(z, x, rtol=1e-5, atol=1e-6)
 
 
 def test_seeds_are_the_disturbance_of_a_system_of_unknown_density():

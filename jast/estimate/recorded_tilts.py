@@ -16,8 +16,7 @@ from jast._jax import quick
 from jast.distributions.parts import Parts, parts
 from jast.episode import Episode, play_back
 from jast.estimate.markov_tilts import dimension, shape, stacked, starts
-from jast.limit_state import normal_numbers
-from jast.pytrees import in_lanes
+from jast.limit_state import normal_numbers, side_by_side
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
@@ -25,8 +24,6 @@ __all__ = ["recorded"]
 
 FAR = 37.0
 """The normal number of a value at the end of a support, whose own is infinite."""
-AT_ONCE = 64
-"""Episodes that one program, of one shape, looks at."""
 
 
 def recorded(sim: Simulator, given: Episode) -> np.ndarray:
@@ -36,7 +33,7 @@ def recorded(sim: Simulator, given: Episode) -> np.ndarray:
     if not len(given.length):
         return np.zeros((0, dimension(shape(sim), sim.horizon)), normal_numbers(sim))
     about = given.x0, given.disturbances, given.length
-    return in_lanes(AT_ONCE, partial(_recorded, sim), *about).astype(normal_numbers(sim))
+    return side_by_side(sim, partial(_recorded, sim), *about).astype(normal_numbers(sim))
 
 
 @quick

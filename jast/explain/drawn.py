@@ -1,5 +1,6 @@
 """The failures that an estimate has drawn, as points of normal numbers."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -58,12 +59,7 @@ def placed(
     about = outline(sim)
     whole = [np.issubdtype(leaf.dtype, np.integer) for leaf in jax.tree.leaves((about.x0, about.x))]
     if any(whole):
-        chance = np.concatenate(
-            [
-                np.asarray(_chances(sim, np.resize(z[i : i + LANES], (LANES, z.shape[1]))))
-                for i in range(0, len(z), LANES)
-            ]
-        )[: len(z)]
+        chance = latent.side_by_side(sim, partial(_chances, sim), z, lanes=LANES)
         u = np.asarray(ndtr(-np.abs(z)))
         u = u + chance * (rng.random(z.shape) - 0.5)
         moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)

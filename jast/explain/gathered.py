@@ -1,5 +1,6 @@
 """Episodes in whatever form a user has them, as one batch; and what their ends left undrawn."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +12,8 @@ from jast import rewards
 from jast._jax import jit
 from jast.episode import Episode, play_back
 from jast.failures import Failures, identity
-from jast.incidents import hosted
+from jast.limit_state import side_by_side
 from jast.outline import outline
-from jast.pytrees import in_lanes
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
@@ -111,11 +111,8 @@ def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Wh
     n = len(e.length)
     if not states and (e.length == sim.horizon).all():
         return Whole(e.x0, e.disturbances, e.length, None, 0)
-    x, s = in_lanes(
-        n if hosted(sim) else LANES,
-        lambda *a: _played_on(sim, key, *a),
-        *(np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length),
-    )
+    rows = np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length
+    x, s = side_by_side(sim, partial(_played_on, sim, key), *rows, lanes=LANES)
     return Whole(e.x0, x, e.length, s, n)
 
 

@@ -12,8 +12,8 @@ from jax.tree_util import Partial
 from jast import rewards
 from jast._jax import jit
 from jast.episode import Episode, play_back, rollout
-from jast.incidents import hosted
-from jast.pytrees import in_lanes
+from jast.limit_state import side_by_side
+from jast.pytrees import bound
 from jast.simulator import Simulator
 
 __all__ = ["observed", "ordinary"]
@@ -24,9 +24,8 @@ LANES = 256
 
 def ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
     """At most ``n`` episodes of the model that do not fail."""
-    size = n if hosted(sim) else LANES
     at = np.arange(n, dtype=np.int32)
-    e = in_lanes(size, lambda at: _drawn(key, sim, at), at)
+    e = side_by_side(sim, partial(_drawn, key, sim), at, lanes=LANES)
     return jax.tree.map(lambda a: a[~e.failure], e)
 
 
@@ -38,9 +37,8 @@ def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
 
 def observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
     """[n, horizon + 1, d] of the states."""
-    watch = observe if isinstance(observe, Partial) else Partial(observe)
-    size = len(e.length) if hosted(sim) else LANES
-    seen = in_lanes(size, partial(_watched, sim, watch), e.x0, e.disturbances, e.length)
+    watched, about = partial(_watched, sim, bound(observe)), (e.x0, e.disturbances, e.length)
+    seen = side_by_side(sim, watched, *about, lanes=LANES)
     if not isinstance(seen, np.ndarray) or seen.ndim != 3:
         shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
         raise ValueError(

@@ -15,8 +15,7 @@ from jast import boundary as B
 from jast._jax import is_traced, is_tracing, jit
 from jast.episode import Episode, play_back
 from jast.incidents import hosted
-from jast.limit_state import check, dimension, normal_numbers, played
-from jast.pytrees import in_lanes
+from jast.limit_state import check, dimension, normal_numbers, played, side_by_side
 from jast.results import asked
 from jast.search import kept as K
 from jast.search import lockstep as E
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["gradient"]
 
-AT_ONCE = 32
-"""Failures that one program, of one shape, plays again."""
 GRADIENT = 4
 """Evaluations that one with its gradient is counted as."""
 SHARE = 2.0
@@ -159,7 +156,7 @@ class _Search:
 
     def _scored(self, e):
         """The episodes, with log p relative to the mode as their reward."""
-        return in_lanes(AT_ONCE, partial(_scored, self.sim, self.reward), e)
+        return side_by_side(self.sim, partial(_scored, self.sim, self.reward), e)
 
     def _best(self, found):
         failing, nearest, _ = found
