@@ -123,9 +123,9 @@ def figures(name: str, budget: int, keys: int) -> dict[str, Any]:
     return row | dict(budget=budget, to_first_failure=cold)
 
 
-def in_its_own_process(name: str, budget: int, keys: int) -> dict[str, Any]:
-    """`figures`, in a fresh process without a cache of compiled programs."""
-    command = [sys.executable, "-m", "benchmarks.doors", "--alone", name, str(budget), str(keys)]
+def fresh(module: str, *arguments: str) -> Any:
+    """What a module prints as JSON in a fresh process, without a cache of compiled programs."""
+    command = [sys.executable, "-m", module, *arguments]
     env = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "0"}
     said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=env)
     return json.loads(said.stdout.splitlines()[-1])
@@ -181,7 +181,8 @@ def main(argv: list[str] | None = None) -> None:
             about = SYSTEMS[name]
             budget = size(args, about.budget, about.budget, 300_000)
             keys = args.seeds or size(args, about.keys, 2, 1)
-            report[name] = in_its_own_process(name, budget, keys)
+            alone = "--alone", name, str(budget), str(keys)
+            report[name] = fresh("benchmarks.doors", *alone)
             say(_row(report[name]))
     if not args.truth:
         report["lines"] = {name: lines(block) for name, block in EXAMPLES.items()}

@@ -28,7 +28,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 import jast  # noqa: E402
-from benchmarks.doors import simulator  # noqa: E402
+from benchmarks.doors import fresh, simulator  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast import _jax  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
@@ -109,16 +109,6 @@ def calls(make: Callable, call: Callable, budgets: tuple) -> list[dict[str, floa
     return rows
 
 
-def in_its_own_process(name: str, smoke: bool) -> list[dict[str, float]]:
-    """`calls` of a system, in a fresh process without a cache of compiled programs."""
-    command = [sys.executable, "-m", "benchmarks.first_minute", "--call", name]
-    env = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "0"}
-    said = subprocess.run(
-        command + ["--smoke"] * smoke, check=True, capture_output=True, text=True, env=env
-    )
-    return json.loads(said.stdout.splitlines()[-1])
-
-
 def ways(make: Callable) -> list[tuple[float, float]]:
     """(CPU seconds to compile, microseconds an episode) of a program that plays `LANES` episodes
     side by side: as JAX does, as `jast._jax` does briefly, and quickly.
@@ -188,8 +178,10 @@ def main(argv: list[str] | None = None) -> None:
         for name, rows in told.items():
             print(f"{name:32}" + "".join(f"{c:10.2f}{us:10.1f}" for c, us in rows))
         return
+    alone = lambda name: ["--call", name, *["--smoke"] * args.smoke]
     results = {
-        name: None if absent(name) else in_its_own_process(name, args.smoke) for name in names
+        name: None if absent(name) else fresh("benchmarks.first_minute", *alone(name))
+        for name in names
     }
     times = size(args, IMPORTS, IMPORTS, 1)
     results["import jast / import jax"] = importing("jast", times) / importing("jax", times)

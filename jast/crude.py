@@ -17,7 +17,7 @@ from jax import lax
 from jast import distributions as D
 from jast import results, rewards, units
 from jast._checks import random_key
-from jast._jax import quick
+from jast._jax import jit, quick
 from jast.checkpoints import stored
 from jast.contract import contract
 from jast.episode import Episode, rollout
@@ -295,7 +295,7 @@ def _counts(key, sim, episodes, begin, end):
     return lax.fori_loop(begin, end, chunk, counts)
 
 
-_count, _count_quickly = jax.jit(_counts), quick(_counts)
+_count, _count_quickly = jit(_counts), quick(_counts)
 
 
 def outcome(key: Any, sim: Any, live: Any, reward: Callable) -> tuple[Progress, Any]:

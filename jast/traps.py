@@ -11,7 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from jast import distributions as D
 from jast.incidents import hosted
-from jast.outline import outline
+from jast.outline import asked, outline
 from jast.pytrees import Key, strong
 from jast.rounding import Looked, looked, words
 from jast.simulator import Simulator
@@ -32,21 +32,19 @@ def traps(sim: Simulator) -> list[str]:
     """
     if hosted(sim):
         return []
-    seen, about = looked(sim), outline(sim)
-    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(about.state, about.x)
-    equations = list(_equations(program.jaxpr))
+    seen, about, (equations, level) = looked(sim), outline(sim), _program(sim)
     found = [f"step: {text}" for text in (words(seen), _jumps(seen)) if text is not None]
     found += _keys(about.state, seen)
-    if seen.felt and any(e.primitive.name == "stop_gradient" for e in equations) and _level(sim):
+    if seen.felt and level:
         found.append(
             "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
             " all ways from one to the other pass through jax.lax.stop_gradient, comparisons or"
             " whole numbers, so that what follows gradients finds nothing; let them through (of a"
             " gymnax environment: env.with_transition_gradients())"
         )
-    if len(equations) > EQUATIONS:
+    if equations > EQUATIONS:
         found.append(
-            f"step: {len(equations):,} operations of JAX take minutes to compile, in the programs"
+            f"step: {equations:,} operations of JAX take minutes to compile, in the programs"
             " of a search or an estimate together; jast.cache() keeps these for the next process,"
             " and a lax.scan in place of a loop of Python makes fewer"
         )
@@ -75,6 +73,17 @@ def _keys(state: Any, seen: Looked) -> Iterator[str]:
                 " every episode. Draw this noise in disturbance, or make the seed a disturbance"
                 " (jast.distributions.seeds) and fold it into the key (jax.random.fold_in)"
             )
+
+
+@asked
+def _program(sim: Simulator, start: Any, state: Any, dist: Any) -> tuple[int, bool]:
+    """How many equations step and evaluate have, and whether `jax.lax.stop_gradient` is among them
+    and leaves no slope.
+    """
+    x = D.sample(dist, jax.random.key(0))
+    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(state, x)
+    names = [equation.primitive.name for equation in _equations(program.jaxpr)]
+    return len(names), "stop_gradient" in names and _level(sim)
 
 
 def _equations(program: Any) -> Iterator[Any]:

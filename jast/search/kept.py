@@ -43,10 +43,8 @@ def likelihood(sim: Simulator) -> rewards.Standard:
 
 
 def none(sim: Simulator, k: int, mark: Any = ()) -> Kept:
-    """No episode yet. ``mark``: of one, shapes and dtypes. On the host."""
-    zeros = lambda tree: jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), tree)
-    episode, whole = zeros(jax.eval_shape(lambda: E.blank(sim, k))), np.zeros(k, np.int32)
-    episode = episode._replace(distance=episode.distance + np.inf, reward=episode.reward - np.inf)
+    """No episode yet. ``mark``: of one, shapes and dtypes."""
+    episode, whole = E.blank(sim, k), np.zeros(k, np.int32)
     mark = jax.tree.map(lambda s: np.zeros((k, *s.shape), s.dtype), mark)
     return Kept(episode, episode.reward, whole.astype(np.uint32), whole, whole, mark)
 

@@ -6,6 +6,7 @@ the start, where it is random, is level 0. So an episode is known by its number,
 it was simulated in.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -153,6 +154,7 @@ def play(sim, reward, keys, draw_start, draw, live, rows=None, record=False, jud
     )
 
 
+@partial(jax.jit, static_argnums=1)
 def blank(sim, n):
     """n episodes that were not played: reward -inf, distance inf, an `Episode` with its
     disturbances.

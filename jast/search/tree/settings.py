@@ -69,7 +69,5 @@ def problem_of(
         focused=is_traced(focus) or focus != 1,
         **{name: chosen[name] for name in SWITCHES},
     )
-    table = widths(total, *chosen["widening"])
-    settings = Settings(jnp.asarray(exploration, jnp.float32), ())
-    made = jax.tree.map(jnp.asarray, Problem(sim, reward, choice, settings))
-    return made._replace(settings=settings._replace(widths=table))
+    settings = Settings(jnp.asarray(exploration, jnp.float32), widths(total, *chosen["widening"]))
+    return Problem(*jax.tree.map(jnp.asarray, (sim, reward, choice)), settings)
