@@ -42,9 +42,6 @@ compilation); long loops run a fifth slower than a user's.
 """
 
 
-LATER = set((Path(__file__).parent / "later.txt").read_text().splitlines())
-
-
 def pytest_configure(config):
     """The short tests are compiled quickly, the long ones are optimised."""
     short = config.option.markexpr == "not long"
@@ -53,12 +50,7 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """The cases of later.txt are long. What depends on the compiler runs twice: with the long ones,
-    optimised.
-    """
-    for item in items:
-        if f"{item.path.name}::{item.name}" in LATER:
-            item.add_marker("long")
+    """What depends on the compiler runs twice: with the long tests, optimised."""
     if config.option.markexpr == "long":
         for item in items:
             if "equal" in item.fixturenames or item.get_closest_marker("compiled"):

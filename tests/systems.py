@@ -187,8 +187,14 @@ def line(**changes):
     return jast.Simulator(**(fields | changes))
 
 
-def ferry_now(cases):
-    """Parameters of a test: those of the ferry at once, of other systems with the long tests."""
-    of = lambda case: case if isinstance(case, tuple) else (case,)
-    marks = lambda case: () if of(case)[0] == "ferry" else pytest.mark.long
-    return [pytest.param(*of(case), marks=marks(case)) for case in cases]
+def mark_long(cases, *long):
+    """The cases of a parametrization. Those of ``long`` run with the long tests: others make the
+    same claim of another system, method or precision.
+    """
+    return [
+        pytest.param(
+            *(case if isinstance(case, tuple) else (case,)),
+            marks=pytest.mark.long if case in long else (),
+        )
+        for case in cases
+    ]

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
+from systems import mark_long
 
 import jast
 from jast import actions
@@ -199,7 +200,7 @@ def test_a_box_may_have_no_width_or_traced_ends():
     assert width(1.0) == -1.0
 
 
-@pytest.mark.parametrize("search", ["monte_carlo", "cem", "mcts"])
+@pytest.mark.parametrize("search", mark_long(["monte_carlo", "cem", "mcts"], "cem", "mcts"))
 def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
     """Of landing: drifts from N(.2, .01^2), so that all fail; offsets at the start from the
     model.

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from systems import mark_long
 
 ROOT = Path(__file__).parents[1]
 SMALLEST = {  # beside each other what shares compiled programs
@@ -98,6 +99,26 @@ def test_no_benchmark_is_left_out():
     assert programs | {"table1"} == SMALLEST.keys()
 
 
+SLOW = (
+    "arch",
+    "blackbox",
+    "bridge",
+    "colav",
+    "cross_entropy",
+    "engine",
+    "ferry",
+    "fms",
+    "memory",
+    "nasa",
+    "probability",
+    "stress",
+    "sweep",
+    "table1",
+    "table1_seeds",
+    "weakness",
+)
+
+
 @pytest.fixture
 def as_users_have_it():
     """JAX's own precision and promotion, which a benchmark may also change for itself."""
@@ -116,7 +137,7 @@ SETTINGS = {
 }
 
 
-@pytest.mark.parametrize("name", SMALLEST)
+@pytest.mark.parametrize("name", mark_long(SMALLEST, *SLOW))
 def test_a_benchmark_runs(name, as_users_have_it, monkeypatch, capsys):
     skip_without(NEEDS_SMALLEST.get(name, []))
     monkeypatch.syspath_prepend(str(ROOT))

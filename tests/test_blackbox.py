@@ -259,6 +259,7 @@ def test_an_outcome_has_no_gradient():
         assert np.isnan(slope).all()
 
 
+@pytest.mark.long
 def test_a_failure_probability():
     sim = box(blackboxes.branches, 1, MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)))
     found = jast.estimate.failure_probability(jax.random.key(0), sim, 5000)

@@ -56,7 +56,12 @@ def _distance_first(log_p, event, distance, terminal, approach):
 
 
 @pytest.mark.parametrize(
-    "choice", [actions.uniform(0.0, 1.0), actions.quantiles(), actions.samples()]
+    "choice",
+    [
+        actions.uniform(0.0, 1.0),
+        pytest.param(actions.quantiles(), marks=pytest.mark.long),
+        pytest.param(actions.samples(), marks=pytest.mark.long),
+    ],
 )
 def test_ferry(key, equal, choice):
     """Random search finds no collision in two million episodes."""
@@ -82,6 +87,7 @@ def test_ferry(key, equal, choice):
     assert 1 < r.first_failure <= r.episodes and r.failing_share == r.failures.seen / r.episodes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("choice", [None, actions.samples(), actions.uniform(0.0, 1.0)])
 def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim = ring()

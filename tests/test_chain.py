@@ -76,6 +76,7 @@ def test_finds_all_modes_and_comes_near_the_best(key, equal):
     assert r.episodes == 3000 == r.steps and r.history.simulations[-1] == 3000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [stress_systems.slips, jast.simulators.landing])
 def test_kinds_of_disturbances(key, equal, make):
     """Whole numbers and random starts."""
@@ -95,6 +96,7 @@ def far(limit, distance):
     )
 
 
+@pytest.mark.long
 def test_goes_to_failures_that_no_draw_reaches(key):
     """Fourteen deviations away."""
     r = chain(key, far(20.0, lambda s: jnp.maximum(20 - s, 0)), **SMALL)
@@ -112,6 +114,7 @@ def test_fewer_episodes_than_looks(key):
     assert r.episodes == 10 and "widths" not in r.settings
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same_and_is_interrupted(key, equal):
     a, b = (chain(key, BRANCHES, **SMALL, top=3) for _ in range(2))
     equal(a.failures, b.failures)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from systems import mark_long
 
 import jast
 from jast import __main__ as cli
@@ -47,7 +48,9 @@ def run(capsys, tmp_path, *argv):
     return status, capsys.readouterr().out, tmp_path / "out"
 
 
-@pytest.mark.parametrize("method", ["forest", "mcts", "cem", "monte-carlo"])
+@pytest.mark.parametrize(
+    "method", mark_long(["forest", "mcts", "cem", "monte-carlo"], "forest", "mcts", "cem")
+)
 def test_every_method_reports_and_saves(capsys, tmp_path, method):
     status, text, out = run(
         capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else [])
@@ -161,6 +164,7 @@ def test_a_seed_gives_the_same_report(capsys, tmp_path):
     assert one == two != other
 
 
+@pytest.mark.long
 def test_without_matplotlib_it_goes_on(capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     status, text, out = run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2")

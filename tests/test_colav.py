@@ -19,6 +19,7 @@ import scipy.stats
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
+from systems import mark_long
 
 import jast
 from jast import distributions as D
@@ -349,9 +350,14 @@ def rows(a, length):
 # contract
 
 
-CHECKED = [(name, "delay") for name in SCENARIOS] + [
-    ("sharp turn", kinds) for kinds in ("steering", "noise", KINDS)
-]
+CHECKED = mark_long(
+    [(name, "delay") for name in SCENARIOS]
+    + [("sharp turn", kinds) for kinds in ("steering", "noise", KINDS)],
+    ("crossing", "delay"),
+    ("overtaking", "delay"),
+    ("sharp turn", "steering"),
+    ("sharp turn", "noise"),
+)
 
 
 @pytest.mark.parametrize("scenario, kinds", CHECKED, ids=str)
@@ -451,6 +457,7 @@ def test_vmap_over_starts_is_a_loop(key):
         np.testing.assert_allclose(one.distance, many.distance[i], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_gradients_are_finite_and_those_of_smooth_inputs_are_difference_quotients():
     """With respect to all disturbances and the encounter. Delays and noise act through the
     planner's choice alone, so their slope is 0 almost everywhere.

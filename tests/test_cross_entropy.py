@@ -112,7 +112,7 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
             np.testing.assert_array_equal([got[tuple(x[i])] for i in rows], value[rows])
 
 
-@pytest.mark.parametrize("k", [0, 3])
+@pytest.mark.parametrize("k", [0, pytest.param(3, marks=pytest.mark.long)])
 def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     """An iteration of Algorithms 2 to 4 put together again from its parts, with NumPy's least
     squares for the surrogate.
@@ -197,7 +197,11 @@ def test_points_of_the_searches_are_evaluated_next(key):
 
 @pytest.mark.parametrize(
     "method, schedule",
-    [("ce_method", None), ("ce_surrogate", (7, 0, 1, 4, 3)), ("ce_mixture", None)],
+    [
+        pytest.param("ce_method", None, marks=pytest.mark.long),
+        ("ce_surrogate", (7, 0, 1, 4, 3)),
+        pytest.param("ce_mixture", None, marks=pytest.mark.long),
+    ],
 )
 def test_one_program_is_ask_and_tell(method, schedule, key, x64):
     settings = dict(samples=5, elites=3, iterations=3, schedule=schedule)
@@ -243,7 +247,9 @@ def test_the_objective_is_asked_for_exactly_the_budget(key):
     assert len(calls) == 100
 
 
-@pytest.mark.parametrize("method", ["ce_method", "ce_mixture"])
+@pytest.mark.parametrize(
+    "method", ["ce_method", pytest.param("ce_mixture", marks=pytest.mark.long)]
+)
 def test_a_search_can_stop_early_and_go_on(method, key):
     search = ce.start(key, START, method, samples=4, elites=3, iterations=3)
     nothing = ce.finish(search)
@@ -342,6 +348,7 @@ def test_float32_and_float64(key, x64):
         assert all(a.dtype == dtype for a in floats) and result.best_value < np_bowl(mean) / 20
 
 
+@pytest.mark.long
 def test_units_do_not_matter(key, x64):
     """Lengths times 4 and an increasing function of the values are the same search."""
     settings = dict(samples=8, elites=4, iterations=5)
@@ -394,7 +401,11 @@ def walled(limit, x):
 
 @pytest.mark.parametrize(
     "method, mode",
-    [("ce_method", "default"), ("ce_surrogate", "thesis"), ("ce_mixture", "default")],
+    [
+        ("ce_method", "default"),
+        pytest.param("ce_surrogate", "thesis", marks=pytest.mark.long),
+        pytest.param("ce_mixture", "default", marks=pytest.mark.long),
+    ],
 )
 def test_what_is_not_finite_is_counted_and_never_an_elite(method, mode, key):
     search = lambda limit: METHODS[method](
@@ -428,7 +439,11 @@ def test_what_is_not_finite_is_counted_and_never_an_elite(method, mode, key):
 
 @pytest.mark.parametrize(
     "method, mode",
-    [("ce_method", "default"), ("ce_surrogate", "thesis"), ("ce_mixture", "default")],
+    [
+        ("ce_method", "default"),
+        pytest.param("ce_surrogate", "thesis", marks=pytest.mark.long),
+        pytest.param("ce_mixture", "default", marks=pytest.mark.long),
+    ],
 )
 def test_a_budget_of_one(method, mode, key):
     result = METHODS[method](key, bowl, START, samples=1, elites=1, iterations=1, mode=mode)
@@ -760,7 +775,7 @@ def test_mode_thesis_is_the_published_code():
     assert all(set(modes["thesis"]) == set(modes["default"]) for modes in MODES.values())
 
 
-@pytest.mark.parametrize("d", [10, 20])
+@pytest.mark.parametrize("d", [pytest.param(10, marks=pytest.mark.long), 20])
 def test_proposals_move_in_many_dimensions(d, key):
     """Ten samples an iteration are fewer than a covariance needs; the judged ones must make up for
     it.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import archive_replays, reward_of
-from systems import TOLD, ring, walk
+from systems import TOLD, mark_long, ring, walk
 
 import jast
 from jast import actions, rewards
@@ -101,7 +101,7 @@ def test_bad_settings(make, message):
         make()
 
 
-@pytest.mark.parametrize("name", LEARNING)
+@pytest.mark.parametrize("name", mark_long(LEARNING, "mcts", "forest"))
 def test_units_change_nothing(key, name):
     """Exactly for powers of two, which lose no digit; up to rounding for others."""
     search = SEARCHES[name]
@@ -135,7 +135,7 @@ def test_the_default_finds_the_likeliest_where_raw_log_p_finds_nothing(key, equa
     assert rare * (1 / found.best.reward - 1) == pytest.approx(4.5**2 / 2, abs=0.1)
 
 
-@pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.parametrize("name", mark_long(SEARCHES, *LEARNING))
 def test_the_scales_are_the_systems_own(key, name, equal):
     """The same for every key; and the episodes that gave them are counted once."""
     sim, search = filter(beta=2.5), SEARCHES[name]
@@ -161,7 +161,7 @@ def _said(result):
     return made[result.settings["actions"].split(".")[1]](**result.settings["action_settings"])
 
 
-@pytest.mark.parametrize("name", ["cem", "mcts"])
+@pytest.mark.parametrize("name", ["cem", pytest.param("mcts", marks=pytest.mark.long)])
 def test_under_jit_and_vmap(key, name):
     search = SEARCHES[name]
     traced = jax.jit(jax.vmap(lambda k: search(k, filter(beta=2.5))))(jax.random.split(key))
@@ -172,6 +172,7 @@ def test_under_jit_and_vmap(key, name):
         np.testing.assert_allclose(traced.best.reward[i], own.best.reward, rtol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["paper", "thesis"])
 def test_published_modes_keep_their_reward(key, mode):
     sim = walk()
@@ -184,6 +185,7 @@ def test_published_modes_keep_their_reward(key, mode):
     assert mcts(key, sim, simulations=30).settings["exploration"] == 1
 
 
+@pytest.mark.long
 def test_where_nothing_points_to_failures_cem_begins_with_wide_noise(key):
     few = dict(samples=20, elites=4, iterations=1)
     blind, guided = (cem(key, sim, **few) for sim in (latch(), filter()))
@@ -248,6 +250,7 @@ def test_wide_draws_and_their_density(key, width):
     assert abs(coins.mean() - share) < 4 * np.sqrt(share * (1 - share) / 4000)
 
 
+@pytest.mark.long
 def test_structured_disturbances_and_starts_are_widened(key, equal):
     sim = ring()
     found = forest(key, sim, trees=2, prunes=2, simulations=40, threads=1)

@@ -376,6 +376,7 @@ def test_policies(key, equal):
 # rates
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make, truth",
     [(walk1d, 0.1087363323), (lambda: walk1d("one-sided"), 9.578759495e-4)],

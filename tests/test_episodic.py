@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import TOLD
+from systems import TOLD, mark_long
 from trees import FERRY, grown, problem
 
 import jast
@@ -85,6 +85,7 @@ def test_an_episode_is_evaluated_once_at_its_end(key):
     assert 50 <= since(host) <= 50 + 256
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("record", [False, True])
 def test_searches_evaluate_each_episode_once_and_replay_what_they_keep(key, record):
     sim, host = counted()
@@ -100,6 +101,7 @@ def test_searches_evaluate_each_episode_once_and_replay_what_they_keep(key, reco
     assert record == (r.trials is not None)
 
 
+@pytest.mark.long
 def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
     host = Host(4)
     ends = lambda s: (s[1] == 3) & (s[2][0] > 0)
@@ -142,7 +144,7 @@ def test_a_random_start_and_an_early_end_are_evaluated_once_too(key):
 
 
 @pytest.mark.parametrize("limit", [1e9, 1.0, -1.0], ids=["never", "sometimes", "at the start"])
-@pytest.mark.parametrize("search", ["monte_carlo", "mcts", "forest"])
+@pytest.mark.parametrize("search", mark_long(["monte_carlo", "mcts", "forest"], "mcts"))
 def test_one_start_and_an_end(key, search, limit):
     """Ended never, early, or at once: each search has the episodes that it says, and their ends are
     those of replays.
@@ -179,7 +181,9 @@ def test_one_start_and_an_end(key, search, limit):
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("search", ["monte_carlo", "cem", "mcts", "forest"])
+@pytest.mark.parametrize(
+    "search", mark_long(["monte_carlo", "cem", "mcts", "forest"], "cem", "mcts")
+)
 def test_trials_are_the_episodes(key, search):
     """Of the ferry: their best is the result's best, their failures are counted, and their numbers
     belong together.
@@ -293,7 +297,7 @@ def episodes_of(sim, keys, simulations, memoize, **choices):
     )
 
 
-@pytest.mark.parametrize("memoize", ["node", "root", "none"])
+@pytest.mark.parametrize("memoize", mark_long(["node", "root", "none"], "root", "none"))
 def test_rebuilt_episodes_are_those_of_the_search_whatever_is_kept(key, memoize):
     sim, keys = needle(), jast.counter.tree_keys(jax.random.key(3), 2)
     tree, x = episodes_of(sim, keys, 400, memoize, follow=True, feed=True, urgent=True)

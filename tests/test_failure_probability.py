@@ -13,6 +13,7 @@ from checks import compiled
 from jax.scipy.special import ndtri
 from jax.tree_util import Partial
 from scipy.special import logsumexp
+from systems import mark_long
 
 import jast
 from benchmarks import limit_states
@@ -121,7 +122,7 @@ def test_two_modes(two):
     )
 
 
-@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("gradients", [pytest.param(True, marks=pytest.mark.long), False])
 def test_one_mode(key, gradients):
     """With gradients and as a black box: P = 2.9e-7."""
     assert good(failure_probability(key, planes(5.0), BUDGET, gradients=gradients), norm.sf(5))
@@ -132,7 +133,7 @@ def test_black_box_finds_both(key):
     assert good(found, 2 * norm.sf(4)) and abs(found.modes[0] - 0.5) < 0.1
 
 
-@pytest.mark.parametrize("up", [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize("up", mark_long([-1.0, 0.0, 1.0], -1.0, 1.0))
 def test_where_failures_are_common(key, up):
     """P = .84, .5 and .16: not worse than counting the same number of episodes."""
     found = failure_probability(key, planes(up), BUDGET)
@@ -240,6 +241,7 @@ def test_no_failure(key):
     assert len(design_points(key, sim).points) == 0
 
 
+@pytest.mark.long
 def test_the_least_budget_is_kept(key):
     """Gradients included; and it is enough for one near plane."""
     found = failure_probability(key, planes(3.0), LEAST)
@@ -675,7 +677,7 @@ def proposal():
     return trace_proposal(LANDING, [to_landing(1.0), to_landing(-1.0)])
 
 
-@pytest.mark.parametrize("moves", [0, 20])
+@pytest.mark.parametrize("moves", [0, pytest.param(20, marks=pytest.mark.long)])
 def test_samples_of_landing(key, proposal, moves):
     """E|s0| = .536 and its deviation, .0689, in closed form (4 standard errors); both signs; every
     one of them replays to a failure.

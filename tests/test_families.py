@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats as st
+from systems import mark_long
 
 from jast import distributions as D
 from jast.distributions.numerics import log_tails, normal_of_log_tails
@@ -77,7 +78,9 @@ def mapped(function, values):
     return np.asarray(jax.jit(jax.vmap(function))(values))
 
 
-@pytest.mark.parametrize("name", list(floats("float32")))
+@pytest.mark.parametrize(
+    "name", mark_long(floats("float32"), "half", "gamma below 1", "beta below 1", "cauchy")
+)
 def test_floats_are_scipys_in_both_tails(name, x64, key):
     d, scipys = floats("float64")[name]
     x = mapped(lambda z: D.from_normal(d, z), jnp.asarray(Z))
@@ -96,7 +99,7 @@ def test_floats_are_scipys_in_both_tails(name, x64, key):
     assert abs(below - 0.3) < 4 * np.sqrt(0.21 / 4000) and D.has_exact_tails(d)
 
 
-@pytest.mark.parametrize("name", list(floats("float32")))
+@pytest.mark.parametrize("name", mark_long(floats("float32"), "gamma below 1", "beta below 1"))
 def test_floats_rise_in_float32(name):
     d, scipys = floats("float32")[name]
     z = jnp.arange(-7, 7.005, 0.01, dtype=jnp.float32)
@@ -109,7 +112,7 @@ def test_floats_rise_in_float32(name):
     np.testing.assert_allclose(x[far], truth(scipys, z)[far], rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", list(counts("float32")))
+@pytest.mark.parametrize("name", mark_long(counts("float32"), "poisson", "binomial"))
 def test_counts_are_scipys_in_both_tails(name, x64, key):
     d, scipys = counts("float64")[name]
     k = mapped(lambda z: D.from_normal(d, z), jnp.asarray(Z))
@@ -135,6 +138,9 @@ def test_counts_are_scipys_in_both_tails(name, x64, key):
     )
 
 
+@pytest.mark.parametrize(
+    "dtype", [pytest.param("float32", marks=pytest.mark.long), "float64"], indirect=True
+)
 def test_a_mixture_is_exact_in_both_tails(dtype, key):
     f = lambda *v: jnp.asarray(v, dtype)
     d = D.MixtureSameFamily(D.Categorical(probs=f(0.99, 0.01)), D.Normal(f(0, 1), f(1, 6)))
@@ -152,6 +158,7 @@ def test_a_mixture_is_exact_in_both_tails(dtype, key):
     assert abs(share - expected) < 4 * np.sqrt(expected / 8000)
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_the_inverse(x64):
     """By central differences: what is solved by steps has derivatives, too."""
     pair = D.Normal(jnp.asarray([0.0, 3.0]), jnp.asarray([1.0, 0.5]))
@@ -174,6 +181,9 @@ def test_the_logs_of_the_tails_invert(dtype):
     np.testing.assert_allclose(normal_of_log_tails(below, above), z, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "dtype", ["float32", pytest.param("float64", marks=pytest.mark.long)], indirect=True
+)
 def test_a_family_of_the_users_own_is_one_row(dtype, key):
     class Rayleigh(D.Distribution):
         event_shape = ()

@@ -358,7 +358,7 @@ def test_odd_routes_give_numbers(x, every, snap):
 # the contract
 
 
-@pytest.mark.parametrize("database", [False, True])
+@pytest.mark.parametrize("database", [pytest.param(False, marks=pytest.mark.long), True])
 def test_contract(database, key):
     sim = fms(database=database)
     assert jast.check(sim) is sim

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import honest, replays
-from systems import S0, TOLD, dice, ferry_now, ring, walk
+from systems import S0, TOLD, dice, mark_long, ring, walk
 
 import jast
 from jast import failures as F
@@ -53,7 +53,8 @@ once = functools.cache(searched)
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ferry_now(["ferry", "landing"]))
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ferry", "landing"])
 def test_fields_are_as_documented(name):
     result, real = once(name), np.dtype(jnp.zeros(()).dtype)
     horizon = SYSTEMS[name].horizon
@@ -91,7 +92,7 @@ def test_fields_are_as_documented(name):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ferry_now(["ferry", "landing", "ring"]))
+@pytest.mark.parametrize("name", mark_long(["ferry", "landing", "ring"], "landing", "ring"))
 def test_results_are_honest(name):
     honest(once(name), SYSTEMS[name], (S0 if name == "ferry" else dict(reward=BONUS))["reward"])
 
@@ -428,6 +429,7 @@ def test_a_traced_search_is_the_same_search():
     np.testing.assert_allclose(traced, once("ferry").best_reward_per_tree, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_vmap_over_simulators_is_a_loop():
     adversaries = jnp.array([[16.0, 0.0], [17.0, 0.0], [30.0, 10.0]])
     together = jax.vmap(best_of, in_axes=(None, 0, None))(jax.random.key(3), adversaries, 10.0)
@@ -468,6 +470,7 @@ def test_a_traced_result_counts_as_an_eager_one():
     assert none == -1
 
 
+@pytest.mark.long
 def test_float64_within_a_block(x64):
     """Precision that is set for a block of code holds in the search's own threads."""
     choices = dict(
@@ -507,7 +510,7 @@ def test_a_forest_beats_random_search():
     assert result.best.reward > random.reward.max()
 
 
-@pytest.mark.parametrize("name", ferry_now(["ferry", "landing"]))
+@pytest.mark.parametrize("name", ["ferry", pytest.param("landing", marks=pytest.mark.long)])
 def test_the_best_paths_that_do_not_fail(name):
     """One a tree without a failure, by falling reward; they replay to what they say."""
     result = once(name)

@@ -76,6 +76,7 @@ def test_a_report_is_saved(crossing, tmp_path):
     assert str(jast.load(tmp_path / "report", sim)) == str(report)
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same_report(key):
     one, two = (jast.stress(key, walk(), 600) for _ in range(2))
     assert str(one) == str(two)

@@ -62,6 +62,7 @@ def test_the_variance_is_the_likeliest(x64):
         assert peer.log_marginal_likelihood_value_ < best
 
 
+@pytest.mark.long
 def test_the_grid_gives_its_likeliest_point(x64):
     x, y = data(30, 2)
     lengthscales, noises = (0.1, 0.4, 1.0, 3.0), (1e-4, 1e-2, 1.0)
@@ -80,7 +81,7 @@ def test_the_grid_gives_its_likeliest_point(x64):
     ) == pytest.approx(1 + gp.JITTER)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])
 def test_masked_rows_do_nothing(dtype, x64):
     x, y = data(20, 2, dtype)
     new = jnp.asarray(data(15, 2, dtype, 1)[0])

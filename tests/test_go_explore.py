@@ -60,6 +60,7 @@ def test_finds_a_sparse_failure_that_chance_does_not(key, equal):
     assert r.episodes == r.history.simulations[-1] == 1500
 
 
+@pytest.mark.long
 def test_steps_are_those_that_are_new(key):
     """A run takes at most ``length`` of them, and without the second phase nothing else is
     simulated.
@@ -69,6 +70,7 @@ def test_steps_are_those_that_are_new(key):
     assert r.steps <= 4500 and r.best.length > 3
 
 
+@pytest.mark.long
 def test_the_second_phase_makes_failures_likelier(key):
     sim = climb()
     first, both = (go_explore(key, sim, **SMALL, backward=b) for b in (0.0, 0.5))
@@ -76,6 +78,7 @@ def test_the_second_phase_makes_failures_likelier(key):
     assert -0.5 * 8 * 1.2**2 > both.best.reward > -0.5 * 8 * 1.2**2 - 5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [stress_systems.slips, jast.simulators.landing])
 def test_kinds_of_disturbances(key, equal, make):
     """Whole-numbered disturbances, random starts, episodic systems."""
@@ -89,6 +92,7 @@ def test_joint_disturbances(key, equal):
     test_kinds_of_disturbances(key, equal, ring)
 
 
+@pytest.mark.long
 def test_seeds_of_unknown_density(key, equal):
     """Six seeds must fall into their own quarter one after another."""
     sim = jast.Simulator(
@@ -102,6 +106,7 @@ def test_seeds_of_unknown_density(key, equal):
     assert archive_replays(sim, r, rewards.standard(), equal)
 
 
+@pytest.mark.long
 def test_cells_of_the_user(key):
     sim = stress_systems.latch()
     r = go_explore(key, sim, **SMALL, cell=lambda run: run)
@@ -130,6 +135,7 @@ def test_nan_is_counted_and_never_best(key):
     assert r.invalid > 0 and not r.failing and r.best.distance == 3
 
 
+@pytest.mark.long
 def test_where_nothing_fails_the_nearest_is_best(key):
     sim = climb(6)
     r = go_explore(key, sim, **SMALL)
@@ -137,6 +143,7 @@ def test_where_nothing_fails_the_nearest_is_best(key):
     assert 2 <= r.best.distance <= 4 and np.isfinite(r.best.reward)
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same(key, equal):
     sim = climb()
     a, b = (go_explore(key, sim, **SMALL, top=3) for _ in range(2))
@@ -144,6 +151,7 @@ def test_the_same_key_gives_the_same(key, equal):
     assert len(a.failures) == 3
 
 
+@pytest.mark.long
 def test_is_watched_and_interrupted(key):
     seen = []
 

@@ -32,6 +32,7 @@ def test_ends_at_the_likeliest_failures(key, equal):
     assert len({tuple(np.sign(e.disturbances[0]).astype(int)) for e in r.failures}) > 1
 
 
+@pytest.mark.long
 def test_counts_of_the_descents(key):
     """Each episode has one step: 12 gradients, at 4 each, and 12 x 6 more."""
     r = gradient(key, BRANCHES, **STEPS)
@@ -76,6 +77,7 @@ def test_nan_is_counted_and_never_best(key):
     assert r.invalid and not r.failing and 2 <= r.best.distance < 4
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same_and_is_watched(key, equal):
     seen = []
     a = gradient(key, BRANCHES, **SMALL, top=2)

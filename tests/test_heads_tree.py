@@ -15,7 +15,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from jax.tree_util import Partial
 from plain_tree import drawn_as_published, drawn_by_default, plain_search
-from systems import ferry_now, walk
+from systems import mark_long, walk
 from trees import SYSTEMS, counts_add_up, grown, large_copies, nbytes, problem, slots_of
 
 import jast
@@ -215,9 +215,13 @@ def agree(key, heads, k, alpha, candidates, weights, focus=1.0, share=1.0, power
 DRAWN = dict(all=1.0, one=0.25)  # independently, as published; spread and focused
 
 
-@pytest.mark.parametrize("candidates", CANDIDATES)
+@pytest.mark.parametrize("candidates", mark_long(CANDIDATES, "all"))
 @pytest.mark.parametrize(
-    ("widening", "weights"), [((0.5, 0.6), (0.6, 0.4)), ((2.0, 0.5), (0.5, 0.5))]
+    ("widening", "weights"),
+    [
+        pytest.param((0.5, 0.6), (0.6, 0.4), marks=pytest.mark.long),
+        ((2.0, 0.5), (0.5, 0.5)),
+    ],
 )
 def test_builds_the_tree_of_an_independent_search_with_a_value_head(
     widening, weights, candidates, key, x64
@@ -226,7 +230,7 @@ def test_builds_the_tree_of_an_independent_search_with_a_value_head(
     agree(key, EXACT, *widening, candidates, weights, share=0.0, focus=DRAWN[candidates])
 
 
-@pytest.mark.parametrize("candidates", CANDIDATES)
+@pytest.mark.parametrize("candidates", mark_long(CANDIDATES, "all"))
 def test_builds_the_tree_of_an_independent_search_with_both_heads(candidates, key, x64):
     agree(key, EXACT, 2.0, 0.5, candidates, (0.6, 0.4), focus=DRAWN[candidates], within=1e-3)
 
@@ -250,7 +254,8 @@ def test_rolls_out_as_an_independent_search_at_the_first_levels_of_the_share_of_
 # --- what holds in every tree
 # ----------------------------------------------------------------------------
 
-EACH = ferry_now(itertools.product(SYSTEMS, CANDIDATES))
+EACH = list(itertools.product(SYSTEMS, CANDIDATES))
+FERRY_ONE = mark_long(EACH, *(case for case in EACH if case != ("ferry", "one")))
 
 
 def searching(name, candidates):
@@ -281,7 +286,7 @@ def built(name, candidates, memoize="node", lanes=3):
     )
 
 
-@pytest.mark.parametrize(("name", "candidates"), EACH)
+@pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_counts_of_every_node_add_up(name, candidates):
     tree, root_visits, _ = built(name, candidates)
     np.testing.assert_array_equal(root_visits[0], 61)
@@ -309,7 +314,7 @@ def edges_there(problem, tree, lane, places):
     return [np.asarray(a) for a in each]
 
 
-@pytest.mark.parametrize(("name", "candidates"), EACH)
+@pytest.mark.parametrize(("name", "candidates"), FERRY_ONE)
 def test_every_child_has_the_value_of_its_head(name, candidates):
     """Visited or waiting: those to be had, and with "one" the next after the last that was tried.
     Others have none, nor has the level of a random start.
@@ -350,6 +355,7 @@ KEPT = [
     ("landing", "all", "root"),
     ("ring", "all", "none"),
 ]
+COPIED = [(*case, "node") for case in EACH] + KEPT
 
 
 @pytest.mark.long  # rounding alike in programs that differ is the optimised compiler's
@@ -362,7 +368,7 @@ def test_memoization_changes_the_steps_and_nothing_else(name, candidates, memoiz
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("candidates", CANDIDATES)
+@pytest.mark.parametrize("candidates", mark_long(CANDIDATES, "all"))
 def test_a_tree_is_the_same_whatever_trees_grow_beside_it(candidates):
     few, many = built("ferry", candidates, lanes=2)[0], built("ferry", candidates)[0]
     np.testing.assert_array_equal(few.outcome, many.outcome[:, :2])
@@ -441,7 +447,7 @@ def test_children_that_wait_need_more_pages():
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     ("name", "candidates", "memoize"),
-    ferry_now([(*each, "node") for each in itertools.product(SYSTEMS, CANDIDATES)] + KEPT),
+    mark_long(COPIED, *(case for case in COPIED if case[::2] != ("ferry", "node"))),
 )
 def test_no_array_of_the_tree_is_copied_in_a_loop(name, candidates, memoize):
     p = searching(name, candidates)
@@ -468,7 +474,12 @@ def test_bytes_per_tree_are_those_of_its_arrays(name, candidates):
 
 
 @pytest.mark.parametrize(
-    ("name", "candidates"), ferry_now([("ferry", "all"), ("landing", "one"), ("ring", "all")])
+    ("name", "candidates"),
+    [
+        ("ferry", "all"),
+        pytest.param("landing", "one", marks=pytest.mark.long),
+        pytest.param("ring", "all", marks=pytest.mark.long),
+    ],
 )
 def test_edges_are_those_of_the_tree(name, candidates):
     p, (tree, *_) = searching(name, candidates), built(name, candidates)
@@ -528,8 +539,9 @@ def test_the_same_key_gives_the_same_result():
     same(once("landing", "all"), searched("landing", "all"))
 
 
+@pytest.mark.long
 @pytest.mark.compiled
-@pytest.mark.parametrize(("name", "candidates"), ferry_now([("ferry", "one"), ("landing", "all")]))
+@pytest.mark.parametrize(("name", "candidates"), [("ferry", "one"), ("landing", "all")])
 def test_threads_change_nothing(name, candidates):
     """Groups of three, the last one filled up, in one thread or two."""
     same(once(name, candidates), searched(name, candidates, threads=2))
@@ -537,7 +549,10 @@ def test_threads_change_nothing(name, candidates):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize(("name", "candidates"), ferry_now([("ferry", "one"), ("landing", "all")]))
+@pytest.mark.parametrize(
+    ("name", "candidates"),
+    [("ferry", "one"), pytest.param("landing", "all", marks=pytest.mark.long)],
+)
 def test_results_are_honest_and_failures_replay_to_the_bit(name, candidates):
     (sim, choices), result = SYSTEMS[name], once(name, candidates)
     honest(result, sim, choices["reward"])

@@ -106,13 +106,6 @@ def test_names_at_each_door_exist_and_are_public():
             assert hasattr(module, each) and not each.startswith("_"), f"{name}.{each}"
 
 
-def test_cases_that_run_later_exist():
-    for line in (ROOT / "tests/later.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            name, case = line.split("::")
-            assert f"def {case.partition('[')[0]}(" in (ROOT / "tests" / name).read_text(), line
-
-
 def test_lines_are_short_and_the_code_is_formatted():
     pytest.importorskip("ruff")
     for command in (["check"], ["format", "--check"]):

@@ -221,6 +221,7 @@ def test_to_the_end_and_to_the_horizon(key):
 # Landing: the published problem
 
 
+@pytest.mark.long
 def test_two_traces(key):
     """1e5 episodes: within 3 standard errors, of at most 1.05 % (theory .92 % without eps), and
     half of it on each side.

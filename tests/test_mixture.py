@@ -359,6 +359,9 @@ def test_a_component_does_not_fall_into_a_point(dtype):
     np.testing.assert_allclose(got.means[1], [100 / 3, -200 / 7], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "dtype", ["float32", pytest.param("float64", marks=pytest.mark.long)], indirect=True
+)
 def test_under_jit_and_vmap(dtype, key):
     x = jnp.stack([jnp.asarray(data(i, 50), dtype) for i in range(3)])
     w, reg = jax.random.uniform(key, (3, 50), dtype), jnp.asarray([0.0, 0.1, 1.0], dtype)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import archive_replays, reward_of
-from systems import S0, ring, two_densities, walk
+from systems import S0, mark_long, ring, two_densities, walk
 
 import jast
 from jast import actions, rewards
@@ -112,7 +112,9 @@ def test_episodes_do_not_depend_on_their_number_or_the_lanes(key, equal, monkeyp
     assert chunked.best_reward_per_tree == pytest.approx(long.best_reward_per_tree)
 
 
-@pytest.mark.parametrize("make", [ring, coins, lottery, jast.simulators.landing])
+@pytest.mark.parametrize(
+    "make", mark_long([ring, coins, lottery, jast.simulators.landing], ring, coins)
+)
 def test_kinds_of_disturbances(key, equal, make):
     """Joint and integer disturbances, seeds of unknown density, random starts."""
     sim = make()
@@ -181,6 +183,7 @@ def test_systems_that_never_or_always_fail(key):
     assert (r.failures.size, r.failures.counts.tolist(), r.failures.seen) == (1, [300], 300)
 
 
+@pytest.mark.long
 def test_under_jit_and_vmap(key):
     thresholds = jnp.array([2.0, 3.0, 50.0])
     search = lambda sim: monte_carlo(key, sim, episodes=1000, refine=0)

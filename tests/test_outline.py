@@ -211,10 +211,18 @@ MOST = 24
     "search",
     [
         lambda key, sim: jast.search.forest(key, sim, trees=4, prunes=3, simulations=20),
-        lambda key, sim: jast.search.mcts(key, sim, trees=2, simulations=20),
-        lambda key, sim: jast.search.cem(key, sim, samples=20, elites=4, iterations=2),
-        lambda key, sim: jast.search.monte_carlo(key, sim, episodes=200),
-        lambda key, sim: jast.nominal(key, sim, episodes=200),
+        pytest.param(
+            lambda key, sim: jast.search.mcts(key, sim, trees=2, simulations=20),
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            lambda key, sim: jast.search.cem(key, sim, samples=20, elites=4, iterations=2),
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            lambda key, sim: jast.search.monte_carlo(key, sim, episodes=200), marks=pytest.mark.long
+        ),
+        pytest.param(lambda key, sim: jast.nominal(key, sim, episodes=200), marks=pytest.mark.long),
     ],
     ids=["forest", "mcts", "cem", "monte_carlo", "nominal"],
 )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from systems import ring, walk
+from systems import mark_long, ring, walk
 
 import jast
 from jast import distributions as D
@@ -26,7 +26,7 @@ DISTRIBUTIONS = dict(
 )
 
 
-@pytest.mark.parametrize("name", DISTRIBUTIONS)
+@pytest.mark.parametrize("name", mark_long(DISTRIBUTIONS, "uniform", "tent"))
 def test_a_moved_and_a_blended_distribution_have_mass_one_and_their_own_samples(name, key):
     """By quadrature in x, and by the share of draws below a point."""
     dist = DISTRIBUTIONS[name]()

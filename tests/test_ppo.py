@@ -155,6 +155,7 @@ def shares(key, policy, sim=ONE_SIDED, n=4000):
     return share, np.sqrt(share * (1 - share) / n)
 
 
+@pytest.mark.long
 def test_a_learned_policy_fails_far_more_often_than_one_that_learned_nothing(learned, key):
     """By .3 and 4 standard errors of the difference; the model itself fails in one of 1044."""
     n, apply = 1, learned.disturbance.args[1]
@@ -167,6 +168,7 @@ def test_a_learned_policy_fails_far_more_often_than_one_that_learned_nothing(lea
     assert share - untrained > 0.3 + 4 * np.hypot(error, own)
 
 
+@pytest.mark.long
 def test_its_weights_give_the_probability(learned, key):
     """9.578759495e-4 within 4 SE of 20,000 episodes, SE below 4 % (crude Monte Carlo: 23 %)."""
     r = importance(key, ONE_SIDED, policy_proposal(ONE_SIDED, learned), 20_000)
@@ -207,6 +209,7 @@ def whole_run(tmp_path_factory):
     return ppo(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=tell), rows, path
 
 
+@pytest.mark.long
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
     policy, rows, _ = whole_run
     assert len(rows) == len(policy.history.episodes) >= 10
@@ -216,6 +219,7 @@ def test_the_callback_gets_the_rows_of_the_history(whole_run):
     assert policy.steps <= rows[-1][1] and np.all(np.diff(policy.history.episodes) > 0)
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same_policy(whole_run, equal):
     again = ppo(jax.random.key(3), WALK, **TINY)
     equal(again.learned, whole_run[0].learned)
@@ -224,6 +228,7 @@ def test_the_same_key_gives_the_same_policy(whole_run, equal):
     assert not np.array_equal(*(jax.tree.leaves(p.actor)[0] for p in (other, again.learned)))
 
 
+@pytest.mark.long
 def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_path):
     seen = []
 
@@ -240,6 +245,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_
     equal(rest.history, whole_run[0].history)
 
 
+@pytest.mark.long
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
     path = whole_run[2]
     with pytest.raises(ValueError, match="ppo: checkpoint .* another call: rates.clip is"):
@@ -259,6 +265,7 @@ def test_an_interruption_before_anything_was_learned_is_raised(monkeypatch):
         ppo(jax.random.key(3), WALK, **TINY)
 
 
+@pytest.mark.long
 def test_a_saved_policy_is_the_same(whole_run, equal, tmp_path, key):
     policy, path = whole_run[0], tmp_path / "policy.npz"
     jast.save(path, policy)

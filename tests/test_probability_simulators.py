@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from systems import mark_long
 
 import jast
 from benchmarks import limit_states
@@ -42,7 +43,7 @@ def test_parameters_are_traced(name, key):
     play(ALL[name](*LIKE_NUMBERS[name]))
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", mark_long(ALL, "autoregression"))
 def test_sweep_and_gradient(name, key):
     """A batch of parameters gives the episodes of each, and every gradient is finite, after the end
     of an episode too.

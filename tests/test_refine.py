@@ -34,7 +34,7 @@ def draws(sim, scale, n=300, seed=0):
     return collect(sim, likelihood(sim), e, top=200)
 
 
-@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("gradients", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_linear_system_ends_at_the_closed_form(gradients, key):
     sim = linear(10)
     found = draws(sim, 4.0)
@@ -82,6 +82,7 @@ def test_slips_of_whole_numbers_are_taken_out(key):
     assert float(result.failures.best.reward) == pytest.approx(3 * math.log(0.04 / 0.9), abs=1e-4)
 
 
+@pytest.mark.long
 def test_disturbances_of_other_families(key):
     """An exponential one, whose mode is at the edge: -x is log p less that of the mode."""
     sim = jast.Simulator(
@@ -95,7 +96,7 @@ def test_disturbances_of_other_families(key):
     assert float(result.failures.best.reward) == pytest.approx(-12, abs=0.01)
 
 
-@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("gradients", [pytest.param(True, marks=pytest.mark.long), False])
 def test_a_kink_at_the_mode(gradients, key):
     """Of Laplace noise the likeliest failure is one large number, in the step that counts most."""
     sim = jast.Simulator(
@@ -150,6 +151,7 @@ def test_a_simulator_whose_modes_are_medians_is_centred_already():
     assert centred(other) != other
 
 
+@pytest.mark.long
 def test_a_random_start_is_refined_too(key):
     sim = jast.Simulator(
         init=lambda x0: x0,
@@ -204,7 +206,7 @@ def test_bad_input_is_named(key):
         refine(key, seeds, found)
 
 
-@pytest.mark.parametrize("name", ["pedestrians", "branches"])
+@pytest.mark.parametrize("name", [pytest.param("pedestrians", marks=pytest.mark.long), "branches"])
 def test_planted_modes_are_recovered(name, key):
     case = CASES[name]
     sim = case.make()
@@ -231,6 +233,7 @@ def test_a_failure_at_another_time_is_of_the_same_mode(key):
     assert len(modes(sim, found)) == 1
 
 
+@pytest.mark.long
 def test_results_print_and_save(key, tmp_path):
     sim = linear(10, sides=2)
     found = draws(sim, 4.0)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import mark_long
 
 import jast
 from jast import results
@@ -82,7 +83,7 @@ def made(name):
     return (MAKERS | OTHERS)[name]()
 
 
-@pytest.mark.parametrize("name", [*MAKERS, *OTHERS])
+@pytest.mark.parametrize("name", mark_long([*MAKERS, *OTHERS], "forest", "sac"))
 def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     value = made(name)
     shown, printed, table = repr(value), str(value), value._repr_html_()
@@ -97,7 +98,7 @@ def test_a_repr_is_short_and_the_table_of_a_notebook_names_every_field(name):
     assert table.count("<tr>") == table.count("</tr>") >= len(fields) and len(table) < 5000
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", mark_long(MAKERS, "sac"))
 def test_every_result_has_the_whole_vocabulary(name):
     value = made(name)
     left = {"failures"} | ({"episodes"} if name == "failure_samples" else set())  # former names
@@ -239,7 +240,7 @@ def same(a, b, at="result"):
 FILED = [*MAKERS, "episode", "failures", "heads", "traces", "history", "roots"]
 
 
-@pytest.mark.parametrize("name", FILED)
+@pytest.mark.parametrize("name", mark_long(FILED, "sac"))
 def test_a_file_gives_the_result_back_to_the_bit(name, tmp_path):
     value, path = made(name), tmp_path / "result"
     jast.save(path, value)
@@ -391,6 +392,7 @@ def test_bad_files_are_refused(tmp_path, monkeypatch):
     assert first
 
 
+@pytest.mark.long
 def test_a_failure_policy_needs_its_simulator(tmp_path):
     jast.save(tmp_path / "p", made("sac"))
     with pytest.raises(ValueError, match="only its simulator can restore: load"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from jax.tree_util import Partial
+from systems import mark_long
 
 import jast
 from jast.simulators import ferry, landing, landing_probability, limit_state, walk1d
@@ -36,9 +37,10 @@ ALL = {
     "limit_state": lambda: limit_state(plane, 3),
     "limit_state of 200": lambda: limit_state(plane, 200),
 }
+CASES = mark_long(ALL, "walk1d one-sided", "limit_state of 200")
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", CASES)
 def test_contract(name, key):
     sim = ALL[name]()
     assert jast.check(sim) is sim
@@ -46,7 +48,7 @@ def test_contract(name, key):
     assert found.invalid == 0 and not found.undisturbed.failure and found.rate < 0.2
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", CASES)
 def test_dtypes(name):
     for enabled, expected in ((False, jnp.float32), (True, jnp.float64)):
         with jax.enable_x64(enabled):

@@ -183,6 +183,7 @@ def test_surrogate_beats_random_search_on_the_ferry(key, equal):
     equal(again, found.best)
 
 
+@pytest.mark.long
 def test_batches_of_runs(key):
     """Runs and simulators side by side; ``tree`` is the run."""
     s = over(walk())

@@ -14,7 +14,7 @@ from checks import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain_tree import drawn_as_published, drawn_by_default, plain_search
-from systems import S0, TOLD, ferry_now
+from systems import S0, TOLD, mark_long
 from trees import (
     FERRY,
     LANDING,
@@ -83,7 +83,9 @@ def agree(key, k, alpha, focus=1.0, x=16.0, **switches):
         )
 
 
-@pytest.mark.parametrize(("k", "alpha"), [(2.0, 0.5), (0.5, 0.6)])
+@pytest.mark.parametrize(
+    ("k", "alpha"), [pytest.param(2.0, 0.5, marks=pytest.mark.long), (0.5, 0.6)]
+)
 def test_builds_the_tree_of_an_independent_search(key, k, alpha):
     agree(key, k, alpha)
 
@@ -93,7 +95,14 @@ def test_builds_the_tree_of_an_independent_search_with_spread_and_focused_action
 
 
 @pytest.mark.parametrize(
-    "switches", [("urgent",), ("feed",), ("follow",), ("follow", "feed", "urgent")], ids=" ".join
+    "switches",
+    [
+        pytest.param(("urgent",), marks=pytest.mark.long),
+        pytest.param(("feed",), marks=pytest.mark.long),
+        pytest.param(("follow",), marks=pytest.mark.long),
+        ("follow", "feed", "urgent"),
+    ],
+    ids=" ".join,
 )
 def test_builds_the_tree_of_an_independent_search_that_uses_its_best_episode(key, switches):
     agree(key, 2.0, 0.5, x=28.0, **dict.fromkeys(switches, True))  # nearer to a collision
@@ -107,7 +116,7 @@ def test_builds_the_tree_of_an_independent_search_in_float64(key, x64):
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ferry_now(SYSTEMS))
+@pytest.mark.parametrize("name", mark_long(SYSTEMS, "landing", "ring"))
 def test_counts_of_every_node_add_up(name, key):
     sim, choices = SYSTEMS[name]
     tree, root_visits, _ = grown(sim, tree_keys(key, 3), widening=(4.0, 0.5), **choices)
@@ -142,13 +151,13 @@ once = functools.cache(searched)
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ferry_now(SYSTEMS))
+@pytest.mark.parametrize("name", mark_long(SYSTEMS, "landing", "ring"))
 def test_the_same_key_gives_the_same_result(name):
     same(once(name), searched(name))
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ferry_now(["ferry", "ring"]))
+@pytest.mark.parametrize("name", ["ferry", pytest.param("ring", marks=pytest.mark.long)])
 def test_threads_and_lanes_change_nothing(name):
     """Groups of three, the last one filled up, in one thread or two; and all trees in one group."""
     for other in (searched(name, threads=2), searched(name, lanes=None)):
@@ -173,6 +182,7 @@ def test_memoization_changes_the_steps_and_nothing_else(name):
     assert node.steps < root.steps < none.steps
 
 
+@pytest.mark.long
 def test_the_steps_of_replays_add_up():
     """From so far off nothing collides, so all episodes are of 21 steps, of which a kept root saves
     its depth.
@@ -323,20 +333,23 @@ def test_large_copies_are_seen():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("memoize", ["node", "root", "none"])
+@pytest.mark.parametrize("memoize", mark_long(["node", "root", "none"], "root", "none"))
 def test_no_array_of_the_tree_is_copied_in_a_loop(memoize):
     assert not large_copies(compiled_text(FERRY, 307, memoize, **S0), 307)
 
 
+@pytest.mark.long
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ferry_now(["landing", "ring"]))
+@pytest.mark.parametrize("name", ["landing", "ring"])
 def test_nor_with_other_states(name):
     sim, choices = SYSTEMS[name]
     assert not large_copies(compiled_text(sim, 307, "node", **choices), 307)
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("sim", [FERRY, LANDING], ids=["ferry", "landing"])
+@pytest.mark.parametrize(
+    "sim", [FERRY, pytest.param(LANDING, marks=pytest.mark.long)], ids=["ferry", "landing"]
+)
 def test_nor_when_the_best_episode_is_followed_and_trials_are_recorded(sim):
     assert not large_copies(
         compiled_text(

@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from systems import mark_long
 
 from jast import plot
 from jast.weakness import auc, digits, encoded, from_idx, judge, load, save, thesis, validate
@@ -517,7 +518,7 @@ def test_systems_that_never_or_always_fail(key, rate):
     assert result.expected == rate * (1797 - result.calls)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 40])
+@pytest.mark.parametrize("n", mark_long([1, 2, 3, 40], 2, 3))
 def test_tables_and_fewer_inputs_than_the_sample(key, n):
     rng = np.random.default_rng(n)
     inputs = rng.normal(size=(n, 20)) * 10.0 ** np.arange(-10, 10)
