@@ -52,7 +52,9 @@ def test_locate_inverts_at(kind, model, dtype, key):
     x, u, again = jax.jit(there_and_back)(jax.random.split(key, 300))
     assert jax.tree.structure(u) == jax.tree.structure(x)
     for a, v, b in zip(*map(jax.tree.leaves, (x, u, again)), strict=True):
-        assert v.shape == a.shape == b.shape and v.dtype == dtype and a.dtype == b.dtype
+        assert v.shape == a.shape == b.shape
+        assert v.dtype == dtype
+        assert a.dtype == b.dtype
         assert ((v >= 0) & (v <= 1)).all()
         if jnp.issubdtype(a.dtype, jnp.floating):
             np.testing.assert_allclose(
@@ -70,9 +72,8 @@ def test_at_is_place_where_there_is_one():
     u, dist = jnp.asarray(0.25), D.Normal(0.0, 1.0)
     for choice in (actions.quantiles(), actions.uniform(0.0, 2.0)):
         assert choice.at(u, dist) == choice.place(u, dist)
-    assert actions.samples().at(u, dist) == D.quantile(dist, u) and not hasattr(
-        actions.samples(), "place"
-    )
+    assert actions.samples().at(u, dist) == D.quantile(dist, u)
+    assert not hasattr(actions.samples(), "place")
     # of the box, not of the model
     assert actions.uniform(0.0, 2.0).locate(jnp.asarray(0.5), dist) == 0.25
 
@@ -141,11 +142,9 @@ def test_a_box_with_ends_for_each_part_is_the_boxes_of_its_parts(key):
         for name, d in dict(a=a, b=b).items()
     )
     draws = jax.vmap(lambda k: box.draw(k, dist))(jax.random.split(key, 500))
-    assert (
-        (jnp.abs(draws["a"]) < 1).all()
-        and (draws["b"].min(0) > jnp.array([0.0, 2.0])).all()
-        and (draws["b"].max(0) > 3.9).all()
-    )
+    assert (jnp.abs(draws["a"]) < 1).all()
+    assert (draws["b"].min(0) > jnp.array([0.0, 2.0])).all()
+    assert (draws["b"].max(0) > 3.9).all()
 
 
 def test_check_says_what_is_wrong_with_the_ends_of_a_box():

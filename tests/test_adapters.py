@@ -125,7 +125,9 @@ def test_what_terminates_is_a_failure_and_is_not_reset():
     sim = drift(action=Normal(jnp.zeros(1), 1.0), gain=1.1)
     rows = {"action": jnp.zeros((5, 1)).at[2].set(3.5)}
     episode = jast.replay(sim, rows)
-    assert episode.failure and episode.length == 3 and episode.distance == -0.5
+    assert episode.failure
+    assert episode.length == 3
+    assert episode.distance == -0.5
     blind = drift(action=Normal(jnp.zeros(1), 1.0), gain=1.1, limit=4.0, distance=None)
     assert jast.replay(blind, rows).distance == 1.0
     other = dict(failure=lambda now: now.total < -100.0)
@@ -436,7 +438,9 @@ def test_pgx_is_its_game_tree(key):
     )
     assert game(Nim(), 0, 2, 0).failure and game(Nim(), 0, 2, 0).length == 3
     won = game(Nim(), 0, 1, 0, 0)
-    assert won.length == 4 and not won.failure and won.states.reward[4] == 1.0
+    assert won.length == 4
+    assert not won.failure
+    assert won.states.reward[4] == 1.0
     alone = type("Alone", (Nim,), {"num_players": 1})()
     assert game(alone, 0, 1, 0, 0).failure  # of one, whatever its reward
 

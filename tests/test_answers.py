@@ -144,7 +144,9 @@ def test_events_of_the_end_and_of_the_start(found, key):
     assert sum(e.probability for e in both) == pytest.approx(found.mean, rel=1e-5)
     assert all(e.reliable for e in both)
     nothing = out["never"]
-    assert nothing.probability == 0 and not nothing.reliable and nothing.interval[1] > 0
+    assert nothing.probability == 0
+    assert not nothing.reliable
+    assert nothing.interval[1] > 0
     # x0 given a failure on the upper side, by quadrature
     x = np.linspace(-6, 10, 8001)
     joint = norm.pdf(x) * norm.sf((2 * BETA - x) / np.sqrt(3))
@@ -169,9 +171,8 @@ def test_first_passage_times(key):
     n = len(t.probability)
     error = np.sqrt(truth * (1 - truth) / 20_000)
     assert (abs(t.probability - truth[:n]) < 4 * error[:n] + 1e-9).all()
-    assert t.probability.sum() == pytest.approx(e.mean) and t.given_failure.sum() == pytest.approx(
-        1
-    )
+    assert t.probability.sum() == pytest.approx(e.mean)
+    assert t.given_failure.sum() == pytest.approx(1)
     assert np.mean((t.low <= truth[:n]) & (truth[:n] <= t.high)) >= 0.8
     cdf = np.cumsum(truth) / truth.sum()
     for q, (_, low, high) in t.quantiles.items():

@@ -60,10 +60,8 @@ def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
         jast.search.monte_carlo(key, s, episodes=1500, top=3, reward=jast.rewards.STANDARD)
         for s in (sim, in_jax(episodic=True))
     )
-    assert (
-        ours.failing_share == theirs.failing_share > 0
-        and ours.first_failure == theirs.first_failure
-    )
+    assert ours.failing_share == theirs.failing_share > 0
+    assert ours.first_failure == theirs.first_failure
     np.testing.assert_array_equal(
         ours.failures.episodes.disturbances, theirs.failures.episodes.disturbances
     )
@@ -71,7 +69,9 @@ def test_episodes_are_those_of_the_system_in_jax_and_counted_once(key):
     n = blackbox.calls(sim)
     # the best one and three failures are replayed
     assert n.rows == n.episodes == ours.episodes + 1 + 3 and n.transitions == 4 * n.episodes
-    assert n.calls < 40 and n.seconds > 0 and "ms an outcome" in str(n)
+    assert n.calls < 40
+    assert n.seconds > 0
+    assert "ms an outcome" in str(n)
     assert incidents(sim) == ()
 
 
@@ -203,11 +203,9 @@ def test_what_goes_wrong_is_counted_with_an_example():
         "wrong answer",
         "wrong answer",
     ]
-    assert (
-        found["raised"].count == 2
-        and found["raised"].disturbances.tolist() == [1, 0]
-        and found["raised"].x0 == ()
-    )
+    assert found["raised"].count == 2
+    assert found["raised"].disturbances.tolist() == [1, 0]
+    assert found["raised"].x0 == ()
     assert found["raised"].message.startswith(
         "raised ZeroDivisionError: float division by zero (blackboxes.py:"
     )
@@ -225,7 +223,9 @@ def test_a_search_goes_on_without_the_invalid_episodes(key):
     sim = box(blackboxes.Fragile, 3, episodic=False)
     found = jast.search.monte_carlo(key, sim, episodes=128, top=2)
     (only,) = incidents(sim)
-    assert 0 < found.invalid < 128 and found.failing_share == 0 and only.count >= found.invalid
+    assert 0 < found.invalid < 128
+    assert found.failing_share == 0
+    assert only.count >= found.invalid
     assert (
         only.message == "raised RuntimeError: beyond 2"
         f" (blackboxes.py:{blackboxes.Fragile.transition.__code__.co_firstlineno + 3})"
@@ -248,7 +248,9 @@ def test_the_log_groups_and_is_bounded():
         log.add("raised", f"raised {i}", lambda i=i: ((), i))
     log.add("raised", "raised 3", lambda: pytest.fail("an example is made once"))
     found = log.all()
-    assert len(found) == GROUPS + 1 and found[3].count == 2 and found[3].disturbances == 3
+    assert len(found) == GROUPS + 1
+    assert found[3].count == 2
+    assert found[3].disturbances == 3
     assert found[-1].kind == "other" and found[-1].count == 20
     assert incidents(jast.simulators.walk1d()) == ()
 
@@ -263,18 +265,16 @@ def test_an_outcome_has_no_gradient():
 def test_a_failure_probability():
     sim = box(blackboxes.branches, 1, MultivariateNormalDiag(jnp.zeros(2), jnp.ones(2)))
     found = jast.estimate.failure_probability(jax.random.key(0), sim, 5000)
-    assert (
-        abs(np.log(found.mean / 2.2227950662e-3)) < 0.25
-        and found.interval[0] < 2.2227950662e-3 < found.interval[1]
-    )
+    assert abs(np.log(found.mean / 2.2227950662e-3)) < 0.25
+    assert found.interval[0] < 2.2227950662e-3 < found.interval[1]
     assert abs(blackbox.calls(sim).episodes - 5000) < 500
 
 
 def test_the_nominal_system():
     found = jast.nominal(jax.random.key(0), sim := box(blackboxes.walk, 4), episodes=500)
-    assert (
-        not found.undisturbed.failure and found.undisturbed.distance == 4 and 0 < found.failing < 50
-    )
+    assert not found.undisturbed.failure
+    assert found.undisturbed.distance == 4
+    assert 0 < found.failing < 50
     assert blackbox.calls(sim).episodes in (501, 502)
 
 
@@ -330,7 +330,9 @@ def test_failures_by_seeds_are_ranked_by_what_the_system_says(key):
     """The likeliest of 400 episodes comes first; without a word from the system all are alike."""
     found = jast.search.monte_carlo(key, box(blackboxes.Sampled, 4, None), episodes=400, top=5)
     log_p = np.asarray(found.failures.episodes.log_prob)
-    assert len(log_p) == 5 and (np.diff(log_p) <= 0).all() and found.best.log_prob == log_p[0] < -4
+    assert len(log_p) == 5
+    assert (np.diff(log_p) <= 0).all()
+    assert found.best.log_prob == log_p[0] < -4
     silent = jast.search.monte_carlo(
         key, box(lambda s: (s[0] % 2 == 0, 1.0), 4, None), episodes=100, top=5
     )
@@ -412,11 +414,9 @@ def test_an_external_program():
     np.testing.assert_array_equal(distance, [3.5, np.nan, np.nan])
     assert not event.any()
     raised, answered = sorted(incidents(sim))
-    assert (
-        "exit status 1: no good" in raised.message
-        and answered.kind == "wrong answer"
-        and "received 'no answer'" in answered.message
-    )
+    assert "exit status 1: no good" in raised.message
+    assert answered.kind == "wrong answer"
+    assert "received 'no answer'" in answered.message
 
 
 def test_a_gymnasium_environment():
@@ -431,7 +431,9 @@ def test_a_gymnasium_environment():
     )
     sim = box(system, 25, start=jast.distributions.seeds(), episodic=False)
     one = jast.replay(sim, jnp.full(25, 2.0), x0=jnp.uint32(3))  # it always does the opposite
-    assert one.failure and 5 < one.length < 25 and one.distance < 0
+    assert one.failure
+    assert 5 < one.length < 25
+    assert one.distance < 0
     env = make()
     seen, _ = env.reset(seed=3)
     for n in range(1, 26):  # noqa: B007
@@ -540,7 +542,9 @@ def test_objects_serve_many_episodes(monkeypatch):
         for _ in range(3):
             for t in range(3 if episodic else 0, 4):
                 reply = runner(np.full(4, t), [], [rows])
-        assert Counted.made == most and reply.problems == [] and runner.kept == {}
+        assert Counted.made == most
+        assert reply.problems == []
+        assert runner.kept == {}
         np.testing.assert_allclose(reply.distance, 4 - rows.sum(1))
     # no more are kept than there is room for: of the lost ones the histories are repeated
     monkeypatch.setattr(worker, "KEPT", 2)
@@ -572,7 +576,9 @@ def test_a_distance_beyond_the_precision_is_no_number():
 
     sim = box(Far, 3)
     state = sim.step(sim.init(()), jnp.ones(()))
-    assert not state.event and state.terminal and np.isnan(state.distance)
+    assert not state.event
+    assert state.terminal
+    assert np.isnan(state.distance)
     (only,) = incidents(sim)
     assert (only.kind, only.message) == ("NaN", "distance is 1e+300, too large for float32")
     assert only.disturbances.tolist() == [1]

@@ -30,13 +30,18 @@ def test_routes_pass_and_fail_as_the_track_says(installed, equal):
     calm, missed = (
         jast.replay(sim, jnp.asarray(x, jnp.zeros(()).dtype)) for x in (STRAIGHT, SHARP)
     )
-    assert not calm.failure and 1 < calm.distance < 7 and missed.failure and missed.distance < -0.5
+    assert not calm.failure
+    assert 1 < calm.distance < 7
+    assert missed.failure
+    assert missed.distance < -0.5
     assert incidents(sim) == () and blackbox.calls(sim).episodes == 2
     equal(missed, jast.replay(sim, jnp.asarray(SHARP, jnp.zeros(()).dtype)))
     for x, episode in ((STRAIGHT, calm), (SHARP, missed)):  # this process has a BlueSky of its own
         flight, again = bluesky_flight(x), bluesky_flight(x)
         equal(flight._asdict() | {"finished": 0}, again._asdict() | {"finished": 0})
-        assert flight.finished and flight.route.shape == (3, 2) and flight.turns[1] == 0
+        assert flight.finished
+        assert flight.route.shape == (3, 2)
+        assert flight.turns[1] == 0
         np.testing.assert_allclose(flight.track[0], 0)
         excess = np.max(flight.nearest - flight.allowed)
         np.testing.assert_allclose(episode.distance, np.log(1 / max(excess, 1e-3)), rtol=1e-5)

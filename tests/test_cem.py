@@ -42,11 +42,9 @@ def test_finds_a_rare_failure_that_random_search_does_not(key, equal):
     sim, reward = hyperplane(6.0), rewards.Partial(_distance_first)
     assert not monte_carlo(key, sim, episodes=4000, reward=reward).failing_per_tree.any()
     r = cem(key, sim, **SMALL | dict(reward=reward, samples=200, elites=20, iterations=20))
-    assert (
-        r.failing_per_tree.all()
-        and r.failures.size == 64
-        and r.settings["actions"] == "actions.quantiles"
-    )
+    assert r.failing_per_tree.all()
+    assert r.failures.size == 64
+    assert r.settings["actions"] == "actions.quantiles"
     assert archive_replays(sim, r, reward, equal)
     np.testing.assert_allclose(r.best.disturbances[0], 3, atol=0.3)
 
@@ -67,23 +65,17 @@ def test_ferry(key, equal, choice):
     """Random search finds no collision in two million episodes."""
     sim = jast.simulators.ferry()
     r = cem(key, sim, trees=4, actions=choice, reward=S0["reward"])
-    assert (
-        r.failing_per_tree.all() and (r.best_reward_per_tree > 29).all() and r.best.reward < 29.65
-    )
-    assert (
-        r.episodes == 36_000
-        and r.steps <= 36_000 * 21
-        and r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
-    )
+    assert r.failing_per_tree.all()
+    assert (r.best_reward_per_tree > 29).all()
+    assert r.best.reward < 29.65
+    assert r.episodes == 36_000
+    assert r.steps <= 36_000 * 21
+    assert r.best_reward_per_tree.max() == pytest.approx(r.best.reward, rel=1e-5)
     assert archive_replays(sim, r, S0["reward"], equal)
-    assert (
-        r.history.best_reward.shape == (30, 4)
-        and (np.diff(r.history.best_reward, axis=0) >= 0).all()
-    )
-    assert (
-        r.history.simulations.tolist() == list(range(300, 9001, 300))
-        and r.history.failures[-1] == r.failures.seen
-    )
+    assert r.history.best_reward.shape == (30, 4)
+    assert (np.diff(r.history.best_reward, axis=0) >= 0).all()
+    assert r.history.simulations.tolist() == list(range(300, 9001, 300))
+    assert r.history.failures[-1] == r.failures.seen
     assert 1 < r.first_failure <= r.episodes and r.failing_share == r.failures.seen / r.episodes
 
 
@@ -93,10 +85,9 @@ def test_structured_disturbances_and_a_random_start(key, equal, choice):
     sim = ring()
     r = cem(key, sim, actions=choice, trees=4, refine=0)
     assert archive_replays(sim, r, reward_of(r), equal)
+    assert r.failing_per_tree.all()
     assert (
-        r.failing_per_tree.all()
-        and r.best_reward_per_tree.mean()
-        > monte_carlo(key, sim, episodes=9000, refine=0).best.reward
+        r.best_reward_per_tree.mean() > monte_carlo(key, sim, episodes=9000, refine=0).best.reward
     )
 
 
@@ -105,9 +96,8 @@ def test_random_start_of_a_rare_failure(key, equal):
     sim, reward = jast.simulators.landing(), rewards.Partial(_far_from_the_line)
     r = cem(key, sim, reward=reward)
     assert archive_replays(sim, r, reward, equal)
-    assert abs(r.best.x0) == pytest.approx(0.526, abs=0.06) and abs(
-        r.best.disturbances
-    ).mean() == pytest.approx(0.0474, abs=0.006)
+    assert abs(r.best.x0) == pytest.approx(0.526, abs=0.06)
+    assert abs(r.best.disturbances).mean() == pytest.approx(0.0474, abs=0.006)
 
 
 def _far_from_the_line(log_p, event, distance, terminal, approach):
@@ -125,7 +115,8 @@ def test_seeds_of_unknown_density(key, equal):
 def test_trees_are_independent_of_their_number(key, equal):
     few, many = (cem(key, walk(), trees=n, **SMALL) for n in (1, 3))
     np.testing.assert_allclose(few.best_reward_per_tree, many.best_reward_per_tree[:1], rtol=1e-5)
-    assert len(set(many.best_reward_per_tree.tolist())) == 3 and set(many.failures.tree) <= {
+    assert len(set(many.best_reward_per_tree.tolist())) == 3
+    assert set(many.failures.tree) <= {
         0,
         1,
         2,
@@ -142,29 +133,22 @@ def test_counts_of_repetitions(key):
         1,
     )
     r = cem(key, sim, trees=2, **TOLD, samples=50, elites=5, iterations=4)
-    assert r.failures.size == 1 and r.failures.counts.sum() == r.failures.seen == round(
-        r.failing_share * 400
-    )
+    assert r.failures.size == 1
+    assert r.failures.counts.sum() == r.failures.seen == round(r.failing_share * 400)
 
 
 def test_invalid_episodes_are_counted_and_never_elite(key):
     r = cem(key, walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x)), **SMALL)
-    assert (
-        0 < r.invalid < 600
-        and np.isfinite(r.best.reward)
-        and np.isfinite(r.failures.episodes.reward).all()
-    )
+    assert 0 < r.invalid < 600
+    assert np.isfinite(r.best.reward)
+    assert np.isfinite(r.failures.episodes.reward).all()
     r = cem(key, walk(step=lambda s, x: s + jnp.nan), trees=2, **SMALL)
-    assert (
-        r.invalid == r.episodes == r.steps == 2000
-        and r.best.reward == -np.inf
-        and not r.best.failure
-    )
-    assert (
-        (r.best_reward_per_tree == -np.inf).all()
-        and r.failures.size == 0
-        and r.first_failure is None
-    )
+    assert r.invalid == r.episodes == r.steps == 2000
+    assert r.best.reward == -np.inf
+    assert not r.best.failure
+    assert (r.best_reward_per_tree == -np.inf).all()
+    assert r.failures.size == 0
+    assert r.first_failure is None
 
 
 def test_systems_that_never_or_always_fail(key):
@@ -200,12 +184,10 @@ def test_under_jit_and_vmap(key):
         assert float(traced.best.reward[i]) == pytest.approx(
             float(traced.best_reward_per_tree[i].max()), rel=1e-5
         )
-    assert (
-        traced.failures is None
-        and traced.history is None
-        and traced.settings is None
-        and traced.failing_per_tree.shape == (2, 2)
-    )
+    assert traced.failures is None
+    assert traced.history is None
+    assert traced.settings is None
+    assert traced.failing_per_tree.shape == (2, 2)
 
 
 def test_interruption(key, equal):
@@ -215,11 +197,9 @@ def test_interruption(key, equal):
             raise KeyboardInterrupt
 
     r = cem(key, walk(), trees=2, callback=callback, **SMALL)
-    assert (
-        r.episodes == 600
-        and r.settings["interrupted"] == "after 600 of 2000 episodes"
-        and len(r.history.failures) == 3
-    )
+    assert r.episodes == 600
+    assert r.settings["interrupted"] == "after 600 of 2000 episodes"
+    assert len(r.history.failures) == 3
     equal(r.failures, cem(key, walk(), trees=2, **SMALL | dict(iterations=3)).failures)
 
 

@@ -100,12 +100,17 @@ def far(limit, distance):
 def test_goes_to_failures_that_no_draw_reaches(key):
     """Fourteen deviations away."""
     r = chain(key, far(20.0, lambda s: jnp.maximum(20 - s, 0)), **SMALL)
-    assert r.failing and r.first_failure > 5 * 64 and -200 < r.best.reward <= -100
+    assert r.failing
+    assert r.first_failure > 5 * 64
+    assert -200 < r.best.reward <= -100
 
 
 def test_nan_is_counted_and_never_best(key):
     r = chain(key, far(40.0, lambda s: jnp.where(s > 5, jnp.nan, 40 - s)), **SMALL)
-    assert r.invalid and not r.failing and 35 <= r.best.distance < 36 and not r.failures.size
+    assert r.invalid
+    assert not r.failing
+    assert 35 <= r.best.distance < 36
+    assert not r.failures.size
 
 
 @pytest.mark.long

@@ -322,9 +322,8 @@ def test_good_simulators_pass(name):
 
 
 def test_actions():
-    assert jast.check(ferry(), actions.uniform(0.0, 1.0)) and jast.check(
-        ferry(), actions.quantiles()
-    )
+    assert jast.check(ferry(), actions.uniform(0.0, 1.0))
+    assert jast.check(ferry(), actions.quantiles())
     with pytest.raises(
         ValueError,
         match=(
@@ -419,7 +418,9 @@ def test_nominal_is_a_loop_of_rollouts(key):
     assert found.interval == clopper_pearson(found.failing, n) and found.rate == found.failing / n
     assert float(found.undisturbed.distance) == 10 and int(found.undisturbed.length) == 30
     text = str(found)
-    assert "no failure" in text and f"{found.failing} of {n}" in text and len(text.splitlines()) < 8
+    assert "no failure" in text
+    assert f"{found.failing} of {n}" in text
+    assert len(text.splitlines()) < 8
 
 
 def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeypatch):
@@ -453,7 +454,9 @@ def test_nominal_interrupted_is_the_nominal_of_what_was_done(key, equal, monkeyp
 def test_nominal_says_when_the_system_fails_undisturbed(key):
     with pytest.warns(UserWarning, match="fails undisturbed"):
         found = jast.nominal(key, line(step=lambda s, x: s + 1), episodes=10)
-    assert found.failing == 10 and found.interval[1] == 1 and "FAILS" in str(found)
+    assert found.failing == 10
+    assert found.interval[1] == 1
+    assert "FAILS" in str(found)
 
 
 def test_nominal_counts_invalid_episodes(key):
@@ -461,11 +464,9 @@ def test_nominal_counts_invalid_episodes(key):
     with pytest.warns(UserWarning, match="of 2000 nominal episodes are invalid"):
         found = jast.nominal(key, sim, episodes=2000)
     share = scipy.stats.norm.sf(1)
-    assert (
-        abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000)
-        and found.mean_distance == pytest.approx(5)
-        and found.failing == 0
-    )
+    assert abs(found.invalid / 2000 - share) < 4 * np.sqrt(share / 2000)
+    assert found.mean_distance == pytest.approx(5)
+    assert found.failing == 0
     with pytest.warns(UserWarning, match="of 5 nominal"):
         assert np.isnan(
             jast.nominal(key, line(step=lambda s, x: s * jnp.nan), episodes=5).mean_distance

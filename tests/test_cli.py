@@ -56,7 +56,9 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
         capsys, tmp_path, "--method", method, *(["--prunes", "3"] if method == "forest" else [])
     )
     assert status == 0
-    assert "undisturbed    no failure" in text and "95 %" in text and "best episode" in text
+    assert "undisturbed    no failure" in text
+    assert "95 %" in text
+    assert "best episode" in text
     rows = [
         line.split()[:2]
         for line in text.splitlines()
@@ -67,11 +69,9 @@ def test_every_method_reports_and_saves(capsys, tmp_path, method):
         [["monte-carlo", episodes]] if method != "monte-carlo" else []
     )
     held, settings = jast.failures.load(out / "failures.npz", jast.simulators.ferry())
-    assert (
-        held.size == 0
-        and settings["simulator"] == "ferry"
-        and settings["method"] == method.replace("-", "_")
-    )
+    assert held.size == 0
+    assert settings["simulator"] == "ferry"
+    assert settings["method"] == method.replace("-", "_")
     pytest.importorskip("matplotlib")
     assert all(
         (out / name).read_bytes().startswith(b"\x89PNG") for name in ("episode.png", "history.png")
@@ -98,7 +98,9 @@ def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
     command = [f"{tmp_path / 'own.py'}:walk", "--budget", "600", "--quiet"]
     assert cli.main([*command, "--output", str(tmp_path / "out")]) == 0
     text = capsys.readouterr().out
-    assert "undisturbed" in text and "likeliest failure: " in text and "next: " in text
+    assert "undisturbed" in text
+    assert "likeliest failure: " in text
+    assert "next: " in text
     page = (tmp_path / "out/report.html").read_text()
     assert "The likeliest failure takes" in page and f"saved {tmp_path / 'out/report.html'}" in text
     report = jast.load(tmp_path / "out/report.npz")
@@ -116,9 +118,9 @@ def test_stress_of_a_system_of_ones_own(capsys, tmp_path):
 def test_stress_is_what_is_run_where_nothing_is_said(capsys, tmp_path):
     assert cli.main(["--budget", "20000", "--quiet", "--output", str(tmp_path / "out")]) == 0
     text = capsys.readouterr().out
-    assert (
-        "undisturbed" in text and "probability" in text and (tmp_path / "out/report.npz").exists()
-    )
+    assert "undisturbed" in text
+    assert "probability" in text
+    assert (tmp_path / "out/report.npz").exists()
     assert ">adversary<" in (tmp_path / "out/report.html").read_text()
 
 
@@ -176,7 +178,8 @@ def test_help(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
     text = capsys.readouterr().out
-    assert end.value.code == 0 and all(
+    assert end.value.code == 0
+    assert all(
         option in text for option in ("--simulator", "--method", "--paper", "--quiet", "ferry-b")
     )
 
@@ -237,7 +240,9 @@ def test_interrupted_baseline_still_reports(capsys, tmp_path, monkeypatch):
 
     monkeypatch.setattr(cli, "monte_carlo", stop)
     status, text, out = run(capsys, tmp_path, "--simulator", "walk1d", "--prunes", "2")
-    assert status == 130 and "interrupted: " in text and (out / "failures.npz").exists()
+    assert status == 130
+    assert "interrupted: " in text
+    assert (out / "failures.npz").exists()
     assert "monte-carlo" not in text
 
 
@@ -265,7 +270,9 @@ def test_interrupted_search_reports_what_was_done(capsys, tmp_path, monkeypatch)
         ]
     )
     text = capsys.readouterr().out
-    assert status == 130 and "interrupted: " in text and "monte-carlo" not in text
+    assert status == 130
+    assert "interrupted: " in text
+    assert "monte-carlo" not in text
     assert (
         0
         < int(next(line for line in text.splitlines() if line.startswith("forest")).split()[1])
@@ -306,6 +313,5 @@ def test_as_a_program(tmp_path):
         text=True,
         timeout=300,
     )
-    assert wrong.returncode == 2 and wrong.stderr.splitlines()[-1].startswith(
-        "python -m jast: error: argument --trees"
-    )
+    assert wrong.returncode == 2
+    assert wrong.stderr.splitlines()[-1].startswith("python -m jast: error: argument --trees")

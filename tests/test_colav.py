@@ -389,16 +389,12 @@ def test_dtypes(flown):
         }
 
     for episode in (f.episode for f in flown.values()):
-        assert (
-            floats(episode) == {"float64"}
-            and episode.states.choice.dtype == episode.states.step.dtype == np.int32
-        )
+        assert floats(episode) == {"float64"}
+        assert episode.states.choice.dtype == episode.states.step.dtype == np.int32
     with jax.enable_x64(False):
         episode = jast.rollout(jax.random.key(0), colav())
-        assert (
-            floats(episode) == {"float32"}
-            and episode.states.choice.dtype == episode.states.step.dtype == np.int32
-        )
+        assert floats(episode) == {"float32"}
+        assert episode.states.choice.dtype == episode.states.step.dtype == np.int32
         given = colav(
             Scenario(np.zeros(3), np.zeros((4, 3)), np.zeros(3)),
             longest_delay=np.float64(10),
@@ -508,9 +504,8 @@ def test_a_longer_horizon_goes_on_as_a_shorter_one(flown):
         short = flown["undisturbed overtaking"].episode
         assert sim.horizon == 27 == int(episode.length)
         np.testing.assert_allclose(episode.states.near[:26], short.states.near, rtol=1e-9)
-        assert not bool(episode.failure) and float(episode.distance) == pytest.approx(
-            14.10, abs=0.02
-        )
+        assert not bool(episode.failure)
+        assert float(episode.distance) == pytest.approx(14.10, abs=0.02)
 
 
 # undisturbed
@@ -527,9 +522,8 @@ def test_the_undisturbed_ferry_keeps_ten_metres(key):
         np.testing.assert_array_equal(found.disturbances, 0)
         again = jast.replay(colav(name), found)
         assert float(again.distance) == float(found.distance) == float(again.states.near.min())
-        assert float(found.distance) >= 10 and float(found.distance) == pytest.approx(
-            expected, abs=0.02
-        )
+        assert float(found.distance) >= 10
+        assert float(found.distance) == pytest.approx(expected, abs=0.02)
 
 
 def test_collision_avoidance_is_worth_metres_in_every_scenario(flown):
@@ -688,11 +682,9 @@ def test_thrust_stays_within_what_the_thrusters_can(x64):
         g.uniform(-1, 1, (500, k)) * 10 ** g.uniform(-2, 2, (500, 1)) for k in (5, 3, 3)
     )
     thrust = np.stack(vessels.forces(Control(*control.T), Pose(*pose.T), Velocity(*velocity.T)), -1)
-    assert (
-        (np.abs(thrust) <= LIMITS).all()
-        and (np.abs(thrust) == LIMITS).any(0).all()
-        and (np.abs(thrust) < LIMITS).any(0).all()
-    )
+    assert (np.abs(thrust) <= LIMITS).all()
+    assert (np.abs(thrust) == LIMITS).any(0).all()
+    assert (np.abs(thrust) < LIMITS).any(0).all()
 
 
 def test_a_ferry_at_rest_stays_at_rest():
@@ -1088,15 +1080,16 @@ def test_zones_reach_as_far_as_published(x64, zone, reach):
     weights = (1000, 100, 10)
     assert ZONES[zone].weight == weights[zone]
     for axis, r in zip(axes, reach, strict=True):
-        assert bool(inside(ZONES[zone], *(axis * (r - 1e-6)))) and not bool(
-            inside(ZONES[zone], *(axis * (r + 1e-6)))
-        )
+        assert bool(inside(ZONES[zone], *(axis * (r - 1e-6))))
+        assert not bool(inside(ZONES[zone], *(axis * (r + 1e-6))))
 
 
 def test_zones_are_nested(x64):
     points = rng(0).uniform(-45, 45, (2, 20000))
     core, high, low = (np.asarray(inside(zone, *points)) for zone in ZONES)
-    assert (high[core]).all() and (low[high]).all() and core.sum() < high.sum() < low.sum()
+    assert (high[core]).all()
+    assert (low[high]).all()
+    assert core.sum() < high.sum() < low.sum()
     # quarters of ellipses: pi/4 (forward + aft)(starboard + port)
     for found, area in ((core, 30 * 20), (high, 40 * 35), (low, 65 * 55)):
         expected = np.pi / 4 * area / 90**2
@@ -1237,7 +1230,9 @@ def test_stops_before_an_obstacle_at_rest(flown):
     """On the path, 45 m ahead; without a plan it would be passed through after about a minute."""
     f = flown["obstacle at rest"]
     s = f.episode.states
-    assert not f.episode.failure and f.episode.length == STEPS and f.episode.distance > 10
+    assert not f.episode.failure
+    assert f.episode.length == STEPS
+    assert f.episode.distance > 10
     assert np.ptp(s.adversary.pose.n) == np.ptp(s.adversary.pose.e) == 0
     assert abs(s.velocity.u[-1]) < 0.1 and 55 - 45 < s.pose.n[-1] < 45
 
@@ -1363,10 +1358,8 @@ def test_miss_distance_is_the_least_at_substeps(flown, sailed, records):
             worst = max(
                 worst, np.abs(near[1:] - distances(name, flown, sailed, records).min(1)).max()
             )
-        assert (
-            near[0] == pytest.approx(np.hypot(*(f.scenario.ferry - f.scenario.adversary)[:2]))
-            and f.episode.distance == near.min()
-        )
+        assert near[0] == pytest.approx(np.hypot(*(f.scenario.ferry - f.scenario.adversary)[:2]))
+        assert f.episode.distance == near.min()
     assert worst < 0.1
 
 
@@ -1415,12 +1408,10 @@ def test_a_ferry_that_cannot_see_is_rammed(flown, sailed, records):
 def test_the_dock_ends_an_episode_without_failure(flown):
     episode = flown["docks"].episode
     north = episode.states.pose.n[: episode.length + 1]
-    assert (
-        not episode.failure
-        and 0 < episode.length < STEPS
-        and (north[:-1] <= 99).all()
-        and north[-1] > 99
-    )
+    assert not episode.failure
+    assert 0 < episode.length < STEPS
+    assert (north[:-1] <= 99).all()
+    assert north[-1] > 99
     at = flown["at the dock"].episode
     assert not at.failure and at.length == 0
 
@@ -1428,11 +1419,9 @@ def test_the_dock_ends_an_episode_without_failure(flown):
 def test_a_failure_comes_before_the_dock(flown):
     """In the second step the ferry is rammed and comes past the dock."""
     episode = flown["rammed at the dock"].episode
-    assert (
-        episode.failure
-        and episode.length == 2
-        and (episode.states.pose.n[:3] > 99).tolist() == [False, False, True]
-    )
+    assert episode.failure
+    assert episode.length == 2
+    assert (episode.states.pose.n[:3] > 99).tolist() == [False, False, True]
 
 
 def test_the_substeps_of_the_text_are_those_of_the_code_to_ten_centimetres():

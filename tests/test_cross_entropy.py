@@ -253,15 +253,15 @@ def test_the_objective_is_asked_for_exactly_the_budget(key):
 def test_a_search_can_stop_early_and_go_on(method, key):
     search = ce.start(key, START, method, samples=4, elites=3, iterations=3)
     nothing = ce.finish(search)
-    assert nothing.best_value == np.inf and np.isnan(nothing.best_x).all() and nothing.invalid == 0
+    assert nothing.best_value == np.inf
+    assert np.isnan(nothing.best_x).all()
+    assert nothing.invalid == 0
     x = ce.ask(search)
     np.testing.assert_array_equal(x, ce.ask(search))
     search = ce.tell(search, x, [np_bowl(row) for row in np.asarray(x)])
     part = ce.finish(search)
-    assert (
-        part.best_value == pytest.approx(min(np_bowl(row) for row in np.asarray(x)), rel=1e-5)
-        and np.isinf(part.history.value[4:]).all()
-    )
+    assert part.best_value == pytest.approx(min(np_bowl(row) for row in np.asarray(x)), rel=1e-5)
+    assert np.isinf(part.history.value[4:]).all()
     leaves, treedef = jax.tree.flatten(search)  # as a checkpoint does
     again = jax.tree.unflatten(
         treedef,
@@ -367,11 +367,9 @@ def test_mixtures_stay_proper(key):
     )
     weights, means, covariances = result.history.proposals
     np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-5)
-    assert (
-        weights.shape == (7, 2)
-        and np.isfinite(means).all()
-        and (np.linalg.eigvalsh(covariances) > 0).all()
-    )
+    assert weights.shape == (7, 2)
+    assert np.isfinite(means).all()
+    assert (np.linalg.eigvalsh(covariances) > 0).all()
     start = ce.Mixture(*jax.tree.map(lambda a: a[-1], (weights, means, covariances)))
     again = ce.ce_mixture(key, ce.sierra(), start, samples=10, elites=5, iterations=2)
     np.testing.assert_array_equal(again.history.proposals.means[0], start.means)
@@ -422,18 +420,16 @@ def test_what_is_not_finite_is_counted_and_never_an_elite(method, mode, key):
     wrong = x[:, 0] > 1.5
     np.testing.assert_array_equal(np.isfinite(value), ~wrong)
     assert 0 < int(result.invalid) == wrong.sum() < 100
-    assert (
-        np.isfinite(result.best_value)
-        and result.best_value == value[~wrong].min()
-        and result.best_x[0] <= 1.5
-    )
+    assert np.isfinite(result.best_value)
+    assert result.best_value == value[~wrong].min()
+    assert result.best_x[0] <= 1.5
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(result.history.proposals))
     assert f"{wrong.sum()} evaluations gave NaN or infinity" in str(result)
 
     nothing = search(-np.inf)  # an honest nothing
-    assert (
-        nothing.best_value == np.inf and np.isnan(nothing.best_x).all() and nothing.invalid == 100
-    )
+    assert nothing.best_value == np.inf
+    assert np.isnan(nothing.best_x).all()
+    assert nothing.invalid == 100
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(nothing.history.proposals))
 
 
@@ -463,9 +459,8 @@ def test_singular_elites_leave_the_proposal(key):
         np.testing.assert_allclose(result.history.proposals.mean[k], START[0])
     assert result.best_value <= result.history.value[0]
     flat = ce.ce_surrogate(key, lambda x: jnp.zeros(()), START, samples=10, iterations=3)
-    assert flat.best_value == 0 and all(
-        np.isfinite(a).all() for a in jax.tree.leaves(flat.history.proposals)
-    )
+    assert flat.best_value == 0
+    assert all(np.isfinite(a).all() for a in jax.tree.leaves(flat.history.proposals))
 
 
 def test_the_call_that_the_thesis_prints(key, x64):
@@ -475,10 +470,8 @@ def test_the_call_that_the_thesis_prints(key, x64):
     proposal = ce.normal(jnp.zeros(2), 200 * jnp.eye(2))
     run = lambda **how: ce.ce_surrogate(key, ce.paraboloid, proposal, mode="thesis", **how)
     squared = run(basis="squared")
-    assert (
-        squared.best_value < 2
-        and squared.best_value == run(surrogate="radial basis", basis="squared").best_value
-    )
+    assert squared.best_value < 2
+    assert squared.best_value == run(surrogate="radial basis", basis="squared").best_value
     assert squared.best_value != run(basis="linear").best_value
 
 
@@ -622,9 +615,8 @@ def test_bad_answers_are_named(key):
 def test_a_result_prints_as_a_table(key):
     result = ce.ce_method(key, bowl, START, samples=4, elites=3, iterations=3)
     lines = str(result).splitlines()
-    assert lines[0].split() == ["iteration", "evaluations", "best", "value", "at"] and [
-        line.split()[1] for line in lines[1:]
-    ] == ["4", "8", "12"]
+    assert lines[0].split() == ["iteration", "evaluations", "best", "value", "at"]
+    assert [line.split()[1] for line in lines[1:]] == ["4", "8", "12"]
     assert float(lines[-1].split()[2]) == pytest.approx(float(result.best_value), rel=1e-5)
     search = ce.start(key, START, "ce_method", samples=4, elites=3, iterations=3)
     assert str(ce.finish(search)).splitlines() == lines[:1]  # nothing done, nothing told

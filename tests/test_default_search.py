@@ -71,7 +71,9 @@ def test_failures_come_first_then_the_likeliest_then_the_nearest():
     assert reward(jnp.asarray(-jnp.inf), True, jnp.asarray(0.0), True) == -jnp.inf
     raw = rewards.lexicographic(near=2.0, rare=5.0, likely=-3.0, density="raw")
     likelier = [float(raw(jnp.asarray(p), True, jnp.asarray(0.0), True)) for p in (-9.0, -3.0, 9.0)]
-    assert likelier == sorted(likelier) and likelier[1] == 1 and likelier[2] < 2
+    assert likelier == sorted(likelier)
+    assert likelier[1] == 1
+    assert likelier[2] < 2
 
 
 def test_the_reward_of_an_episode_is_that_of_its_log_p_and_distance(key):

@@ -350,7 +350,9 @@ def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
         assert run.log_mean == -np.inf and run.points.shape == (0, 2)
         assert run.invalid == run.evaluations
     found = population(key, sim, 20_000, particles=256)
-    assert np.isnan(found.mean) and not found.reliable and found.interval == (0, found.interval[1])
+    assert np.isnan(found.mean)
+    assert not found.reliable
+    assert found.interval == (0, found.interval[1])
     assert any("invalid" in w for w in found.warnings)
 
 
@@ -360,7 +362,9 @@ def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
 def test_plain_draws_have_the_interval_of_their_counts(key):
     found = population(key, limit_state(lambda u: 1.0 - u[0], 2), 60_000, particles=N, level=0.9)
     k, _, n = found.plain
-    assert found.samples == n <= 60_000 and found.failing == k and found.mean == k / n
+    assert found.samples == n <= 60_000
+    assert found.failing == k
+    assert found.mean == k / n
     assert found.interval == clopper_pearson(k, n, 0.9)
 
 
@@ -369,7 +373,9 @@ def test_a_few_invalid_episodes_are_counted_and_do_no_harm(key):
     sim = limit_state(lambda u: jnp.where(u[1] > 4.5, jnp.nan, 3.0 - jnp.abs(u[0])), 2)
     found = population(key, sim, 300_000, particles=N)
     truth = 2 * norm.sf(3)
-    assert found.invalid > 0 and found.reliable and found.interval[0] < found.mean
+    assert found.invalid > 0
+    assert found.reliable
+    assert found.interval[0] < found.mean
     assert found.mean < found.interval[1]
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
@@ -532,7 +538,8 @@ def test_stress_of_a_rare_failure(key, small):
     """
     report = jast.stress(key, limit_state(lambda u: 4.0 - jnp.sum(u) / 3**0.5, 3), 150_000)
     p = report.probability
-    assert "populations" in p.method and [t.name for t in report.tried][:3] == [
+    assert "populations" in p.method
+    assert [t.name for t in report.tried][:3] == [
         "nominal",
         "populations",
         "cooled",

@@ -76,11 +76,9 @@ def test_quantiles_of_a_joint(dtype):
     x, n = D.quantile(d, (jnp.asarray(0.975, dtype), jnp.asarray(0.7, dtype)))
     assert float(x) == pytest.approx(1.959964, rel=1e-5) and int(n) == 1
     u, v = D.cdf(d, (x, n))
-    assert (
-        float(u) == pytest.approx(0.975, rel=1e-5)
-        and float(v) == 0.75
-        and u.dtype == v.dtype == dtype
-    )
+    assert float(u) == pytest.approx(0.975, rel=1e-5)
+    assert float(v) == 0.75
+    assert u.dtype == v.dtype == dtype
 
 
 @pytest.mark.parametrize("bijector, truth", [("neg", 1.2), ("pos", -1.2)])
@@ -101,7 +99,9 @@ def test_value_errors_name_the_distribution():
         D.quantile(shares, jnp.asarray([0.5, 0.5]))
     with pytest.raises(ValueError, match="Seeds has neither a mode nor a median"):
         D.mode(D.seeds())
-    assert not D.has_quantile(shares) and not D.has_mode(D.seeds()) and D.has_mode(D.Fixed())
+    assert not D.has_quantile(shares)
+    assert not D.has_mode(D.seeds())
+    assert D.has_mode(D.Fixed())
 
 
 # cdf
@@ -443,7 +443,9 @@ def test_tent(center, width, low, high, dtype, key):
     )
     u = jnp.linspace(0, 1, 101, dtype=dtype)
     q = np.asarray(jax.vmap(d.quantile)(u), np.float64)
-    assert (np.diff(q) >= 0).all() and q[0] >= low and q[-1] <= high
+    assert (np.diff(q) >= 0).all()
+    assert q[0] >= low
+    assert q[-1] <= high
     cdf = np.interp(q, x, np.concatenate([[0], np.cumsum((p[1:] + p[:-1]) / 2 * np.diff(x))]))
     np.testing.assert_allclose(cdf, u, atol=tolerance(dtype, 2e-4, 1e-6))
     mean, second = np.trapezoid(p * x, x), np.trapezoid(p * x * x, x)
@@ -499,9 +501,8 @@ def test_where_under_vmap_and_jit(key):
     x, log_p = jax.vmap(draw)(preds, keys)
     for i in range(6):
         one = D.tent(jnp.asarray(0.9)) if preds[i] else D.Normal(0.0, 1.0)
-        assert x[i] == pytest.approx(float(one.sample(seed=keys[i])), rel=1e-5) and log_p[
-            i
-        ] == pytest.approx(float(one.log_prob(x[i])), rel=1e-4)
+        assert x[i] == pytest.approx(float(one.sample(seed=keys[i])), rel=1e-5)
+        assert log_p[i] == pytest.approx(float(one.log_prob(x[i])), rel=1e-4)
 
 
 def test_seeds(key):
@@ -513,12 +514,10 @@ def test_seeds(key):
 
 
 def test_fixed_and_deterministic(key):
-    assert (
-        D.Fixed().sample(seed=key) == ()
-        and D.mode(D.Fixed()) == ()
-        and D.Fixed().log_prob(()) == 0
-        and D.quantile(D.Fixed(), ()) == ()
-    )
+    assert D.Fixed().sample(seed=key) == ()
+    assert D.mode(D.Fixed()) == ()
+    assert D.Fixed().log_prob(()) == 0
+    assert D.quantile(D.Fixed(), ()) == ()
     assert D.has_cdf(D.Fixed()) and D.cdf(D.Fixed(), ()) == ()
     d = D.Deterministic((jnp.ones(2), jnp.int32(3)))
     assert D.sample(d, key)[1] == 3 and d.log_prob(D.mode(d)) == 0
@@ -572,12 +571,10 @@ def test_a_distribution_of_the_users_own_need_be_no_pytree(key):
         def log_prob(self, x):
             return -x * x
 
-    assert (
-        D.event_like(Own()).shape == ()
-        and not D.has_mode(Own())
-        and not D.has_quantile(Own())
-        and not D.has_cdf(Own())
-    )
+    assert D.event_like(Own()).shape == ()
+    assert not D.has_mode(Own())
+    assert not D.has_quantile(Own())
+    assert not D.has_cdf(Own())
 
 
 @settings(max_examples=40, deadline=None)

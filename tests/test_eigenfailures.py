@@ -85,7 +85,9 @@ def test_failures_of_an_estimate(key, source):
         given = jast.estimate.failure_samples(key, sim, given, 500)
     found = explain.eigenfailures(key, sim, given)
     shift, v = above(3.0)
-    assert found.reliable and found.ess >= 500 and found.directions.shape == (1, 3)
+    assert found.reliable
+    assert found.ess >= 500
+    assert found.directions.shape == (1, 3)
     assert 1 - abs(found.directions[0] @ normal) < 10 * 2 * v / found.ess
     assert found.shifts[0] == pytest.approx(shift, abs=5 * math.sqrt(v / found.ess))
     assert found.directions[0] @ found.mean > 0 and found.nats[0] > shift**2 / 2
@@ -98,7 +100,9 @@ def test_failures_of_an_estimate(key, source):
     assert bool(found.middle.failure)
     assert found.evaluations == 3 + (len(given.failures.length) if source == "samples" else 0)
     lines = str(found).splitlines()
-    assert "1 steps" in lines[2] and lines[3].startswith("   x[0] +0.") and "x[2] -0." in lines[3]
+    assert "1 steps" in lines[2]
+    assert lines[3].startswith("   x[0] +0.")
+    assert "x[2] -0." in lines[3]
 
 
 def lane(limit=4.0):
@@ -157,7 +161,9 @@ def test_failures_at_any_time_are_one_direction(key):
     assert set(few.length) == {1, 2, 3, 4, 5, 6}
     found = explain.eigenfailures(key, sim, few)
     shift, v = above(2.5)
-    assert found.end == 6 and len(found.directions) == 1 and found.directions[0, 5] > 0.99
+    assert found.end == 6
+    assert len(found.directions) == 1
+    assert found.directions[0, 5] > 0.99
     assert found.shifts[0] == pytest.approx(shift, abs=6 * math.sqrt(v / found.ess))
     assert found.middle.failure and int(found.middle.length) == 6
 
@@ -181,7 +187,9 @@ def test_of_an_archive_and_of_choices(key):
     assert abs(told.mean[3]) < 5 / math.sqrt(n)
     assert told.directions.shape == (3, 4) and np.abs(told.directions[:, 3]).max() < 0.1
     assert np.abs(told.variances / v - 1).max() < told.chance[1] - 1
-    assert told.ess == n and told.evaluations == n + 7 and told.reliable
+    assert told.ess == n
+    assert told.evaluations == n + 7
+    assert told.reliable
     few = explain.eigenfailures(key, sim, jax.tree.map(lambda a: a[:60], found))
     assert not few.reliable and str(few).startswith("UNRELIABLE")
 

@@ -82,7 +82,9 @@ def test_a_reward_of_ones_own_and_what_is_published_have_none(key):
     own = dict(reward=rewards.standard(event_bonus=30.0, density="mode"))
     wide = dict(actions=actions.wide(2.0))
     found = cem(key, SIM, **few, **own, **wide)
-    assert found.failing and found.refined is None and found.settings["refine"] == 0
+    assert found.failing
+    assert found.refined is None
+    assert found.settings["refine"] == 0
     # asked for, the best is the best by that reward, and no more are kept than were to be
     asked = cem(key, SIM, **few, **own, **wide, refine=0.2, top=2)
     assert len(asked.failures) == 2 and asked.best.reward == asked.failures.best.reward
@@ -95,7 +97,9 @@ def test_where_it_is_off(key):
     search.
     """
     few = SEARCHES["cem"](key, SIM, refine=0.05)
-    assert few.failing and few.refined is None and few.episodes * 0.05 < 100
+    assert few.failing
+    assert few.refined is None
+    assert few.episodes * 0.05 < 100
     relative, raw = (rewards.lexicographic(1.0, 5.0, density=d) for d in ("mode", "raw"))
     assert ending.usual(SIM, relative) == 0.1 == ending.planned("", None, SIM, {}, 0.1)["refine"]
     assert ending.usual(SIM, raw) == 0 == ending.usual(SIM, rewards.STANDARD)
@@ -177,7 +181,9 @@ def test_an_interruption_leaves_what_was_found(key, monkeypatch):
 
     monkeypatch.undo()
     found = search(key, SIM, callback=stop)
-    assert found.failing and found.refined is None and "interrupted" in found.settings
+    assert found.failing
+    assert found.refined is None
+    assert "interrupted" in found.settings
 
 
 def test_nothing_found_nothing_refined(key):

@@ -132,16 +132,13 @@ def test_replay_of_fewer_rows_ends_there(equal):
 def test_padding_is_zero(key):
     episode = jast.replay(ferry(), floats(PUBLISHED + [0.9]))
     assert int(episode.length) == 20
-    assert not np.asarray(episode.disturbances[20:]).any() and not any(
-        np.asarray(leaf[21:]).any() for leaf in episode.states
-    )
+    assert not np.asarray(episode.disturbances[20:]).any()
+    assert not any(np.asarray(leaf[21:]).any() for leaf in episode.states)
     drawn = jax.vmap(lambda k: jast.rollout(k, walk1d(sigma=3.0)))(jax.random.split(key, 50))
     after = np.arange(30) >= np.asarray(drawn.length)[:, None]
-    assert (
-        after.any()
-        and not np.asarray(drawn.disturbances)[after].any()
-        and np.asarray(drawn.disturbances)[~after].all()
-    )
+    assert after.any()
+    assert not np.asarray(drawn.disturbances)[after].any()
+    assert np.asarray(drawn.disturbances)[~after].all()
 
 
 @pytest.mark.parametrize(
@@ -176,9 +173,8 @@ def test_a_failure_at_the_start_has_length_zero(key):
     assert not np.asarray(episode.disturbances).any()
     started = line(init=lambda x0: x0, start=lambda: D.Normal(9.0, 1.0))
     episode = jast.rollout(key, started)
-    assert int(episode.length) == 0 and float(episode.log_prob) == pytest.approx(
-        float(D.Normal(9.0, 1.0).log_prob(episode.x0))
-    )
+    assert int(episode.length) == 0
+    assert float(episode.log_prob) == pytest.approx(float(D.Normal(9.0, 1.0).log_prob(episode.x0)))
 
 
 def test_the_order_at_a_state_is_failure_then_terminal_then_horizon():
@@ -234,11 +230,9 @@ def test_nan_is_an_outcome(changes):
 def test_nan_after_the_end_is_not_counted():
     sim = line(step=lambda s, x: jnp.where(s >= 5, jnp.nan, s + x))
     episode = jast.replay(sim, floats([6.0]))
-    assert (
-        bool(episode.failure)
-        and np.isfinite(episode.reward)
-        and np.isfinite(np.asarray(episode.states)).all()
-    )
+    assert bool(episode.failure)
+    assert np.isfinite(episode.reward)
+    assert np.isfinite(np.asarray(episode.states)).all()
 
 
 def test_gradients_are_finite_where_an_ended_lane_would_give_nan(key):
@@ -283,9 +277,8 @@ def test_vmap_over_simulators_is_a_loop(key):
         lambda *a: jnp.stack(a), *(walk1d(threshold=b) for b in (4.0, 8.0, 12.0))
     )
     many = jax.vmap(lambda s: jast.replay(s, xs))(stacked)
-    assert np.asarray(many.failure).tolist() == [True, True, False] and np.asarray(
-        many.length
-    ).tolist() == [1, 2, 3]
+    assert np.asarray(many.failure).tolist() == [True, True, False]
+    assert np.asarray(many.length).tolist() == [1, 2, 3]
     swept = jax.vmap(lambda b: jast.rollout(key, landing(b=b)))(floats([0.01, 9.0]))
     assert np.asarray(swept.failure).tolist() == [True, False]
     ferries = jax.vmap(ferry)(floats([[16.0, 0.0], [17.0, 0.0]]))
@@ -330,9 +323,8 @@ def test_pytree_and_integer_disturbances_and_a_ring_buffer(key, equal):
     sim = jast.check(ring())
     keys = jax.random.split(key, 2000)
     many = jax.vmap(jast.rollout, (0, None))(keys, sim)
-    assert jnp.issubdtype(many.disturbances["kind"].dtype, jnp.integer) and many.disturbances[
-        "push"
-    ].shape == (2000, 6, 2)
+    assert jnp.issubdtype(many.disturbances["kind"].dtype, jnp.integer)
+    assert many.disturbances["push"].shape == (2000, 6, 2)
     truth = 1 - 0.8**6 - 6 * 0.2 * 0.8**5  # two or more hits of six
     assert abs(float(many.failure.mean()) - truth) < 4 * np.sqrt(truth * (1 - truth) / 2000)
     one = jast.rollout(keys[0], sim)
@@ -353,9 +345,8 @@ def test_log_prob_counts_the_start(key):
     expected = D.Normal(0.0, 0.1).log_prob(episode.x0) + sum(
         D.Normal(0.0, 0.03).log_prob(x) for x in episode.disturbances
     )
-    assert float(episode.log_prob) == pytest.approx(float(expected), rel=1e-5) and float(
-        episode.states.x2[0]
-    ) == float(episode.x0)
+    assert float(episode.log_prob) == pytest.approx(float(expected), rel=1e-5)
+    assert float(episode.states.x2[0]) == float(episode.x0)
 
 
 # policies

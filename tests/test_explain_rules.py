@@ -64,7 +64,9 @@ def test_the_planted_rule_in_the_words_of_the_user(found):
     assert bounds["gust at step 5"][0] == pytest.approx(2, abs=0.2)
     assert bounds["delay at step 5"][0] == pytest.approx(1, abs=0.2)
     text = str(found)
-    assert "gust at step 5 > " in text and "-> fails" in text and "recall" in text
+    assert "gust at step 5 > " in text
+    assert "-> fails" in text
+    assert "recall" in text
     low, high = rule.precision_interval
     assert low <= rule.precision == found.precision["fails"] <= high
     assert found.evaluations > 10 * 400 and found.settings["method"] == "rules"
@@ -178,7 +180,9 @@ def test_an_early_end_tells_nothing():
     for r in (explain.rules(sim, bad, calm), explain.rules(sim, bad, episodes=200)):
         (rule,) = r.rules
         ((what, _, low, high),) = rule.conditions
-        assert what == "greatest gust" and low == pytest.approx(2.5, abs=0.1) and high == np.inf
+        assert what == "greatest gust"
+        assert low == pytest.approx(2.5, abs=0.1)
+        assert high == np.inf
         assert r.precision["fails"] > 0.95 and r.recall["fails"] > 0.95
 
 
@@ -188,7 +192,9 @@ def test_rules_of_choices():
     e = jax.vmap(lambda k: jast.rollout(k, sim))(jax.random.split(jax.random.key(0), 20_000))
     bad = jax.tree.map(lambda a: a[e.failure], e)
     r = explain.rules(sim, bad, episodes=300)
-    assert r.rules and "x = 1" in str(r) and r.recall["fails"] > 0.8
+    assert r.rules
+    assert "x = 1" in str(r)
+    assert r.recall["fails"] > 0.8
 
 
 def test_a_start_and_states_have_their_names():
@@ -211,7 +217,9 @@ def test_one_failure_and_float64(x64):
     sim = late_gust()
     one = jax.tree.map(lambda a: a[0], drawn(0, 1, sim, gust=2.0, delay=1.0))
     r = explain.rules(sim, one, 200, episodes=200)
-    assert "gust" in str(r) and "delay" in str(r) and r.recall["fails"] > 0.9
+    assert "gust" in str(r)
+    assert "delay" in str(r)
+    assert r.recall["fails"] > 0.9
     assert sum(r.held_out.values()) < 0.35 * 400
 
 
@@ -288,12 +296,18 @@ def test_a_monitor_warns_before_a_walk_fails(walked, model):
     sim, bad, calm = walked
     m = explain.monitor(sim, bad, calm, within=3, model=model, false_alarms=0.1)
     assert m.auc > 0.9 and m.auc_interval[0] < m.auc < m.auc_interval[1]
-    assert m.roc.area == pytest.approx(m.auc) and m.warned[0] > 0.7 and m.ahead[1] >= 1
+    assert m.roc.area == pytest.approx(m.auc)
+    assert m.warned[0] > 0.7
+    assert m.ahead[1] >= 1
     # of 120 others held out, within 4 standard errors of a tenth, that of the threshold included
     assert m.false_alarms[0] < 0.1 + 4 * np.sqrt(0.09 / 120 + 0.09 / 84)
     p = m.probability(np.linspace(-1, 4.9, 8)[:, None])
-    assert p.shape == (8,) and p[-1] > p[0] and m.probability([4.9]) == pytest.approx(p[-1])
-    assert m.warns([4.9]) and not m.warns([0.0]) and m.threshold_for(0.0) >= m.threshold
+    assert p.shape == (8,)
+    assert p[-1] > p[0]
+    assert m.probability([4.9]) == pytest.approx(p[-1])
+    assert m.warns([4.9])
+    assert not m.warns([0.0])
+    assert m.threshold_for(0.0) >= m.threshold
     assert "area under the ROC curve" in str(m) and m.evaluations == len(bad.length) + 400
 
 

@@ -109,17 +109,13 @@ def two():
 def test_two_modes(two):
     sim, truth, found = two
     assert good(found, truth), str(found)
-    assert (
-        found.method == "failure_probability"
-        and len(found.modes) == 2
-        and found.modes.sum() == pytest.approx(1)
-    )
+    assert found.method == "failure_probability"
+    assert len(found.modes) == 2
+    assert found.modes.sum() == pytest.approx(1)
     assert abs(found.modes[1] - norm.sf(4.5) / truth) < 4 * 2 * np.sqrt(0.1 / found.ess)
-    assert (
-        found.evaluations > 0.95 * BUDGET
-        and BUDGET // 10 <= found.samples < found.evaluations
-        and len(found.history) > 3
-    )
+    assert found.evaluations > 0.95 * BUDGET
+    assert BUDGET // 10 <= found.samples < found.evaluations
+    assert len(found.history) > 3
 
 
 @pytest.mark.parametrize("gradients", [pytest.param(True, marks=pytest.mark.long), False])
@@ -138,9 +134,8 @@ def test_where_failures_are_common(key, up):
     """P = .84, .5 and .16: not worse than counting the same number of episodes."""
     found = failure_probability(key, planes(up), BUDGET)
     truth = norm.sf(up)
-    assert good(found, truth) and found.relative_error < 1.1 * np.sqrt(
-        (1 - truth) / truth / found.samples
-    )
+    assert good(found, truth)
+    assert found.relative_error < 1.1 * np.sqrt((1 - truth) / truth / found.samples)
 
 
 def test_the_draws_of_the_model_guarantee_an_interval(key):
@@ -190,10 +185,8 @@ def test_invalid_episodes(key):
         0,
     )
     truth, error = w.mean(), w.std() / np.sqrt(len(w))
-    assert (
-        abs(found.mean - truth) < 4 * np.hypot(error, found.standard_error)
-        and found.relative_error < 0.05
-    )
+    assert abs(found.mean - truth) < 4 * np.hypot(error, found.standard_error)
+    assert found.relative_error < 0.05
     assert not found.reliable and any("if they failed" in w for w in found.warnings)
     assert found.invalid > 0 and "invalid" in found.warnings[-1], str(found)
     _, invalid, n = found.plain
@@ -205,11 +198,9 @@ def test_below_the_least_double(key):
     of scipy's.
     """
     found = failure_probability(key, planes(60.0, 60.0), BUDGET)
-    assert (
-        abs(found.log_mean - np.log(2) - norm.logsf(60)) < 4 * found.relative_error < 0.2
-        and found.mean == 0
-        and "doubtful       10^-783." in str(found)  # flagged: no budget is left for a guard
-    )
+    assert abs(found.log_mean - np.log(2) - norm.logsf(60)) < 4 * found.relative_error < 0.2
+    assert found.mean == 0
+    assert "doubtful       10^-783." in str(found)  # flagged: no budget is left for a guard
 
 
 def test_no_failure(key):
@@ -218,18 +209,14 @@ def test_no_failure(key):
     """
     sim = planes(sight=-FAR)
     found = failure_probability(key, sim, BUDGET)
-    assert (
-        np.isnan(found.mean)
-        and not found.reliable
-        and found.failing == 0
-        and found.proposal is None
-        and found.evaluations <= BUDGET
-    )
-    assert (
-        found.interval[0] == 0 < found.interval[1] < 1e-3
-        and str(found).startswith("UNRELIABLE: no failure in")
-        and found.invalid >= found.samples
-    )
+    assert np.isnan(found.mean)
+    assert not found.reliable
+    assert found.failing == 0
+    assert found.proposal is None
+    assert found.evaluations <= BUDGET
+    assert found.interval[0] == 0 < found.interval[1] < 1e-3
+    assert str(found).startswith("UNRELIABLE: no failure in")
+    assert found.invalid >= found.samples
     with pytest.raises(
         ValueError,
         match=(
@@ -245,10 +232,8 @@ def test_no_failure(key):
 def test_the_least_budget_is_kept(key):
     """Gradients included; and it is enough for one near plane."""
     found = failure_probability(key, planes(3.0), LEAST)
-    assert (
-        found.evaluations <= LEAST
-        and abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error
-    ), found.history
+    assert found.evaluations <= LEAST, found.history
+    assert abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error, found.history
 
 
 def test_interrupts_keep_whole_chunks(two):
@@ -261,14 +246,11 @@ def test_interrupts_keep_whole_chunks(two):
     sim, truth, whole = two
     found = failure_probability(jax.random.key(5), sim, BUDGET, callback=stop)
     done, total = seen[0]
-    assert (
-        len(seen) == 1
-        and found.samples == done < total == whole.samples
-        and found.history == whole.history
-    )
-    assert whole.evaluations - found.evaluations == total - done and found.warnings == (
-        f"interrupted after {done} of {total} episodes",
-    )
+    assert len(seen) == 1
+    assert found.samples == done < total == whole.samples
+    assert found.history == whole.history
+    assert whole.evaluations - found.evaluations == total - done
+    assert found.warnings == (f"interrupted after {done} of {total} episodes",)
     assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
 
 
@@ -319,15 +301,12 @@ def test_subset_simulation(key):
     %; each population is counted.
     """
     found = subset_simulation(key, planes(4.0), SIZE)
-    assert (
-        abs(found.mean - norm.sf(4)) < 4 * found.standard_error
-        and found.relative_error < 0.3
-        and found.reliable
-    )
+    assert abs(found.mean - norm.sf(4)) < 4 * found.standard_error
+    assert found.relative_error < 0.3
+    assert found.reliable
     assert "k-hat" not in str(found) and "ESS" in str(found)  # its weights have no tail to fit
-    assert found.samples == found.failing == 5000 and found.evaluations == sum(
-        int(h.split()[-2]) for h in found.history
-    )
+    assert found.samples == found.failing == 5000
+    assert found.evaluations == sum(int(h.split()[-2]) for h in found.history)
     assert found.interval[0] < found.mean < found.interval[1]
     with pytest.raises(
         ValueError,
@@ -338,12 +317,10 @@ def test_subset_simulation(key):
 
 def test_adaptive_cross_entropy(key):
     found = adaptive_cross_entropy(key, planes(3.5), BUDGET)
-    assert (
-        good(found, norm.sf(3.5))
-        and found.method == "adaptive_cross_entropy"
-        and found.evaluations == BUDGET
-        and found.samples == BUDGET * 4 // 5
-    )
+    assert good(found, norm.sf(3.5))
+    assert found.method == "adaptive_cross_entropy"
+    assert found.evaluations == BUDGET
+    assert found.samples == BUDGET * 4 // 5
 
 
 def _gamma(s):
@@ -433,10 +410,10 @@ def test_design_points(key):
     """
     found = design_points(key, planes(4.0, 4.5))
     np.testing.assert_allclose(found.points, [4 * DIAGONAL, -4.5 * DIAGONAL], atol=0.05)
-    assert (
-        L.outcomes(planes(4.0, 4.5), jnp.asarray(found.points, jnp.zeros(()).dtype)).failure.all()
-        and found.evaluations > 0
-    )
+    assert L.outcomes(
+        planes(4.0, 4.5), jnp.asarray(found.points, jnp.zeros(()).dtype)
+    ).failure.all()
+    assert found.evaluations > 0
 
 
 def test_distinct_points():
@@ -456,17 +433,13 @@ def test_populations_estimate(key):
     found = [explore(k, planes(4.0), SIZE) for k in jax.random.split(key, 12)]
     p = np.exp([f.log_mean for f in found])
     expected = np.sqrt(-np.log(norm.sf(4)) / np.log(4) * 3 / SIZE * 4)
-    assert (
-        abs(p.mean() / norm.sf(4) - 1) < 4 * expected / np.sqrt(12)
-        and p.std() / norm.sf(4) < 2 * expected
-    )
+    assert abs(p.mean() / norm.sf(4) - 1) < 4 * expected / np.sqrt(12)
+    assert p.std() / norm.sf(4) < 2 * expected
     for f in found:
-        assert (
-            f.points.shape == (SIZE, 4)
-            and (f.points.sum(axis=1) / 2 > 4).all()
-            and (np.diff(f.levels) < 0).all()
-            and f.evaluations == SIZE * (len(f.levels) + 6)
-        )
+        assert f.points.shape == (SIZE, 4)
+        assert (f.points.sum(axis=1) / 2 > 4).all()
+        assert (np.diff(f.levels) < 0).all()
+        assert f.evaluations == SIZE * (len(f.levels) + 6)
 
 
 def test_populations_kept_out(key):
@@ -488,12 +461,10 @@ def test_populations_kept_out(key):
 def test_populations_give_up(key):
     """At the evaluations or the probability they are given."""
     found = explore(key, planes(12.0), SIZE, most=3000)
-    assert (
-        not found.reached
-        and found.log_mean == -np.inf
-        and found.evaluations <= 3000
-        and found.points.shape == (0, 4)
-    )
+    assert not found.reached
+    assert found.log_mean == -np.inf
+    assert found.evaluations <= 3000
+    assert found.points.shape == (0, 4)
     assert len(explore(key, planes(12.0), SIZE, least=-5.0).levels) <= 5
 
 
@@ -503,11 +474,9 @@ def test_cooling_keeps_every_mode(key):
     """
     points = cool(key, planes(4.0, 5.5), 128).points
     along, norms = points.sum(axis=1) / 2, np.linalg.norm(points, axis=1)
-    assert (
-        (along > 4).sum() > 10
-        and (along < -5.5).sum() > 10
-        and np.median(np.where(along > 0, norms / 4, norms / 5.5)) < 1.2
-    )
+    assert (along > 4).sum() > 10
+    assert (along < -5.5).sum() > 10
+    assert np.median(np.where(along > 0, norms / 4, norms / 5.5)) < 1.2
     assert not cool(key, planes(), 128).reached
 
 
@@ -586,9 +555,8 @@ def test_draws_of_a_mixture(key):
     )
     z = np.asarray(L.place(q, *numbers(key, n, 4, dtype)), float)
     near = z.sum(axis=1) < -40
-    assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n) and logsumexp(
-        q.log_weights
-    ) == pytest.approx(0, abs=1e-5)
+    assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n)
+    assert logsumexp(q.log_weights) == pytest.approx(0, abs=1e-5)
     other, covariance = z[~near], basis[0] @ np.diag(g.values[0]) @ basis[0].T
     assert (
         abs(other.mean(axis=0) - g.means[0]) < 4.5 * np.sqrt(np.diag(covariance) / len(other))
@@ -603,21 +571,19 @@ def test_shrunk():
     rng = np.random.default_rng(0)
     values = np.linalg.eigvalsh(np.cov(rng.normal(size=(20, 80)), bias=True))
     found = shrunk(values, 80)
-    assert (
-        values.max() / values.min() > 5
-        and np.ptp(found) == 0
-        and found[0] == pytest.approx(values.mean())
-    )
+    assert values.max() / values.min() > 5
+    assert np.ptp(found) == 0
+    assert found[0] == pytest.approx(values.mean())
     x = rng.normal(size=(20, 80)) * np.array([12.0**0.5] + [1.0] * 19)[:, None]
     values = np.linalg.eigvalsh(np.cov(x, bias=True))
     found = shrunk(values, 80)
-    assert found[-1] == values[-1] > 8 and np.ptp(found[:-1]) == 0 and 0.8 < found[0] < 1.1
+    assert found[-1] == values[-1] > 8
+    assert np.ptp(found[:-1]) == 0
+    assert 0.8 < found[0] < 1.1
     different = np.array([0.1, 0.5, 1.0, 3.0])
     np.testing.assert_allclose(shrunk(different, 1e6), different)
-    assert (
-        shrunk(np.array([0.3]), 1).tolist() == [0.3]
-        and (shrunk(different, 0.5) == different.mean()).all()
-    )
+    assert shrunk(np.array([0.3]), 1).tolist() == [0.3]
+    assert (shrunk(different, 0.5) == different.mean()).all()
 
 
 @pytest.mark.parametrize("points", [60, 2000])
@@ -685,13 +651,11 @@ def test_samples_of_landing(key, proposal, moves):
     found = failure_samples(key, LANDING, proposal, 500, moves=moves)
     e = found.failures
     n = len(e.length)
-    assert (
-        480 < n <= 500
-        and e.failure.all()
-        and e.states is None
-        and found.ess > 300
-        and found.distinct > 200
-    )
+    assert 480 < n <= 500
+    assert e.failure.all()
+    assert e.states is None
+    assert found.ess > 300
+    assert found.distinct > 200
     # s0 given the end y, |y| > 1: mean 10/19 y; y beyond 1 by sigma / beta = .019, so that E|y| =
     # 1.0184
     truth, size = (
@@ -699,10 +663,8 @@ def test_samples_of_landing(key, proposal, moves):
         min(found.ess, n),
     )
     assert truth == pytest.approx(0.536, abs=5e-4)
-    assert (
-        abs(abs(e.x0).mean() - truth) < 4 * 0.069 / np.sqrt(size)
-        and abs(e.x0.std() ** 2 + e.x0.mean() ** 2 - truth**2 - 0.069**2) < 0.02
-    )
+    assert abs(abs(e.x0).mean() - truth) < 4 * 0.069 / np.sqrt(size)
+    assert abs(e.x0.std() ** 2 + e.x0.mean() ** 2 - truth**2 - 0.069**2) < 0.02
     assert abs((e.x0 > 0).mean() - 0.5) < 4 * 0.5 / np.sqrt(size) and e.log_prob.shape == (n,)
     assert (abs(e.x0 + e.disturbances.sum(axis=1, dtype=float)) > 1 - 1e-6).all()
     assert all(jast.replay(LANDING, jax.tree.map(lambda a, i=i: a[i], e)).failure for i in range(3))
@@ -715,13 +677,11 @@ def test_samples_of_an_estimate(key, two):
     sim, truth, estimate = two
     found = failure_samples(key, sim, estimate, 500)
     along = found.failures.disturbances.sum(axis=1) / 2
-    assert ((along > 4) | (along < -4.5)).all() and abs(
-        (along < 0).mean() - norm.sf(4.5) / truth
-    ) < 4 * np.sqrt(0.1 / min(found.ess, 500))
+    assert ((along > 4) | (along < -4.5)).all()
+    assert abs((along < 0).mean() - norm.sf(4.5) / truth) < 4 * np.sqrt(0.1 / min(found.ess, 500))
     # beyond the plane by 1 / beta, and N(0, I) along it
-    assert abs(along[along > 0].mean() - norm.pdf(4) / norm.sf(4)) < 4 * 0.24 / np.sqrt(
-        300
-    ) and "500 failures from" in str(found)
+    assert abs(along[along > 0].mean() - norm.pdf(4) / norm.sf(4)) < 4 * 0.24 / np.sqrt(300)
+    assert "500 failures from" in str(found)
 
 
 @pytest.mark.long

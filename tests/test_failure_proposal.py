@@ -93,12 +93,10 @@ def test_known_probabilities(key, name, precision):
     with jax.enable_x64(precision == "float64"):
         make, truth, bound = CASES[name]
         mean, error, found = estimates(key, make())
-        assert (
-            found.reached.all()
-            and (found.levels[:, -1] == 0).all()
-            and (found.invalid == 0).all()
-            and (found.evaluations == 10_000).all()
-        )
+        assert found.reached.all()
+        assert (found.levels[:, -1] == 0).all()
+        assert (found.invalid == 0).all()
+        assert (found.evaluations == 10_000).all()
         assert (abs(mean - truth) < 4 * error).all(), (mean / truth, error / truth)
         assert (error / truth < bound).all() and bound < 1 / np.sqrt(20_000 * truth) / 4
         assert (found.levels[:, 0] > 0).all() and (found.failing[:, -1] > 200).all()
@@ -111,12 +109,10 @@ def test_unequal_sides(key):
     """
     mean, error, found = estimates(key, sides())
     near, whole = scipy.stats.norm.sf(3.5), scipy.stats.norm.sf(3.5) + scipy.stats.norm.sf(4.0)
-    assert (
-        found.reached.all()
-        and (mean > near - 4 * error).all()
-        and (mean < whole + 4 * error).all()
-        and (error < 0.1 * near).all()
-    )
+    assert found.reached.all()
+    assert (mean > near - 4 * error).all()
+    assert (mean < whole + 4 * error).all()
+    assert (error < 0.1 * near).all()
 
 
 def test_random_start_is_tilted(key):
@@ -125,11 +121,9 @@ def test_random_start_is_tilted(key):
     """
     sim, whole = jast.simulators.landing(b=0.6), 2 * scipy.stats.norm.sf(0.6 / np.sqrt(0.019))
     mean, error, found = estimates(key, sim)
-    assert (
-        found.reached.all()
-        and found.start.mean.shape == (SEEDS, 1)
-        and (abs(found.start.mean) > 0.5).all()
-    )
+    assert found.reached.all()
+    assert found.start.mean.shape == (SEEDS, 1)
+    assert (abs(found.start.mean) > 0.5).all()
     assert (mean > whole / 2 - 4 * error).all() and (mean < whole + 4 * error).all()
 
 
@@ -177,7 +171,9 @@ def test_tilted_density(key, name, precision):
         below = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid))])
         assert below[-1] == pytest.approx(1, abs=2e-3)
         x = np.asarray(jax.jit(jax.vmap(lambda k: D.sample(q, k)))(jax.random.split(key, 40_000)))
-        assert x.dtype == precision and grid[0] <= x.min() and x.max() <= grid[-1]
+        assert x.dtype == precision
+        assert grid[0] <= x.min()
+        assert x.max() <= grid[-1]
         edges = np.interp(np.linspace(0, below[-1], 11), below, grid)
         observed = np.histogram(x, bins=edges)[0]
         assert scipy.stats.chisquare(
@@ -211,7 +207,8 @@ def test_tilted_vectors_and_structures(key):
     inner = D.Uniform(jnp.zeros(2), jnp.ones(2))
     q = tilted(D.Independent(inner, 1), m, s)
     x = jnp.array([0.2, 0.6])
-    assert q.log_prob(x).shape == () and float(q.log_prob(x)) == pytest.approx(
+    assert q.log_prob(x).shape == ()
+    assert float(q.log_prob(x)) == pytest.approx(
         float(tilted(inner, m, s).log_prob(x).sum()), rel=1e-6
     )
     q = tilted(
@@ -252,14 +249,14 @@ def test_invalid_episodes_are_counted_and_never_elite(key):
     """A step of more than 1.5 gives NaN; the level is still reached by smaller ones."""
     sim = walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x))
     found = failure_proposal(key, sim, **SMALL)
-    assert found.reached and 0 < found.invalid < 2400 and np.isfinite(found.levels).all()
+    assert found.reached
+    assert 0 < found.invalid < 2400
+    assert np.isfinite(found.levels).all()
     found = failure_proposal(key, walk(step=lambda s, x: s + jnp.nan), **SMALL)
-    assert (
-        not found.reached
-        and found.invalid == 2400
-        and np.isinf(found.levels).all()
-        and (found.ess == 0).all()
-    )
+    assert not found.reached
+    assert found.invalid == 2400
+    assert np.isinf(found.levels).all()
+    assert (found.ess == 0).all()
     assert (found.steps.mean == 0).all() and (found.steps.deviation == 1).all()
 
 
@@ -268,7 +265,9 @@ def test_what_cannot_fail_and_what_always_does(key):
     assert not found.reached and (found.failing == 0).all()
     # at the start: no step is ever taken
     found = failure_proposal(key, walk(fails=lambda s: s < 1e9), **SMALL)
-    assert found.reached and (found.failing == 400).all() and (found.levels == 0).all()
+    assert found.reached
+    assert (found.failing == 400).all()
+    assert (found.levels == 0).all()
     assert (found.steps.mean == 0).all() and (found.steps.deviation == 1).all()
 
 
@@ -282,7 +281,9 @@ def test_failures_with_a_distance(key):
         6,
     )
     found = failure_proposal(key, sim)
-    assert found.reached and found.levels[-1] == 0 and found.failing[-1] > 100
+    assert found.reached
+    assert found.levels[-1] == 0
+    assert found.failing[-1] > 100
 
 
 def test_jit_vmap_and_text(key):
@@ -339,4 +340,6 @@ def test_bad_disturbances(key):
     )
     # one that cannot is drawn from its own distribution
     found = failure_proposal(key, start, **SMALL)
-    assert found.start == () and found.reached and isinstance(found.policy.start(), D.VonMises)
+    assert found.start == ()
+    assert found.reached
+    assert isinstance(found.policy.start(), D.VonMises)

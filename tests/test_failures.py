@@ -103,12 +103,12 @@ def test_ferry_failures_are_deduplicated_counted_and_ranked():
     found = F.collect(
         FERRY, REWARD, candidates, tree=[3, 2, 1, 0, 5, 9], simulation=[7, 8, 8, 0, 1, 9]
     )
-    assert found.size == 3 and found.seen == 5 and found.dropped == 0
-    assert (
-        list(found.counts) == [3, 1, 1]
-        and list(found.tree) == [1, 3, 5]
-        and list(found.simulation) == [8, 7, 1]
-    )
+    assert found.size == 3
+    assert found.seen == 5
+    assert found.dropped == 0
+    assert list(found.counts) == [3, 1, 1]
+    assert list(found.tree) == [1, 3, 5]
+    assert list(found.simulation) == [8, 7, 1]
     assert np.all(np.diff(found.episodes.reward) <= 0) and found.episodes.failure.all()
     assert abs(found.best.reward - 29.092054904933118) < 1e-4 and found.best.length == 20
     np.testing.assert_array_equal(
@@ -164,7 +164,9 @@ def _draw():
 def test_no_failure_works_and_says_so(tmp_path):
     none = F.collect(FERRY, REWARD, ferry_episodes([0.5] * 21))
     same(none, F.empty(FERRY))
-    assert none.size == 0 and none.best is None and str(none) == "no failure was found"
+    assert none.size == 0
+    assert none.best is None
+    assert str(none) == "no failure was found"
     F.save(tmp_path / "none", none, dict(seed=1))
     back, header = F.load(tmp_path / "none", FERRY)
     same(back, none)
@@ -179,11 +181,9 @@ def test_no_failure_works_and_says_so(tmp_path):
 def test_table():
     table = str(F.collect(FERRY, REWARD, ferry_episodes(*(perturbed(i) for i in range(12)))))
     lines = table.splitlines()
-    assert (
-        lines[0].startswith("12 distinct failures (12 failing episodes")
-        and len(lines) == 13
-        and lines[-1] == "... and 2 more"
-    )
+    assert lines[0].startswith("12 distinct failures (12 failing episodes")
+    assert len(lines) == 13
+    assert lines[-1] == "... and 2 more"
     assert "29.092" in lines[2] and max(map(len, lines)) < 100
     assert str(F.collect(FERRY, REWARD, ferry_episodes(PUBLISHED))).startswith(
         "1 distinct failure (1 failing episode simulated)"
@@ -324,10 +324,8 @@ def test_precision_is_kept(tmp_path):
             jax.device_get(jast.replay(sim, jnp.array(PUBLISHED), reward=REWARD)),
         )
         double = F.collect(sim, REWARD, replayed)
-        assert (
-            double.best.disturbances.dtype == np.float64
-            and abs(double.best.reward - 29.092054904933118) < 1e-12
-        )
+        assert double.best.disturbances.dtype == np.float64
+        assert abs(double.best.reward - 29.092054904933118) < 1e-12
         F.save(tmp_path / "double", double)
     same(F.load(tmp_path / "double")[0], double)
     half = single._replace(

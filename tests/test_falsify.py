@@ -91,7 +91,9 @@ def test_what_came_after_an_episodes_end_is_left_as_it_is():
 def test_none_is_found_where_there_is_none(key):
     sim = held(evaluate=lambda s: (jnp.zeros((), bool), jnp.abs(s - 2)))
     found = falsify(key, sim, simulations=35)
-    assert found.episodes == 35 and found.first_failure is None and not len(found.failures)
+    assert found.episodes == 35
+    assert found.first_failure is None
+    assert not len(found.failures)
     assert float(found.best.distance) == pytest.approx(-found.history.best_reward[-1, 0])
 
 

@@ -91,7 +91,10 @@ def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
     r = failure_probability(jax.random.key(0), sim, 50)
     truth = norm.sf(4.5)
     assert abs(r.mean / truth - 1) < 4 * r.relative_error < 0.4
-    assert r.reliable and r.evaluations == 50 and r.samples == 50 - 32 and 0 < r.failing
+    assert r.reliable
+    assert r.evaluations == 50
+    assert r.samples == 50 - 32
+    assert 0 < r.failing
     assert r.proposal.means.dtype == dtype and "learning: 32 calls" in r.history[0]
     assert r.settings["budget"] == 50 and "50 evaluations" in str(r)
     assert r.unseen == pytest.approx(-np.log(0.05) / 6) and "unseen" in str(r)
@@ -100,7 +103,9 @@ def test_fifty_calls_find_a_hyperplane_in_ten_dimensions(dtype, coarse):
 def test_a_key_gives_one_answer_and_another_budget_spends_all(coarse):
     sim = limit_state(Partial(_plane, jnp.asarray(3.0)), 2)
     a, b = (failure_probability(jax.random.key(0), sim, 53) for _ in range(2))
-    assert a.log_mean == b.log_mean and a.history == b.history and a.evaluations == 53
+    assert a.log_mean == b.log_mean
+    assert a.history == b.history
+    assert a.evaluations == 53
 
 
 def test_a_black_box_with_workers_is_called_as_often_as_said(coarse):
@@ -122,7 +127,9 @@ def test_far_modes_end_right_or_flagged(coarse):
 def test_a_system_that_never_fails_has_an_upper_bound(coarse):
     r = failure_probability(jax.random.key(0), limit_state(lambda x: 3.0 + jnp.sum(x**2), 2), 60)
     n = r.samples
-    assert not r.reliable and np.isnan(r.mean) and n == 60 - 36
+    assert not r.reliable
+    assert np.isnan(r.mean)
+    assert n == 60 - 36
     assert r.interval == r.guaranteed == clopper_pearson(0, n) and r.evaluations == 60
     assert f"no failure in {n} episodes" in r.warnings[0]
 
@@ -143,7 +150,9 @@ def test_known_failures_join_what_is_learned_and_cost_no_call(coarse):
     assert r.evaluations == 50 and abs(r.mean / norm.sf(3.0) - 1) < 4 * r.relative_error
     common = few_calls.few_calls(jax.random.key(0), limit_state(lambda x: x[0], 2), 60, 0.95)
     k, _, n = common.plain  # every other one of the initial design
-    assert n == pytest.approx(-np.log(0.05) / common.unseen) and 0 < k < n and common.mean <= 1
+    assert n == pytest.approx(-np.log(0.05) / common.unseen)
+    assert 0 < k < n
+    assert common.mean <= 1
 
 
 def test_an_error_above_the_mean_leaves_an_upper_end():
@@ -162,7 +171,9 @@ def test_an_interruption_keeps_what_the_last_calls_have_shown(coarse):
         return tell
 
     r = failure_probability(jax.random.key(0), sim, 50, callback=stop(42))
-    assert not r.reliable and "interrupted after" in r.warnings[0] and r.evaluations < 50
+    assert not r.reliable
+    assert "interrupted after" in r.warnings[0]
+    assert r.evaluations < 50
     with pytest.raises(KeyboardInterrupt):
         failure_probability(jax.random.key(0), sim, 50, callback=stop(12))
 

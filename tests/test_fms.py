@@ -226,12 +226,12 @@ def test_an_arc_leads_nearly_all_the_way_round():
     episode = jast.replay(sim, jnp.asarray(turning(0.01, (240.0, 200.0))))
     path = fms_path(sim, episode)
     angles = events.extent(sim.init.args[0].build.earth, path)
-    assert 6.1 < angles[1] < 2 * np.pi and path.turn[0] > 1 and path.turn[1] < -0.6
+    assert 6.1 < angles[1] < 2 * np.pi
+    assert path.turn[0] > 1
+    assert path.turn[1] < -0.6
     error = (angles[1] * abs(path.radius[1]) - path.beta[1]) / FOOT
-    assert (
-        float(episode.distance) == pytest.approx(100 * np.log(10 / float(error)), abs=1e-6)
-        and float(episode.distance) < -980
-    )
+    assert float(episode.distance) == pytest.approx(100 * np.log(10 / float(error)), abs=1e-6)
+    assert float(episode.distance) < -980
 
 
 # measured rates: within 4.5 standard errors of those of 400,000 routes
@@ -246,11 +246,9 @@ def test_rate_and_miss_distances():
     np.testing.assert_array_equal(fails, skipped)  # fails if and only if the defect acted
     rate = 1.29e-3
     assert abs(fails.mean() - rate) < 4.5 * np.sqrt(rate / n + 0.06e-3**2)
-    assert (
-        abs(d.mean() - 407.0) < 4.5 * 74 / np.sqrt(n)
-        and 55 < d[~fails].std() < 60
-        and d[~fails].min() > 200
-    )
+    assert abs(d.mean() - 407.0) < 4.5 * 74 / np.sqrt(n)
+    assert 55 < d[~fails].std() < 60
+    assert d[~fails].min() > 200
     assert -1100 < d.min() < -900 and abs(d[fails].mean() + 845) < 4.5 * 110 / np.sqrt(fails.sum())
     assert fails.sum() < (legs.min(1) < 0.03).sum()  # near-duplicates do not always cause failures
     assert (np.array(found[1:]) > 0).all()  # the other events see nothing
@@ -274,9 +272,8 @@ def test_rate_of_short_legs():
     # the thesis's first proposal of the cross-entropy method
     x = routes(n, 1, np.array([180.0, 1, -88.5, 66.8]), np.array([45.0, 3, 39.5, 24.4]))
     d = fly(fms(), x)[0].arc_length
-    assert abs((d <= 0).mean() - 0.0428) < 4.5 * np.sqrt(0.0428 / n) and abs(
-        d.mean() - 791
-    ) < 4.5 * 341 / np.sqrt(n)
+    assert abs((d <= 0).mean() - 0.0428) < 4.5 * np.sqrt(0.0428 / n)
+    assert abs(d.mean() - 791) < 4.5 * 341 / np.sqrt(n)
     assert fly(fms(fixed=True), x[:CHUNK])[0].arc_length.min() > 0
 
 
@@ -300,14 +297,15 @@ def test_database():
 
     states = many(jax.random.split(jax.random.key(0), 5 * CHUNK))
     found, skipped, legs = judge(sim, states)
-    assert not skipped.any() and found.arc_length.min() > 100 and legs.min() > 4.9
+    assert not skipped.any()
+    assert found.arc_length.min() > 100
+    assert legs.min() > 4.9
     assert {tuple(w) for w in np.asarray(states.waypoints).reshape(-1, 2)} == set(FIXES.values())
     dist = sim.disturbance(sim.init(()))
     x = {"fix": jnp.int32(list(FIXES).index("SFO")), "wind": jnp.zeros(2)}
     assert dist.log_prob(x) == -jnp.inf  # the beacon of the airport is less than 5 nmi away
-    assert (
-        not np.diag(database.APART).any() and (database.APART[:-2] == database.APART[:-2].T).all()
-    )
+    assert not np.diag(database.APART).any()
+    assert (database.APART[:-2] == database.APART[:-2].T).all()
 
 
 # odd routes
@@ -324,7 +322,9 @@ def test_unfinished_routes_and_empty_states():
         jast.replay(sim, jnp.asarray(turning(0.01)[:3])),
         fms_path(sim, full._replace(t=jnp.int32(3))),
     )
-    assert bool(short.failure) and float(path.legs[4:].max()) == 0 and not path.arc[3:].any()
+    assert bool(short.failure)
+    assert float(path.legs[4:].max()) == 0
+    assert not path.arc[3:].any()
     few = fms(waypoints=3)  # ends where the cut one did
     assert float(jast.replay(few, jnp.asarray(turning(0.01)[:3])).distance) == pytest.approx(
         float(short.distance), abs=1e-6
@@ -365,20 +365,16 @@ def test_contract(database, key):
     if database:
         return
     episode = jast.rollout(key, sim)
-    assert (
-        int(episode.length) == 12
-        and episode.distance.dtype == episode.log_prob.dtype == jnp.float64
-    )
+    assert int(episode.length) == 12
+    assert episode.distance.dtype == episode.log_prob.dtype == jnp.float64
     assert float(fms_misses(sim, episode).arc_length) == float(
         fms_misses(sim, episode._replace(states=None)).arc_length
     )
     assert float(fms_misses(sim, episode).arc_length) == pytest.approx(
         float(episode.distance), abs=1e-3
     )
-    assert (
-        sim.observe(jax.tree.map(lambda a: a[5], episode.states)).shape == (8,)
-        and np.abs(sim.observe(sim.init(()))).max() < 5
-    )
+    assert sim.observe(jax.tree.map(lambda a: a[5], episode.states)).shape == (8,)
+    assert np.abs(sim.observe(sim.init(()))).max() < 5
 
 
 def test_settings_are_traced(key, traced):

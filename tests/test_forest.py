@@ -59,15 +59,12 @@ def test_fields_are_as_documented(name):
     result, real = once(name), np.dtype(jnp.zeros(()).dtype)
     horizon = SYSTEMS[name].horizon
     assert isinstance(result, jast.search.SearchResult)
-    assert result.best.disturbances.shape == (horizon,) and jax.tree.leaves(result.best.states)[
-        0
-    ].shape == (horizon + 1,)
+    assert result.best.disturbances.shape == (horizon,)
+    assert jax.tree.leaves(result.best.states)[0].shape == (horizon + 1,)
     assert (result.best_reward_per_tree.shape, result.best_reward_per_tree.dtype) == ((6,), real)
     assert (result.failing_per_tree.shape, result.failing_per_tree.dtype) == ((6,), np.dtype(bool))
-    assert (
-        all(type(v) is int for v in (result.episodes, result.steps, result.invalid))
-        and type(result.failing_share) is float
-    )
+    assert all(type(v) is int for v in (result.episodes, result.steps, result.invalid))
+    assert type(result.failing_share) is float
     assert result.first_failure is None if name == "ferry" else type(result.first_failure) is int
     history = result.history
     moments = history.simulations.shape[0]
@@ -76,10 +73,15 @@ def test_fields_are_as_documented(name):
     np.testing.assert_array_equal(history.best_reward[-1], result.best_reward_per_tree)
     roots = result.roots
     children = roots.visits.shape[2]
-    assert roots.depth.shape == roots.valid.shape == (
-        3,
-        6,
-    ) and roots.visits.shape == roots.q.shape == roots.actions.shape == (3, 6, children)
+    assert (
+        roots.depth.shape
+        == roots.valid.shape
+        == (
+            3,
+            6,
+        )
+    )
+    assert roots.visits.shape == roots.q.shape == roots.actions.shape == (3, 6, children)
     assert (
         jax.tree.leaves(roots.starts) == []
         if name == "ferry"
@@ -152,11 +154,9 @@ def test_settings_say_what_was_asked_and_are_saved_with_the_failures(tmp_path, e
 def test_a_result_is_readable():
     found, none = str(once("landing")), str(once("ferry"))
     for text in (found, none):
-        assert (
-            text.splitlines()[0].split()[:3] == ["method", "episodes", "steps"]
-            and "forest" in text
-            and str(EPISODES) in text
-        )
+        assert text.splitlines()[0].split()[:3] == ["method", "episodes", "steps"]
+        assert "forest" in text
+        assert str(EPISODES) in text
         assert max(map(len, text.splitlines())) < 120
     assert "likeliest failure: reward" in found
     assert "no failure was found; the nearest episode came to distance" in none
@@ -172,9 +172,8 @@ def test_random_starts_are_found():
     first = result.roots.visits[0] > 0
     np.testing.assert_allclose(result.roots.starts[0][first].std(), 0.1, rtol=0.5)
     mixed = once("ring")
-    assert np.issubdtype(mixed.failures.episodes.x0["hit"].dtype, np.integer) and set(
-        np.unique(mixed.failures.episodes.x0["hit"])
-    ) <= {0, 1}
+    assert np.issubdtype(mixed.failures.episodes.x0["hit"].dtype, np.integer)
+    assert set(np.unique(mixed.failures.episodes.x0["hit"])) <= {0, 1}
     assert mixed.failures.episodes.disturbances["gust"].shape == (mixed.failures.size, 8, 2)
 
 
@@ -241,11 +240,9 @@ def test_a_simulator_that_returns_nan_is_counted_and_never_best():
 def test_a_simulator_that_returns_only_nan():
     sim = walk(step=lambda s, x: s * jnp.nan)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
-    assert (
-        result.invalid == result.episodes > 0
-        and result.failures.size == 0
-        and not result.best.failure
-    )
+    assert result.invalid == result.episodes > 0
+    assert result.failures.size == 0
+    assert not result.best.failure
     np.testing.assert_array_equal(result.best_reward_per_tree, -np.inf)
     assert "no failure was found" in str(result)
     honest(result, sim, BONUS)
@@ -254,11 +251,9 @@ def test_a_simulator_that_returns_only_nan():
 def test_a_system_that_never_fails():
     sim = walk(fails=lambda s: s > 1e6)
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
-    assert (
-        result.failures.size == result.failures.seen == 0
-        and result.first_failure is None
-        and result.failing_share == 0
-    )
+    assert result.failures.size == result.failures.seen == 0
+    assert result.first_failure is None
+    assert result.failing_share == 0
     assert "no failure was found" in str(result) and "no failure was found" in str(result.failures)
     honest(result, sim, BONUS)
 
@@ -272,11 +267,9 @@ def test_a_system_that_fails_at_its_start_takes_one_episode_a_tree():
         result.first_failure,
         result.failing_share,
     ) == (6, 0, 1, 1.0)
-    assert (
-        result.best.length == 0
-        and result.failures.size == 1
-        and result.failures.seen == result.failures.counts[0] == 6
-    )
+    assert result.best.length == 0
+    assert result.failures.size == 1
+    assert result.failures.seen == result.failures.counts[0] == 6
     honest(result, sim, BONUS)
 
 
@@ -284,7 +277,9 @@ def test_a_system_that_always_fails_at_its_first_step():
     sim = walk(step=lambda s, x: jnp.full_like(s, 4.0))
     result = forest(jax.random.key(0), sim, **SIZE, reward=BONUS, actions=ACTIONS["samples"])
     # the next root would be an episode's end
-    assert result.episodes == 6 * 60 and result.failing_share == 1.0 and result.first_failure == 1
+    assert result.episodes == 6 * 60
+    assert result.failing_share == 1.0
+    assert result.first_failure == 1
     # an end that is visited again is not simulated again
     assert result.steps < result.episodes
     assert (result.failures.episodes.length == 1).all()

@@ -278,10 +278,8 @@ def test_elites_that_do_not_span_the_space(seed, d, double, enough):
         got = FIT(old, jnp.asarray(x, dtype), jnp.asarray(w, dtype))
         assert same(got, old) is not enough
         if enough:
-            assert (
-                np.isfinite(SCORE(got, got.mean))
-                and np.isfinite(DRAW(jax.random.key(seed), got, 3)).all()
-            )
+            assert np.isfinite(SCORE(got, got.mean))
+            assert np.isfinite(DRAW(jax.random.key(seed), got, 3)).all()
 
 
 def test_the_spread_of_points_far_from_the_origin(dtype):

@@ -75,7 +75,9 @@ def test_inverse():
 def test_points_that_coincide_or_nearly_do():
     points = legs(200, 2)[0]
     length, first, last = inverse(earth(), jnp.asarray(points), jnp.asarray(points))
-    assert (length == 0).all() and jnp.isfinite(first).all() and jnp.isfinite(last).all()
+    assert (length == 0).all()
+    assert jnp.isfinite(first).all()
+    assert jnp.isfinite(last).all()
     back, course = direct(earth(), jnp.asarray(points), jnp.ones(200), jnp.zeros(200))
     assert apart(np.asarray(back), points).max() < 1e-8
     np.testing.assert_allclose(course, 1, rtol=1e-12)
@@ -103,9 +105,8 @@ def test_poles_equator_and_antipodes_are_finite():
     )
     length, first, last = (np.asarray(v).reshape(8, 8) for v in inverse(earth(), a, b))
     assert np.isfinite([length, first, last]).all()
-    assert length[2, 3] == pytest.approx(R * np.pi / 18, abs=1e-8) and first[2, 3] == pytest.approx(
-        np.pi / 2
-    )
+    assert length[2, 3] == pytest.approx(R * np.pi / 18, abs=1e-8)
+    assert first[2, 3] == pytest.approx(np.pi / 2)
     assert length[6, 7] < 1e-8  # one point, from both sides of the date line
     assert length[0, 2] == pytest.approx(10001965.729, abs=1e-3)  # a quarter of a meridian
 

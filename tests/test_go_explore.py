@@ -132,14 +132,18 @@ def test_nan_is_counted_and_never_best(key):
         sim.horizon,
     )
     r = go_explore(key, broken, **SMALL)
-    assert r.invalid > 0 and not r.failing and r.best.distance == 3
+    assert r.invalid > 0
+    assert not r.failing
+    assert r.best.distance == 3
 
 
 @pytest.mark.long
 def test_where_nothing_fails_the_nearest_is_best(key):
     sim = climb(6)
     r = go_explore(key, sim, **SMALL)
-    assert not r.best.failure and r.failures.size == 0 and r.first_failure is None
+    assert not r.best.failure
+    assert r.failures.size == 0
+    assert r.first_failure is None
     assert 2 <= r.best.distance <= 4 and np.isfinite(r.best.reward)
 
 

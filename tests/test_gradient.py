@@ -60,8 +60,12 @@ def test_a_random_start(key, equal):
 
 def test_a_flat_distance_gives_no_failure_and_says_why(key):
     r = gradient(key, stress_systems.latch(10), **SMALL)
-    assert not r.failing and r.failures.size == 0 and r.first_failure is None
-    assert r.settings["useful_gradients"] == 0 and not r.best.failure and r.best.distance == 1
+    assert not r.failing
+    assert r.failures.size == 0
+    assert r.first_failure is None
+    assert r.settings["useful_gradients"] == 0
+    assert not r.best.failure
+    assert r.best.distance == 1
     assert r.episodes == 1920
 
 
@@ -74,7 +78,9 @@ def test_nan_is_counted_and_never_best(key):
         2,
     )
     r = gradient(key, broken, **STEPS)
-    assert r.invalid and not r.failing and 2 <= r.best.distance < 4
+    assert r.invalid
+    assert not r.failing
+    assert 2 <= r.best.distance < 4
 
 
 @pytest.mark.long

@@ -56,9 +56,8 @@ def test_a_network_is_the_formula(activation, first_activation, outputs, key):
         key, 3, outputs, hidden=(16, 8), activation=activation, first_activation=first_activation
     )
     (a, b), (c, d), (e, f) = layers(head)
-    assert [w.shape for w in (a, c, e)] == [(3, 16), (16, 8), (8, int(np.prod(outputs)))] and [
-        w.shape for w in (b, d)
-    ] == [(16,), (8,)]
+    assert [w.shape for w in (a, c, e)] == [(3, 16), (16, 8), (8, int(np.prod(outputs)))]
+    assert [w.shape for w in (b, d)] == [(16,), (8,)]
     x = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     act = ACTIVATIONS[activation]
     below = x @ a + b
@@ -74,9 +73,8 @@ def test_weights_and_biases_start_uniform_within_the_root_of_the_fan_in(key):
         for numbers in (kernel, bias):
             assert numbers.dtype == np.float32 and 0.9 * bound < np.abs(numbers).max() <= bound
             m, s = numbers.size, bound / np.sqrt(3)
-            assert abs(numbers.mean()) < 4 * s / np.sqrt(m) and abs(
-                numbers.std() / s - 1
-            ) < 4 / np.sqrt(m)
+            assert abs(numbers.mean()) < 4 * s / np.sqrt(m)
+            assert abs(numbers.std() / s - 1) < 4 / np.sqrt(m)
 
 
 def test_networks_of_one_shape_share_their_function_and_differ_by_key():
@@ -168,9 +166,8 @@ def test_unflat_is_the_inverse_of_flat(shapes):
     n = sum(int(np.prod(shape)) for shape in shapes.values())
     u = jnp.arange(n, dtype=jnp.float32) / 16
     back = unflat(u, event)
-    assert {name: a.shape for name, a in back.items()} == shapes and all(
-        jnp.issubdtype(a.dtype, jnp.floating) for a in back.values()
-    )
+    assert {name: a.shape for name, a in back.items()} == shapes
+    assert all(jnp.issubdtype(a.dtype, jnp.floating) for a in back.values())
     np.testing.assert_array_equal(flat(back), u)
 
 
@@ -197,7 +194,9 @@ def test_draws_of_a_histogram_invert_its_distribution_function(logits, u):
     u = np.sort(np.array(u + [0.0, 1 - 2.0**-24], np.float32))
     rows = jnp.broadcast_to(jnp.asarray(logits, jnp.float32), (len(u), 5))
     x = np.asarray(binned(rows, jnp.asarray(u)), np.float64)
-    assert (0 <= x).all() and (x < 1).all() and (np.diff(x) >= -1e-6).all()
+    assert (0 <= x).all()
+    assert (x < 1).all()
+    assert (np.diff(x) >= -1e-6).all()
     p = special.softmax(np.array(logits))
     # the distribution function
     below = np.interp(x, np.arange(6) / 5, np.concatenate([[0], np.cumsum(p)]))
@@ -309,10 +308,8 @@ def test_samples_of_roots_that_are_not_finite_are_left_out_and_counted():
     roots.visits[1, 2, 3] = roots.visits[0, 0, 0] = 2
     policy, value = of_roots(PLANE, samples(), roots, 5, good)
     assert policy.dropped == 1 and value.dropped == 1 + (roots.visits[0, 0] > 0).sum()
-    assert (
-        len(policy.seen) == roots.valid.sum() - 2
-        and len(value.seen) == (roots.visits[roots.valid] > 0).sum() - value.dropped
-    )
+    assert len(policy.seen) == roots.valid.sum() - 2
+    assert len(value.seen) == (roots.visits[roots.valid] > 0).sum() - value.dropped
     assert all(np.isfinite(a).all() for found in (policy, value) for a in found[:3])
 
 
@@ -362,12 +359,10 @@ def test_samples_of_episodes(sim, n, d):
         for i in np.flatnonzero(good)
         for t in range(int(episodes.length[i]))
     ]
-    assert (
-        found.seen.shape == (len(rows), n)
-        and found.x.shape == (len(rows), 0)
-        and found.target.shape == (len(rows), d, bins)
-        and found.dropped == 0
-    )
+    assert found.seen.shape == (len(rows), n)
+    assert found.x.shape == (len(rows), 0)
+    assert found.target.shape == (len(rows), d, bins)
+    assert found.dropped == 0
     np.testing.assert_allclose(found.seen, [seen for seen, _ in rows], rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(found.target, [target for _, target in rows])
 
@@ -583,7 +578,9 @@ def test_a_lesson_that_is_not_finite_is_rejected(bad, key, equal):
         how |= dict(rate=1e30)
     before = learner(jnp.asarray([0.5, -0.25], jnp.float32))
     after, lesson = learn(key, before, jax.tree_util.Partial(apply), PLAIN, samples, **how)
-    assert lesson.rejected and not np.isfinite(lesson.loss) and lesson.steps == 20
+    assert lesson.rejected
+    assert not np.isfinite(lesson.loss)
+    assert lesson.steps == 20
     equal(after._replace(kept=None), before)
 
 
@@ -677,13 +674,11 @@ def test_forests_of_all_kinds_learn(name, heads, actions):
         replays(result.failures.episode(i), SYSTEMS[name], BONUS)
     assert [tuple(lesson) for lesson in result.lessons] == [TRAINED[heads]] * 2
     for of in (of for lesson in result.lessons for of in lesson.values()):
-        assert (
-            of.steps == 50
-            and of.samples > 0
-            and of.dropped == 0
-            and not of.rejected
-            and np.isfinite(of.loss)
-        )
+        assert of.steps == 50
+        assert of.samples > 0
+        assert of.dropped == 0
+        assert not of.rejected
+        assert np.isfinite(of.loss)
     made = enrol(
         jax.random.fold_in(jax.random.key(5), 8), SYSTEMS[name], ACTIONS[actions], heads, QUICK
     ).heads
@@ -704,16 +699,12 @@ def test_forests_of_all_kinds_learn(name, heads, actions):
 
 def test_fields_are_as_documented():
     result = once()
-    assert (
-        isinstance(result.heads, Heads)
-        and isinstance(result.lessons, tuple)
-        and all(isinstance(of, Lesson) for of in result.lessons[0].values())
-    )
+    assert isinstance(result.heads, Heads)
+    assert isinstance(result.lessons, tuple)
+    assert all(isinstance(of, Lesson) for of in result.lessons[0].values())
     asked = QUICK._asdict() | dict(round=4)
-    assert (
-        result.settings["heads"] == "both"
-        and json.loads(json.dumps(result.settings)) == result.settings
-    )
+    assert result.settings["heads"] == "both"
+    assert json.loads(json.dumps(result.settings)) == result.settings
     assert result.settings["head_settings"] == {
         name: list(v) if isinstance(v, tuple) else v for name, v in asked.items()
     }
@@ -790,11 +781,9 @@ def test_heads_that_are_not_trained_stay_as_they_are(equal):
         searched(heads=once().heads, head_settings=QUICK._replace(train=False)),
     )
     unchanged(again.heads, first, equal)
-    assert (
-        again.lessons == ()
-        and again.heads.levels == first.levels
-        and again.settings["heads"] == "policy/value"
-    )
+    assert again.lessons == ()
+    assert again.heads.levels == first.levels
+    assert again.settings["heads"] == "policy/value"
     nothing = searched(heads=made(), head_settings=QUICK._replace(train=False))
     # so are the heads of the first round
     np.testing.assert_array_equal(nothing.best_reward_per_tree[:4], once().best_reward_per_tree[:4])
@@ -822,10 +811,8 @@ def test_training_that_diverges_is_rejected_and_the_search_goes_on(equal):
     assert result.heads.levels == 0
     text = str(result)
     for n, name in ((1, "policy"), (2, "value")):
-        assert (
-            f"round {n}: training of the {name} head was rejected, its loss was" in text
-            and "the parameters from before were kept" in text
-        )
+        assert f"round {n}: training of the {name} head was rejected, its loss was" in text
+        assert "the parameters from before were kept" in text
     guided = searched(heads=made(), head_settings=QUICK._replace(train=False))
     np.testing.assert_array_equal(result.best_reward_per_tree, guided.best_reward_per_tree)
     honest(result, PLANE, BONUS)
@@ -853,12 +840,10 @@ def test_heads_of_any_framework_and_one_that_only_says_nan(equal):
         (False, True)
     ] * 2
     equal(result.heads.value.params, own.value.params)
-    assert (result.heads.policy.params["w"] != 0).any() and result.settings[
-        "heads"
-    ] == "policy/value"
-    assert "training of the value head was rejected, its loss was nan" in str(
-        result
-    ) and "policy head was rejected" not in str(result)
+    assert (result.heads.policy.params["w"] != 0).any()
+    assert result.settings["heads"] == "policy/value"
+    assert "training of the value head was rejected, its loss was nan" in str(result)
+    assert "policy head was rejected" not in str(result)
 
 
 @pytest.mark.parametrize("sight", [1.5, 0.0])
@@ -866,11 +851,9 @@ def test_an_observe_that_turns_nan_loses_samples_and_nothing_else(sight):
     result = searched(sim=plane(sight=sight))
     dropped = sum(of.dropped for lesson in result.lessons for of in lesson.values())
     assert dropped > 0 and f"{dropped} samples for the heads were left out" in str(result)
-    assert (
-        result.invalid == 0
-        and np.isfinite(result.best.reward)
-        and np.isfinite(result.best_reward_per_tree).all()
-    )
+    assert result.invalid == 0
+    assert np.isfinite(result.best.reward)
+    assert np.isfinite(result.best_reward_per_tree).all()
     assert not any(of.rejected for lesson in result.lessons for of in lesson.values())
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(result.heads))
     honest(result, plane(sight=sight), BONUS)
@@ -878,11 +861,11 @@ def test_an_observe_that_turns_nan_loses_samples_and_nothing_else(sight):
 
 def test_a_system_that_fails_at_its_start():
     result = searched(sim=plane(-1.0))
-    assert result.episodes == 8 and result.failing_share == 1 and result.steps == 0
-    assert (
-        all(of.samples == of.steps == 0 for lesson in result.lessons for of in lesson.values())
-        and result.heads.levels == 0
-    )
+    assert result.episodes == 8
+    assert result.failing_share == 1
+    assert result.steps == 0
+    assert all(of.samples == of.steps == 0 for lesson in result.lessons for of in lesson.values())
+    assert result.heads.levels == 0
 
 
 # --- interruption
@@ -898,11 +881,9 @@ def test_a_search_interrupted_between_rounds_says_so():
             raise KeyboardInterrupt
 
     result = searched(callback=stop)
-    assert (
-        40 * result.roots.valid[:, :4].sum() < result.episodes <= 960
-        and "of 960 simulations" in result.settings["interrupted"]
-        and len(result.lessons) == 1
-    )
+    assert 40 * result.roots.valid[:, :4].sum() < result.episodes <= 960
+    assert "of 960 simulations" in result.settings["interrupted"]
+    assert len(result.lessons) == 1
     assert 4 < len(result.best_reward_per_tree) <= 8
     np.testing.assert_array_equal(result.best_reward_per_tree[:4], once().best_reward_per_tree[:4])
     honest(result, PLANE, BONUS)
@@ -914,10 +895,8 @@ def test_a_search_interrupted_in_a_lesson_says_so(monkeypatch, equal):
 
     monkeypatch.setattr(trees, "teach", interrupted)
     result = searched()
-    assert (
-        result.episodes == 40 * result.roots.valid.sum()
-        and result.best_reward_per_tree.shape == (4,)
-    )
+    assert result.episodes == 40 * result.roots.valid.sum()
+    assert result.best_reward_per_tree.shape == (4,)
     assert "of 960 simulations" in result.settings["interrupted"] and result.lessons == ()
     unchanged(result.heads, made(), equal)
 
@@ -948,9 +927,8 @@ def test_the_published_heads(round, equal):
     for lesson in result.lessons:
         assert lesson["policy"].steps == lesson["policy"].samples == 2 * round  # roots
         assert lesson["value"].steps == lesson["value"].samples > 20 * round  # edges
-    assert result.heads.inputs.count == 0 and not any(
-        of.rejected for lesson in result.lessons for of in lesson.values()
-    )
+    assert result.heads.inputs.count == 0
+    assert not any(of.rejected for lesson in result.lessons for of in lesson.values())
 
 
 def test_the_text_departs_from_the_code_where_the_table_says():
@@ -1208,7 +1186,5 @@ def test_unknown_settings_are_named():
         match=r"head_settings must be those of jast.heads.settings\(...\), received dict",
     ):
         searched(head_settings=dict(round=3))
-    assert (
-        H.settings("code", round=8) == H.MODES["code"]._replace(round=8)
-        and H.settings() == H.MODES["default"]
-    )
+    assert H.settings("code", round=8) == H.MODES["code"]._replace(round=8)
+    assert H.settings() == H.MODES["default"]

@@ -75,7 +75,8 @@ def test_file_gives_back_what_was_saved(tmp_path, equal, policy, value):
     heads = made(policy, value)
     back = saved(tmp_path / "h.jast", heads)
     equal(back, heads)
-    assert isinstance(back.levels, int) and (back.policy is None, back.value is None) == (
+    assert isinstance(back.levels, int)
+    assert (back.policy is None, back.value is None) == (
         not policy,
         not value,
     )
@@ -91,7 +92,8 @@ def test_file_gives_back_what_was_saved(tmp_path, equal, policy, value):
     assert [p.name for p in tmp_path.iterdir()] == ["h.jast"]
     with np.load(tmp_path / "h.jast") as pack:  # no pickle inside
         header = json.loads(pack["header"].tobytes())
-    assert header["format"] == "jast heads" and set(header["heads"]) == {
+    assert header["format"] == "jast heads"
+    assert set(header["heads"]) == {
         n for n, there in (("policy", policy), ("value", value)) if there
     }
     if value:
@@ -107,7 +109,9 @@ def test_untrained_heads_have_no_moments(tmp_path, equal):
     equal(back, heads)
     one = Heads(heads.policy, inputs=INPUTS, levels=np.int32(3))
     back = saved(tmp_path / "h", one)
-    assert back.returns is None and type(back.levels) is int and back.levels == 3
+    assert back.returns is None
+    assert type(back.levels) is int
+    assert back.levels == 3
     equal(back.inputs, INPUTS)
 
 

@@ -161,12 +161,10 @@ def test_one_step_exactly(key):
         np.log(np.maximum((np.exp(-np.asarray(t.log_weight, float)) - 0.3) / 0.7, 1e-300)) + 4.5
     ) / 3
     sure = abs(x - 2.5) > 1e-3
-    assert (
-        (t.failure[sure] == (x > 2.5)[sure]).all()
-        and 0.3 < t.failure.mean() < 0.7
-        and (t.length == 1).all()
-        and not t.invalid.any()
-    )
+    assert (t.failure[sure] == (x > 2.5)[sure]).all()
+    assert 0.3 < t.failure.mean() < 0.7
+    assert (t.length == 1).all()
+    assert not t.invalid.any()
     inside = x > -1  # below, the weight is flat in x
     cdf = lambda x: 0.3 * norm.cdf(x) + 0.7 * norm.cdf(x, 3)
     assert (
@@ -183,20 +181,16 @@ def test_to_the_end_and_to_the_horizon(key):
     """
     q, truth = trace_proposal(WALK, UP), walk_probability(10.0, 10, False)
     end, paper = importance(key, WALK, q, MORE), importance(key, WALK, q, MORE, mode="paper")
-    assert (
-        truth == pytest.approx(9.578759495e-4, rel=1e-8)
-        and within(end, truth)
-        and within(paper, truth)
-    )
+    assert truth == pytest.approx(9.578759495e-4, rel=1e-8)
+    assert within(end, truth)
+    assert within(paper, truth)
     assert max(end.relative_error, paper.relative_error) < 0.08
     assert end.failing == paper.failing and end.steps == paper.steps < 10 * MORE
     t, p = log_weights(key, WALK, q, LANES), log_weights(key, WALK, q, LANES, mode="paper")
     same = np.asarray(t.length) == 10
-    assert (
-        (t.failure == p.failure).all()
-        and (t.length == p.length).all()
-        and 0.05 < same.mean() < 0.95
-    )
+    assert (t.failure == p.failure).all()
+    assert (t.length == p.length).all()
+    assert 0.05 < same.mean() < 0.95
     np.testing.assert_allclose(t.log_weight[same], p.log_weight[same], atol=1e-4)
     assert (t.log_weight[~same] != p.log_weight[~same]).mean() > 0.5
 
@@ -213,9 +207,8 @@ def test_to_the_end_and_to_the_horizon(key):
             (log_w[fails], np.asarray(p.log_weight)[np.asarray(p.failure)]),
         )
     ]
-    assert min(p_values) > 1e-3 and abs(fails.mean() - np.asarray(t.failure).mean()) < 4 * np.sqrt(
-        0.5 / LANES
-    )
+    assert min(p_values) > 1e-3
+    assert abs(fails.mean() - np.asarray(t.failure).mean()) < 4 * np.sqrt(0.5 / LANES)
 
 
 # Landing: the published problem
@@ -228,24 +221,21 @@ def test_two_traces(key):
     """
     found = importance(key, SIM, trace_proposal(SIM, BOTH))
     assert float(landing_probability()) == pytest.approx(MU, rel=1e-4)
-    assert (
-        within(found, MU, 3)
-        and 0.009 < found.relative_error < 0.0105
-        and found.reliable
-        and found.warnings == ()
-    )
+    assert within(found, MU, 3)
+    assert 0.009 < found.relative_error < 0.0105
+    assert found.reliable
+    assert found.warnings == ()
     assert abs(found.modes - 0.5).max() < 4 * 0.5 * 0.015 and found.modes.sum() == pytest.approx(1)
     assert (found.samples, found.evaluations, found.steps, found.invalid) == (
         100_000,
         100_000,
         1_000_000,
         0,
-    ) and found.k_hat < 0.7
-    assert (
-        found.interval[0] < MU * 1.03
-        and found.interval[1] > MU * 0.97
-        and found.standard_error == pytest.approx(found.mean * found.relative_error)
     )
+    assert found.k_hat < 0.7
+    assert found.interval[0] < MU * 1.03
+    assert found.interval[1] > MU * 0.97
+    assert found.standard_error == pytest.approx(found.mean * found.relative_error)
 
 
 @pytest.mark.parametrize("exponent", [-30, -100])
@@ -259,11 +249,9 @@ def test_any_range(key, exponent):
     found = importance(
         key, landing(b), trace_proposal(landing(b), [most_probable(s, b) for s in (1.0, -1.0)])
     )
-    assert (
-        abs(found.log10_mean - exponent) < 3 * found.relative_error / np.log(10)
-        and found.relative_error < 0.025
-        and found.reliable
-    )
+    assert abs(found.log10_mean - exponent) < 3 * found.relative_error / np.log(10)
+    assert found.relative_error < 0.025
+    assert found.reliable
     assert found.mean > 0 and found.interval[0] > 0
 
 
@@ -278,12 +266,10 @@ def test_a_lost_mode_is_half(key):
 def test_policy_with_a_tilted_start(key):
     """1e5 episodes, standard error at most 1 %."""
     found = importance(key, SIM, policy_proposal(SIM, STEER))
-    assert (
-        within(found, MU, 3)
-        and found.relative_error < 0.01
-        and found.reliable
-        and found.k_hat < 0.7
-    )
+    assert within(found, MU, 3)
+    assert found.relative_error < 0.01
+    assert found.reliable
+    assert found.k_hat < 0.7
 
 
 @pytest.mark.long
@@ -294,9 +280,9 @@ def test_algorithm_2_verbatim_is_unreliable():
     q = policy_proposal(SIM, STEER, tilt_start=False)
     for seed in range(20):
         found = importance(jax.random.key(seed), SIM, q, MORE)
-        assert (
-            not found.reliable and found.ess < 100 and (found.k_hat > 0.7 or found.max_share > 0.05)
-        )
+        assert not found.reliable
+        assert found.ess < 100
+        assert found.k_hat > 0.7 or found.max_share > 0.05
         assert str(found).startswith("UNRELIABLE: ") and found.failing > 100
 
 
@@ -343,11 +329,9 @@ def test_bounded_disturbances(key):
         BOXES, {"tent": jnp.full(2, 0.8), "flat": jnp.full(2, 0.9), "coin": jnp.ones(2, jnp.int32)}
     )
     found, truth = importance(key, BOXES, trace_proposal(BOXES, e), MORE), boxes_probability()
-    assert (
-        within(found, truth)
-        and found.reliable
-        and found.relative_error < 0.05 < np.sqrt(1 / truth / MORE) / 4
-    ), (found.mean, truth)
+    assert within(found, truth), (found.mean, truth)
+    assert found.reliable, (found.mean, truth)
+    assert found.relative_error < 0.05 < np.sqrt(1 / truth / MORE) / 4, (found.mean, truth)
 
 
 def test_a_batch_and_a_list_are_the_same_proposal():
@@ -398,41 +382,32 @@ def test_all_of_the_model_is_plain(key):
     np.testing.assert_allclose(t.log_weight, 0, atol=1e-5)
     found = importance(key, WALK, odd(), 10 * MORE)
     k, n = found.failing, found.samples
-    assert (
-        found.mean == pytest.approx(k / n)
-        and found.ess == pytest.approx(k)
-        and within(found, 9.578759495e-4)
-        and found.reliable
-    )
-    assert (
-        found.relative_error == pytest.approx(np.sqrt((1 - k / n) / k), rel=1e-4)
-        and found.k_hat == -np.inf
-    )
+    assert found.mean == pytest.approx(k / n)
+    assert found.ess == pytest.approx(k)
+    assert within(found, 9.578759495e-4)
+    assert found.reliable
+    assert found.relative_error == pytest.approx(np.sqrt((1 - k / n) / k), rel=1e-4)
+    assert found.k_hat == -np.inf
 
 
 def test_a_proposal_that_does_not_cover(key):
     """Steps above 2.2 cannot be drawn: flagged, though the weights look fine."""
     found = importance(key, WALK, odd(2.2, -np.inf, 2.2), 10 * MORE)
-    assert (
-        not found.reliable
-        and "density 0 on" in found.warnings[0]
-        and "of the model's own episodes" in found.warnings[0]
-        and found.failing > 100
-    )
+    assert not found.reliable
+    assert "density 0 on" in found.warnings[0]
+    assert "of the model's own episodes" in found.warnings[0]
+    assert found.failing > 100
 
 
 def test_weights_that_are_nan(key):
     """They count for nothing, and the estimate is not to be believed; neither are infinite ones."""
     for value in (np.nan, -np.inf):
         found = importance(key, WALK, odd(2.5, value), 10 * MORE)
-        assert (
-            not found.reliable
-            and any(
-                "failing episodes have a weight that is NaN or infinite" in w
-                for w in found.warnings
-            )
-            and np.isfinite(found.log_mean)
+        assert not found.reliable
+        assert any(
+            "failing episodes have a weight that is NaN or infinite" in w for w in found.warnings
         )
+        assert np.isfinite(found.log_mean)
 
 
 def test_invalid_episodes(key):
@@ -446,9 +421,8 @@ def test_invalid_episodes(key):
     first = np.where(above.any(axis=1), above.argmax(axis=1), 6)
     truth = (above.any(axis=1) & ~(bad & (np.arange(6) <= first[:, None])).any(axis=1)).mean()
     assert abs(found.mean - truth) < 4 * np.hypot(np.sqrt(truth / 400_000), found.standard_error)
-    assert 0 < found.invalid < MORE - found.failing and any(
-        "are invalid" in w for w in found.warnings
-    )
+    assert 0 < found.invalid < MORE - found.failing
+    assert any("are invalid" in w for w in found.warnings)
 
 
 def test_no_failure(key):
@@ -456,17 +430,15 @@ def test_no_failure(key):
     found = importance(key, landing(50.0), trace_proposal(SIM, BOTH), MORE)
     assert np.isnan(
         [found.mean, found.log_mean, found.relative_error, found.standard_error, found.log10_mean]
-    ).all() and found.interval == (0.0, 1.0)
-    assert (
-        not found.reliable
-        and found.failing == 0
-        and found.warnings == ("no failure was seen",)
-        and found.ess == 0
-        and found.modes is None
-    )
-    assert str(found).startswith("UNRELIABLE: no failure was seen\n") and "nothing is known" in str(
-        found
-    )
+    ).all()
+    assert found.interval == (0.0, 1.0)
+    assert not found.reliable
+    assert found.failing == 0
+    assert found.warnings == ("no failure was seen",)
+    assert found.ess == 0
+    assert found.modes is None
+    assert str(found).startswith("UNRELIABLE: no failure was seen\n")
+    assert "nothing is known" in str(found)
 
 
 # Chunks
@@ -490,19 +462,16 @@ def test_chunks_are_those_of_log_weights(key):
         for f in ("log_weight", "failure", "shares")
     )
     w = np.where(failure, np.exp(log_w.astype(float)), 0)
-    assert found.mean == pytest.approx(
-        w.mean(), rel=1e-10
-    ) and found.standard_error == pytest.approx(w.std(ddof=1) / np.sqrt(MORE), rel=1e-8)
-    assert found.ess == pytest.approx(
-        w.sum() ** 2 / (w**2).sum()
-    ) and found.max_share == pytest.approx(w.max() / w.sum())
+    assert found.mean == pytest.approx(w.mean(), rel=1e-10)
+    assert found.standard_error == pytest.approx(w.std(ddof=1) / np.sqrt(MORE), rel=1e-8)
+    assert found.ess == pytest.approx(w.sum() ** 2 / (w**2).sum())
+    assert found.max_share == pytest.approx(w.max() / w.sum())
     assert found.failing == failure.sum()
     np.testing.assert_allclose(
         np.sort(found.modes), np.sort((w @ np.exp(shares.astype(float))) / w.sum()), rtol=1e-6
     )
-    assert seen == [(even(MORE), MORE), (MORE, MORE)] and str(importance(key, SIM, q, MORE)) == str(
-        found
-    )
+    assert seen == [(even(MORE), MORE), (MORE, MORE)]
+    assert str(importance(key, SIM, q, MORE)) == str(found)
 
 
 def test_interrupts_keep_whole_chunks(key, capsys):
@@ -516,16 +485,12 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         importance(key, SIM, q, MORE, callback=stop, progress=True),
         importance(key, SIM, q, even(MORE)),
     )
-    assert (
-        found.samples == found.evaluations == even(MORE)
-        and found.mean == first.mean
-        and found.relative_error == first.relative_error
-    )
-    assert (
-        found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",)
-        and found.reliable
-        and "importance" in capsys.readouterr().err
-    )
+    assert found.samples == found.evaluations == even(MORE)
+    assert found.mean == first.mean
+    assert found.relative_error == first.relative_error
+    assert found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",)
+    assert found.reliable
+    assert "importance" in capsys.readouterr().err
     with pytest.raises(KeyboardInterrupt):
         watch = Watch("importance", MORE, "episode", False, None)
         chunks(lambda shared, i, post: stop(0, 0, None), None, LANES, watch)
@@ -647,23 +612,19 @@ def test_monte_carlo(key):
     """Counts, an exact interval, and the bounds of the paper also where nothing was seen."""
     found = monte_carlo(key, WALK, 10 * MORE)
     k, n = found.failing, 10 * MORE
-    assert (
-        found.reliable
-        and found.mean == k / n
-        and within(found, 9.578759495e-4)
-        and found.samples == found.evaluations == n
-    )
+    assert found.reliable
+    assert found.mean == k / n
+    assert within(found, 9.578759495e-4)
+    assert found.samples == found.evaluations == n
     assert found.interval == pytest.approx(clopper_pearson(k, n), rel=1e-6)
     assert (found.jeffreys, found.chernoff) == pytest.approx(
         (jeffreys(k, n), chernoff(k, n)), rel=1e-6
     )
     none = monte_carlo(key, walk1d("one-sided", threshold=100.0), MORE, level=0.9)
-    assert (
-        np.isnan(none.mean)
-        and not none.reliable
-        and none.interval[0] == 0
-        and none.chernoff == pytest.approx(-np.expm1(np.log(0.1) / MORE), rel=1e-5)
-    )
+    assert np.isnan(none.mean)
+    assert not none.reliable
+    assert none.interval[0] == 0
+    assert none.chernoff == pytest.approx(-np.expm1(np.log(0.1) / MORE), rel=1e-5)
     assert "UNRELIABLE: no failure in 20000 episodes" in str(none) and "Chernoff" in str(none)
 
 

@@ -67,9 +67,8 @@ def test_order_of_the_bounds(data):
     k = data.draw(st.integers(0, n))
     level = data.draw(st.floats(0.51, 0.9999))
     exact = 1.0 if k == n else beta.ppf(level, k + 1, n - k)
-    assert jeffreys(k, n, level) <= exact * (1 + 1e-9) and exact <= chernoff(k, n, level) * (
-        1 + 1e-9
-    )
+    assert jeffreys(k, n, level) <= exact * (1 + 1e-9)
+    assert exact <= chernoff(k, n, level) * (1 + 1e-9)
     assert chernoff(k, n, level) > k / n or k == n
     # the interval is two one-sided ones
     assert clopper_pearson(k, n, 2 * level - 1)[1] == pytest.approx(exact, rel=1e-6)
@@ -94,9 +93,8 @@ def test_no_failure_in_a_million():
     """The published numbers: 3.00e-6 and 1.92e-6; the rule of three, and Chernoff's bound is the
     exact one at k = 0.
     """
-    assert jeffreys(0, 10**6) == pytest.approx(1.92e-6, abs=0.005e-6) and chernoff(
-        0, 10**6
-    ) == pytest.approx(3.00e-6, abs=0.005e-6)
+    assert jeffreys(0, 10**6) == pytest.approx(1.92e-6, abs=0.005e-6)
+    assert chernoff(0, 10**6) == pytest.approx(3.00e-6, abs=0.005e-6)
     assert chernoff(0, 10**6) == pytest.approx(clopper_pearson(0, 10**6, 0.9)[1], rel=1e-9)
 
 

@@ -187,5 +187,8 @@ def test_a_count_of_few_failures_is_not_believed():
     sim = limit_state(_sum, 8)
     found = [monte_carlo(jax.random.key(0), sim, n) for n in (2000, 40_000)]
     few, many = found
-    assert 0 < few.failing < 10 and not few.reliable and many.failing > 10 and many.reliable
+    assert 0 < few.failing < 10
+    assert not few.reliable
+    assert many.failing > 10
+    assert many.reliable
     assert few.warnings == (f"{few.failing} failures are too few: only the interval is known",)

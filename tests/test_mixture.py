@@ -81,7 +81,9 @@ def test_densities_are_scipys(dtype):
         DENSITY(three(dtype), jnp.asarray(x, dtype)),
         PARTS(three(dtype), jnp.asarray(x, dtype)),
     )
-    assert got.dtype == parts.dtype == dtype and got.shape == (4, 5) and parts.shape == (4, 5, 3)
+    assert got.dtype == parts.dtype == dtype
+    assert got.shape == (4, 5)
+    assert parts.shape == (4, 5, 3)
     np.testing.assert_allclose(got, np.log(joint.sum(-1)), rtol=rtol)
     np.testing.assert_allclose(
         parts, joint / joint.sum(-1, keepdims=True), rtol=rtol * 10, atol=1e-30
@@ -337,10 +339,8 @@ def test_em_never_returns_nan_either(seed, double, least, exponent):
             0.0,
             least,
         )
-        assert (
-            all(np.isfinite(a).all() for a in got)
-            and np.isfinite(jnp.linalg.cholesky(got.covariances)).all()
-        )
+        assert all(np.isfinite(a).all() for a in got)
+        assert np.isfinite(jnp.linalg.cholesky(got.covariances)).all()
         assert np.isfinite(np.asarray(DENSITY(got, jnp.asarray(x, dtype)))).all()
 
 

@@ -57,15 +57,14 @@ def test_rate_of_a_known_system(key, equal):
         n,
         0,
         64,
-    ) and r.failing_per_tree.tolist() == [True]
+    )
+    assert r.failing_per_tree.tolist() == [True]
     assert r.best_reward_per_tree.shape == (1,) and r.history.best_reward.shape[1] == 1
     assert r.history.simulations[-1] == n and r.history.failures[-1] == r.failures.seen
     assert (np.diff(r.history.best_reward[:, 0]) >= 0).all()
-    assert (
-        r.settings["method"] == "monte_carlo"
-        and r.settings["episodes"] == n
-        and "interrupted" not in r.settings
-    )
+    assert r.settings["method"] == "monte_carlo"
+    assert r.settings["episodes"] == n
+    assert "interrupted" not in r.settings
     assert "likeliest failure" in str(r)
 
 
@@ -89,7 +88,9 @@ def test_counts_are_those_of_the_episodes(key):
     )
     played = [jax.tree.map(lambda a: a[0], one(jnp.int32(i))) for i in range(n)]
     failing = [i for i, e in enumerate(played) if e.failure]
-    assert r.episodes == n and r.failures.seen == len(failing) and r.first_failure == failing[0] + 1
+    assert r.episodes == n
+    assert r.failures.seen == len(failing)
+    assert r.first_failure == failing[0] + 1
     assert r.steps == sum(int(e.length) for e in played)
     assert sorted(r.failures.simulation) == failing and (r.failures.counts == 1).all()
     for i, number in enumerate(r.failures.simulation):
@@ -100,10 +101,8 @@ def test_episodes_do_not_depend_on_their_number_or_the_lanes(key, equal, monkeyp
     sim = walk()
     short, long = (monte_carlo(key, sim, episodes=n, top=400) for n in (500, 700))
     within = long.failures.simulation < 500
-    assert (
-        sorted(short.failures.simulation) == sorted(long.failures.simulation[within])
-        and short.first_failure == long.first_failure
-    )
+    assert sorted(short.failures.simulation) == sorted(long.failures.simulation[within])
+    assert short.first_failure == long.first_failure
     equal(jax.tree.map(lambda a: a[within], long.failures.episodes), short.failures.episodes)
     monkeypatch.setattr(module, "LANES", 64)
     chunked = monte_carlo(key, sim, episodes=700, top=400)
@@ -122,12 +121,10 @@ def test_kinds_of_disturbances(key, equal, make):
     archive_replays(sim, r, reward_of(r), equal)
     assert r.failing_per_tree.any() == (make is not jast.simulators.landing)
     if make is jast.simulators.landing:
-        assert (
-            r.steps == 30_000
-            and not r.best.failure
-            and r.failures.size == 0
-            and r.first_failure is None
-        )
+        assert r.steps == 30_000
+        assert not r.best.failure
+        assert r.failures.size == 0
+        assert r.first_failure is None
         assert "no failure" in str(r)
     # many repetitions: each distinct failure is kept once, with the times that it was found
     if make is coins:
@@ -139,11 +136,9 @@ def test_kinds_of_disturbances(key, equal, make):
 def test_uniform_actions(key, equal):
     sim = jast.simulators.ferry()
     r = monte_carlo(key, sim, episodes=20_000, **S0)
-    assert (
-        not r.failing_per_tree.any()
-        and 20.9 < r.steps / r.episodes <= 21
-        and -20 < r.best.reward < -13
-    )
+    assert not r.failing_per_tree.any()
+    assert 20.9 < r.steps / r.episodes <= 21
+    assert -20 < r.best.reward < -13
     near = jast.Simulator(
         sim.init,
         sim.step,
@@ -157,16 +152,16 @@ def test_uniform_actions(key, equal):
 def test_invalid_episodes_are_counted_and_never_best(key):
     sim = walk(step=lambda s, x: jnp.where(x > 1.5, jnp.nan, s + x))
     r = monte_carlo(key, sim, episodes=2000, refine=0)
-    assert 0.2 < r.invalid / 2000 < 0.5 and np.isfinite(r.best.reward) and r.failing_per_tree.any()
+    assert 0.2 < r.invalid / 2000 < 0.5
+    assert np.isfinite(r.best.reward)
+    assert r.failing_per_tree.any()
     assert np.isfinite(r.failures.episodes.reward).all() and "invalid" in str(r)
     r = monte_carlo(key, walk(step=lambda s, x: s + jnp.nan), episodes=200)
-    assert (
-        r.invalid == 200
-        and r.steps == 200
-        and r.best.reward == -np.inf
-        and not r.failing_per_tree.any()
-        and r.failures.size == 0
-    )
+    assert r.invalid == 200
+    assert r.steps == 200
+    assert r.best.reward == -np.inf
+    assert not r.failing_per_tree.any()
+    assert r.failures.size == 0
     assert r.best_reward_per_tree == -np.inf
 
 
@@ -210,10 +205,11 @@ def test_under_jit_and_vmap(key):
             r.invalid,
         )
         assert traced.first_failure[i] == (-1 if r.first_failure is None else r.first_failure)
-        assert traced.failing_per_tree[i] == r.failing_per_tree and traced.failing_share[
-            i
-        ] == pytest.approx(r.failing_share)
-    assert traced.failures is None and traced.history is None and traced.settings is None
+        assert traced.failing_per_tree[i] == r.failing_per_tree
+        assert traced.failing_share[i] == pytest.approx(r.failing_share)
+    assert traced.failures is None
+    assert traced.history is None
+    assert traced.settings is None
 
 
 def test_interruption_and_callback(key, equal, monkeypatch):
@@ -226,11 +222,9 @@ def test_interruption_and_callback(key, equal, monkeypatch):
             raise KeyboardInterrupt
 
     r = monte_carlo(key, walk(), episodes=1000, callback=callback)
-    assert (
-        seen == [(128, 1000), (256, 1000)]
-        and r.episodes == 256
-        and r.settings["interrupted"] == "after 256 of 1000 episodes"
-    )
+    assert seen == [(128, 1000), (256, 1000)]
+    assert r.episodes == 256
+    assert r.settings["interrupted"] == "after 256 of 1000 episodes"
     assert "interrupted: after 256" in str(r)
     equal(r.failures, monte_carlo(key, walk(), episodes=256).failures)
     with pytest.raises(KeyboardInterrupt):

@@ -144,10 +144,8 @@ def test_log_does_not_underflow_and_keeps_the_order():
     seen = np.asarray(plain) < -1e-30
     np.testing.assert_allclose(log[seen], -np.log(-exact[seen]), rtol=1e-5)
     assert len(set(np.asarray(log).tolist())) > 490
-    assert (
-        np.isfinite(batch(jax.grad(sierra(log=True)))).all()
-        and np.isfinite(batch(jax.grad(sierra()))).all()
-    )
+    assert np.isfinite(batch(jax.grad(sierra(log=True)))).all()
+    assert np.isfinite(batch(jax.grad(sierra()))).all()
 
 
 def test_branin(dtype):
@@ -165,11 +163,9 @@ def test_branin(dtype):
 def test_ackley_and_paraboloid(d, dtype):
     origin = jnp.zeros(d, dtype)
     slope = jax.jit(jax.grad(ackley))
-    assert (
-        ackley(origin) == paraboloid(origin) == 0
-        and ackley(origin).dtype == paraboloid(origin).dtype == dtype
-        and (slope(origin) == 0).all()
-    )
+    assert ackley(origin) == paraboloid(origin) == 0
+    assert ackley(origin).dtype == paraboloid(origin).dtype == dtype
+    assert (slope(origin) == 0).all()
     value = jax.jit(ackley)
     for x in np.random.default_rng(d).normal(0, 3, (20, d)).astype(dtype):
         v = x.astype(np.float64)
@@ -200,9 +196,8 @@ def test_of_lists_and_whole_numbers_alone_and_in_a_batch(f):
     alone = [one(p) for p in x]
     assert all(v.shape == () for v in alone)
     np.testing.assert_allclose(jax.jit(jax.vmap(f))(x), jnp.stack(alone), rtol=1e-6, atol=1e-6)
-    assert f([1, 2]) == f(jnp.asarray([1.0, 2.0])) and one(jnp.asarray([1, 2])) == one(
-        jnp.asarray([1.0, 2.0])
-    )
+    assert f([1, 2]) == f(jnp.asarray([1.0, 2.0]))
+    assert one(jnp.asarray([1, 2])) == one(jnp.asarray([1.0, 2.0]))
 
 
 @pytest.mark.parametrize(

@@ -45,9 +45,8 @@ def test_of_a_walk():
     assert (about.x.shape, about.x.dtype) == ((), default())
     assert (about.state.shape, about.state.dtype) == ((), default())
     assert about.dtype == default() and about.observation == (1,)
-    assert (
-        about.start == Offer("Fixed", True, "", frozenset({"Fixed"})) and about.disturbance.quantile
-    )
+    assert about.start == Offer("Fixed", True, "", frozenset({"Fixed"}))
+    assert about.disturbance.quantile
 
 
 def test_of_a_tree_of_disturbances_and_a_random_start():

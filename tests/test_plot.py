@@ -89,9 +89,8 @@ def test_disturbances_of_any_structure():
         horizon=4,
     )
     axes = plot.disturbances(jast.rollout(jax.random.key(0), sim))
-    assert [len(drawn(ax).lines) for ax in axes] == [1, 3, 9] and [
-        ax.get_ylabel() for ax in axes
-    ] == ["a", "b", "c"]
+    assert [len(drawn(ax).lines) for ax in axes] == [1, 3, 9]
+    assert [ax.get_ylabel() for ax in axes] == ["a", "b", "c"]
     with pytest.raises(ValueError, match="plot.disturbances: axes must be at least 3"):
         plot.disturbances(jast.rollout(jax.random.key(0), sim), plt.figure().subplots())
     drawn(plot.disturbances(jast.replay(FERRY, jnp.zeros((0,))))[0])

@@ -132,11 +132,9 @@ def test_titles_tell_the_orders_and_the_outcome():
     for t, ax in enumerate(axes):  # what is ordered on a picture is in force in the next step
         assert ax.get_title(loc="left") == f"t = {3 * t} s, ordered {orders[min(t + 1, N)]:.2f} m/s"
     title = axes[0].figure.get_suptitle()
-    assert (
-        "no failure, steps: 25" in title
-        and f"log p {float(EPISODE.log_prob):.3f}" in title
-        and "reward" in title
-    )
+    assert "no failure, steps: 25" in title
+    assert f"log p {float(EPISODE.log_prob):.3f}" in title
+    assert "reward" in title
     assert f"closest approach {float(EPISODE.distance):.2f} m by t = {3 * NEAREST} s" in title
     assert (
         "failure at step 25"
@@ -155,9 +153,8 @@ def test_all_panels_have_the_same_limits_that_hold_the_ways():
 def test_the_legend_stands_beside_the_panels():
     axes = drawn(plot.colav(EPISODE))
     legend = axes[-1].get_legend()
-    assert {t.get_text() for t in legend.get_texts()} == set(labelled(axes[-1])) and len(
-        legend.get_texts()
-    ) == 8
+    assert {t.get_text() for t in legend.get_texts()} == set(labelled(axes[-1]))
+    assert len(legend.get_texts()) == 8
     assert legend.get_window_extent().x0 >= axes[-1].get_window_extent().x1
 
 
@@ -167,9 +164,8 @@ def test_given_axes_are_drawn_into():
     assert all(a is b for a, b in zip(axes, given[:3], strict=True)) and not given[3].lines
     given = plt.figure(layout="constrained").subplots(3)
     axes = drawn(plot.colav_story(EPISODE, axes=given))
-    assert all(a is b for a, b in zip(axes, given, strict=True)) and {
-        ax.get_xlim() for ax in axes
-    } == {(0, 75)}
+    assert all(a is b for a, b in zip(axes, given, strict=True))
+    assert {ax.get_xlim() for ax in axes} == {(0, 75)}
     for draw in (plot.colav, plot.colav_story):
         with pytest.raises(
             ValueError,

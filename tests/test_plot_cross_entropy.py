@@ -125,9 +125,8 @@ def test_default_bounds_hold_the_points_and_given_ones_say_how_many_do_not():
     [ax] = plot.proposal_contours(MIXED, None, iterations=2, bounds=((0, 1), (-1, 2)))
     x = MIXED.history.x[4:8]
     outside = np.sum((x[:, 0] < 0) | (x[:, 0] > 1) | (x[:, 1] < -1) | (x[:, 1] > 2))
-    assert (ax.get_xlim(), ax.get_ylim()) == ((0, 1), (-1, 2)) and [
-        t.get_text() for t in ax.texts
-    ] == [f"{outside} of 4 outside"]
+    assert (ax.get_xlim(), ax.get_ylim()) == ((0, 1), (-1, 2))
+    assert [t.get_text() for t in ax.texts] == [f"{outside} of 4 outside"]
 
 
 def test_a_proposal_that_shrank_to_a_point_is_drawn():
@@ -150,10 +149,8 @@ def test_the_objective_is_drawn_below_whatever_it_is_written_in():
         for f in (paraboloid, outside_jax)
     ]
     np.testing.assert_allclose(areas[0].get_array(), areas[1].get_array(), rtol=1e-4)
-    assert (
-        areas[0].get_array().min() < 1
-        and areas[0].get_zorder() < ellipses(plt.gca())[0].get_zorder()
-    )
+    assert areas[0].get_array().min() < 1
+    assert areas[0].get_zorder() < ellipses(plt.gca())[0].get_zorder()
     for flat in (lambda x: jnp.zeros(()), lambda x: jnp.full((), jnp.nan)):
         assert not drawn(plot.proposal_contours(MIXED, flat, iterations=1))[0].collections
     assert not plot.proposal_contours(MIXED, None, iterations=1)[0].collections
@@ -245,11 +242,9 @@ def test_sierra_is_drawn_as_printed():
 def test_given_axes_are_used_and_settings_left_alone():
     before = dict(matplotlib.rcParams)
     axes = plt.figure().subplots(2, 3)
-    assert (
-        plot.proposal_contours(MIXED, paraboloid, axes) == axes.ravel().tolist()[:3]
-        and not axes[1, 2].lines
-        and axes[1, 2].axison
-    )
+    assert plot.proposal_contours(MIXED, paraboloid, axes) == axes.ravel().tolist()[:3]
+    assert not axes[1, 2].lines
+    assert axes[1, 2].axison
     axes = plt.figure().subplots(1, 2)
     assert plot.surrogate_samples(MODELLED, paraboloid, 1, axes) == list(axes)
     axes = plt.figure().subplots()

@@ -35,10 +35,8 @@ def test_the_failing_arc_is_shown(x64):
     path = fms_path(sim, episode)
     ground, turn = drawn(plot.fms(episode, sim))
     title, other = ground.get_title(loc="left"), turn.get_title(loc="left")
-    assert (
-        "failure at step 12" in title
-        and f"arc length: miss distance {float(episode.distance):,.5g}" in title
-    )
+    assert "failure at step 12" in title
+    assert f"arc length: miss distance {float(episode.distance):,.5g}" in title
     assert "Turn at waypoint 2, 61 ft behind 1" in other and "was not fitted" in other
     [whole] = lines(ground, "predicted path")
     np.testing.assert_allclose(whole[[0, -1]], [KSFO[::-1], KLAX[::-1]], atol=1e-9)
@@ -56,9 +54,8 @@ def test_the_failing_arc_is_shown(x64):
     assert 6.1 < abs(angles[-1] - angles[0]) < 2 * np.pi
     [built] = lines(turn, "as it was built")
     np.testing.assert_allclose(built[-1], arc[-1], atol=1e-6)
-    assert {"s", "e", "c"} <= {text.get_text() for text in turn.texts} and "1, 2" in [
-        text.get_text() for text in ground.texts
-    ]
+    assert {"s", "e", "c"} <= {text.get_text() for text in turn.texts}
+    assert "1, 2" in [text.get_text() for text in ground.texts]
 
 
 def test_other_routes_are_drawn(x64):
@@ -68,9 +65,8 @@ def test_other_routes_are_drawn(x64):
         sim,
         plt.figure(layout="constrained").subplots(1, 2),
     )
-    assert "no failure" in drawn(sound)[0].get_title(loc="left") and "was not fitted" not in sound[
-        1
-    ].get_title(loc="left")
+    assert "no failure" in drawn(sound)[0].get_title(loc="left")
+    assert "was not fitted" not in sound[1].get_title(loc="left")
     drawn(plot.fms(jast.replay(sim, route()[:3]), sim))
     empty = drawn(plot.fms(jast.replay(sim, route()[:0]), sim))
     assert not empty[1].lines and len(lines(empty[0], "predicted path")[0]) == 2
@@ -124,10 +120,8 @@ def test_running_figures():
     np.testing.assert_allclose(mean_line.get_ydata(), [np.nan, 4.5, 1.5, 2])
     np.testing.assert_allclose(least_line.get_ydata(), [np.nan, 4, -2.5, -2.5])
     np.testing.assert_allclose(failure_line.get_ydata(), [0, 0, 1, 1])
-    assert (
-        len(mean.collections) == 1
-        and mean.get_legend().get_texts()[0].get_text() == "mean of 2 trees"
-    )
+    assert len(mean.collections) == 1
+    assert mean.get_legend().get_texts()[0].get_text() == "mean of 2 trees"
     band = mean.collections[0].get_paths()[0].vertices  # quartiles of 3 and 6, 1 and 2, 2 and 2
     assert band[:, 1].max() == pytest.approx(5.25) and band[:, 1].min() == pytest.approx(1.25)
 
@@ -144,20 +138,17 @@ def test_running_figures_of_several_searches():
         "many: mean of 20 trees",
     ]
     one, many = axes[2].lines
-    assert (
-        len(one.get_xdata()) == 2000
-        and one.get_xdata()[-1] == 5000
-        and one.get_ydata()[-1] == (results["one"].trials.distance <= 0).sum()
-    )
+    assert len(one.get_xdata()) == 2000
+    assert one.get_xdata()[-1] == 5000
+    assert one.get_ydata()[-1] == (results["one"].trials.distance <= 0).sum()
     assert many.get_ydata()[-1] == pytest.approx((results["many"].trials.distance <= 0).sum() / 20)
 
 
 def test_ends_that_a_tree_knew_are_left_out():
     ran = [[True], [True], [False], [True]]
     axes = plot.trials(recorded([[4.0], [-2.0], [-2.0], [7.0]], ran))
-    assert (
-        list(axes[2].lines[0].get_ydata()) == [0, 1, 1, 1] and axes[0].lines[0].get_ydata()[-1] == 3
-    )
+    assert list(axes[2].lines[0].get_ydata()) == [0, 1, 1, 1]
+    assert axes[0].lines[0].get_ydata()[-1] == 3
     top, bottom = plot.trial_distances(recorded([[4.0], [-2.0], [-2.0], [7.0]], ran))
     assert top.get_legend().get_texts()[0].get_text() == "3 episodes, 1 fail"
 
@@ -172,9 +163,8 @@ def test_distributions_of_trials():
     ]
     assert [t.get_text() for t in bottom.get_legend().get_texts()] == ["few: mean -4.5"]
     shares = [patch.get_data().values for patch in top.patches]
-    assert len(shares) == 4 and all(
-        share.sum() == pytest.approx(1) and len(share) == 8 for share in shares
-    )
+    assert len(shares) == 4
+    assert all(share.sum() == pytest.approx(1) and len(share) == 8 for share in shares)
     assert shares[0][0] == pytest.approx(2 / 6)  # both failures
     assert "none" in [
         t.get_text() for t in drawn(plot.trial_distances(recorded(np.full((9, 2), 5.0))))[1].texts

@@ -65,13 +65,12 @@ def test_an_estimate_and_its_interval_are_where_the_numbers_say():
     ax = drawn(plot.probability(e, 1.1e-9))
     truth, interval, dot = ax.lines
     assert ax.get_xscale() == "log" and ax.get_xlabel() == "failure probability"
-    assert (
-        tuple(interval.get_xdata()) == e.interval
-        and list(dot.get_xdata()) == [e.mean]
-        and list(truth.get_xdata()) == [1.1e-9] * 2
-    )
+    assert tuple(interval.get_xdata()) == e.interval
+    assert list(dot.get_xdata()) == [e.mean]
+    assert list(truth.get_xdata()) == [1.1e-9] * 2
     assert [label.get_text() for label in ax.get_yticklabels()] == ["made"]
-    assert words(ax) == ["1e-09  SE 10 %"] and legend(ax) == [
+    assert words(ax) == ["1e-09  SE 10 %"]
+    assert legend(ax) == [
         "truth 1.1e-09",
         "estimate, 0.95 interval",
     ]
@@ -80,8 +79,12 @@ def test_an_estimate_and_its_interval_are_where_the_numbers_say():
 def test_what_is_not_to_be_believed_is_drawn_otherwise_and_named():
     ax = drawn(plot.probability({"good": made(), "bad": made(reliable=False)}))
     good, dot, bad, cross = ax.lines
-    assert good.get_color() == BLUE and not good.is_dashed() and dot.get_marker() == "o"
-    assert bad.get_color() == VERMILION and bad.is_dashed() and cross.get_marker() == "X"
+    assert good.get_color() == BLUE
+    assert not good.is_dashed()
+    assert dot.get_marker() == "o"
+    assert bad.get_color() == VERMILION
+    assert bad.is_dashed()
+    assert cross.get_marker() == "X"
     assert words(ax) == ["1e-09  SE 10 %", "1e-09  UNRELIABLE"] and "UNRELIABLE" in legend(ax)
     flagged = made(reliable=False)._replace(plain=(0, 0, 1_000_000))
     counted = flagged._replace(chernoff=0.1, jeffreys=0.1)
@@ -110,11 +113,9 @@ def test_several_seeds_share_a_row():
 def test_no_failure_is_an_upper_bound():
     ax = drawn(plot.probability({"nominal": NOTHING}))
     [bound] = ax.lines
-    assert (
-        list(bound.get_xdata()) == [3.7e-6]
-        and words(ax) == ["below 3.7e-06"]
-        and "upper bound" in legend(ax)[0]
-    )
+    assert list(bound.get_xdata()) == [3.7e-6]
+    assert words(ax) == ["below 3.7e-06"]
+    assert "upper bound" in legend(ax)[0]
     ax = drawn(plot.probability({"none": NOTHING._replace(interval=(0.0, 1.0)), "one": made()}))
     assert words(ax)[0] == "no failure seen" and len(ax.lines) == 2
     assert plot.probability(made(interval=(1e-320, 1e-8))).lines[0].get_xdata()[0] > 0
@@ -154,16 +155,16 @@ def test_a_fan_replays_every_failure():
     assert {line.get_color() for line in lines} == {BLUE, VERMILION}
     for line in lines:  # the side is that of the end
         assert (line.get_ydata()[-1] > 0) == (line.get_color() == BLUE)
-    assert (
-        sum(int(text.split()[0]) for text in legend(ax)[1:]) == len(FAILED.length)
-        and legend(ax)[0] == "120 nominal episodes"
-    )
+    assert sum(int(text.split()[0]) for text in legend(ax)[1:]) == len(FAILED.length)
+    assert legend(ax)[0] == "120 nominal episodes"
 
 
 def test_a_fan_of_miss_distances():
     ax = drawn(plot.failure_fan(FailureSamples(FAILED, 5.0, 5, 0.5, 100), WALK, most=3))
     lines = [line for line in ax.lines if len(line.get_xdata()) and line.get_linestyle() != "None"]
-    assert len(lines) == 3 and legend(ax) == ["3 failures"] and ax.get_ylabel() == "miss distance"
+    assert len(lines) == 3
+    assert legend(ax) == ["3 failures"]
+    assert ax.get_ylabel() == "miss distance"
     assert all(line.get_ydata()[-1] == 0 for line in lines)
     given = plt.figure().subplots()
     assert plot.failure_fan(FAILED, WALK, ax=given) is given

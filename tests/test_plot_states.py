@@ -45,7 +45,9 @@ def test_names_of_any_pytree():
     ]
     assert found[0].values.shape == (2, 3)
     [whole] = fields(np.array([True, False]), "state")
-    assert whole.name == "state" and whole.entries == [""] and whole.values.tolist() == [[1], [0]]
+    assert whole.name == "state"
+    assert whole.entries == [""]
+    assert whole.values.tolist() == [[1], [0]]
     assert fields({"deep": {"speed": np.zeros(1)}}, "s")[0].name == "deep.speed"
 
 

@@ -186,9 +186,8 @@ def test_roc_curves_are_those_of_the_scores():
             curve.get_xydata(), np.stack([expected.false_positive, expected.true_positive], 1)
         )
     light = [sum(matplotlib.colors.to_rgb(curve.get_color())) for curve in ax.lines[1:]]
-    assert (np.diff(light) < 0).all() and (
-        np.diff([curve.get_linewidth() for curve in ax.lines[1:]]) > 0
-    ).all()
+    assert (np.diff(light) < 0).all()
+    assert (np.diff([curve.get_linewidth() for curve in ax.lines[1:]]) > 0).all()
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), [[0, 0], [1, 1]])
     assert words(ax) == ["chance"] and ax.get_aspect() == 1
     for given, names in (
@@ -259,7 +258,9 @@ def test_the_grid_takes_names_and_colours():
 
 def test_the_grid_of_no_failure_says_so():
     [ax] = drawn(plot.first_failures(NOTHING, IMAGES, LABELS))
-    assert words(ax) == ["no failure found"] and not ax.axison and not ax.images
+    assert words(ax) == ["no failure found"]
+    assert not ax.axison
+    assert not ax.images
 
 
 def test_the_influence_of_columns_is_bars_from_the_greatest():

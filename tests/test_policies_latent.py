@@ -119,7 +119,10 @@ def test_the_shaping_telescopes_and_a_failure_counts_as_no_distance():
         far.init, far.step, far.disturbance, lambda s: (s > 3.0, jnp.abs(10.0 - s)), far.horizon
     )
     lane, rows, _ = play(far, (), [3.5])
-    assert lane.failed and lane.over and float(rows.approach[0]) == 10.0 and rows.done[0]
+    assert lane.failed
+    assert lane.over
+    assert float(rows.approach[0]) == 10.0
+    assert rows.done[0]
 
 
 def test_only_the_last_distance_counts_where_shaping_is_at_the_end():
@@ -154,7 +157,10 @@ def test_an_episode_is_judged_as_a_rollout_is(key):
 def test_a_start_that_ends_the_episode_gives_no_transition():
     sim = walk(lambda x0: x0, start=lambda: D.Normal(jnp.zeros(()), 1.0))
     lane, _, flags = play(sim, jnp.asarray(4.0), [1.0])
-    assert lane.over and lane.failed and flags == [(False, False)] and int(lane.t) == 0
+    assert lane.over
+    assert lane.failed
+    assert flags == [(False, False)]
+    assert int(lane.t) == 0
 
 
 @pytest.mark.parametrize("where", ["step", "evaluate", "observe", "init"])
@@ -172,7 +178,9 @@ def test_what_is_not_finite_is_invalid_and_ends_the_episode(where):
             sim.init, sim.step, sim.disturbance, lambda s: (s > 3.0, bad(3.0 - bad(s))), sim.horizon
         )
     lane, _, flags = play(sim, (), [2.0])
-    assert flags == [(False, True)] and lane.over and not lane.failed
+    assert flags == [(False, True)]
+    assert lane.over
+    assert not lane.failed
 
 
 def test_the_ring_buffer_holds_the_latest_valid_rows():

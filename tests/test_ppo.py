@@ -47,7 +47,9 @@ def test_advantages_are_the_sums_that_define_them(trace, dtype):
     given = X.advantages(
         *map(jnp.asarray, (reward.astype(dtype), value.astype(dtype))), done, valid, trace
     )
-    assert given.dtype == dtype and (done & valid).any() and (~valid).any()
+    assert given.dtype == dtype
+    assert (done & valid).any()
+    assert (~valid).any()
     expected = np.stack(
         [plain(*(a[:, i] for a in (reward, value, done, valid)), trace) for i in range(5)], 1
     )
@@ -183,7 +185,9 @@ def test_two_modes_from_a_random_start_that_is_far_from_both():
     policy = ppo(jax.random.key(0), sim)
     r = importance(jax.random.key(100), sim, policy_proposal(sim, policy), 20_000)
     error = abs(r.mean / 4.0236721906842e-13 - 1)
-    assert r.reliable and r.relative_error < 0.04 and error < min(0.1, 4 * r.relative_error)
+    assert r.reliable
+    assert r.relative_error < 0.04
+    assert error < min(0.1, 4 * r.relative_error)
     means = np.asarray(policy.learned.tilt.means)[:, 0]
     up = np.asarray(policy.learned.tilt.weights)[means > 0].sum()
     assert 0.3 < up < 0.7

@@ -28,11 +28,9 @@ def test_contract(name):
         with jax.enable_x64(enabled):
             episode = jax.eval_shape(jast.rollout, jax.random.key(0), ALL[name]())
             leaves = [a for a in jax.tree.leaves(episode) if jnp.issubdtype(a.dtype, jnp.floating)]
-            assert (
-                leaves
-                and all(a.dtype == expected for a in leaves)
-                and episode.length.dtype == jnp.int32
-            )
+            assert leaves
+            assert all(a.dtype == expected for a in leaves)
+            assert episode.length.dtype == jnp.int32
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -110,9 +108,9 @@ def test_pendulum_truth(key):
     n, truth = 100_000, 8.169e-3
     error = np.sqrt(truth / n)
     found = jast.nominal(key, pendulum(), n)
-    assert (
-        abs(found.rate - truth) < 4 * error and not found.undisturbed.failure and found.invalid == 0
-    )
+    assert abs(found.rate - truth) < 4 * error
+    assert not found.undisturbed.failure
+    assert found.invalid == 0
     assert abs(in_numpy(np.random.default_rng(0), n).mean() - truth) < 4 * error
 
 
@@ -122,16 +120,17 @@ def test_pendulum_step():
             PendulumState(jnp.asarray(0.3), jnp.asarray(7.99)), jnp.asarray([0.1, -0.2])
         )  # torque at its bound
         omega = 7.99 + 0.05 * (15 * np.sin(0.3) - 6)
-        assert float(s.theta) == pytest.approx(0.3 + 0.05 * omega, rel=1e-12) and float(
-            s.omega
-        ) == pytest.approx(min(omega, 8), rel=1e-12)
+        assert float(s.theta) == pytest.approx(0.3 + 0.05 * omega, rel=1e-12)
+        assert float(s.omega) == pytest.approx(min(omega, 8), rel=1e-12)
         fast = pendulum().step(
             PendulumState(jnp.asarray(0.7), jnp.asarray(7.99)), jnp.asarray([-2.0, -2.0])
         )
         # moved before its speed was cut
         assert float(fast.omega) == 8 and float(fast.theta) > 0.7 + 0.05 * 8
     start = jast.replay(pendulum(), jnp.zeros((1, 2)), x0=jnp.asarray([-0.8, 0.0]))
-    assert bool(start.failure) and int(start.length) == 0 and float(start.distance) == 0
+    assert bool(start.failure)
+    assert int(start.length) == 0
+    assert float(start.distance) == 0
 
 
 # autoregression
@@ -152,9 +151,8 @@ def first_passage(nodes, a, threshold, steps):
 
 def test_autoregression_truth(key):
     coarse, fine = (first_passage(n, np.exp(-0.1), 5.0, 100) for n in (150, 220))
-    assert coarse == pytest.approx(fine, rel=1e-9) and fine == pytest.approx(
-        1.7438880336e-5, rel=1e-9
-    )
+    assert coarse == pytest.approx(fine, rel=1e-9)
+    assert fine == pytest.approx(1.7438880336e-5, rel=1e-9)
     p, n = first_passage(150, np.exp(-0.2), 2.5, 100), 20_000
     assert abs(jast.nominal(key, autoregression(0.2, 2.5), n).rate - p) < 4 * np.sqrt(
         p * (1 - p) / n
@@ -179,9 +177,8 @@ def test_ruin_truth(key):
         fair, good = jax.jit(jax.vmap(lambda up: ruin_probability(up, 3, 12)))(
             jnp.asarray([0.5, 0.6])
         )
-        assert float(fair) == 0.25 and float(good) == pytest.approx(
-            ((2 / 3) ** 3 - 1) / ((2 / 3) ** 12 - 1), rel=1e-12
-        )
+        assert float(fair) == 0.25
+        assert float(good) == pytest.approx(((2 / 3) ** 3 - 1) / ((2 / 3) ** 12 - 1), rel=1e-12)
     # 1e-70: nothing overflows to NaN
     assert float(jax.jit(ruin_probability, static_argnums=(1, 2))(jnp.float32(0.3), 10, 200)) == 0
     p, n = float(ruin_probability(0.45, 2, 6, horizon=30)), 20_000
@@ -245,9 +242,8 @@ def test_family(family):
     drawn = [limit_states.draw(family, seed) for seed in range(4)]
     assert all(0.99e-12 < c.truth < 1.1e-2 for c in drawn) and len({c.truth for c in drawn}) == 4
     again = limit_states.draw(family, 0)
-    assert again.truth == drawn[0].truth and jax.tree.structure(
-        again.simulator
-    ) == jax.tree.structure(drawn[0].simulator)
+    assert again.truth == drawn[0].truth
+    assert jax.tree.structure(again.simulator) == jax.tree.structure(drawn[0].simulator)
     shapes = lambda sim: (jax.tree.structure(sim), *(a.shape for a in jax.tree.leaves(sim)))
     assert len({shapes(limit_states.draw(family, seed).simulator) for seed in range(12)}) <= 8
     limit = limit_states.limit(family, 0)

@@ -96,7 +96,10 @@ def test_cells_of_the_users_own_and_numbers_that_are_not_finite():
     cell = lambda seen, t: jnp.where(seen[0] > 0, 1, 0) + 2 * t
     policy = q_learning(KEY, sim, episodes=64, cells=4, cell=cell, values=3)
     q = np.asarray(policy.learned.actor.q)
-    assert q.shape == (4, 3) and np.all(np.isfinite(q)) and np.all(q <= 0) and np.any(q < 0)
+    assert q.shape == (4, 3)
+    assert np.all(np.isfinite(q))
+    assert np.all(q <= 0)
+    assert np.any(q < 0)
     assert policy.invalid > 0
     # a push up ends the episode in NaN, so nothing was learned of it
     assert policy.learned.actor.actions[-1] == 3 and np.all(q[:, -1] == 0)

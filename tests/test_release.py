@@ -52,7 +52,9 @@ def test_the_citation_has_what_its_format_requires():
         assert citation[key].strip()
     assert citation["license"] == PROJECT["project"]["license"]
     for reference in [citation, *citation["references"]]:
-        assert reference["type"] and reference["title"] and reference["authors"]
+        assert reference["type"]
+        assert reference["title"]
+        assert reference["authors"]
         for author in reference["authors"]:  # an entity has a name, a person other fields
             assert set(author) <= {"name"} or set(author) <= {"family-names", "given-names"}
 

@@ -165,7 +165,9 @@ def test_a_repr_does_not_raise_whatever_the_leaves_are():
 
 def test_html_is_escaped():
     table = results.html_table("a<b", {"x": "<script>"})
-    assert "<script>" not in table and "&lt;script&gt;" in table and "a&lt;b" in table
+    assert "<script>" not in table
+    assert "&lt;script&gt;" in table
+    assert "a&lt;b" in table
 
 
 # the archive is a sequence
@@ -180,7 +182,9 @@ def test_an_archive_is_a_sequence_of_episodes(equal):
     assert len(every) == 64
     equal(every[5], archive[5])
     few = archive[3:7]
-    assert isinstance(few, jast.failures.Failures) and len(few) == 4 and few.seen == archive.seen
+    assert isinstance(few, jast.failures.Failures)
+    assert len(few) == 4
+    assert few.seen == archive.seen
     equal(few[1], archive[4])
     np.testing.assert_array_equal(few.simulation, archive.simulation[3:7])
     with pytest.raises(IndexError, match="within the 64 episodes held, received 64"):

@@ -47,12 +47,10 @@ def test_defaults():
 def test_a_schedule_spends_its_budget(budget, iterations, p, normaliser):
     for schedule in (schedules.uniform(), schedules.geometric(p, normaliser)):
         sizes = schedule(budget, iterations)
-        assert (
-            len(sizes) == iterations
-            and sum(sizes) == budget
-            and min(sizes) >= 0
-            and all(type(n) is int for n in sizes)
-        )
+        assert len(sizes) == iterations
+        assert sum(sizes) == budget
+        assert min(sizes) >= 0
+        assert all(type(n) is int for n in sizes)
         assert list(sizes[:-1]) == sorted(sizes[:-1], reverse=True)
 
 

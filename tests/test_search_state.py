@@ -66,7 +66,9 @@ def test_a_proposal_promises_what_its_draws_are_worth(family):
         true = norm.sf(BETA) ** 2 / (np.exp(mean**2) * norm.sf(BETA + mean))
         said = promise(state, log_ratios(family, at(family, mean), state.batches))
         assert said == pytest.approx(true, rel=0.1)
-    assert state.q is state.batches[0].q and serves(state, 0.2) and not serves(state, 0.5)
+    assert state.q is state.batches[0].q
+    assert serves(state, 0.2)
+    assert not serves(state, 0.5)
 
 
 def test_the_model_itself_does_not_serve(key):
@@ -107,8 +109,12 @@ def test_adapting_keeps_to_its_end(family):
 def test_a_state_goes_on_to_another_family(family):
     state = searched(family, 3.0).noted("a", 7).against("b")._replace(plain=(1, 2, 3))
     new = state.carried()
-    assert new.spent == 7 and new.history == ("a, 7 evaluations",) and new.plain == (1, 2, 3)
-    assert new.q is None and not new.batches and not new.reasons
+    assert new.spent == 7
+    assert new.history == ("a, 7 evaluations",)
+    assert new.plain == (1, 2, 3)
+    assert new.q is None
+    assert not new.batches
+    assert not new.reasons
 
 
 @pytest.mark.parametrize("kind", [GaussianFamily, TiltFamily])
@@ -135,7 +141,9 @@ def test_points_of_tilts_are_played_again(key):
     assert state.spent == 300 and len(points.length) == o.failure.sum() > 10
     np.testing.assert_array_equal(points.length, np.asarray(o.length)[np.asarray(o.failure)])
     state, same = GaussianFamily(f.sim, 10_000, begun(key)).points_of(State(), z, z[:, 0])
-    assert state.spent == 0 and isinstance(same, Points) and len(same.z) == 300
+    assert state.spent == 0
+    assert isinstance(same, Points)
+    assert len(same.z) == 300
 
 
 def test_every_number_of_the_search_has_its_reason():

@@ -201,12 +201,10 @@ def test_latent_is_finite(dtype):
             jnp.asarray([-1.0, 0.0, tiny, 0.5, 1.0, 2.0], dtype)
         )
     )
-    assert (
-        np.isfinite(z).all()
-        and (np.diff(z[2:]) >= 0).all()
-        and z[3] == 0
-        and z[0] == z[1] < -5 < 5 < z[4] == z[5]
-    )
+    assert np.isfinite(z).all()
+    assert (np.diff(z[2:]) >= 0).all()
+    assert z[3] == 0
+    assert z[0] == z[1] < -5 < 5 < z[4] == z[5]
     assert normal_score(jnp.asarray([0.5, 1.0], dtype)).dtype == dtype
 
 

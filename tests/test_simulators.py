@@ -45,7 +45,9 @@ def test_contract(name, key):
     sim = ALL[name]()
     assert jast.check(sim) is sim
     found = jast.nominal(key, sim, episodes=1000)
-    assert found.invalid == 0 and not found.undisturbed.failure and found.rate < 0.2
+    assert found.invalid == 0
+    assert not found.undisturbed.failure
+    assert found.rate < 0.2
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -100,9 +102,8 @@ def test_walk_likeliest_failures():
 def test_walk_parameters():
     assert walk1d(horizon=5).horizon == 5 and walk1d("one-sided").horizon == 10
     below = jnp.asarray([-6.0, -6.0])
-    assert bool(jast.replay(walk1d(), below).failure) and not bool(
-        jast.replay(walk1d("one-sided"), below).failure
-    )
+    assert bool(jast.replay(walk1d(), below).failure)
+    assert not bool(jast.replay(walk1d("one-sided"), below).failure)
     assert float(jast.replay(walk1d("one-sided"), below).distance) == 10
 
 
@@ -130,11 +131,9 @@ def test_landing_likeliest_failure():
     with jax.enable_x64(True):
         x0, x = 0.01 / 0.019, 0.0009 / 0.019
         episode = jast.replay(landing(), jnp.full((10,), x * (1 + 1e-9)), x0=jnp.asarray(x0))
-        assert (
-            bool(episode.failure)
-            and float(episode.states.x1[-1]) == 10
-            and float(episode.distance) == 0
-        )
+        assert bool(episode.failure)
+        assert float(episode.states.x1[-1]) == 10
+        assert float(episode.distance) == 0
         expected = scipy.stats.norm.logpdf(x0, scale=0.1) + 10 * scipy.stats.norm.logpdf(
             x, scale=0.03
         )
@@ -158,9 +157,8 @@ def test_limit_state():
     assert float(hit.log_prob) == pytest.approx(scipy.stats.norm.logpdf(2.6) * 4, rel=1e-5)
     # not asked at the origin
     assert not bool(jast.rollout(jax.random.key(0), limit_state(lambda x: x[0] ** 2, 1)).failure)
-    assert sim.observe(jnp.zeros(4)).shape == (4,) and limit_state(plane, 200).observe(
-        jnp.zeros(200)
-    ).shape == (64,)
+    assert sim.observe(jnp.zeros(4)).shape == (4,)
+    assert limit_state(plane, 200).observe(jnp.zeros(200)).shape == (64,)
 
 
 def test_limit_state_truths():

@@ -204,7 +204,9 @@ def test_which_part_broke_and_when():
     assert not by_name["always[0, 1] (y > 0)"].decides and by_name["always[0, 1] (y > 0)"].held
     np.testing.assert_array_equal(by_name["x > 0"].values, SAMPLES)
     text = str(found)
-    assert "does not" in text and "x > 0" in text and len(text.splitlines()) == 8
+    assert "does not" in text
+    assert "x > 0" in text
+    assert len(text.splitlines()) == 8
 
 
 def test_a_long_formula_prints_whole():

@@ -209,7 +209,9 @@ def test_a_system_that_ends_early_has_a_shorter_trace():
         assert float(e.distance) >= distance and not goes_on(e)
     calm = under(sim, always(high(-1.0), 0, 6))
     certain, whole = jast.replay(calm, x), jast.replay(calm, 0 * x)
-    assert goes_on(certain) and int(certain.length) == 1 and not goes_on(whole)
+    assert goes_on(certain)
+    assert int(certain.length) == 1
+    assert not goes_on(whole)
     with pytest.raises(ValueError, match="goes_on: episode must be a jast.replay"):
         goes_on(jast.replay(sim, x))
 

@@ -21,11 +21,9 @@ def test_points_of_a_walk(dtype):
     / 2 up to the failure.
     """
     s = over(walk())
-    assert (
-        s.proposal.mean.shape == (6,)
-        and s.proposal.mean.dtype == dtype
-        and (s.proposal.covariance == np.eye(6)).all()
-    )
+    assert s.proposal.mean.shape == (6,)
+    assert s.proposal.mean.dtype == dtype
+    assert (s.proposal.covariance == np.eye(6)).all()
     z = jnp.asarray(
         [
             [0.5, 0.5, 0.0, -3.0, 0.0, 0.0],
@@ -37,17 +35,14 @@ def test_points_of_a_walk(dtype):
     )
     value = jax.jit(jax.vmap(s.objective))(z)
     np.testing.assert_allclose(value, [2, -1 / 4.125, -1 / 3.125, -1 / 41.5], rtol=1e-5)
-    assert value.dtype == dtype and [float(s.objective(row)) for row in z] == pytest.approx(
-        value.tolist(), rel=1e-5
-    )
+    assert value.dtype == dtype
+    assert [float(s.objective(row)) for row in z] == pytest.approx(value.tolist(), rel=1e-5)
     e = s.episode(z[1])
-    assert (
-        e.failure
-        and e.length == 2
-        and e.disturbances[:3].tolist() == [2, 1.5, 0]
-        and float(e.reward) == pytest.approx(-3.125)
-        and e.states is not None
-    )
+    assert e.failure
+    assert e.length == 2
+    assert e.disturbances[:3].tolist() == [2, 1.5, 0]
+    assert float(e.reward) == pytest.approx(-3.125)
+    assert e.states is not None
 
 
 def test_failures_before_the_rest_whatever_the_units(key):
@@ -146,13 +141,11 @@ def test_no_mode_and_no_density():
 def test_what_is_not_finite_is_nan_and_counted(key):
     s = over(walk(step=lambda s, x: jnp.where(x > 1.0, jnp.nan, s + x)))
     r = ce_method(key, s.objective, s.proposal, **METHOD)
-    assert 0 < int(r.invalid) == np.isnan(np.asarray(r.history.value)).sum() < 300 and np.isfinite(
-        r.best_value
-    )
+    assert 0 < int(r.invalid) == np.isnan(np.asarray(r.history.value)).sum() < 300
+    assert np.isfinite(r.best_value)
     with_reward = over(s.sim, reward=rewards.standard())
-    assert np.isnan(with_reward.objective(jnp.full(6, 2.0))) and np.isnan(
-        s.objective(jnp.full(6, 2.0))
-    )
+    assert np.isnan(with_reward.objective(jnp.full(6, 2.0)))
+    assert np.isnan(s.objective(jnp.full(6, 2.0)))
     outside = over(jast.simulators.ferry(), actions=actions.uniform(2.0, 3.0))  # p(x | s) = 0 there
     assert np.isnan(outside.objective(jnp.zeros(21)))
 
@@ -173,11 +166,9 @@ def test_surrogate_beats_random_search_on_the_ferry(key, equal):
     e = s.episode(r.best_x)
     assert e.failure and float(r.best_value) == pytest.approx(-1 / (1 - float(e.reward)), rel=1e-4)
     found = s.failures(r, top=5)
-    assert (
-        found.size == 5
-        and found.seen == (np.asarray(r.history.value) < 0).sum()
-        and (np.diff(found.episodes.reward) <= 0).all()
-    )
+    assert found.size == 5
+    assert found.seen == (np.asarray(r.history.value) < 0).sum()
+    assert (np.diff(found.episodes.reward) <= 0).all()
     assert r.history.value[found.simulation[0]] == r.best_value
     again = jax.device_get(jast.replay(s.sim, found.best, reward=s.reward)._replace(states=None))
     equal(again, found.best)
@@ -191,11 +182,9 @@ def test_batches_of_runs(key):
         jax.random.split(key, 3)
     )
     found = s.failures(r, top=100)
-    assert (
-        found.seen == (np.asarray(r.history.value) < 0).sum()
-        and set(found.tree) <= {0, 1, 2}
-        and found.simulation.max() < 300
-    )
+    assert found.seen == (np.asarray(r.history.value) < 0).sum()
+    assert set(found.tree) <= {0, 1, 2}
+    assert found.simulation.max() < 300
     assert float(found.best.reward) == pytest.approx(float(1 + 1 / r.best_value.min()), rel=1e-4)
     sims = jax.vmap(lambda a: jast.simulators.walk1d("one-sided", threshold=a))(
         jnp.asarray([2.0, 8.0])

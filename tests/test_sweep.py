@@ -265,7 +265,9 @@ def test_where_there_is_no_crossing_the_error_says_why():
     one = table_of([0.0, 1.0, 2.0, 3.0], [200, 101, 99, 20]).crossing(0.1)
     assert 1 < one.value < 2
     noisy = table_of([0.0, 1.0, 2.0, 3.0], [120, 98, 103, 80]).crossing(0.1)
-    assert 0.5 < noisy.value < 2.5 and noisy.interval[0] < 1 and noisy.interval[1] > 2
+    assert 0.5 < noisy.value < 2.5
+    assert noisy.interval[0] < 1
+    assert noisy.interval[1] > 2
     assert math.isinf(table_of([0.0, 1.0], [11, 9]).crossing(0.01).interval[0])
 
 
@@ -311,7 +313,9 @@ def test_the_picture(key):
     table = table_of([0.0, 1.0, 2.0, 3.0], [300, 100, 30, 0])
     ax = table.plot(level=0.05, truth=lambda x: 0.3 * np.exp(-1.1 * x))
     labels = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert labels[0] == "probability" and "no failure seen: below" in labels and "truth" in labels
+    assert labels[0] == "probability"
+    assert "no failure seen: below" in labels
+    assert "truth" in labels
     assert ax.get_yscale() == "log" and ax.get_xlabel() == "gain"
     with pytest.raises(ValueError, match="plot.sweep: table must be a Sweep, received int"):
         jast.plot.sweep(3)

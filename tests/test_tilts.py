@@ -104,7 +104,10 @@ def test_parts_of_a_joint():
     )
     z, i = jnp.asarray([0.5, 1.0, -1.0, 2.0]), jnp.asarray([1, 0, 2], jnp.int32)
     x = assembled(p, z, i)
-    assert x["b"].tolist() == [1, 0] and x["c"] == 2 and x["n"] == 2 and x["w"] == 7
+    assert x["b"].tolist() == [1, 0]
+    assert x["c"] == 2
+    assert x["n"] == 2
+    assert x["w"] == 7
     assert x["v"].tolist() == [1, -1]
     like = D.sample(d, jax.random.key(0))
     assert jax.tree.map(lambda a: (a.shape, a.dtype), x) == jax.tree.map(

@@ -156,9 +156,7 @@ def test_nodes_open_in_a_browser(found, tmp_path):
     children = [len(nodes.children(n)) for n in nodes.path]
     assert seen["best"] == len(nodes.path) and seen["before"] == 1 + sum(children)
     assert seen["visits"] == seen["again"] == nodes.visits[nodes.children(0)].tolist()
-    assert (
-        seen["closed"] == 1
-        and seen["more"] > 0
-        and seen["marked"] == "\N{BLACK DOWN-POINTING SMALL TRIANGLE}"
-    )
+    assert seen["closed"] == 1
+    assert seen["more"] > 0
+    assert seen["marked"] == "\N{BLACK DOWN-POINTING SMALL TRIANGLE}"
     assert seen["action"].startswith("gust = ") and "hit = " in seen["action"]  # of x0

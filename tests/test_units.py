@@ -326,14 +326,18 @@ def test_a_system_is_not_asked_again(name, key, same, tmp_path, monkeypatch):
 def test_a_unit_that_fails_elsewhere_is_tried_again():
     flaky = Flaky(2)
     ran = squares(executor=flaky)
-    assert ran.state == (0, 1, 4, 9, 16) and ran.left_out == () and ran.incidents == ()
+    assert ran.state == (0, 1, 4, 9, 16)
+    assert ran.left_out == ()
+    assert ran.incidents == ()
     assert set(flaky.tries.values()) == {3}
 
 
 def test_a_unit_that_goes_on_failing_is_left_out_and_told():
     with ThreadPoolExecutor(2) as executor:
         ran = squares(function=fails, executor=executor)
-    assert ran.state == (0, 4, 9, 16) and ran.left_out == (1,) and ran.done == 5
+    assert ran.state == (0, 4, 9, 16)
+    assert ran.left_out == (1,)
+    assert ran.done == 5
     (incident,) = ran.incidents
     assert "ZeroDivisionError: one" in str(incident) and "make the same call again" in str(incident)
     assert "units 1 are left out" in units.note("units", ran, 4, 5)

@@ -57,7 +57,9 @@ def test_the_bar_says_how_far(capsys):
         watch.reach(12, failures=3)
         watch.more(8)
     text = capsys.readouterr().err
-    assert "search: " in text and "20/20" in text and "failures=3" in text
+    assert "search: " in text
+    assert "20/20" in text
+    assert "failures=3" in text
 
 
 def test_the_bar_says_what_the_work_is_at(capsys):

@@ -105,9 +105,8 @@ def test_every_input_is_asked_at_most_once_and_every_call_is_counted(n, budget, 
         result.predicted, np.where(np.isin(np.arange(n), result.order), answers, -1)
     )
     assert sorted(result.ranked.tolist() + result.order.tolist()) == list(range(n))
-    assert result.history.calls[-1] == result.calls and result.history.found[-1] == len(
-        result.failures
-    )
+    assert result.history.calls[-1] == result.calls
+    assert result.history.found[-1] == len(result.failures)
 
 
 def test_random_choice_expects_what_its_rate_says():
@@ -198,10 +197,8 @@ def test_an_interrupted_validation_goes_on_as_if_it_had_not_been(at, error):
         part = validate(KEY, system, inputs, labels, selector=in_turn())
     assert len(part.incidents) == 1 and part.calls == len(system.asked) < 60
     if isinstance(error, RuntimeError):
-        assert (
-            "RuntimeError: out of memory" in part.incidents[0]
-            and f"[{at // 7 * 7}, " in part.incidents[0]
-        )
+        assert "RuntimeError: out of memory" in part.incidents[0]
+        assert f"[{at // 7 * 7}, " in part.incidents[0]
         assert "out of memory" in str(part)
     rest = validate(
         jax.random.key(99), system, inputs, labels, selector=in_turn(), state=part.state
@@ -282,12 +279,10 @@ def test_answers_that_an_iteration_does_not_ask_for_again_are_kept():
     mind.append(True)
     result = validate(KEY, system, inputs, labels, selector=changing, budget=50, state=part.state)
     assert len(system.asked) == len(set(system.asked.tolist())) == result.calls == 50
-    assert result.history.calls.tolist() == [25, 40, 50] and set(range(10)) <= set(
-        result.order.tolist()
-    )
-    assert result.state.complete == 50 and sorted(
-        result.ranked.tolist() + result.order.tolist()
-    ) == list(range(60))
+    assert result.history.calls.tolist() == [25, 40, 50]
+    assert set(range(10)) <= set(result.order.tolist())
+    assert result.state.complete == 50
+    assert sorted(result.ranked.tolist() + result.order.tolist()) == list(range(60))
 
 
 def test_a_larger_budget_goes_on():
@@ -335,7 +330,9 @@ def test_a_selector_may_pause():
         labels,
         selector=Selector("pauses", {}, lambda key, data: {"turn": np.asarray(0)}, step),
     )
-    assert result.calls == 30 and len(result.history.calls) == 31 and not result.incidents
+    assert result.calls == 30
+    assert len(result.history.calls) == 31
+    assert not result.incidents
 
 
 @pytest.mark.parametrize("wrong", [[-1], [60], [0.5], [[1, 2]]])
@@ -465,12 +462,10 @@ def test_a_selector_may_end_before_the_budget():
     inputs, labels, answers = problem(20)
     done = Selector("done", {}, lambda key, data: {}, lambda key, data, memory, seen, ask: None)
     result = validate(KEY, System(answers), inputs, labels, selector=done)
-    assert (
-        result.calls == 0
-        and result.incidents == ()
-        and result.state.finished
-        and len(result.ranked) == 20
-    )
+    assert result.calls == 0
+    assert result.incidents == ()
+    assert result.state.finished
+    assert len(result.ranked) == 20
     assert "0 failures in 0 calls" in str(result)
 
 
@@ -479,11 +474,9 @@ def test_a_selector_may_end_before_the_budget():
 def test_a_system_without_failures_and_one_with_nothing_else(wrong, selector):
     inputs, labels, _ = problem(30)
     result = validate(KEY, System((labels + wrong) % 3), inputs, labels, selector=selector)
-    assert (
-        len(result.failures) == (30 if wrong else 0)
-        and np.isnan(result.history.auc).all()
-        and str(result)
-    )
+    assert len(result.failures) == (30 if wrong else 0)
+    assert np.isnan(result.history.auc).all()
+    assert str(result)
     judged = weakness.judge(result, np.full(30, wrong))
     assert np.isnan(judged.auc).all()
 
@@ -500,9 +493,8 @@ def test_progress_and_callback(capsys):
         progress=True,
         callback=lambda done, total, r: calls.append((done, total, r.calls)),
     )
-    assert (
-        calls == [(n, 60, n) for n in (14, 28, 42, 56, 60)] and "60/60" in capsys.readouterr().err
-    )
+    assert calls == [(n, 60, n) for n in (14, 28, 42, 56, 60)]
+    assert "60/60" in capsys.readouterr().err
 
 
 def test_results_print_as_a_table():
@@ -671,11 +663,9 @@ def test_judged_by_the_truth():
     judged = weakness.judge(result, failed, threshold=0.8)
     for i, s in enumerate(result.history.scores):
         picked = s >= 0.8
-        assert (
-            judged.candidates[i] == picked.sum()
-            and judged.precision[i] == failed[picked].mean()
-            and judged.recall[i] == failed[picked].sum() / failed.sum()
-        )
+        assert judged.candidates[i] == picked.sum()
+        assert judged.precision[i] == failed[picked].mean()
+        assert judged.recall[i] == failed[picked].sum() / failed.sum()
         assert judged.auc[i] == pytest.approx(roc_auc_score(failed, s))
     top = weakness.judge(result, failed, top=20)
     np.testing.assert_array_equal(top.candidates, [20, 20])

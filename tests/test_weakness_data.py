@@ -39,12 +39,10 @@ def test_idx_reads_every_type(tmp_path, code, packed):
     raw = golden(code, (2, 3), numbers)
     path.write_bytes(gzip.compress(raw) if packed else raw)
     array = idx(path)
-    assert (
-        array.dtype == np.dtype(CODES[code][0])
-        and array.dtype.isnative
-        and array.shape == (2, 3)
-        and array.flags.writeable
-    )
+    assert array.dtype == np.dtype(CODES[code][0])
+    assert array.dtype.isnative
+    assert array.shape == (2, 3)
+    assert array.flags.writeable
     assert array.ravel().tolist() == numbers
 
 
@@ -117,7 +115,9 @@ def test_from_idx(tmp_path, joint, packed):
             gzip.compress(raw) if packed else raw
         )
     inputs, labels = from_idx(tmp_path, "some")
-    assert inputs.dtype == np.float32 and inputs.shape == (2, 1, 3) and labels.dtype == np.int32
+    assert inputs.dtype == np.float32
+    assert inputs.shape == (2, 1, 3)
+    assert labels.dtype == np.int32
     np.testing.assert_array_equal(
         inputs.ravel(), np.array([0, 255, 51, 1, 2, 3], np.float32) / np.float32(255)
     )
@@ -157,13 +157,13 @@ def test_from_idx_says_what_is_wrong(tmp_path):
 
 def test_digits():
     inputs, labels = digits()
-    assert (
-        inputs.dtype == np.float32
-        and inputs.shape == (1797, 8, 8)
-        and labels.dtype == np.int32
-        and labels.shape == (1797,)
-    )
-    assert inputs.min() == 0 and inputs.max() == 1 and set(labels.tolist()) == set(range(10))
+    assert inputs.dtype == np.float32
+    assert inputs.shape == (1797, 8, 8)
+    assert labels.dtype == np.int32
+    assert labels.shape == (1797,)
+    assert inputs.min() == 0
+    assert inputs.max() == 1
+    assert set(labels.tolist()) == set(range(10))
     assert np.isin(inputs * 16, np.arange(17)).all()
 
 
@@ -178,7 +178,9 @@ def test_digits_without_scikit_learn(monkeypatch):
 )
 def test_mnist():
     inputs, labels = from_idx(MNIST)
-    assert inputs.shape == (10000, 28, 28) and inputs.min() == 0 and inputs.max() == 1
+    assert inputs.shape == (10000, 28, 28)
+    assert inputs.min() == 0
+    assert inputs.max() == 1
     # as published
     assert np.bincount(labels).tolist() == [980, 1135, 1032, 1010, 982, 892, 958, 1028, 974, 1009]
     weights = np.load(MNIST / "sut_784x32x10.npz")

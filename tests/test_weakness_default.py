@@ -104,11 +104,9 @@ def test_the_committee_learns_as_adam_by_hand(monkeypatch):
 
 def test_every_input_is_left_out_as_often():
     learn = committee.folds(np.random.default_rng(0), 53, 5, 4)
-    assert (
-        learn.shape == (20, 53)
-        and np.all((~learn).sum(0) == 4)
-        and np.all((~learn).reshape(4, 5, 53).sum(1) == 1)
-    )
+    assert learn.shape == (20, 53)
+    assert np.all((~learn).sum(0) == 4)
+    assert np.all((~learn).reshape(4, 5, 53).sum(1) == 1)
 
 
 def forward(trained, x):
@@ -265,9 +263,8 @@ def test_views_of_images_keep_their_shades():
     assert views.reduce(None, data).shape == (40, 0)
     seen_as = views.views(data, views.reduce(None, data))
     np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
-    assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4) and all(
-        a.dtype == np.float32 for a in seen_as
-    )
+    assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4)
+    assert all(a.dtype == np.float32 for a in seen_as)
     centred, close = (
         seen_as.centred.astype(float),
         views.components(None, seen_as.centred, 64).astype(float),
@@ -287,11 +284,9 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
     data = Data(wide, np.zeros(200, np.int32), 2)
     reduced = views.reduce(np.random.default_rng(1), data)
     seen_as = views.views(data, reduced)
-    assert (
-        seen_as.scaled.shape == (200, 4)
-        and np.abs(seen_as.scaled).max() == pytest.approx(1)
-        and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
-    )
+    assert seen_as.scaled.shape == (200, 4)
+    assert np.abs(seen_as.scaled).max() == pytest.approx(1)
+    assert seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
     flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
     true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
     ours = np.linalg.qr(reduced[:, :3].astype(float))[0]
@@ -308,11 +303,9 @@ def test_a_validation_of_wide_inputs(brief, monkeypatch):
         (inputs[:, 0, 0] > 0).astype(int),
         budget=30,
     )
-    assert (
-        result.calls == 30
-        and result.state.memory["reduced"].shape == (60, 72)
-        and result.state.memory["close"].shape == (60, 64)
-    )
+    assert result.calls == 30
+    assert result.state.memory["reduced"].shape == (60, 72)
+    assert result.state.memory["close"].shape == (60, 64)
 
 
 @pytest.mark.parametrize("reference", [20_000, 120])
@@ -472,10 +465,8 @@ def test_one_value_far_out_does_not_hide_a_column(far):
     seen_as = views.views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
     assert len(np.unique(seen_as.scaled[:, 0])) == 300
     rest = np.arange(300) != 7
-    assert (
-        np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99
-        and seen_as.centred[rest, 0].std() > 0.3
-    )
+    assert np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99
+    assert seen_as.centred[rest, 0].std() > 0.3
 
 
 @pytest.mark.long
@@ -499,7 +490,8 @@ def test_what_failures_teach(digits):
     )
     # what random choice finds of these, with a hypergeometric standard error below the binomial one
     share = 360 / len(labels)
-    assert len(easy) > 30 and np.isin(easy, result.failures).mean() > share + 3 * np.sqrt(
+    assert len(easy) > 30
+    assert np.isin(easy, result.failures).mean() > share + 3 * np.sqrt(
         share * (1 - share) / len(easy)
     )
 
@@ -533,10 +525,8 @@ def test_influence_names_the_column():
     )
     shown = weakness.influence(KEY, result, inputs, labels)
     assert shown.shape == (len(wrong), 6) and set(result.failures) == set(wrong)
-    assert (
-        shown.mean(0).argmax() == 2
-        and shown[:, 2].mean() > 3 * np.abs(np.delete(shown, 2, 1).mean(0)).max()
-    )
+    assert shown.mean(0).argmax() == 2
+    assert shown[:, 2].mean() > 3 * np.abs(np.delete(shown, 2, 1).mean(0)).max()
 
 
 @pytest.mark.long
@@ -571,21 +561,18 @@ def test_few_inputs(brief, n, wrong):
         labels,
         classes=3,
     )
-    assert (
-        result.calls == n
-        and len(result.failures) == n * wrong
-        and np.isfinite(result.scores).all()
-        and result.expected == 0
-    )
+    assert result.calls == n
+    assert len(result.failures) == n * wrong
+    assert np.isfinite(result.scores).all()
+    assert result.expected == 0
 
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_no_failures_and_nothing_else(brief, wrong):
     inputs, labels = table(200)
     result = validate(KEY, lookup(inputs, (labels + wrong) % 3), inputs, labels, budget=120)
-    assert (
-        len(result.failures) == 120 * wrong and (result.scores[result.ranked].mean() > 0.5) == wrong
-    )
+    assert len(result.failures) == 120 * wrong
+    assert (result.scores[result.ranked].mean() > 0.5) == wrong
 
 
 def test_inputs_that_are_all_the_same(brief):

@@ -54,13 +54,11 @@ def leaky(x):
 
 
 def test_sizes():
-    assert (
-        sizes(784) == (392, 64)
-        and sizes(5000) == (392, 64)
-        and sizes(64) == (32, 16)
-        and sizes(20) == (10, 5)
-        and sizes(1) == (1, 1)
-    )
+    assert sizes(784) == (392, 64)
+    assert sizes(5000) == (392, 64)
+    assert sizes(64) == (32, 16)
+    assert sizes(20) == (10, 5)
+    assert sizes(1) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -78,11 +76,9 @@ def test_autoencoder_is_what_the_thesis_says(key, inputs, hidden, widths):
     assert [kernel.shape for kernel, _ in found] == list(zip(widths, widths[1:]))
     for kernel, bias in found:
         bound = np.sqrt(6 / sum(kernel.shape))  # Glorot's
-        assert (
-            np.abs(kernel).max() <= bound
-            and (kernel.size < 100 or np.abs(kernel).max() > 0.9 * bound)
-            and not bias.any()
-        )
+        assert np.abs(kernel).max() <= bound
+        assert kernel.size < 100 or np.abs(kernel).max() > 0.9 * bound
+        assert not bias.any()
     assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(params))
 
     params = jax.tree.map(lambda p: p + np.float32(0.05), params)
@@ -110,7 +106,8 @@ def test_adversary_is_what_the_thesis_says(key):
         (64, 128),
         (128, 64),
         (64, 1),
-    ] and not any(bias.any() for _, bias in layers(params))
+    ]
+    assert not any(bias.any() for _, bias in layers(params))
     params = jax.tree.map(lambda p: p + np.float32(0.02), params)
     x = np.random.default_rng(0).normal(size=(9, 64)).astype(np.float32)
     np.testing.assert_allclose(
@@ -208,9 +205,8 @@ def test_draws_with_replacement_repeat(key):
         assert least <= len(set([*lesson, *rest])) <= most
     with pytest.raises(ValueError, match="replacement must be True or False, received 1"):
         thesis(replacement=1)
-    assert (
-        "replacement" not in thesis().settings and thesis(replacement=True).settings["replacement"]
-    )
+    assert "replacement" not in thesis().settings
+    assert thesis(replacement=True).settings["replacement"]
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +280,9 @@ def test_training_lowers_the_losses(key):
     rows = inputs[:600].reshape(600, -1)
     params, losses = fit_autoencoder(key, rows, (32, 16), epochs=10, batch=60)
     codes = codes_of(params, rows, (32, 16))
-    assert codes.shape == (600, 16) and codes.dtype == np.float32 and losses.shape == (10,)
+    assert codes.shape == (600, 16)
+    assert codes.dtype == np.float32
+    assert losses.shape == (10,)
     assert losses[-1] < 0.6 * losses[0] and losses[-1] < rows.var()
     most = np.asarray(codes)[:, np.argmax(np.std(codes, axis=0))]
     failed = (most > np.median(most)).astype(np.float32)
@@ -292,9 +290,8 @@ def test_training_lowers_the_losses(key):
     params, losses = fit_adversary(
         key, adversary(16).init(key), codes, failed, number, 600, epochs=10, rate=1e-3
     )
-    assert (
-        losses[-1] < 0.5 * losses[0] and auc(np.asarray(logits(params, codes)), failed > 0) > 0.95
-    )
+    assert losses[-1] < 0.5 * losses[0]
+    assert auc(np.asarray(logits(params, codes)), failed > 0) > 0.95
 
 
 # --- iterations
@@ -349,28 +346,22 @@ def test_an_iteration_is_what_the_thesis_says(key):
     inputs, labels, answers = problem()
     data, chosen = arrays("test", inputs, labels), thesis(iterations=4, **QUICK)
     desk, memory = Desk(data, answers), chosen.start(key, data)
-    assert (
-        memory["codes"].shape == (1797, 12)
-        and memory["losses"].shape == (2,)
-        and all(isinstance(a, np.ndarray) for a in memory.values())
-    )
+    assert memory["codes"].shape == (1797, 12)
+    assert memory["losses"].shape == (2,)
+    assert all(isinstance(a, np.ndarray) for a in memory.values())
     drawn = failed = 0
     for i in range(4):
         seen, before = desk.seen, memory
         step = desk.step(chosen, jax.random.fold_in(key, i), memory)
         memory, (lesson, candidates) = step.memory, desk.sets
-        assert (
-            len(set(lesson.tolist())) == 60
-            and len(candidates) <= 60
-            and not set(lesson) & set(candidates)
-        )
+        assert len(set(lesson.tolist())) == 60
+        assert len(candidates) <= 60
+        assert not set(lesson) & set(candidates)
         np.testing.assert_array_equal(candidates, step.candidates)
-        assert (
-            step.scores.shape == (1797,)
-            and step.scores.dtype == np.float32
-            and (step.scores >= 0).all()
-            and (step.scores <= 1).all()
-        )
+        assert step.scores.shape == (1797,)
+        assert step.scores.dtype == np.float32
+        assert (step.scores >= 0).all()
+        assert (step.scores <= 1).all()
         assert (step.scores[candidates] >= 0.5).all()
         params = {"params": {}}
         for name, array in memory.items():
@@ -419,21 +410,21 @@ def test_what_was_not_answered_is_not_learned_from(key):
     memory = chosen.start(key, data)
     desk = Desk(data, answers, budget=20)
     step = desk.step(chosen, key, memory)
-    assert desk.counts == [20, 0] and step.memory["drawn"] == 20 and np.isfinite(step.scores).all()
+    assert desk.counts == [20, 0]
+    assert step.memory["drawn"] == 20
+    assert np.isfinite(step.scores).all()
     lesson = desk.sets[0]
     liar = answers.copy()
     liar[lesson[20:]] = (labels[lesson[20:]] + 1) % 10  # would be seen by who peeks
     same = Desk(data, liar, budget=20).step(chosen, key, memory)
     np.testing.assert_array_equal(same.scores, step.scores)
     nothing = Desk(data, answers, budget=0).step(chosen, key, memory)
-    assert (
-        all(
-            np.array_equal(nothing.memory[name], memory[name])
-            for name in memory
-            if name.startswith("adversary/")
-        )
-        and nothing.expected == 0
+    assert all(
+        np.array_equal(nothing.memory[name], memory[name])
+        for name in memory
+        if name.startswith("adversary/")
     )
+    assert nothing.expected == 0
 
 
 class Counted:
@@ -454,7 +445,9 @@ def test_calls_are_counted_and_never_repeated_and_the_same_again(key, equal):
     system = Counted(inputs, answers)
     result = validate(key, system, inputs, labels, selector=thesis(iterations=12, **QUICK))
     assert system.asked == result.order.tolist() and len(set(system.asked)) == result.calls < 1797
-    assert len(result.history.calls) == 12 and result.state.finished and not result.incidents
+    assert len(result.history.calls) == 12
+    assert result.state.finished
+    assert not result.incidents
     equal(
         validate(
             key, Counted(inputs, answers), inputs, labels, selector=thesis(iterations=12, **QUICK)
@@ -532,11 +525,9 @@ def test_tables_and_fewer_inputs_than_the_sample(key, n):
         selector=thesis(iterations=2, epochs=2),
         classes=2,
     )
-    assert (
-        result.calls <= n
-        and np.isfinite(result.scores).all()
-        and result.state.memory["codes"].shape == (n, 5)
-    )
+    assert result.calls <= n
+    assert np.isfinite(result.scores).all()
+    assert result.state.memory["codes"].shape == (n, 5)
     assert result.calls >= (n + 1) // 2
 
 
