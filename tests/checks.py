@@ -1,4 +1,4 @@
-"""What holds in every result of a search, and how many programs were compiled."""
+"""What holds in each result of a search and in estimates; how many programs were compiled."""
 
 from contextlib import contextmanager
 
@@ -81,6 +81,16 @@ def same(a, b):
     np.testing.assert_array_equal(a.failures.episodes.reward, b.failures.episodes.reward)
     np.testing.assert_array_equal(a.failures.counts, b.failures.counts)
     assert a.failures.seen == b.failures.seen
+
+
+def check_estimate(found, truth, precision=0.05, budget=np.inf):
+    """Within 4 of its standard errors, which are small; believed; and no more evaluations than were
+    granted.
+    """
+    assert abs(found.log_mean - np.log(truth)) < 4 * found.relative_error, str(found)
+    assert found.relative_error < precision, str(found)
+    assert found.reliable, str(found)
+    assert found.evaluations <= budget, str(found)
 
 
 @contextmanager

@@ -669,8 +669,8 @@ def test_an_episode_of_jumanji_is_its_own_loop(key, theirs):
         state, now = step(state, slipped(act(now.observation), episode.disturbances["action"][t]))
         np.testing.assert_array_equal(states.observation.grid[t + 1], now.observation.grid)
     assert now.last() and episode.failure
+    wrapped = library("jumanji.wrappers")[0].AutoResetWrapper(env)
     with pytest.raises(ValueError, match="jumanji: env .*AutoResetWrapper of Snake"):
-        wrapped = library("jumanji.wrappers")[0].AutoResetWrapper(env)
         jumanji(wrapped, act, horizon=60, seed="episode")
 
 

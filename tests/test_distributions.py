@@ -392,10 +392,8 @@ def test_cdf_names_the_distribution_that_has_no_quantile():
         for e in (d, D.where(True, d, d)) + (
             (D.Joint([D.Normal(0.0, 1.0), d]),) if d.event_shape == () else ()
         ):
-            with pytest.raises(
-                ValueError, match=f"cdf: {type(d).__name__} has no quantile function here to invert"
-            ):
-                x = D.sample(d, jax.random.key(0))
+            x = D.sample(d, jax.random.key(0))
+            with pytest.raises(ValueError, match=f"cdf: {type(d).__name__} has no quantile"):
                 D.cdf(e, [one, x] if isinstance(e, D.Joint) else x)
     twice = D.Transformed(D.Normal(0.0, 1.0), lambda x: x + jnp.exp(x))
     assert D.has_quantile(twice) and not D.has_cdf(twice)

@@ -258,9 +258,10 @@ def test_bad_rules():
         explain.rules(SIM, jast.estimate.monte_carlo(jax.random.key(0), SIM, 100))
     with pytest.raises(ValueError, match="rules: of must be"):
         explain.rules(SIM, bad, of="everything")
+    always = late_gust(evaluate=lambda s: (s[0] >= 0, jnp.zeros(())))
+    failing = drawn(0, 6, always)
     with pytest.raises(ValueError, match="rules: others: expected .* received 0: nearly"):
-        always = late_gust(evaluate=lambda s: (s[0] >= 0, jnp.zeros(())))
-        explain.rules(always, drawn(0, 6, always), episodes=40)
+        explain.rules(always, failing, episodes=40)
 
 
 def test_without_scikit_learn(monkeypatch):

@@ -100,8 +100,8 @@ def test_none_is_found_where_there_is_none(key):
 def test_bad_input_and_interrupts(key):
     with pytest.raises(ValueError, match="falsify: batch"):
         falsify(key, held(), batch=0)
+    seeds = held(disturbance=lambda s: jast.distributions.seeds(), step=lambda s, x: s)
     with pytest.raises(ValueError, match="falsify: disturbance: "):
-        seeds = held(disturbance=lambda s: jast.distributions.seeds(), step=lambda s, x: s)
         falsify(key, seeds)
     with pytest.raises(ValueError, match="falsify: cannot be traced"):
         jax.jit(lambda k: falsify(k, held()).episodes)(key)

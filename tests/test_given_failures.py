@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import check_estimate
 from jax.tree_util import Partial
 
 import jast
@@ -66,12 +67,6 @@ def archive(sim, *rows):
     return jast.failures.collect(sim, jast.rewards.standard(), e)
 
 
-def right(found, truth):
-    """Within 4 of its standard errors, of at most 5 %, and believed."""
-    error = abs(found.log_mean - math.log(truth))
-    return error < 4 * found.relative_error < 0.2 and found.reliable
-
-
 # with no goal in reach the search meets no failure, and begins with what is given
 @pytest.mark.parametrize("goal", [14, 1000])
 def test_a_mode_that_the_search_loses_is_found_with_a_failure_of_it(key, goal):
@@ -79,11 +74,11 @@ def test_a_mode_that_the_search_loses_is_found_with_a_failure_of_it(key, goal):
     chattering = (UP * (1 - UP)) ** (CHATTERS // 2)
     known = archive(sim, np.arange(STEPS) % 2)
     found = failure_probability(key, sim, 8000, failures=known)
-    assert right(found, chattering + leads(goal)), str(found)
+    check_estimate(found, chattering + leads(goal))
     assert found.episodes <= 8000
     if goal == 14:
         without = failure_probability(key, sim, 8000)
-        assert right(without, leads(goal)), str(without)
+        check_estimate(without, leads(goal))
 
 
 def test_failures_given_lead_and_are_not_counted(key):
@@ -92,7 +87,7 @@ def test_failures_given_lead_and_are_not_counted(key):
     one = archive(sim, np.ones(60))
     many = one._replace(episodes=jax.tree.map(lambda a: np.repeat(a, 50, axis=0), one.episodes))
     with_it, without = (failure_probability(key, sim, 8000, failures=f) for f in (many, None))
-    assert right(with_it, ruin_probability(0.4, 1, 15, 60))
+    check_estimate(with_it, ruin_probability(0.4, 1, 15, 60))
     a, b = with_it.draws, without.draws
     assert a.samples == b.samples - 50
     rows = b.row < a.samples

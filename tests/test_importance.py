@@ -491,8 +491,8 @@ def test_interrupts_keep_whole_chunks(key, capsys):
     assert found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",)
     assert found.reliable
     assert "importance" in capsys.readouterr().err
+    watch = Watch("importance", MORE, "episode", False, None)
     with pytest.raises(KeyboardInterrupt):
-        watch = Watch("importance", MORE, "episode", False, None)
         chunks(lambda shared, i, post: stop(0, 0, None), None, LANES, watch)
 
 

@@ -16,12 +16,6 @@ KEY = jax.random.key(0)
 WALK = jast.simulators.walk1d(threshold=3.0, horizon=8)
 
 
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plt.close("all")
-
-
 def test_the_levels_of_a_proposal_fall_to_failures():
     found = jast.estimate.failure_proposal(KEY, WALK, samples=200)
     ax = plot.levels(found)

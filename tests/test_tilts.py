@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import check_estimate
 from jax.tree_util import Partial
 from scipy.stats import norm
 
@@ -217,15 +218,6 @@ def test_a_known_tilt_is_found(mixed):
     assert np.abs(found.first.means).max() < 0.1
 
 
-def good(found, truth, most=0.05):
-    """Within 4 of its standard errors, which are small; believed."""
-    return (
-        abs(found.log_mean - np.log(truth)) < 4 * found.relative_error
-        and found.relative_error < most
-        and found.reliable
-    )
-
-
 @pytest.fixture(scope="module")
 def gambler():
     sim = ruin(goal=15, horizon=100)
@@ -234,7 +226,7 @@ def gambler():
 
 def test_ruin(gambler):
     found = gambler[1]
-    assert good(found, ruin_probability(0.4, 1, 15, 100), 0.02), str(found)
+    check_estimate(found, ruin_probability(0.4, 1, 15, 100), 0.02)
     assert found.evaluations <= BUDGET and any("tilts" in line for line in found.history)
     # those of the last draws that are the model's own fail as often as it does
     (k, _, n), p = found.plain, ruin_probability(0.4, 1, 15, 100)
@@ -261,7 +253,7 @@ def test_samples_of_tilts(gambler, tmp_path):
 def test_first_passage():
     sim = autoregression(threshold=4.5, horizon=40)
     found = failure_probability(jax.random.key(0), sim, BUDGET)
-    assert good(found, autoregression_probability(0.1, 4.5, 40)), str(found)
+    check_estimate(found, autoregression_probability(0.1, 4.5, 40))
 
 
 @pytest.mark.long
@@ -269,7 +261,7 @@ def test_first_passage():
 def test_choices(name):
     make, truth = CASES[name]
     found = failure_probability(jax.random.key(0), make(), 50_000)
-    assert good(found, truth, 0.03), str(found)
+    check_estimate(found, truth, 0.03)
 
 
 @pytest.mark.long
@@ -280,7 +272,7 @@ def test_choices(name):
 def test_long_first_passage(rate, threshold, horizon, budget):
     sim = autoregression(rate, threshold, horizon)
     found = failure_probability(jax.random.key(0), sim, budget)
-    assert good(found, autoregression_probability(rate, threshold, horizon)), str(found)
+    check_estimate(found, autoregression_probability(rate, threshold, horizon))
 
 
 def test_several_gaussians_serve_where_one_does_not():
