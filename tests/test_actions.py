@@ -158,19 +158,11 @@ def test_check_says_what_is_wrong_with_the_ends_of_a_box():
     )
     jast.check(sim, actions.uniform({"a": -1.0, "b": -2.0}, 2.0))
     with pytest.raises(
-        ValueError,
-        match=(
-            r"actions.uniform: low is PyTreeDef\({'a': \*}\), expected an array or the structure"
-            r" of a disturbance, PyTreeDef\({'a'"
-        ),
+        ValueError, match=r"actions.uniform: low is PyTreeDef\({'a'.*expected an array"
     ):
         jast.check(sim, actions.uniform({"a": -1.0}, 2.0))
     with pytest.raises(
-        ValueError,
-        match=(
-            r"actions.uniform: high has shape \(3,\), expected one that broadcasts to the"
-            r" disturbance's \(\)"
-        ),
+        ValueError, match=r"actions.uniform: high has shape \(3,\), expected .* \(\)"
     ):
         jast.check(sim, actions.uniform(0.0, {"a": 1.0, "b": jnp.ones(3)}))
 
@@ -225,8 +217,5 @@ def test_searches_draw_from_the_proposal_and_score_by_the_model(key, search):
 
 def test_a_proposal_without_quantiles_is_refused():
     for wrong in (D.seeds(), 3.0):
-        with pytest.raises(
-            ValueError,
-            match="actions.quantiles: proposal must be a distribution with a quantile function",
-        ):
+        with pytest.raises(ValueError, match="actions.quantiles: proposal must be .* quantile"):
             actions.quantiles(wrong)

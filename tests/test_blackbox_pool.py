@@ -189,10 +189,7 @@ class Broken(blackboxes.Walk):
 
 def test_bad_input_is_named(monkeypatch):
     lock = threading.Lock()
-    with pytest.raises(
-        ValueError,
-        match="system cannot be sent to a worker process: .*lock.*define it at the top of a module",
-    ):
+    with pytest.raises(ValueError, match="system cannot be sent to a worker process: .*lock"):
         box(lambda x: (lock.locked(), 1.0))
     with pytest.raises(ValueError, match="from_python: system: the process ended"):
         box(Broken, episodic=False)
@@ -210,7 +207,5 @@ def test_a_system_that_no_worker_can_load_ends_the_search(tmp_path, monkeypatch)
 
     sim = box(only_here.run, workers=1)
     (tmp_path / "only_here.py").write_text("raise OSError('no licence')\n")
-    with pytest.raises(
-        RuntimeError, match="a worker process could not load the system: OSError: no licence"
-    ):
+    with pytest.raises(RuntimeError, match="could not load the system: OSError: no licence"):
         ends(sim, [0.0])

@@ -104,11 +104,7 @@ def test_bad_input_and_a_missing_extra_are_named(monkeypatch):
     with pytest.raises(ValueError, match="bluesky: tolerance must be a number of nmi above 0"):
         bluesky(tolerance=0.0)
     with pytest.raises(
-        ValueError,
-        match=(
-            r"bluesky_flight: disturbances must be finite and \[waypoints, 4\], received shape"
-            r" \(3,\)"
-        ),
+        ValueError, match=r"bluesky_flight: disturbances must .*received shape \(3,\)"
     ):
         bluesky_flight(np.zeros(3))
 

@@ -325,11 +325,7 @@ def test_actions():
     assert jast.check(ferry(), actions.uniform(0.0, 1.0))
     assert jast.check(ferry(), actions.quantiles())
     with pytest.raises(
-        ValueError,
-        match=(
-            r"actions\.uniform: expected disturbances inside the support.* \d+% of 64 draws at the"
-            r" start on the box \[2.*, 9"
-        ),
+        ValueError, match=r"actions\.uniform: .* \d+% of 64 draws .* the box \[2.*, 9"
     ):
         jast.check(ferry(), actions.uniform(2.0, 9.0))
     with pytest.raises(
@@ -342,24 +338,16 @@ def test_actions():
 @pytest.mark.parametrize("function", [jast.check, partial(contract, "f")])
 def test_action_shapes(function):
     with pytest.raises(
-        ValueError,
-        match=(
-            r"actions\.uniform: low has shape \(3,\), expected one that broadcasts to the"
-            r" disturbance's \(\)"
-        ),
+        ValueError, match=r"actions\.uniform: low has shape \(3,\), expected .* \(\)"
     ):
         function(walk1d(), actions.uniform(jnp.zeros(3), 1.0))
     with pytest.raises(ValueError, match=r"actions\.uniform: high has shape \(2,\).*\(5,\)"):
         function(limit_state(lambda x: x.sum(), 5), actions.uniform(0.0, jnp.ones(2)))
     lacking = line(disturbance=lambda s: D.VonMises(jnp.asarray(2.0), jnp.asarray(1.0)))
-    with pytest.raises(
-        ValueError, match=r"actions\.quantiles: .*quantile: VonMises has no quantile function"
-    ):
+    with pytest.raises(ValueError, match=r"actions\.quantiles: .*VonMises has no quantile"):
         function(lacking, actions.quantiles())
     started = line(start=lambda: D.VonMises(jnp.asarray(2.0), jnp.asarray(1.0)))
-    with pytest.raises(
-        ValueError, match=r"actions\.quantiles: .*quantile: VonMises has no quantile function"
-    ):
+    with pytest.raises(ValueError, match=r"actions\.quantiles: .*VonMises has no quantile"):
         function(started, actions.quantiles())
     with pytest.raises(
         ValueError, match="actions: expected one of jast.actions, received 'uniform'"

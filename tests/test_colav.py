@@ -1448,49 +1448,37 @@ HERE = (20.0, 45.0, 0.0)
 @pytest.mark.parametrize(
     "bad, match",
     [
-        (
-            lambda: colav("harbour"),
-            (
-                r"colav: scenario must be one of \['head-on', 'crossing', 'overtaking', 'sharp"
-                r" turn'\] or a Scenario, received 'harbour'"
-            ),
-        ),
-        (
-            lambda: colav(7),
-            r"colav: scenario must be one of \['head-on', .* or a Scenario, received int",
-        ),
-        (
-            lambda: colav((HERE, ROUTE)),
-            "colav: scenario must be one of .* or a Scenario, received tuple",
-        ),
-        (lambda: colav(None), "colav: scenario must be one of .* or a Scenario, received NoneType"),
+        (lambda: colav("harbour"), "colav: scenario must .*received 'harbour'"),
+        (lambda: colav(7), "colav: scenario must .*received int"),
+        (lambda: colav((HERE, ROUTE)), "colav: scenario must .*received tuple"),
+        (lambda: colav(None), "colav: scenario must .*received NoneType"),
         (
             lambda: colav(Scenario((20.0, 45.0), ROUTE)),
-            r"colav: adversary of the scenario must be three numbers .*, received shape \(2,\)",
+            r"colav: adversary of the scenario must .*received shape \(2,\)",
         ),
         (
             lambda: colav(Scenario(20.0, ROUTE)),
-            r"colav: adversary of the scenario must be three numbers .*, received shape \(\)",
+            r"colav: adversary of the scenario must .*received shape \(\)",
         ),
         (
             lambda: colav(Scenario(HERE, ROUTE[0])),
-            r"colav: route of the scenario must be \[steps, 3\] .*, received shape \(3,\)",
+            r"colav: route of the scenario must .*received shape \(3,\)",
         ),
         (
             lambda: colav(Scenario(HERE, ROUTE[:, :2])),
-            r"colav: route of the scenario must be \[steps, 3\] .*, received shape \(25, 2\)",
+            r"colav: route of the scenario must .*received shape \(25, 2\)",
         ),
         (
             lambda: colav(Scenario(HERE, ROUTE[:0])),
-            r"colav: route of the scenario must be \[steps, 3\] .*, received shape \(0, 3\)",
+            r"colav: route of the scenario must .*received shape \(0, 3\)",
         ),
         (
             lambda: colav(Scenario(HERE, ROUTE, np.zeros((1, 3)))),
-            r"colav: ferry of the scenario must be three numbers .*, received shape \(1, 3\)",
+            r"colav: ferry of the scenario must .*received shape \(1, 3\)",
         ),
         (
             lambda: colav(Scenario((20.0, np.nan, 0.0), ROUTE)),
-            r"colav: adversary of the scenario must be finite, received \(20.0, nan, 0.0\)",
+            r"colav: adversary of the scenario must .*received \(20.0, nan, 0.0\)",
         ),
         (
             lambda: colav(Scenario(HERE, np.full((25, 3), np.inf))),
@@ -1498,11 +1486,11 @@ HERE = (20.0, 45.0, 0.0)
         ),
         (
             lambda: colav(Scenario(HERE, ROUTE, (0.0, 0.0, np.inf))),
-            r"colav: ferry of the scenario must be finite, received \(0.0, 0.0, inf\)",
+            r"colav: ferry of the scenario must .*received \(0.0, 0.0, inf\)",
         ),
         (
             lambda: colav(Scenario("there", ROUTE)),
-            "colav: adversary of the scenario must be three numbers .*, received 'there'",
+            "colav: adversary of the scenario must .*received 'there'",
         ),
         (
             lambda: colav(Scenario(HERE, "straight")),
@@ -1512,25 +1500,16 @@ HERE = (20.0, 45.0, 0.0)
             lambda: colav(Scenario(HERE, None)),
             "colav: route of the scenario must be .*, received None",
         ),
-        (
-            lambda: colav(disturbances="wind"),
-            (
-                r"colav: disturbances must be one or several of \('delay', 'steering', 'noise'\),"
-                r" received 'wind'"
-            ),
-        ),
+        (lambda: colav(disturbances="wind"), "colav: disturbances must .*received 'wind'"),
         (
             lambda: colav(disturbances=("delay", "wind")),
-            r"colav: disturbances must be one or several of .*, received \('delay', 'wind'\)",
+            r"colav: disturbances must .*received \('delay', 'wind'\)",
         ),
         (
             lambda: colav(disturbances=("delay", "delay")),
-            r"colav: disturbances must be one or several of .*, received \('delay', 'delay'\)",
+            r"colav: disturbances must .*received \('delay', 'delay'\)",
         ),
-        (
-            lambda: colav(disturbances=()),
-            r"colav: disturbances must be one or several of .*, received \(\)",
-        ),
+        (lambda: colav(disturbances=()), r"colav: disturbances must .*received \(\)"),
         (
             lambda: colav(disturbances=5),
             "colav: disturbances must be one or several of .*, received 5",
@@ -1565,10 +1544,7 @@ HERE = (20.0, 45.0, 0.0)
             lambda: colav(delay_easing=0),
             "colav: delay_easing must be a positive number, received 0",
         ),
-        (
-            lambda: colav(steering_change=0.0),
-            "colav: steering_change must be a positive number, received 0.0",
-        ),
+        (lambda: colav(steering_change=0.0), "colav: steering_change must .*received 0.0"),
         (
             lambda: colav(steering_change=np.ones(2)),
             "colav: steering_change must be a positive number, received",
@@ -1578,14 +1554,8 @@ HERE = (20.0, 45.0, 0.0)
             lambda: colav(noise=(0.3, 0.1, 0.1)),
             r"colav: noise must be a pair, .*, received \(0.3, 0.1, 0.1\)",
         ),
-        (
-            lambda: colav(noise=(0.3, 0.0)),
-            "colav: noise_of_velocity must be a positive number, received 0.0",
-        ),
-        (
-            lambda: colav(noise=(-0.3, 0.1)),
-            "colav: noise_of_position must be a positive number, received -0.3",
-        ),
+        (lambda: colav(noise=(0.3, 0.0)), "colav: noise_of_velocity must .*received 0.0"),
+        (lambda: colav(noise=(-0.3, 0.1)), "colav: noise_of_position must .*received -0.3"),
     ],
 )
 def test_bad_input(bad, match):
@@ -1615,8 +1585,5 @@ def test_scales_may_be_arrays_and_are_refused_by_name():
     assert jast.check(colav(disturbances="noise", noise=np.array([0.3, 0.1]))).horizon == STEPS
     with pytest.raises(ValueError, match="colav: delay_change must be a positive number"):
         jax.jit(lambda width: colav(delay_change=width).horizon)(jnp.ones(2))
-    with pytest.raises(
-        ValueError,
-        match=r"colav: delay_change must be a positive number, received \[1.0, \[2.0\]\]",
-    ):
+    with pytest.raises(ValueError, match=r"colav: delay_change must .*received \[1.0, \[2.0\]\]"):
         colav(delay_change=[1.0, [2.0]])

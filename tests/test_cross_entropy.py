@@ -589,13 +589,7 @@ def test_bad_proposals_and_objectives_are_named(key):
 def test_bad_answers_are_named(key):
     search = ce.start(key, START, samples=4, elites=2, iterations=1)
     x = np.asarray(ce.ask(search))
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"tell: expected x of shape \(4, 2\) and values of shape \(4,\), received \(3, 2\) and"
-            r" \(3,\)"
-        ),
-    ):
+    with pytest.raises(ValueError, match=r"tell: expected x of shape \(4, 2\) .*received \(3, 2\)"):
         ce.tell(search, x[:3], np.zeros(3))
     for beyond in (np.nan, 1e300 if x.dtype == np.float32 else np.inf):
         with pytest.raises(ValueError, match="tell: x must be finite"):

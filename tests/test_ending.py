@@ -136,9 +136,7 @@ def test_bad_shares(key, search, share):
 
 
 def test_what_was_asked_for_in_vain_is_refused(key):
-    with pytest.raises(
-        ValueError, match="refine must be 0, since Seeds has no quantile function, received 0.1"
-    ):
+    with pytest.raises(ValueError, match="refine must be 0, since Seeds .*received 0.1"):
         monte_carlo(key, dice(), refine=0.1, reward=rewards.STANDARD)
     with pytest.raises(ValueError, match="monte_carlo: refine must be 0 inside of jax.jit"):
         jax.jit(lambda key: monte_carlo(key, SIM, episodes=100, refine=0.1).episodes)(key)

@@ -395,33 +395,21 @@ def test_settings_are_traced(key, traced):
     "bad, match",
     [
         (lambda: fms(eps=-0.1), "fms: eps must be a number of nmi, at least 0, received -0.1"),
-        (
-            lambda: fms(bank=90),
-            "fms: bank must be a number of degrees between 0 and 90, received 90",
-        ),
+        (lambda: fms(bank=90), "fms: bank must .*received 90"),
         (lambda: fms(tas=0.0), "fms: tas must be a number of knots, positive, received 0.0"),
         (lambda: fms(waypoints=0), "fms: waypoints must be a whole number of at least 1"),
         (lambda: fms(guard="some"), "fms: guard must be one of 's-turns', 'all', received 'some'"),
-        (
-            lambda: fms(event="stall"),
-            (
-                "fms: event must be one of 'arc length', 'kink', 'disconnection', 'course',"
-                " received 'stall'"
-            ),
-        ),
+        (lambda: fms(event="stall"), "fms: event must .*received 'stall'"),
         (lambda: fms(earth="flat"), "fms: earth must be one of 'wgs84', 'sphere', received 'flat'"),
         (lambda: fms(fixed="no"), "fms: fixed must be True or False, received 'no'"),
         (
             lambda: fms_path(jast.simulators.walk1d(), None),
             "fms_path: sim must be a jast.simulators.fms",
         ),
-        (
-            lambda: fms_misses(fms(), jnp.zeros(3)),
-            "fms_misses: episode must be one Episode or FmsState of 12 waypoints",
-        ),
+        (lambda: fms_misses(fms(), jnp.zeros(3)), "fms_misses: episode must .* 12 waypoints"),
         (
             lambda: fms_misses(fms(waypoints=3), fms().init(())),
-            "fms_misses: episode must be one Episode or FmsState of 3 waypoints, received FmsState",
+            "fms_misses: episode must .* 3 waypoints, received FmsState",
         ),
     ],
 )

@@ -117,13 +117,7 @@ def test_bad_starts(mean, covariance, message, dtype):
 
 def test_what_is_no_start():
     for proposal in (None, 3.0, jnp.zeros((2, 2)), D.Normal(0.0, 1.0), (1, 2, 3)):
-        with pytest.raises(
-            ValueError,
-            match=(
-                "proposal: expected a Gaussian, a pair .* or a distribution with mean\\(\\) and"
-                " covariance\\(\\), received"
-            ),
-        ):
+        with pytest.raises(ValueError, match="proposal: expected a Gaussian, .*, received"):
             as_gaussian(proposal)
     with pytest.raises(ValueError, match="normal: covariance must be a number, 2 variances"):
         jax.jit(normal)(jnp.zeros(2), jnp.ones(3))

@@ -134,13 +134,7 @@ def test_it_vmaps():
 
 def test_bad_input_is_named():
     x, y = jnp.zeros((4, 2)), jnp.zeros(4)
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"gaussian_process.fit: kernel must be one of \['squared exponential', .*received"
-            r" 'cubic'"
-        ),
-    ):
+    with pytest.raises(ValueError, match="gaussian_process.fit: kernel must .*received 'cubic'"):
         gp.fit(x, y, y == 0, (1.0,), kernel="cubic")
     with pytest.raises(
         ValueError, match=r"x must be \[n, d\], y and mask \[n\], received \(4, 2\), \(3,\)"

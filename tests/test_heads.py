@@ -95,18 +95,12 @@ def test_networks_of_one_shape_share_their_function_and_differ_by_key():
     ],
 )
 def test_sizes_of_networks_are_checked(changed):
-    with pytest.raises(
-        ValueError,
-        match="make_head: inputs, hidden and outputs must be integers of at least 1, received",
-    ):
+    with pytest.raises(ValueError, match="make_head: inputs, hidden and outputs must be integers"):
         make_head(jax.random.key(0), **dict(inputs=2) | changed)
 
 
 def test_activations_of_networks_are_checked():
-    with pytest.raises(
-        ValueError,
-        match=r"activation must be one of \['gelu', 'relu', 'silu', 'tanh'\], received 'elu'",
-    ):
+    with pytest.raises(ValueError, match="activation must .*received 'elu'"):
         make_head(jax.random.key(0), 2, activation="elu")
 
 
@@ -1113,8 +1107,7 @@ def test_bad_heads_are_named(heads, message):
 @pytest.mark.parametrize("heads", ["both", Heads(zeros(2, 5))])
 def test_an_observe_that_is_not_finite_at_the_start_is_named(heads):
     with pytest.raises(
-        ValueError,
-        match=r"must return finite numbers where heads .*, received \[nan nan\] at the start",
+        ValueError, match=r"must return finite numbers .*received \[nan nan\] at the start"
     ):
         searched(heads=heads, sim=plane(sight=-1.0))
 
@@ -1122,11 +1115,7 @@ def test_an_observe_that_is_not_finite_at_the_start_is_named(heads):
 def test_a_policy_head_needs_a_distribution_function():
     for heads in ("rollout", "both", Heads(zeros(1, 5))):
         with pytest.raises(
-            ValueError,
-            match=(
-                'a rollout head needs disturbances with a distribution function; use heads="value",'
-                " or actions.uniform: cdf: Seeds"
-            ),
+            ValueError, match="a rollout head needs .* distribution function; .*cdf: Seeds"
         ):
             searched(heads=heads, sim=dice())
 
@@ -1173,18 +1162,11 @@ def test_settings_out_of_range_are_named(name, values):
 
 
 def test_unknown_settings_are_named():
-    with pytest.raises(
-        ValueError, match=r"mode must be one of \['code', .*'text'\], received 'published'"
-    ):
+    with pytest.raises(ValueError, match="mode must .*received 'published'"):
         H.settings("published")
-    with pytest.raises(
-        ValueError, match="expected settings among round, bins, .*, received epochs, layers"
-    ):
+    with pytest.raises(ValueError, match="expected settings among .*, received epochs, layers"):
         H.settings(layers=3, epochs=2)
-    with pytest.raises(
-        ValueError,
-        match=r"head_settings must be those of jast.heads.settings\(...\), received dict",
-    ):
+    with pytest.raises(ValueError, match="head_settings must .*received dict"):
         searched(head_settings=dict(round=3))
     assert H.settings("code", round=8) == H.MODES["code"]._replace(round=8)
     assert H.settings() == H.MODES["default"]

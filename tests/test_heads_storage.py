@@ -156,11 +156,7 @@ def test_functions_around_a_network_are_ones_own(tmp_path, equal):
         heads = Heads(head)
         jast.heads.save(tmp_path / "h", heads)
         with pytest.raises(
-            ValueError,
-            match=(
-                r"holds a policy head with a function that is not in the file: load\(path, heads\)"
-                r" with Heads that have it"
-            ),
+            ValueError, match="holds a policy head with a function that is not in the file"
         ):
             jast.heads.load(tmp_path / "h")
         equal(jast.heads.load(tmp_path / "h", heads), heads)
@@ -291,10 +287,7 @@ def test_save_refuses_what_no_file_can_hold(tmp_path):
     ):
         with pytest.raises(ValueError, match=reason):
             jast.heads.save(tmp_path / "h", heads)
-    with pytest.raises(
-        ValueError,
-        match=r"save: policy.* must be an array of numbers, received float32\[5\], traced",
-    ):
+    with pytest.raises(ValueError, match=r"save: policy.* must .*received float32\[5\], traced"):
         jax.jit(lambda p: jast.heads.save(tmp_path / "h", Heads((p, linear))))(head.params)
     assert not list(tmp_path.iterdir())
 
@@ -302,9 +295,7 @@ def test_save_refuses_what_no_file_can_hold(tmp_path):
 def test_load_refuses_heads_that_do_not_fit(tmp_path):
     path = tmp_path / "h"
     jast.heads.save(path, Heads(value=own()))
-    with pytest.raises(
-        ValueError, match="load: .*h holds a value head with a function that is not in the file"
-    ):
+    with pytest.raises(ValueError, match="load: .*h holds a value head with a function"):
         jast.heads.load(path)
     kept = own().params
     for params, reason in (
@@ -322,11 +313,7 @@ def test_load_refuses_heads_that_do_not_fit(tmp_path):
         with pytest.raises(ValueError, match="load: .*h does not fit heads: " + reason):
             jast.heads.load(path, Heads(value=(params, linear)))
     with pytest.raises(
-        ValueError,
-        match=(
-            r"load: value\.params\['a'\]\[1\] of heads must be an array of numbers, received"
-            r" float 1.0"
-        ),
+        ValueError, match=r"load: value\.params\['a'\]\[1\] of heads must .*float 1.0"
     ):
         jast.heads.load(path, Heads(value=(kept | {"a": (np.zeros(2), 1.0)}, linear)))
     with pytest.raises(
@@ -334,9 +321,7 @@ def test_load_refuses_heads_that_do_not_fit(tmp_path):
     ):
         jast.heads.load(path, Heads(made().policy, own()))
     jast.heads.save(path, Heads(made().policy, own()))
-    with pytest.raises(
-        ValueError, match="load: .*h holds a value head with a function that is not in the file"
-    ):
+    with pytest.raises(ValueError, match="load: .*h holds a value head with a function"):
         jast.heads.load(path, Heads(made().policy))
     for heads, reason in (
         (Heads(), "must have a policy or a value head"),
@@ -349,11 +334,7 @@ def test_load_refuses_heads_that_do_not_fit(tmp_path):
 def test_load_refuses_another_network(tmp_path):
     jast.heads.save(tmp_path / "h", made())
     with pytest.raises(
-        ValueError,
-        match=(
-            "does not fit heads: policy is the network .*'activation': 'tanh'.*, expected"
-            " .*'activation': 'relu'"
-        ),
+        ValueError, match="does not fit heads: policy .*'tanh'.*, expected .*'relu'"
     ):
         jast.heads.load(tmp_path / "h", made(activation="relu"))
 
@@ -363,11 +344,7 @@ def test_load_refuses_an_unknown_activation(tmp_path, monkeypatch):
     jast.heads.save(tmp_path / "h", made(activation="mish"))
     monkeypatch.undo()
     with pytest.raises(
-        ValueError,
-        match=(
-            "has the activation 'mish', which this jast does not know: use the jast that"
-            f" wrote the file, {jast.__version__}"
-        ),
+        ValueError, match=f"has the activation 'mish', .* wrote the file, {jast.__version__}"
     ):
         jast.heads.load(tmp_path / "h")
 
@@ -388,11 +365,7 @@ def test_load_refuses_other_files_and_versions(tmp_path, monkeypatch):
             patch.setitem(files.KINDS, "jast heads", kind)
             jast.heads.save(path, made())
         with pytest.raises(
-            ValueError,
-            match=(
-                f"has version {version}, and this jast reads version 1: use the jast that"
-                f" wrote the file, {jast.__version__}"
-            ),
+            ValueError, match=f"has version {version}, .* wrote the file, {jast.__version__}"
         ):
             jast.heads.load(path)
     jast.heads.save(path, made())

@@ -502,15 +502,12 @@ def test_interrupts_keep_whole_chunks(key, capsys):
 @pytest.mark.parametrize(
     "make, match",
     [
-        (
-            lambda: trace_proposal(SIM, BOTH, 0.0),
-            "trace_proposal: epsilon must be a number above 0 and at most 1, received 0.0",
-        ),
+        (lambda: trace_proposal(SIM, BOTH, 0.0), "trace_proposal: epsilon must .*received 0.0"),
         (lambda: trace_proposal(SIM, BOTH, 1.1), "trace_proposal: epsilon must be"),
         (lambda: policy_proposal(SIM, STEER, np.nan), "policy_proposal: epsilon must be"),
         (
             lambda: trace_proposal(SIM, BOTH, mixing="both"),
-            'trace_proposal: mixing must be "step" or "trace", received \'both\'',
+            "trace_proposal: mixing must .*received 'both'",
         ),
         (lambda: trace_proposal(SIM, []), "trace_proposal: episodes must be"),
         (lambda: trace_proposal(SIM, STEER), "trace_proposal: episodes must be"),
@@ -521,35 +518,32 @@ def test_interrupts_keep_whole_chunks(key, capsys):
         ),
         (
             lambda: importance(jax.random.key(0), SIM, "x"),
-            "importance: proposal must be a Proposal or a jast.Policy, received str",
+            "importance: proposal must .*received str",
         ),
         (
             lambda: importance(jax.random.key(0), WALK, recorded(jnp.ones(10))),
-            "importance: proposal must have a density, received a policy that plays one value",
+            "importance: proposal must .*received a policy that plays one value",
         ),
         (
             lambda: log_weights(jax.random.key(0), WALK, recorded(jnp.ones(10)), 5),
-            "log_weights: proposal must have a density, received a policy that plays one value",
+            "log_weights: proposal must .*received a policy that plays one value",
         ),
         (
             lambda: importance(jax.random.key(0), SIM, STEER, 1),
-            "importance: samples must be a whole number of at least 2, received 1",
+            "importance: samples must .*received 1",
         ),
         (
             lambda: importance(jax.random.key(0), SIM, STEER, mode="thesis"),
-            'importance: mode must be "default" or "paper", received \'thesis\'',
+            "importance: mode must .*received 'thesis'",
         ),
         (
             lambda: log_weights(jax.random.key(0), SIM, STEER, 5, mode="thesis"),
-            'log_weights: mode must be "default" or "paper", received \'thesis\'',
+            "log_weights: mode must .*received 'thesis'",
         ),
-        (
-            lambda: monte_carlo(jax.random.key(0), SIM, 0),
-            "monte_carlo: samples must be a whole number of at least 1, received 0",
-        ),
+        (lambda: monte_carlo(jax.random.key(0), SIM, 0), "monte_carlo: samples must .*received 0"),
         (
             lambda: monte_carlo(jax.random.key(0), SIM, 5, level=1.0),
-            "monte_carlo: level must be a number between 0 and 1, received 1.0",
+            "monte_carlo: level must .*received 1.0",
         ),
     ],
 )
@@ -560,9 +554,7 @@ def test_bad_arguments(make, match):
 
 def test_a_bad_level_is_told_before_anything_is_simulated(key):
     seen = []
-    with pytest.raises(
-        ValueError, match="importance: level must be a number between 0 and 1, received 95"
-    ):
+    with pytest.raises(ValueError, match="importance: level must .*received 95"):
         importance(
             key, SIM, trace_proposal(SIM, BOTH), MORE, level=95, callback=lambda *a: seen.append(a)
         )

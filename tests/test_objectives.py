@@ -233,7 +233,5 @@ def test_points_of_another_shape():
                 match=f"{name}: x must be a vector of {expected} numbers, received shape",
             ):
                 jax.jit(f)(jnp.zeros(shape))
-    with pytest.raises(
-        ValueError, match=r"branin: x must be a vector of 2 numbers, received shape \(3,\)"
-    ):
+    with pytest.raises(ValueError, match=r"branin: x must .*received shape \(3,\)"):
         branin(jnp.zeros(3))

@@ -137,8 +137,7 @@ def test_one_episode_of_the_right_system_is_asked_for():
     many = jax.tree.map(lambda a: jnp.stack([a, a]), HIT)
     for draw in (plot.ferry, plot.disturbances):
         with pytest.raises(
-            ValueError,
-            match=r"episode must be one Episode, received Episode with leading axes \(2,\)",
+            ValueError, match=r"episode must .*received Episode with leading axes \(2,\)"
         ):
             draw(many)
     with pytest.raises(ValueError, match="plot.ferry: episode must be of jast.simulators.ferry"):

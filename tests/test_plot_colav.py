@@ -324,11 +324,7 @@ def test_a_format_without_its_writer_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(mpl_animation.writers, "is_available", lambda name: name == "html")
     for name in ("a.mp4", "a.gif", "a.webm", "a"):
         with pytest.raises(
-            ValueError,
-            match=(
-                r"plot.colav_animation: path must end in one of \['.html'\], .* received"
-                rf" '.*{name}'"
-            ),
+            ValueError, match=rf"plot.colav_animation: path must .*'.html'.* received '.*{name}'"
         ):
             plot.colav_animation(SHORT, path=tmp_path / name)
     assert not list(tmp_path.iterdir())
@@ -344,10 +340,7 @@ def test_one_episode_of_the_right_system_is_asked_for(draw):
         draw(many)
     with pytest.raises(ValueError, match=f"{name} be one Episode, received NoneType"):
         draw(None)
-    with pytest.raises(
-        ValueError,
-        match=f"{name} have states, or sim be the simulator to replay it on, received neither",
-    ):
+    with pytest.raises(ValueError, match=f"{name} have states, or sim .*received neither"):
         draw(EPISODE._replace(states=None))
     with pytest.raises(
         ValueError, match=f"{name} be of jast.simulators.colav, received states of FerryState"
@@ -357,10 +350,7 @@ def test_one_episode_of_the_right_system_is_asked_for(draw):
 
 @pytest.mark.parametrize("moments", [0, -1, 2.5, "last", None, [], [0, 26], [-1], [1.5], [[1]]])
 def test_moments_outside_the_episode_are_refused(moments):
-    with pytest.raises(
-        ValueError,
-        match=r"plot.colav: moments must be at least 1, or step numbers in 0 .. 25, received",
-    ):
+    with pytest.raises(ValueError, match="plot.colav: moments must be at least 1, or .* 0 .. 25"):
         plot.colav(EPISODE, moments=moments)
 
 

@@ -259,24 +259,18 @@ def test_what_cannot_be_drawn_is_refused():
         lambda result, objective: plot.surrogate_samples(result, objective, 1),
     ):
         with pytest.raises(
-            ValueError, match=r"result must be one run, received one with leading axes \(8,\)"
+            ValueError, match=r"result must .*received one with leading axes \(8,\)"
         ):
             draw(RUNS, OBJECTIVE)
         with pytest.raises(
             ValueError, match="result must be of an objective of 2 numbers, received 3"
         ):
             draw(three, paraboloid)
-        with pytest.raises(
-            ValueError,
-            match=(
-                "result must be a CEResult, received Array|result must be a CEResult, received"
-                " ndarray"
-            ),
-        ):
+        with pytest.raises(ValueError, match="result must be a CEResult, received (Array|ndarray)"):
             draw(RUN.best_x, OBJECTIVE)
     for wrong in ([0], [1, 5], 2.5, [True], ["1"]):
         with pytest.raises(
-            ValueError, match=r"plot.proposal_contours: iterations must be in 1 .. 4, received"
+            ValueError, match="plot.proposal_contours: iterations must be in 1 .. 4"
         ):
             plot.proposal_contours(RUN, OBJECTIVE, iterations=wrong)
     with pytest.raises(ValueError, match="iterations must name at least one"):
@@ -287,25 +281,14 @@ def test_what_cannot_be_drawn_is_refused():
     with pytest.raises(ValueError, match="elites must be an int of at least 1, received 0"):
         plot.proposal_contours(RUN, OBJECTIVE, elites=0)
     with pytest.raises(
-        ValueError,
-        match="plot.proposal_contours: axes must be at least 4, one for each iteration, received 1",
+        ValueError, match="plot.proposal_contours: axes must be at least 4.*received 1"
     ):
         plot.proposal_contours(RUN, OBJECTIVE, plt.figure().subplots())
-    with pytest.raises(
-        ValueError, match="plot.surrogate_samples: result must be of a method with a surrogate"
-    ):
+    with pytest.raises(ValueError, match="plot.surrogate_samples: result must .* with a surrogate"):
         plot.surrogate_samples(RUN, OBJECTIVE, 1)
-    with pytest.raises(
-        ValueError, match=r"plot.surrogate_samples: iteration must be in 1 .. 3, received 4"
-    ):
+    with pytest.raises(ValueError, match="plot.surrogate_samples: iteration must .*received 4"):
         plot.surrogate_samples(MODELLED, OBJECTIVE, 4)
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"plot.convergence: results must be CEResults with one leading axis, received leading"
-            r" axes \(\) for 'one'"
-        ),
-    ):
+    with pytest.raises(ValueError, match=r"plot.convergence: results must .*axes \(\) for 'one'"):
         plot.convergence({"one": RUN})
     with pytest.raises(ValueError, match="plot.convergence: results must hold at least one"):
         plot.convergence({})

@@ -175,19 +175,11 @@ def test_distributions_of_trials():
 def test_trials_are_asked_for():
     for draw, name in ((plot.trials, "trials"), (plot.trial_distances, "trial_distances")):
         with pytest.raises(
-            ValueError,
-            match=(
-                f"plot.{name}: results must be of searches with record=True, received a"
-                " SimpleNamespace"
-            ),
+            ValueError, match=f"plot.{name}: results must .*record=True, received a SimpleNamespace"
         ):
             draw(SimpleNamespace(trials=None))
         with pytest.raises(
-            ValueError,
-            match=(
-                rf"plot.{name}: trials must be arrays \[n, trees\], received distances of shape"
-                r" \(3,\)"
-            ),
+            ValueError, match=rf"plot.{name}: trials must .*received distances of shape \(3,\)"
         ):
             draw({"flat": recorded(np.ones(3))})
         with pytest.raises(ValueError, match=f"plot.{name}: results must be a search result"):

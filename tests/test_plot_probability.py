@@ -205,9 +205,7 @@ def test_a_fan_refuses():
         plot.failure_fan(FAILED, WALK, modes=[0])
     with pytest.raises(ValueError, match="plot.failure_fan: most must be"):
         plot.failure_fan(FAILED, WALK, most=0)
-    with pytest.raises(
-        ValueError, match=r"plot.failure_fan: value must return one number, received shape \(2,\)"
-    ):
+    with pytest.raises(ValueError, match=r"plot.failure_fan: value must .*received shape \(2,\)"):
         plot.failure_fan(FAILED, WALK, lambda s: jnp.zeros(2))
 
 
@@ -251,10 +249,7 @@ def test_weights_of_any_kind():
     drawn(plot.weights(traces(-1000 - np.random.default_rng(0).exponential(size=1000))))
     with pytest.raises(ValueError, match="plot.weights: traces must be Traces"):
         plot.weights(np.zeros(3))
-    with pytest.raises(
-        ValueError,
-        match="plot.weights: traces must hold at least 2 failures, received 0 for 'none'",
-    ):
+    with pytest.raises(ValueError, match="plot.weights: traces must .*received 0 for 'none'"):
         plot.weights({"none": traces(np.zeros(9), np.zeros(9, bool))})
 
 

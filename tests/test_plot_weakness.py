@@ -467,8 +467,7 @@ def test_a_grid_that_cannot_be_drawn_is_refused():
         names={0: "a"},
     )
     with pytest.raises(
-        ValueError,
-        match="plot.first_failures: axes must be at least 12, one for each failure, received 1",
+        ValueError, match="plot.first_failures: axes must be at least 12.*received 1"
     ):
         grid(result, IMAGES, LABELS, axes=plt.figure().subplots())
 

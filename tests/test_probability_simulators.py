@@ -68,10 +68,7 @@ def test_sweep_and_gradient(name, key):
     [
         (lambda: pendulum(noise=0.0), "pendulum: noise must be a positive number, received 0.0"),
         (lambda: pendulum(limit=np.ones(2)), "pendulum: limit must be a positive number"),
-        (
-            lambda: autoregression(rate=-0.1),
-            "autoregression: rate must be a positive number, received -0.1",
-        ),
+        (lambda: autoregression(rate=-0.1), "autoregression: rate must .*received -0.1"),
         (lambda: autoregression(horizon=0), "horizon must be an int of at least 1, received 0"),
         (lambda: ruin(up=1.0), "ruin: up must be a number between 0 and 1, received 1.0"),
         (lambda: ruin(start=0), "ruin: start must be a whole number of at least 1, received 0"),

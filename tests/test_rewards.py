@@ -78,9 +78,7 @@ def test_the_last_step_counts():
 )
 def test_density_is_checked(make):
     assert rewards.density_of(make("mode")) == "mode"
-    with pytest.raises(
-        ValueError, match=r'rewards\.\w+: density must be "raw" or "mode", received .log.'
-    ):
+    with pytest.raises(ValueError, match=r"rewards\.\w+: density must .*received .log."):
         make("log")
 
 

@@ -260,9 +260,7 @@ def test_a_file_that_does_not_fit_is_refused(learned, whole_run, tmp_path):
         load(path, two)
     with pytest.raises(ValueError, match="is not a file of a jast failure policy"):
         load(whole_run[2], WALK)
-    with pytest.raises(
-        ValueError, match="save: policy must be a jast.policies.FailurePolicy, received Policy"
-    ):
+    with pytest.raises(ValueError, match="save: policy must .*received Policy"):
         save(path, jast.Policy(_start, lambda s, t: _disturbance(s)))
 
 

@@ -99,10 +99,7 @@ def test_manual():
     for budget, iterations in ((99, 10), (100, 9)):
         with pytest.raises(
             ValueError,
-            match=(
-                f"schedule: expected {iterations} counts that sum to {budget}, received 10 that sum"
-                " to 100"
-            ),
+            match=f"expected {iterations} counts .* {budget}, received 10 that sum to 100",
         ):
             schedules.manual(published)(budget, iterations)
 
@@ -114,38 +111,27 @@ def test_a_function_of_the_users_own():
         0,
     )
     with pytest.raises(
-        ValueError,
-        match="schedule: expected 3 counts that sum to the budget 15, received 3 that sum to 12",
+        ValueError, match="schedule: expected 3 counts .*, received 3 that sum to 12"
     ):
         schedules.counts(lambda budget, iterations: (4,) * iterations, 5, 3)
     with pytest.raises(
-        ValueError,
-        match="schedule: expected 3 counts that sum to the budget 15, received 2 that sum to 15",
+        ValueError, match="schedule: expected 3 counts .*, received 2 that sum to 15"
     ):
         schedules.counts(lambda budget, iterations: (10, 5), 5, 3)
-    with pytest.raises(
-        ValueError,
-        match="schedule: counts must be whole numbers of at least 0, and not all 0, received 7",
-    ):
+    with pytest.raises(ValueError, match="schedule: counts must .*received 7"):
         schedules.counts(lambda budget, iterations: 7, 5, 3)
 
 
 @pytest.mark.parametrize("given", [(), (0, 0), (3, -1), (1.0, 2), (True, 2), 7, object()])
 def test_bad_counts(given):
-    with pytest.raises(
-        ValueError,
-        match="schedule: counts must be whole numbers of at least 0, and not all 0, received",
-    ):
+    with pytest.raises(ValueError, match="schedule: counts must be whole numbers"):
         schedules.counts(given, 10, 10)
     with pytest.raises(ValueError, match="schedule: counts must be"):
         schedules.manual(given)
 
 
 def test_bad_settings():
-    with pytest.raises(
-        ValueError,
-        match="schedule: expected None, \"uniform\", a function .*, received 'geometric'",
-    ):
+    with pytest.raises(ValueError, match="schedule: expected None, .*, received 'geometric'"):
         schedules.counts("geometric", 10, 10)
     for samples in (0, -1, 2.0, True, None):
         with pytest.raises(
@@ -161,7 +147,5 @@ def test_bad_settings():
             ValueError, match="geometric: p must be a number between 0 and 1, received"
         ):
             schedules.geometric(p)
-    with pytest.raises(
-        ValueError, match='geometric: normaliser must be "before" or "after", received None'
-    ):
+    with pytest.raises(ValueError, match="geometric: normaliser must .*received None"):
         schedules.geometric(normaliser=None)

@@ -207,24 +207,15 @@ def test_limit_state_rate(key):
         (lambda: ferry(3.0), "ferry: adversary must be two numbers"),
         (lambda: ferry((1.0, 2.0, 3.0)), "ferry: adversary must be two numbers"),
         (lambda: ferry("left"), "ferry: adversary must be two numbers"),
-        (
-            lambda: walk1d("both"),
-            'walk1d: form must be "two-sided" or "one-sided", received .both.',
-        ),
+        (lambda: walk1d("both"), "walk1d: form must .*received .both."),
         (lambda: walk1d(sigma=-1.0), "walk1d: sigma must be a positive number, received -1.0"),
         (lambda: walk1d(horizon=0), "horizon must be an int of at least 1, received 0"),
         (lambda: landing(b=0.0), "landing: b must be a positive number, received 0.0"),
         (lambda: landing(sigma_t=jnp.ones(2)), "landing: sigma_t must be a positive number"),
-        (
-            lambda: limit_state(plane, 0),
-            "limit_state: dimension must be an int of at least 1, received 0",
-        ),
+        (lambda: limit_state(plane, 0), "limit_state: dimension must .*received 0"),
         (lambda: limit_state(plane, 2.0), "limit_state: dimension must be an int of at least 1"),
         (lambda: limit_state(5, 2), "limit_state: g must be a function, received 5"),
-        (
-            lambda: limit_state(lambda x: x, 2),
-            r"limit_state: g must return a float scalar, received float..\[2\]",
-        ),
+        (lambda: limit_state(lambda x: x, 2), r"limit_state: g must .*received float..\[2\]"),
         (
             lambda: limit_state(lambda x: x.sum() > 0, 2),
             r"limit_state: g must return a float scalar, received bool\[\]",

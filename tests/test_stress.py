@@ -207,13 +207,7 @@ def test_ask_and_tell(key, equal):
 
 
 def test_bad_input():
-    with pytest.raises(
-        ValueError,
-        match=(
-            "over: actions must be jast.actions.quantiles\\(\\) or uniform\\(low, high\\), received"
-            " Samples"
-        ),
-    ):
+    with pytest.raises(ValueError, match="over: actions must .*received Samples"):
         over(walk(), actions=actions.samples())
     lacking = lambda s=None: D.VonMises(jnp.asarray(2.0), jnp.asarray(3.0))
     sim = jast.Simulator(
@@ -233,8 +227,7 @@ def test_bad_input():
         2,
     )
     with pytest.raises(
-        ValueError,
-        match="over: disturbance: VonMises has no quantile function; give actions=jast.actions.uni",
+        ValueError, match="over: disturbance: VonMises .*give actions=jast.actions.uni"
     ):
         over(sim)
     assert over(sim, actions=actions.uniform(0.0, 1.0)).proposal.mean.shape == (4,)

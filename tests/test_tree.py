@@ -418,11 +418,7 @@ def test_a_node_costs_its_edges_and_its_state():
 def test_trees_that_do_not_fit_are_refused_with_the_numbers():
     ran = []
     with pytest.raises(
-        ValueError,
-        match=(
-            r"forest: 1 trees in each of 1 threads take .* MB .*3 x 120 simulations.*10 kB are"
-            r" free; use fewer"
-        ),
+        ValueError, match="forest: 1 trees .* MB .*3 x 120 simulations.*10 kB .*use fewer"
     ):
         forest(
             jax.random.key(0),

@@ -344,9 +344,7 @@ def test_a_unit_that_goes_on_failing_is_left_out_and_told():
 
 
 def test_where_all_units_fail_the_call_says_why():
-    with pytest.raises(
-        RuntimeError, match="squares: every unit of work failed in the executor, 3 times.*Zero"
-    ):
+    with pytest.raises(RuntimeError, match="squares: every unit of work failed .*, 3 times.*Zero"):
         squares(executor=Flaky(9))
     with pytest.raises(ZeroDivisionError):  # in this process, at once
         squares(function=fails)

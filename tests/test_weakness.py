@@ -610,9 +610,7 @@ def test_a_system_that_does_not_answer_at_all(predict, message):
 def test_a_state_of_something_else_is_refused():
     inputs, labels, answers = problem(20)
     state = validate(KEY, System(answers), inputs, labels, budget=10, selector=in_turn()).state
-    with pytest.raises(
-        ValueError, match="state must be the state of a Result, received Result: give result.state"
-    ):
+    with pytest.raises(ValueError, match="state must .*received Result: give result.state"):
         validate(
             KEY,
             System(answers),

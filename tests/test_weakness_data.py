@@ -127,23 +127,17 @@ def test_from_idx(tmp_path, joint, packed):
 def test_from_idx_says_what_is_wrong(tmp_path):
     images, labels = tmp_path / "t10k-images-idx3-ubyte", tmp_path / "t10k-labels-idx1-ubyte"
     with pytest.raises(
-        FileNotFoundError,
-        match="from_idx: none of t10k-images-idx3-ubyte, .*t10k-images.idx3-ubyte.gz is in ",
+        FileNotFoundError, match="from_idx: none of .*t10k-images.idx3-ubyte.gz is in "
     ):
         from_idx(tmp_path)
     images.write_bytes(IMAGES)
     with pytest.raises(FileNotFoundError, match="t10k-labels-idx1-ubyte"):
         from_idx(tmp_path)
     labels.write_bytes(golden(0x08, (3,), [7, 0, 1]))
-    with pytest.raises(
-        ValueError,
-        match="from_idx: t10k in .* a label for each image, received 2 images and 3 labels",
-    ):
+    with pytest.raises(ValueError, match="from_idx: t10k .*received 2 images and 3 labels"):
         from_idx(tmp_path)
     labels.write_bytes(golden(0x0C, (2,), [7, 0]))
-    with pytest.raises(
-        ValueError, match="from_idx: .*labels.* unsigned bytes in 1 dimensions, received int32"
-    ):
+    with pytest.raises(ValueError, match="from_idx: .*labels.* 1 dimensions, received int32"):
         from_idx(tmp_path)
     labels.write_bytes(IMAGES)
     with pytest.raises(
