@@ -1,8 +1,11 @@
-"""What holds in each result of a search and in estimates; how many programs were compiled."""
+"""What holds in each result of a search, in estimates and in trainings; how many programs were
+compiled.
+"""
 
 from contextlib import contextmanager
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jast
@@ -91,6 +94,75 @@ def check_estimate(found, truth, precision=0.05, budget=np.inf):
     assert found.relative_error < precision, str(found)
     assert found.reliable, str(found)
     assert found.evaluations <= budget, str(found)
+
+
+def whole_training(train, path):
+    """An uninterrupted training with its checkpoint at ``path``, and the rows that the callback
+    got. ``train(number_of_the_key, **settings)`` gives a policy.
+    """
+    rows = []
+    tell = lambda done, total, so_far: rows.append((done, total, so_far))
+    return train(3, checkpoint=path, callback=tell), rows, path
+
+
+def check_rows(policy, rows):
+    """The callback got the rows of the history, one more at each call."""
+    assert len(rows) == len(policy.history.episodes) >= 10
+    assert all(done <= total for done, total, _ in rows)
+    assert rows[-1][0] == rows[-1][1] >= policy.steps
+    assert (np.diff(policy.history.episodes) >= 0).all()
+    for n, (*_, so_far) in enumerate(rows):
+        np.testing.assert_array_equal(so_far.episodes, policy.history.episodes[: n + 1])
+        np.testing.assert_array_equal(so_far.failing_share, policy.history.failing_share[: n + 1])
+
+
+def check_key_decides(train, policy, equal):
+    """The key of `whole_training` gives its ``policy`` again; another one gives another."""
+    again = train(3)
+    equal(again.learned, policy.learned)
+    equal(again.history, policy.history)
+    other = train(4).learned
+    assert not np.array_equal(*(jax.tree.leaves(p.actor)[0] for p in (other, again.learned)))
+
+
+def check_training_goes_on(train, policy, path, equal):
+    """A training that is interrupted goes on from its checkpoint to the bits of ``policy``."""
+    seen = []
+
+    def stop(done, total, so_far):
+        seen.append(done)
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+
+    part = train(3, checkpoint=path, callback=stop)
+    assert len(part.history.episodes) == 4  # what is there is handed out
+    rest = train(3, checkpoint=path)
+    equal(rest.learned, policy.learned)
+    equal(rest.history, policy.history)
+
+
+def weighted_episodes(key, sim, policy, n):
+    """Log importance weights (-inf where it did not fail), x0 and the last state of ``n`` episodes
+    of ``policy``.
+    """
+
+    def one(key):
+        e = jast.rollout(key, sim, policy)
+        steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
+            jax.tree.map(lambda a: a[:-1], e.states),
+            jnp.arange(sim.horizon, dtype=jnp.int32),
+            e.disturbances,
+        )
+        log_q = policy.start().log_prob(e.x0) + jnp.sum(
+            jnp.where(jnp.arange(sim.horizon, dtype=jnp.int32) < e.length, steps, 0)
+        )
+        return (
+            jnp.where(e.failure, e.log_prob - log_q, -jnp.inf),
+            e.x0,
+            jax.tree.leaves(e.states)[-1][e.length],
+        )
+
+    return jax.jit(jax.vmap(one))(jax.random.split(key, n))
 
 
 @contextmanager

@@ -11,10 +11,11 @@ import numpy as np
 import jast
 from jast.crude import Nominal
 from jast.distributions import Joint, Normal
+from jast.estimate.estimate import Estimate
 from jast.search.failure_modes import Mode, Modes
 from jast.stress_testing.report import Report, Tried
 
-__all__ = ["EVIL", "SIM", "Car", "made"]
+__all__ = ["EVIL", "SIM", "Car", "estimate", "made"]
 
 EVIL = "</script><script>fail()</script><b>&\"'<!--"
 
@@ -31,6 +32,12 @@ SIM = jast.Simulator(
     evaluate=lambda s: (s.speed > 4, jnp.maximum(4 - s.speed, 0)),
     horizon=8,
 )
+
+
+def estimate(**changes):
+    """A probability of 1e-5, by hand."""
+    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
+    return Estimate("mine", *numbers, True, (), unseen=0.02)._replace(**changes)
 
 
 def made(**changes):

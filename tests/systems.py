@@ -187,6 +187,12 @@ def line(**changes):
     return jast.Simulator(**(fields | changes))
 
 
+def above(limit, horizon, **changes):
+    """A sum of standard normal steps that fails from ``limit`` on; new functions at every call."""
+    evaluate = lambda s: (s >= limit, jnp.maximum(limit - s, 0.0))
+    return line(**dict(evaluate=evaluate, horizon=horizon) | changes)
+
+
 def mark_long(cases, *long):
     """The cases of a parametrization. Those of ``long`` run with the long tests: others make the
     same claim of another system, method or precision.

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from systems import line
 
 import jast
 from benchmarks.stress_systems import slips
@@ -159,14 +160,7 @@ def walk(below):
             near = jnp.minimum(near, jnp.maximum(s + below, 0.0))
         return near <= 0, near
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=evaluate,
-        horizon=2,
-        episodic=True,
-    )
+    return line(evaluate=evaluate, horizon=2, episodic=True)
 
 
 def test_a_regression_is_where_the_new_version_alone_fails():

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import above
 
 import jast
 from benchmarks.explain_systems import planted
@@ -275,13 +276,7 @@ def test_without_scikit_learn(monkeypatch):
 
 
 def walk(limit=5.0, steps=20):
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 0.5),
-        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
-        horizon=steps,
-    )
+    return above(limit, steps, disturbance=lambda s: Normal(0.0, 0.5))
 
 
 @pytest.fixture(scope="module")

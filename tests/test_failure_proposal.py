@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from checks import weighted_episodes
 from systems import hyperplane, ring, walk
 
 import jast
@@ -45,30 +46,13 @@ def sides():
     )
 
 
-def log_weights(key, sim, policy, n):
-    """log p / q of ``n`` fresh failures under ``policy``, to their end; -inf for episodes that do
-    not fail.
-    """
-
-    def one(key):
-        e = jast.rollout(key, sim, policy)
-        t = jnp.arange(sim.horizon, dtype=jnp.int32)
-        log_q = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
-            jax.tree.map(lambda a: a[:-1], e.states), t, e.disturbances
-        )
-        log_q = jnp.sum(jnp.where(t < e.length, log_q, 0)) + policy.start().log_prob(e.x0)
-        return jnp.where(e.failure, e.log_prob - log_q, -jnp.inf)
-
-    return jax.vmap(one)(jax.random.split(key, n))
-
-
 def estimates(key, sim, n=10_000, **settings):
     """Of ``SEEDS`` proposals: (mean [seeds], its standard error [seeds], the proposals)."""
 
     def run(key):
         to_find, to_estimate = jax.random.split(key)
         found = failure_proposal(to_find, sim, **settings)
-        return log_weights(to_estimate, sim, found.policy, n), found
+        return weighted_episodes(to_estimate, sim, found.policy, n)[0], found
 
     log_w, found = jax.jit(jax.vmap(run))(jax.random.split(key, SEEDS))
     w = np.exp(np.asarray(log_w, float))

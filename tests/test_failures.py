@@ -382,13 +382,16 @@ def test_load_refuses_other_files_and_versions(tmp_path, archive, monkeypatch):
 
 def test_load_refuses_missing_and_changed_arrays(tmp_path, archive):
     path = tmp_path / "a"
-    F.save(path, archive)
+    F.save(path, archive, dict(seed=1))
     with np.load(path) as pack:
         arrays = dict(pack)
+    other = arrays["header"].tobytes().replace(b'"seed": 1', b'"seed": 2')
+    assert other != arrays["header"].tobytes()
     for change in (
         lambda a: a.pop("reward.0"),
         lambda a: a.update({"reward.0": a["reward.0"] + 1}),
         lambda a: a.update(extra=np.zeros(1)),
+        lambda a: a.update(header=np.frombuffer(other, np.uint8)),
     ):
         changed = dict(arrays)
         change(changed)

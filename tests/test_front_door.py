@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import above
 
 import jast
 from benchmarks.stress_systems import CASES, PEDESTRIANS, pedestrians
@@ -14,14 +15,7 @@ from jast.distributions import Independent, Normal, seeds
 
 
 def walk(limit=4.0, **changes):
-    given = dict(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
-        horizon=2,
-    )
-    return jast.Simulator(**given | changes)
+    return above(limit, 2, **changes)
 
 
 @pytest.fixture(scope="module")

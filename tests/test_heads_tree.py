@@ -615,15 +615,6 @@ def test_a_traced_search_is_the_same_search():
 
 
 @pytest.mark.long
-def test_vmap_over_simulators_is_a_loop():
-    adversaries = jnp.array([[16.0, 0.0], [17.0, 0.0], [30.0, 10.0]])
-    together = jax.vmap(best_of, in_axes=(0, None, None))(adversaries, KNOWN["ferry"], "one")
-    apart = jnp.stack([best_of(adversary, KNOWN["ferry"], "one") for adversary in adversaries])
-    np.testing.assert_allclose(together, apart, rtol=1e-4)
-    assert (together[2] != together[0]).all()
-
-
-@pytest.mark.long
 def test_vmap_over_heads_is_a_loop():
     several = [KNOWN["ferry"], known(5, 1, 21, seed=1), without(KNOWN["ferry"])]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)

@@ -4,13 +4,12 @@ import gc
 import weakref
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import above
 
 import jast
 from jast import memory
-from jast.distributions import Normal
 from jast.search.tree import memory as of_trees
 
 maps = pytest.mark.skipif(not memory._MAPS.exists(), reason="only Linux tells of mappings")
@@ -22,13 +21,7 @@ def counted():
 
 def fresh():
     """A system with a step function of its own, which no program knows."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: 0.5 * s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s > 3.0, jnp.maximum(3.0 - s, 0.0)),
-        horizon=3,
-    )
+    return above(3.0, 3, step=lambda s, x: 0.5 * s + x)
 
 
 def met(calls, monkeypatch, work, room):

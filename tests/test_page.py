@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import Page, browsed
-from reports import EVIL, SIM, made
+from reports import EVIL, SIM, estimate, made
 
 import jast
 from jast.distributions import Normal
-from jast.estimate.estimate import Estimate
 from jast.explain import Criticality, Minimal
 from jast.page import document, report, traces
 from jast.search.failure_modes import Modes
@@ -205,8 +204,7 @@ def test_a_report_from_a_file_has_a_page(tmp_path):
 
 
 def test_the_verdict_says_whether_to_believe_it(tmp_path):
-    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
-    p = Estimate("mine", *numbers, True, (EVIL,), unseen=0.02)
+    p = estimate(warnings=(EVIL,))
     blank = p._replace(log_mean=np.nan, reliable=False, relative_error=np.nan, interval=(0, 0.003))
     quiet = made().nominal.undisturbed._replace(failure=np.True_)
     none = made(failures=jast.failures.empty(SIM), modes=Modes())
@@ -288,8 +286,8 @@ def test_a_report_in_a_cell_of_a_notebook(monkeypatch):
     for _, attributes in [t for t in seen.tags if t[0] == "img"]:
         png = b64decode(attributes["src"].removeprefix("data:image/png;base64,"))
         assert png.startswith(b"\x89PNG") and len(png) < 20_000
-    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
-    doubtful = made(probability=Estimate("mine", *numbers, False, (EVIL,)))._repr_html_()
+    doubt = estimate(reliable=False, warnings=(EVIL,), unseen=None)
+    doubtful = made(probability=doubt)._repr_html_()
     assert "UNRELIABLE" in doubtful
     assert "&lt;script&gt;fail()" in doubtful
     assert EVIL not in doubtful

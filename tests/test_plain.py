@@ -1,13 +1,12 @@
 """Plain draws: by normal numbers where these are as cheap as draws, else by keys."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from checks import compiled
 from scipy import stats
+from systems import line
 
-import jast
 from jast import distributions as D
 from jast.estimate import events, monte_carlo
 from jast.estimate.batches import plain_chunk
@@ -18,9 +17,7 @@ SAMPLES = 20_000
 
 def above(disturbance, threshold, steps=1):
     """It fails where the sum of so many disturbances is above a threshold."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
+    return line(
         disturbance=lambda s: disturbance,
         evaluate=lambda s: (s > threshold, threshold - s),
         horizon=steps,

@@ -144,11 +144,6 @@ def test_one_episode_of_the_right_system_is_asked_for():
         plot.ferry(HIT._replace(states=jnp.zeros(22)))
 
 
-def test_matplotlib_is_imported_only_to_draw():
-    code = "import sys, jast.plot; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
 def test_settings_of_matplotlib_are_left_alone():
     before = dict(matplotlib.rcParams)
     plot.ferry(HIT)

@@ -5,23 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pictures import drawn, plt
-from reports import EVIL, SIM, made
+from reports import EVIL, SIM, estimate, made
 
 import jast
 from jast import plot
 from jast.distributions import seeds
-from jast.estimate.estimate import Estimate
 from jast.search.failure_modes import Mode, Modes
 
 
 def said(figure):
     figure.canvas.draw()
     return [text.get_text() for text in figure.texts]
-
-
-def estimate(**changes):
-    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
-    return Estimate("mine", *numbers, True, (), unseen=0.02)._replace(**changes)
 
 
 def test_a_report_on_one_page(tmp_path):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import check_key_decides, check_rows, check_training_goes_on, whole_training
 from scipy import stats
 from systems import ring, walk
 
@@ -205,48 +206,28 @@ def test_a_reward_at_the_end_alone_is_learned_from(key):
     assert share - 4 * error > 2 * stats.norm.sf(3 / np.sqrt(6))
 
 
+def train(number, **settings):
+    return ppo(jax.random.key(number), WALK, **TINY, **settings)
+
+
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
-    """An uninterrupted training with its checkpoint, and the rows that the callback got."""
-    rows, path = [], tmp_path_factory.mktemp("ppo") / "whole.jast"
-    tell = lambda done, total, so_far: rows.append((done, total, so_far))
-    return ppo(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=tell), rows, path
+    return whole_training(train, tmp_path_factory.mktemp("ppo") / "whole.jast")
 
 
 @pytest.mark.long
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
-    policy, rows, _ = whole_run
-    assert len(rows) == len(policy.history.episodes) >= 10
-    assert all(done <= total for done, total, _ in rows) and rows[-1][0] == rows[-1][1]
-    for n, (*_, so_far) in enumerate(rows):
-        np.testing.assert_array_equal(so_far.failing_share, policy.history.failing_share[: n + 1])
-    assert policy.steps <= rows[-1][1] and np.all(np.diff(policy.history.episodes) > 0)
+    check_rows(*whole_run[:2])
 
 
 @pytest.mark.long
 def test_the_same_key_gives_the_same_policy(whole_run, equal):
-    again = ppo(jax.random.key(3), WALK, **TINY)
-    equal(again.learned, whole_run[0].learned)
-    equal(again.history, whole_run[0].history)
-    other = ppo(jax.random.key(4), WALK, **TINY).learned
-    assert not np.array_equal(*(jax.tree.leaves(p.actor)[0] for p in (other, again.learned)))
+    check_key_decides(train, whole_run[0], equal)
 
 
 @pytest.mark.long
 def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_path):
-    seen = []
-
-    def stop(done, total, so_far):
-        seen.append(done)
-        if len(seen) == 4:
-            raise KeyboardInterrupt
-
-    path = tmp_path / "run.jast"
-    part = ppo(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=stop)
-    assert len(part.history.episodes) == 4  # what is there is handed out
-    rest = ppo(jax.random.key(3), WALK, **TINY, checkpoint=path)
-    equal(rest.learned, whole_run[0].learned)
-    equal(rest.history, whole_run[0].history)
+    check_training_goes_on(train, whole_run[0], tmp_path / "run.jast", equal)
 
 
 @pytest.mark.long

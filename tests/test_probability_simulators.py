@@ -2,7 +2,6 @@
 benchmarks: each truth is derived again by other means.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,27 +17,6 @@ from jast.simulators.pendulum import PendulumState
 ALL = {"pendulum": pendulum, "autoregression": autoregression, "ruin": ruin}
 # parameters unlike the defaults, by position
 LIKE_NUMBERS = {"pendulum": (0.2, 0.3, 1.0, 0.5), "autoregression": (0.3, 2.0), "ruin": (0.45,)}
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_contract(name):
-    checked = ALL[name]()
-    assert jast.check(checked) is checked
-    for enabled, expected in ((False, jnp.float32), (True, jnp.float64)):
-        with jax.enable_x64(enabled):
-            episode = jax.eval_shape(jast.rollout, jax.random.key(0), ALL[name]())
-            leaves = [a for a in jax.tree.leaves(episode) if jnp.issubdtype(a.dtype, jnp.floating)]
-            assert leaves
-            assert all(a.dtype == expected for a in leaves)
-            assert episode.length.dtype == jnp.int32
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_parameters_are_traced(name, key):
-    chex.clear_trace_counter()  # another case of this test counts as the same function
-    play = jax.jit(chex.assert_max_traces(lambda sim: jast.rollout(key, sim), n=1))
-    play(ALL[name]())
-    play(ALL[name](*LIKE_NUMBERS[name]))
 
 
 @pytest.mark.parametrize("name", mark_long(ALL, "autoregression"))

@@ -6,6 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checks import (
+    check_key_decides,
+    check_rows,
+    check_training_goes_on,
+    weighted_episodes,
+    whole_training,
+)
 from scipy import integrate, stats
 from systems import walk
 
@@ -50,30 +57,6 @@ ONE_WAY_OR_THE_OTHER = jast.Simulator(
 WALK = walk()
 
 
-def weighed(key, sim, policy, n):
-    """Log importance weights (-inf where it did not fail), x0 and the last state of ``n`` episodes
-    of ``policy``.
-    """
-
-    def one(key):
-        e = jast.rollout(key, sim, policy)
-        steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
-            jax.tree.map(lambda a: a[:-1], e.states),
-            jnp.arange(sim.horizon, dtype=jnp.int32),
-            e.disturbances,
-        )
-        log_q = policy.start().log_prob(e.x0) + jnp.sum(
-            jnp.where(jnp.arange(sim.horizon, dtype=jnp.int32) < e.length, steps, 0)
-        )
-        return (
-            jnp.where(e.failure, e.log_prob - log_q, -jnp.inf),
-            e.x0,
-            jax.tree.leaves(e.states)[-1][e.length],
-        )
-
-    return jax.jit(jax.vmap(one))(jax.random.split(key, n))
-
-
 @pytest.fixture(scope="module")
 def learned():
     return sac(jax.random.key(1), TWO_SIDES, **SMALL)
@@ -84,7 +67,7 @@ def test_a_learned_policy_fails_on_both_sides_and_its_weights_give_the_probabili
     """2 Phi(-5 / sqrt 3) = .0038924 within 4 SE of 4000 episodes, SE below 4 % (crude Monte Carlo:
     25 %), half of it on each side.
     """
-    log_w, x0, _ = weighed(key, TWO_SIDES, learned, 4000)
+    log_w, x0, _ = weighted_episodes(key, TWO_SIDES, learned, 4000)
     w = np.exp(np.float64(log_w))
     se = w.std() / np.sqrt(len(w))
     truth = 2 * stats.norm.sf(5 / np.sqrt(3))
@@ -120,7 +103,7 @@ def test_two_ways_out_of_one_state_are_both_taken(key):
     policy of one component leaves a side out.
     """
     policy = sac(key, ONE_WAY_OR_THE_OTHER, **SMALL | dict(updates=30))
-    log_w, _, sides = weighed(key, ONE_WAY_OR_THE_OTHER, policy, 4000)
+    log_w, _, sides = weighted_episodes(key, ONE_WAY_OR_THE_OTHER, policy, 4000)
     w, truth = np.exp(np.float64(log_w)), 2 * stats.norm.sf(4)
     assert abs(w.mean() - truth) < 4 * w.std() / np.sqrt(len(w)) < 0.16 * truth
     assert 0.4 < w[np.asarray(sides) > 0].sum() / w.sum() < 0.6
@@ -158,54 +141,25 @@ def test_a_policy_goes_through_jit_and_vmap(learned, key):
     assert given.shape == (3,) and bool(jnp.all(jnp.isfinite(given)))
 
 
+def train(number, **settings):
+    return sac(jax.random.key(number), WALK, **TINY, **settings)
+
+
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
-    """An uninterrupted training with its checkpoint, and the rows that the callback got."""
-    rows = []
-    path = tmp_path_factory.mktemp("sac") / "whole.jast"
-    policy = sac(
-        jax.random.key(3),
-        WALK,
-        **TINY,
-        checkpoint=path,
-        callback=lambda done, total, so_far: rows.append((done, total, so_far)),
-    )
-    return policy, rows, path
+    return whole_training(train, tmp_path_factory.mktemp("sac") / "whole.jast")
 
 
 def test_the_callback_gets_the_rows_of_the_history(whole_run):
-    policy, rows, _ = whole_run
-    assert len(rows) == len(policy.history.episodes) >= 10
-    assert all(done <= total for done, total, _ in rows) and rows[-1][0] == rows[-1][1]
-    assert [h.episodes[-1] for *_, h in rows] == policy.history.episodes.tolist()
-    for n, (*_, so_far) in enumerate(rows):
-        np.testing.assert_array_equal(so_far.failing_share, policy.history.failing_share[: n + 1])
+    check_rows(*whole_run[:2])
 
 
 def test_the_same_key_gives_the_same_policy(whole_run, equal):
-    again = sac(jax.random.key(3), WALK, **TINY)
-    equal(again.learned, whole_run[0].learned)
-    equal(again.history, whole_run[0].history)
-    other = sac(jax.random.key(4), WALK, **TINY)
-    assert not np.array_equal(
-        jax.tree.leaves(other.learned.actor)[0], jax.tree.leaves(again.learned.actor)[0]
-    )
+    check_key_decides(train, whole_run[0], equal)
 
 
 def test_an_interrupted_training_goes_on_to_the_same_bits(whole_run, equal, tmp_path):
-    seen = []
-
-    def stop(done, total, so_far):
-        seen.append(done)
-        if len(seen) == 4:
-            raise KeyboardInterrupt
-
-    path = tmp_path / "run.jast"
-    part = sac(jax.random.key(3), WALK, **TINY, checkpoint=path, callback=stop)
-    assert len(part.history.episodes) == 4  # what is there is handed out
-    rest = sac(jax.random.key(3), WALK, **TINY, checkpoint=path)
-    equal(rest.learned, whole_run[0].learned)
-    equal(rest.history, whole_run[0].history)
+    check_training_goes_on(train, whole_run[0], tmp_path / "run.jast", equal)
 
 
 def test_a_checkpoint_of_another_training_is_refused(whole_run):
@@ -339,7 +293,7 @@ def test_landing_without_a_word_about_its_modes(seed):
     """
     sim = jast.simulators.landing()
     policy = sac(jax.random.key(seed), sim)
-    log_w, x0, _ = weighed(jax.random.key(100 + seed), sim, policy, 100_000)
+    log_w, x0, _ = weighted_episodes(jax.random.key(100 + seed), sim, policy, 100_000)
     w = np.exp(np.float64(log_w))
     assert abs(w.mean() / 4.0236721906842e-13 - 1) < 0.1
     assert w.std() / w.mean() / np.sqrt(len(w)) < 0.02

@@ -12,7 +12,16 @@ from jax.tree_util import Partial
 from systems import mark_long
 
 import jast
-from jast.simulators import ferry, landing, landing_probability, limit_state, walk1d
+from jast.simulators import (
+    autoregression,
+    ferry,
+    landing,
+    landing_probability,
+    limit_state,
+    pendulum,
+    ruin,
+    walk1d,
+)
 
 
 def plane(x):
@@ -36,6 +45,9 @@ ALL = {
     "landing": landing,
     "limit_state": lambda: limit_state(plane, 3),
     "limit_state of 200": lambda: limit_state(plane, 200),
+    "pendulum": pendulum,
+    "autoregression": autoregression,
+    "ruin": ruin,
 }
 CASES = mark_long(ALL, "walk1d one-sided", "limit_state of 200")
 
@@ -248,12 +260,15 @@ def shifted(level, x):
         (lambda: ferry((16.0, 0.0)), lambda: ferry((17.0, 1.0))),
         (lambda: walk1d(sigma=1.0), lambda: walk1d(sigma=2.0, threshold=3)),
         (lambda: landing(), lambda: landing(b=0.2, sigma_i=0.3)),
+        (pendulum, lambda: pendulum(0.2, 0.3, 1.0, 0.5)),
+        (autoregression, lambda: autoregression(0.3, 2.0)),
+        (ruin, lambda: ruin(0.45)),
         (
             lambda: limit_state(Partial(shifted, jnp.asarray(1.0)), 2),
             lambda: limit_state(Partial(shifted, jnp.asarray(2.0)), 2),
         ),
     ],
-    ids=["ferry", "walk1d", "landing", "limit_state"],
+    ids=["ferry", "walk1d", "landing", "pendulum", "autoregression", "ruin", "limit_state"],
 )
 def test_a_second_instance_does_not_recompile(first, second, key):
     chex.clear_trace_counter()  # another case of this test counts as the same function

@@ -9,15 +9,15 @@ import pickle
 from statistics import NormalDist
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from reports import estimate
+from systems import above
 
 import jast
 from jast.crude import Nominal
-from jast.distributions import Normal
-from jast.estimate import Estimate, failure_probability
+from jast.estimate import failure_probability
 from jast.estimate.markov_tilts import Tilts
 from jast.estimate.tilt_fit import as_tilts, of_tilts
 from jast.intervals import clopper_pearson
@@ -28,14 +28,7 @@ LIMITS = (0.5, 1.0, 1.5, 2.0)
 
 
 def make(limit, horizon=1):
-    """Fails where the sum of its steps is above ``limit``; new functions at every call."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
-        horizon=horizon,
-    )
+    return above(limit, horizon)
 
 
 def crude(key, limits=LIMITS, simulators=make, **how):
@@ -207,8 +200,7 @@ def test_a_setting_may_be_called_as_a_column():
 
 
 def test_a_flagged_row_shows_what_plain_draws_guarantee_and_the_doubtful_number_behind():
-    numbers = (-11.5, 1e-5, 1e-6, 0.1, (8e-6, 2e-5), 0.95, 90.0, 0.5, 0.01, 9, 99, 999, 9, 0, None)
-    good = Estimate("mine", *numbers, True, (), plain=(0, 0, 1000))
+    good = estimate(unseen=None, plain=(0, 0, 1000))
     bad = good._replace(reliable=False, warnings=("no",), plain=(0, 0, 1_000_000))
     bare, none = bad._replace(plain=None), (None,) * 3
     head, *rows = str(Sweep({"gain": (1, 2, 3)}, (good, bad, bare), none, none, {})).splitlines()
@@ -336,14 +328,7 @@ def test_partials_of_make_are_equal_in_other_sweeps_and_processes():
 
 def after_five(limit):
     """The sum of five steps is above ``limit`` at the end: Phi(-limit / sqrt(5))."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
-        horizon=5,
-        episodic=True,
-    )
+    return above(limit, 5, episodic=True)
 
 
 def test_a_row_that_follows_is_the_call_with_its_neighbour(key, equal):

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import line
 
 import jast
-from jast.distributions import Normal
 from jast.estimate import Estimate
 from jast.estimate.sample import Sample, counted
 from jast.sweeping.join import joined
@@ -21,14 +21,8 @@ PHI = NormalDist()
 
 def walk(limit, horizon=1):
     """The sum of its steps leaves [-limit, limit] at the end: 2 Phi(-limit / sqrt(horizon))."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (jnp.abs(s) > limit, jnp.maximum(limit - jnp.abs(s), 0.0)),
-        horizon=horizon,
-        episodic=True,
-    )
+    evaluate = lambda s: (jnp.abs(s) > limit, jnp.maximum(limit - jnp.abs(s), 0.0))
+    return line(evaluate=evaluate, horizon=horizon, episodic=True)
 
 
 def log_truth(limits, horizon=1):
