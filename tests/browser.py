@@ -52,9 +52,7 @@ setTimeout(() => {
 
 def browsed(page, check, tmp_path):
     """What the JavaScript ``check`` puts into ``found`` in a headless browser, and its console."""
-    browser = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip("no browser: chromium or google-chrome is not installed")
     path = tmp_path / "probe.html"

@@ -2,7 +2,11 @@
 compiled.
 """
 
+import os
+import subprocess
+import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +14,8 @@ import numpy as np
 
 import jast
 from jast import failures as F
+
+ROOT = Path(__file__).parents[1]
 
 
 def honest(result, sim, reward):
@@ -163,6 +169,21 @@ def weighted_episodes(key, sim, policy, n):
         )
 
     return jax.jit(jax.vmap(one))(jax.random.split(key, n))
+
+
+def python(*arguments, cwd):
+    """What a Python program prints that runs with this jast in the folder ``cwd``."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": path, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
 
 
 @contextmanager

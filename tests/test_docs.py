@@ -5,15 +5,13 @@ import functools
 import importlib
 import inspect
 import operator
-import os
 import re
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from checks import python
 from doors import DOORS
 
 import jast
@@ -24,20 +22,6 @@ PAGES = [ROOT / "docs/start.md", *sorted((ROOT / "docs/guides").glob("*.md"))]
 SYSTEMS = ROOT / "docs/guides/environments.md"  # its examples stand alone, and need other libraries
 PAGES.remove(SYSTEMS)
 ROOMS = [name for name in jast.__all__ if isinstance(getattr(jast, name), ModuleType)]
-
-
-def python(*arguments, cwd):
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=cwd,
-        env=os.environ | {"PYTHONPATH": path, "MPLBACKEND": "agg"},
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    return done.stdout
 
 
 @pytest.mark.long

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import above
 
 import jast
 from jast.distributions import Joint, Normal, Uniform
@@ -18,13 +19,10 @@ falsify = jast.search.falsify
 def held(horizon=12, **changes):
     """A level follows its input slowly: it is above .9 only where that is held near 1 for long."""
     given = dict(
-        init=lambda x0: jnp.zeros(()),
         step=lambda s, x: s + 0.3 * (x - s),
         disturbance=lambda s: Uniform(0.0, 1.0),
-        evaluate=lambda s: (s >= 0.9, jnp.maximum(0.9 - s, 0.0)),
-        horizon=horizon,
     )
-    return jast.Simulator(**given | changes)
+    return above(0.9, horizon, **given | changes)
 
 
 def test_what_must_be_held_is_found_with_few_simulations(key):

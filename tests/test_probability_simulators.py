@@ -11,6 +11,7 @@ from systems import mark_long
 
 import jast
 from benchmarks import limit_states
+from benchmarks.limit_states import autoregression_probability
 from jast.simulators import autoregression, pendulum, ruin, ruin_probability
 from jast.simulators.pendulum import PendulumState
 
@@ -111,24 +112,11 @@ def test_pendulum_step():
 # autoregression
 
 
-def first_passage(nodes, a, threshold, steps):
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    # from -9 to the threshold
-    x, w = (threshold - 9) / 2 + x * (threshold + 9) / 2, w * (threshold + 9) / 2
-    spread = np.sqrt(1 - a**2)
-    passes = lambda s: scipy.stats.norm.sf(threshold, a * s, spread)
-    total, density = passes(0.0), scipy.stats.norm.pdf(x, 0, spread)
-    for _ in range(steps - 1):
-        total += np.sum(w * density * passes(x))
-        density = scipy.stats.norm.pdf(x[:, None], a * x, spread) @ (w * density)
-    return total
-
-
 def test_autoregression_truth(key):
-    coarse, fine = (first_passage(n, np.exp(-0.1), 5.0, 100) for n in (150, 220))
+    coarse, fine = (autoregression_probability(0.1, 5.0, 100, n) for n in (150, 220))
     assert coarse == pytest.approx(fine, rel=1e-9)
     assert fine == pytest.approx(1.7438880336e-5, rel=1e-9)
-    p, n = first_passage(150, np.exp(-0.2), 2.5, 100), 20_000
+    p, n = autoregression_probability(0.2, 2.5, 100), 20_000
     assert abs(jast.nominal(key, autoregression(0.2, 2.5), n).rate - p) < 4 * np.sqrt(
         p * (1 - p) / n
     )

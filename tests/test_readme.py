@@ -1,12 +1,10 @@
 """The README: its example runs, its commands and names exist."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from checks import python
 
 import jast
 
@@ -20,17 +18,7 @@ def run(text, folder):
     """What the one Python example of ``text`` prints."""
     [code] = re.findall(r"```python\n(.*?)```", text, re.S)
     (folder / "example.py").write_text(code)
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [sys.executable, "example.py"],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return python("example.py", cwd=folder)
 
 
 @pytest.mark.long

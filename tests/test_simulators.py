@@ -12,6 +12,7 @@ from jax.tree_util import Partial
 from systems import mark_long
 
 import jast
+from benchmarks.limit_states import walk_probability
 from jast.simulators import (
     autoregression,
     ferry,
@@ -74,31 +75,13 @@ def test_dtypes(name):
 # walk
 
 
-def first_passage(nodes, steps, threshold, two_sided):
-    """P(|s| or s >= threshold within ``steps``): Gauss-Legendre nodes on the surviving band, the
-    mass that passes summed step by step.
-    """
-    low = -threshold if two_sided else -threshold - 8 * np.sqrt(steps)
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    x, w = low + (x + 1) * (threshold - low) / 2, w * (threshold - low) / 2
-    passes = lambda s: (
-        scipy.stats.norm.sf(threshold - s)
-        + (scipy.stats.norm.cdf(-threshold - s) if two_sided else 0)
-    )
-    total, density = passes(0.0), scipy.stats.norm.pdf(x)
-    for _ in range(steps - 1):
-        total += np.sum(w * density * passes(x))
-        density = scipy.stats.norm.pdf(x[:, None] - x) @ (w * density)
-    return total
-
-
 @pytest.mark.parametrize(
     "form, two_sided, truth",
     [("two-sided", True, 0.1087363323), ("one-sided", False, 9.578759495e-4)],
 )
 def test_walk_truth(form, two_sided, truth):
     horizon = walk1d(form).horizon
-    coarse, fine = (first_passage(n, horizon, 10.0, two_sided) for n in (200, 300))
+    coarse, fine = (walk_probability(10.0, horizon, two_sided, n) for n in (200, 300))
     assert coarse == pytest.approx(fine, rel=1e-9) and fine == pytest.approx(truth, rel=1e-9)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import line
 
 import jast
 from jast.distributions import Normal
@@ -30,13 +31,11 @@ HORIZON = 8
 def gusts(level=0.0, horizon=HORIZON, **changes):
     """Each state is its gust, N(0, 1); the first is 0. It never fails by itself."""
     given = dict(
-        init=lambda x0: jnp.zeros(()),
         step=lambda s, x: x + 0 * s,
-        disturbance=lambda s: Normal(0.0, 1.0),
         evaluate=lambda s: (jnp.zeros((), bool), jnp.ones(())),
         horizon=horizon,
     )
-    return jast.Simulator(**given | changes)
+    return line(**given | changes)
 
 
 def high(level):
