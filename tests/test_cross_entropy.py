@@ -397,14 +397,14 @@ def walled(limit, x):
     return jnp.where(x[0] > limit, jnp.where(x[1] > 0, jnp.nan, -jnp.inf), bowl(x))
 
 
-@pytest.mark.parametrize(
-    "method, mode",
-    [
-        ("ce_method", "default"),
-        pytest.param("ce_surrogate", "thesis", marks=pytest.mark.long),
-        pytest.param("ce_mixture", "default", marks=pytest.mark.long),
-    ],
-)
+EACH_METHOD = [
+    ("ce_method", "default"),
+    pytest.param("ce_surrogate", "thesis", marks=pytest.mark.long),
+    pytest.param("ce_mixture", "default", marks=pytest.mark.long),
+]
+
+
+@pytest.mark.parametrize("method, mode", EACH_METHOD)
 def test_what_is_not_finite_is_counted_and_never_an_elite(method, mode, key):
     search = lambda limit: METHODS[method](
         key,
@@ -433,14 +433,7 @@ def test_what_is_not_finite_is_counted_and_never_an_elite(method, mode, key):
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(nothing.history.proposals))
 
 
-@pytest.mark.parametrize(
-    "method, mode",
-    [
-        ("ce_method", "default"),
-        pytest.param("ce_surrogate", "thesis", marks=pytest.mark.long),
-        pytest.param("ce_mixture", "default", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("method, mode", EACH_METHOD)
 def test_a_budget_of_one(method, mode, key):
     result = METHODS[method](key, bowl, START, samples=1, elites=1, iterations=1, mode=mode)
     assert (
