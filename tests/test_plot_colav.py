@@ -393,3 +393,28 @@ def test_settings_of_matplotlib_are_left_alone():
     plot.colav_story(SHORT)
     plot.colav_animation(SHORT._replace(length=jnp.int32(1)), smooth=1).to_jshtml()
     assert dict(matplotlib.rcParams) == before
+
+
+def test_the_published_view_shows_what_is_perceived():
+    """Figures 2 and 3 of Lytskjold and Mengshoel: the zones, the circle and the heading are those
+    of the perceived adversary, and both tails end where the vessels are.
+    """
+    axes = drawn(plot.colav_published(EPISODE, moments=[7, N]))
+    for ax, t in zip(axes, (7, N), strict=True):
+        shown, track = labelled(ax), at(EPISODE, t).track
+        ferry, adversary, believed = ways(EPISODE, t)
+        np.testing.assert_allclose(shown["ferry, its path"].get_xydata(), ferry, rtol=1e-6)
+        np.testing.assert_allclose(shown["adversary, its path"].get_xydata(), adversary, rtol=1e-6)
+        np.testing.assert_allclose(shown["perceived position"].get_xydata(), believed[-1:])
+        start, end = shown["perceived heading"].get_xydata()
+        course = np.arctan2(track.v_e, track.v_n)
+        np.testing.assert_allclose(start, believed[-1])
+        np.testing.assert_allclose(end - start, 15 * np.array([np.sin(course), np.cos(course)]))
+        for zone in planner.ZONES:
+            edge = zone_outline(zone, track.n, track.e, course)
+            np.testing.assert_allclose(shown[zone.name].get_xy()[:200], edge, atol=1e-4)
+        assert shown["the ferry's desired path"].is_dashed()
+        assert ax.get_title(loc="left") == f"t = {3 * t} s"
+    assert len(plot.colav_published(EPISODE, moments=1)) == 1
+    with pytest.raises(ValueError, match="plot.colav_published: moments must be at least 1"):
+        plot.colav_published(EPISODE, moments=0)
