@@ -6,9 +6,6 @@ Then the failure probability that `failure_proposal` leads to: by importance sam
 new episodes, over the truth, where one is known; each of several seeds with a proposal of its own.
 """
 
-import argparse
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +13,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.ferry import REWARD
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size
 from jast import cross_entropy as ce
 from jast.estimate import clopper_pearson, importance
 
@@ -95,11 +92,8 @@ def proposals(name, seeds, iterations=20):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.bridge", description=__doc__.splitlines()[0]
-    )
-    args = options(parser, "under two minutes: fewer runs").parse_args(argv)
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
+    args = options(__doc__, "under two minutes: fewer runs").parse_args(argv)
+    say = printer(args)
     report = {"found": found(*size(args, (20,), (5,), (1, 10, 2, ["ce_method"]))), "proposals": {}}
     say("runs of 1000 episodes that find a collision on the ferry")
     for name, r in report["found"].items():
@@ -119,8 +113,7 @@ def main(argv=None):
             f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to"
             f" {100 * max(r['relative_error']):.1f} %   (crude {100 * r['crude']:.3g} %)"
         )
-    if args.json:
-        print(json.dumps(report))
+    show(args, report)
 
 
 if __name__ == "__main__":

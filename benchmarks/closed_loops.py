@@ -11,8 +11,6 @@ Tank, store and oven were judged on until the move that draws anew all after a l
 them; freezer and packets were made after it.
 """
 
-import argparse
-import json
 import math
 import time
 from collections.abc import Callable
@@ -25,16 +23,11 @@ from jax import lax
 
 import jast
 from benchmarks.operators import OPERATORS, SYSTEMS, easier
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size
 from jast.distributions import Bernoulli, Independent, Joint, Normal
 from jast.limit_state import outcome
 
-__all__ = [
-    "JUDGED",
-    "RARE",
-    "TUNED",
-    "Loop",
-]
+__all__ = ["JUDGED", "RARE", "TUNED", "Loop"]
 
 LANES = 128
 """Episodes that are drawn side by side."""
@@ -373,11 +366,7 @@ JUDGED = (
         **_ARM,
     ),
 )
-RARE = (
-    _exact("rail", 9.1717e-07),
-    _exact("freezer", 3.2289e-06),
-    _exact("packets", 6.9634e-06),
-)
+RARE = (_exact("rail", 9.1717e-07), _exact("freezer", 3.2289e-06), _exact("packets", 6.9634e-06))
 
 
 def truth_of(loop: Loop, draws: int, cells: int) -> tuple[float, float]:
@@ -389,11 +378,11 @@ def truth_of(loop: Loop, draws: int, cells: int) -> tuple[float, float]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "200,000 draws a loop")
+    parser = options(__doc__, "200,000 draws a loop")
     parser.add_argument("--loops", nargs="+", help="default: all")
     args = parser.parse_args(argv)
     draws, cells = size(args, 10_000_000, 200_000, LANES), size(args, 2400, 600, 100)
-    rows = []
+    say, rows = printer(args), []
     for loop in TUNED + JUDGED + RARE:
         if args.loops and loop.name not in args.loops:
             continue
@@ -415,20 +404,17 @@ def main(argv: list[str] | None = None) -> None:
             row |= dict(relative=p / loop.truth - 1)
             text = f"recomputed {p:.5g}, {row['relative']:+.1e} of it"
         rows.append(row)
-        if not args.json:
-            print(
-                f"{loop.name:10s} {loop.numbers:4d} numbers  truth {loop.truth:.4g}"
-                f" +- {loop.error:.1%}  {text}",
-                flush=True,
-            )
+        say(
+            f"{loop.name:10s} {loop.numbers:4d} numbers  truth {loop.truth:.4g}"
+            f" +- {loop.error:.1%}  {text}"
+        )
     checked = easier(size(args, 1_000_000, 200_000, 1000), cells)
-    for name, row in ({} if args.json else checked).items():
-        print(
+    for name, row in checked.items():
+        say(
             f"{name:10s} made easier: operator {row['operator']:.4g}, drawn {row['drawn']:.4g},"
             f" {row['apart']:.1f} standard errors apart"
         )
-    if args.json:
-        print(json.dumps(dict(loops=rows, easier=checked)))
+    show(args, dict(loops=rows, easier=checked))
 
 
 if __name__ == "__main__":

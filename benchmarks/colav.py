@@ -8,19 +8,16 @@ compilation excluded, the best of alternated runs (of one with ``--quick``), in 
 has one thread.
 """
 
-import argparse
 import functools
 import itertools
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.engine import alone, cpu, here, problem, whole
-from benchmarks.ferry import timed
-from benchmarks.sizes import options, size
+from benchmarks.engine import cpu, problem, whole
+from benchmarks.sizes import alone, here, options, printer, show, size, timed
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
@@ -86,11 +83,7 @@ def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     return (
         share(result.failing_per_tree)
         | best
-        | {
-            "episodes": result.episodes,
-            "steps": result.steps,
-            "cpu_s": seconds,
-        }
+        | {"episodes": result.episodes, "steps": result.steps, "cpu_s": seconds}
     )
 
 
@@ -173,10 +166,7 @@ def picture(rows, path):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.colav", description=__doc__.splitlines()[0]
-    )
-    options(parser, "fewer episodes, trees and rows: under two minutes")
+    parser = options(__doc__, "fewer episodes, trees and rows: under two minutes")
     parser.add_argument(
         "--memoization", action="store_true", help="only what keeping states is worth"
     )
@@ -188,7 +178,7 @@ def main(argv=None):
     )
     parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
     args = parser.parse_args(argv)
-    say = (lambda *a: None) if args.json else functools.partial(print, flush=True)
+    say = printer(args)
     percent = lambda r, name: (
         f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
     )
@@ -257,8 +247,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(report["memoization"][-len(SUBSTEPS) :], args.picture)
-    if args.json:
-        print(json.dumps(report, indent=1))
+    show(args, report)
 
 
 if __name__ == "__main__":

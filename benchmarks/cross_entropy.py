@@ -8,24 +8,18 @@ no other minimum is). The table of the thesis is R. J. Moss's Table 2.1. Peers (
 have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C.
 """
 
-import argparse
 import functools
-import json
-import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks import peers  # noqa: E402
-from benchmarks.cases import CASES  # noqa: E402
-from benchmarks.engine import cpu  # noqa: E402
-from benchmarks.ferry import timed  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast import cross_entropy as ce  # noqa: E402
-from jast.cross_entropy.surrogates import RADIAL  # noqa: E402
+from benchmarks import peers
+from benchmarks.cases import CASES
+from benchmarks.engine import cpu
+from benchmarks.sizes import options, printer, show, size, timed
+from jast import cross_entropy as ce
+from jast.cross_entropy.surrogates import RADIAL
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
 METHODS = ("ce_method", "ce_surrogate", "ce_mixture")
@@ -171,21 +165,17 @@ def surrogates(seeds, cases=("sierra 1A", "paraboloid 2")):
     }
 
 
-def say_row(name, r, published=None):
+def row_text(name, r, published=None):
     far = f"   d {r['distance']:6.2f}   F {r['F']:6.1f}" if "F" in r else ""
     note = f"   thesis {published[0]:.4f} / {published[1]:.2f}" if published else ""
-    print(
+    return (
         f"  {name:34} {r['best']:.4f} +- {r['best_se']:.4f}{far}   hit {r['hit']:.2f}  "
-        f" ({r['seeds']} seeds){note}",
-        flush=True,
+        f" ({r['seeds']} seeds){note}"
     )
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.cross_entropy", description=__doc__.splitlines()[0]
-    )
-    options(parser, "under two minutes: 64 seeds, fewer cases and peers")
+    parser = options(__doc__, "under two minutes: 64 seeds, fewer cases and peers")
     parser.add_argument("--seeds", type=int, help="runs of each row; 256, or 64 with --quick")
     parser.add_argument(
         "--slow-seeds",
@@ -201,17 +191,13 @@ def main(argv=None):
     methods, modes = METHODS, ("thesis", "default")
     if args.smoke:  # the others differ in their names alone
         methods, modes = ("ce_surrogate",), ("default",)
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    show = (lambda *a: None) if args.json else say_row
+    say = printer(args)
     if args.surrogates:
         report = surrogates(seeds, *(((SIERRA[0],),) if args.smoke else ()))
         for name, r in report.items():
-            show(name, r) if name.startswith("sierra") else say(
-                f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
-            )
-        if args.json:
-            print(json.dumps(report))
-        return
+            other = f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
+            say(row_text(name, r) if name.startswith("sierra") else other)
+        return show(args, report)
     report = {
         "seeds": seeds,
         "speed": speed(seeds, methods),
@@ -235,14 +221,14 @@ def main(argv=None):
             for method in methods:
                 if args.quick and (method, mode) == ("ce_mixture", "thesis"):
                     continue
-                report["sierra"][f"{case}, {method}, {mode}"] = r = ours(
-                    method, case, seeds, mode=mode
-                )
-                show(f"{method}, {mode}", r, TABLE[method][i] if mode == "thesis" else None)
+                r = ours(method, case, seeds, mode=mode)
+                report["sierra"][f"{case}, {method}, {mode}"] = r
+                published = TABLE[method][i] if mode == "thesis" else None
+                say(row_text(f"{method}, {mode}", r, published))
         for peer in (*cheap, *size(args, ("expected_improvement",), (), ())):
             n = args.slow_seeds if peer == "expected_improvement" else seeds
             report["peers"][f"{case}, {peer}"] = r = theirs(peer, case, n)
-            show(peer, r)
+            say(row_text(peer, r))
 
     if not args.quick:
         say(
@@ -254,7 +240,7 @@ def main(argv=None):
             report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours(
                 "ce_surrogate", case, seeds, dtype=np.float32
             )
-            show(f"{case}, float32", r)
+            say(row_text(f"{case}, float32", r))
             logged = program("ce_surrogate", ce.sierra(log=True), *CASES[case].budgets, ())
             c = CASES[case]
             found = logged(
@@ -266,14 +252,15 @@ def main(argv=None):
             report["sierra"][f"{case}, ce_surrogate, float32, log"] = r = row(
                 c.objective(x), np.linalg.norm(x, axis=-1)
             )
-            show(f"{case}, float32, log=True", r)
+            say(row_text(f"{case}, float32, log=True", r))
         jax.config.update("jax_enable_x64", True)
         say("\nexperiment 2: schedules, CE-surrogate from 1B")
         report["schedules"] = schedules(
             seeds, *((0.1,), ("before",), ("default",)) if args.smoke else ()
         )
         for name, r in report["schedules"].items():
-            show(name, r, SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None)
+            published = SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None
+            say(row_text(name, r, published))
 
     say("\nother objectives: median best value (mean)")
     others = [case for case in CASES if case not in SIERRA]
@@ -295,8 +282,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(args.picture, report)
-    if args.json:
-        print(json.dumps(report))
+    show(args, report)
 
 
 def picture(path, report):

@@ -8,13 +8,8 @@ more it cuts kernels over threads, which wait for each other at the cost of CPU 
 own threads, which use all cores, are measured in ``cores``.
 """
 
-import argparse
 import functools
-import importlib
 import json
-import os
-import subprocess
-import sys
 import time
 from typing import NamedTuple
 
@@ -25,7 +20,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks import reference
-from benchmarks.sizes import options, size
+from benchmarks.sizes import NO_CACHE, alone, here, options, processors, show, size, timed
 from jast.counter import tree_keys
 from jast.progress import Progress, begin
 from jast.rewards import as_pytree
@@ -48,9 +43,7 @@ def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
 
 def cpu(function):
     """CPU and wall seconds of one call."""
-    start = time.process_time(), time.perf_counter()
-    jax.block_until_ready(function())
-    return time.process_time() - start[0], time.perf_counter() - start[1]
+    return timed(function)[1:]
 
 
 @functools.partial(jax.jit, static_argnames="simulations")
@@ -172,31 +165,6 @@ def cores(repeats, trees=200, prunes=6, simulations=500):
         for _ in range(repeats + 1)
     ][1:]
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
-
-
-ONE_THREAD = {"PJRT_NPROC": "1"}
-NO_CACHE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-
-
-def alone(name, *arguments, module="engine", settings=ONE_THREAD):
-    """A measurement of this module, or of another benchmark, in a process of its own with these
-    environment variables: an XLA of one thread, say.
-    """
-    code = (
-        f"import json; from benchmarks import {module};"
-        f" print(json.dumps({module}.{name}(*{arguments!r})))"
-    )
-    env = os.environ | settings | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    return json.loads(
-        subprocess.run(
-            [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env
-        ).stdout.splitlines()[-1]
-    )
-
-
-def here(name, *arguments, module="engine", **_):
-    """The same measurement in this process: compiled programs are shared, figures mean less."""
-    return getattr(importlib.import_module(f"benchmarks.{module}"), name)(*arguments)
 
 
 def compile_time(total=9000, lanes=100):
@@ -336,18 +304,15 @@ def peer(repeats, lanes=200, simulations=500):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.engine", description=__doc__.splitlines()[0]
-    )
-    args = options(parser, "fewer repetitions, smaller memoization runs").parse_args(argv)
-    repeats, measure = size(args, 5, 2, 1), here if args.smoke else alone
+    args = options(__doc__, "fewer repetitions, smaller memoization runs").parse_args(argv)
+    repeats = size(args, 5, 2, 1)
+    measure = functools.partial(here if args.smoke else alone, module="engine")
     least = lambda *arguments: arguments if args.smoke else ()
-    p = problem(9000)
-    one = run.bytes_per_tree(p, run.Plan(18, 500, 1, "node"))
+    one = run.bytes_per_tree(problem(9000), run.Plan(18, 500, 1, "node"))
+    smallest = (2, 2, 45, [(1, "1 substep")], ["node", "none"])
+    systems = size(args, (100, 18, 100), (32, 4, 100), smallest)
     report = {
-        "processors": (
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        ),
+        "processors": processors(),
         "bytes_per_tree_of_9000": one,
         "bytes_per_node": one / 9000,
         **measure("rates", repeats, *least(2, 2, 45, 1)),
@@ -355,18 +320,9 @@ def main(argv=None):
         "cores": cores(repeats, *least(2, 2, 45)),
         "peer_at_200_x_500": measure("peer", repeats, *least(2, 20)),
         "compile_s": measure("compile_time", *least(90, 2), settings=NO_CACHE),
-        "memoization": measure(
-            "memoization",
-            *size(
-                args, (100, 18, 100), (32, 4, 100), (2, 2, 45, [(1, "1 substep")], ["node", "none"])
-            ),
-        ),
+        "memoization": measure("memoization", *systems),
     }
-    if args.json:
-        print(json.dumps(report, indent=1))
-        return
-    for name, value in report.items():
-        print(f"{name}: {json.dumps(value, default=str)}")
+    show(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 
 if __name__ == "__main__":

@@ -10,9 +10,7 @@ are none; the area under the ROC curve of monitors; the CPU time of explaining a
 ferry.
 """
 
-import argparse
 import contextlib
-import json
 import math
 import time
 import warnings
@@ -26,7 +24,7 @@ from jax.tree_util import Partial
 import jast
 from benchmarks import stress_systems
 from benchmarks.explain_systems import PLANTED, SIDE, lane, planted, version, walk
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, show, size, some_of
 from jast import explain
 from jast.distributions import Normal
 
@@ -328,8 +326,7 @@ PARTS = {
 
 def run(parts, seeds, budget):
     report = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for name in parts:
             report[name] = PARTS[name](seeds, budget)
     return report
@@ -350,19 +347,16 @@ QUICK = [part for part in PARTS if part not in ("rules_of_estimates", "sensitivi
 
 
 def main(argv=None):
-    quick = "two seeds, fewer evaluations"
-    parser = options(argparse.ArgumentParser(description=__doc__), quick)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, help="default: all")
+    parser = options(__doc__, "two seeds, fewer evaluations")
+    some_of(parser, "--parts", PARTS)
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     parts = args.parts or size(args, list(PARTS), QUICK, ["criticality"])
     seeds = args.seeds or size(args, 20, 2, 1)
     budget = size(args, 20_000, 10_000, 2000)
     report = run(parts, seeds, budget)
-    if args.json:
-        print(json.dumps(dict(settings=dict(budget=budget, seeds=seeds), parts=report)))
-    else:
-        print("\n".join(lines(report)))
+    settings = dict(budget=budget, seeds=seeds)
+    show(args, dict(settings=settings, parts=report), "\n".join(lines(report)))
 
 
 if __name__ == "__main__":

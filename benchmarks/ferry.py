@@ -7,16 +7,14 @@ Lytskjold and Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--pict
 that table, networks included, and where they pay (`benchmarks.table1`).
 """
 
-import argparse
 import json
 import pathlib
-import time
 
 import jax
 import numpy as np
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size, timed
 from jast.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
@@ -56,13 +54,6 @@ def golden():
             np.max(np.abs(np.array(found) - [e["reward"] for e in episodes]))
         )
     return {"episodes": len(episodes), "greatest_error": errors}
-
-
-def timed(function):
-    """What a function returns, its CPU and its wall seconds."""
-    start = time.process_time(), time.perf_counter()
-    result = function()
-    return result, time.process_time() - start[0], time.perf_counter() - start[1]
 
 
 def outcome(best):
@@ -145,10 +136,7 @@ SMOKE = ("forest, paper", "mcts, paper", "monte carlo", "cem")
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0]
-    )
-    options(parser, "100 trees a row; of --table1 also fewer rows")
+    parser = options(__doc__, "100 trees a row; of --table1 also fewer rows")
     parser.add_argument("--trees", type=int, help="trees a row (default 1000; of --table1 200)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -167,33 +155,27 @@ def main(argv=None):
         from benchmarks import table1
 
         return table1.report(args)
-    trees = args.trees or size(args, 1000, 100, 2)
+    say, trees = printer(args), args.trees or size(args, 1000, 100, 2)
     report = {"golden": golden(), "seed": args.seed, "rows": {}}
-    if not args.json:
-        print("golden episodes:", report["golden"] or "data not found")
-        print(
-            f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
-            f" {'of 200: least, median':>21} {'CPU s':>7}"
-        )
+    say("golden episodes:", report["golden"] or "data not found")
+    say(
+        f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
+        f" {'of 200: least, median':>21} {'CPU s':>7}"
+    )
     table = rows(trees, *((2, 45) if args.smoke else ()))
-    shown = size(args, [*table], [name for name in table if name not in QUICK], SMOKE)
-    for name in shown:
-        search = table[name]
-        report["rows"][name] = r = row(search, args.seed)
-        if not args.json:
-            low, high = (100 * v for v in r["rate_95"])
-            of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
-            mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
-            print(
-                f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f}"
-                f" {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}",
-                flush=True,
-            )
-            if name in PUBLISHED:
-                rate, mean, best = PUBLISHED[name]
-                print(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
-    if args.json:
-        print(json.dumps(report, indent=1))
+    for name in size(args, [*table], [name for name in table if name not in QUICK], SMOKE):
+        report["rows"][name] = r = row(table[name], args.seed)
+        low, high = (100 * v for v in r["rate_95"])
+        of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
+        mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
+        say(
+            f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f}"
+            f" {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}"
+        )
+        if name in PUBLISHED:
+            rate, mean, best = PUBLISHED[name]
+            say(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
+    show(args, report)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ first-order and the total ones are from the truth, and how often their 95 % inte
 keys; and the CPU time beyond that of the estimate.
 """
 
-import argparse
-import json
 import time
 from statistics import NormalDist
 from typing import Any
@@ -17,7 +15,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size
 from jast.simulators import limit_state
 
 __all__ = ["CASES", "run"]
@@ -100,19 +98,17 @@ def run(seeds: int, budget: int, draws: int) -> dict:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "fewer keys")
-    args = parser.parse_args(argv)
+    args = options(__doc__, "fewer keys").parse_args(argv)
+    say = printer(args)
     report = run(*size(args, (40, 20_000, 400), (10, 20_000, 400), (1, 5000, 20)))
-    if args.json:
-        print(json.dumps(report))
-        return
-    print("case                  P         first     error  cover   total  error  cover  CPU s")
+    say("case                  P         first     error  cover   total  error  cover  CPU s")
     for name, r in report.items():
-        print(
+        say(
             f"{name:<20} {r['probability']:9.3g} {r['first']:9.3g}  {100 * r['error_first']:5.1f} %"
             f"  {100 * r['cover_first']:3.0f} %  {r['total']:6.3f}  {100 * r['error_total']:4.1f} %"
             f"  {100 * r['cover_total']:3.0f} %  {r['cpu_seconds']:.2f}"
         )
+    show(args, report)
 
 
 if __name__ == "__main__":

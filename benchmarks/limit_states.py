@@ -9,9 +9,7 @@ compiled program. A limit state ``g(*parameters, x [..., d], np)`` fails where i
 I_d); it is written once for two array libraries.
 """
 
-import argparse
 import functools
-import json
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +21,7 @@ from jax.tree_util import Partial
 from scipy import integrate, optimize, stats
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size
 from jast.simulators import autoregression, landing, limit_state, pendulum, ruin, walk1d
 
 __all__ = ["FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
@@ -459,35 +457,21 @@ def check(family, seed, n=400_000):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.limit_states",
-        description="Check the truths of the families by sampling.",
-    )
+    """Check the truths of the families by sampling."""
+    parser = options(main.__doc__, "2 problems of a family")
     parser.add_argument("--seeds", type=int, help="problems of a family (default 8)")
-    args = options(parser, "2 problems of a family").parse_args(argv)
-    seeds, n, report = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000), {}
+    args = parser.parse_args(argv)
+    seeds, n = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000)
+    say, report = printer(args), {}
+    off = lambda z: f"rms {np.sqrt(np.mean(z**2)):.2f}, greatest {np.abs(z).max():.2f}"
     for family in FAMILIES:
         scores = [check(family, seed, n) for seed in range(seeds)]
-        easy, rare = (
-            np.array([s[0] for s in scores]),
-            np.array([s[1] for s in scores if len(s) > 1]),
-        )
-        note = (
-            f", rare: rms {np.sqrt(np.mean(rare**2)):.2f}, greatest {np.abs(rare).max():.2f}"
-            f" ({len(rare)} seeds)"
-            if len(rare)
-            else ""
-        )
+        easy = np.array([s[0] for s in scores])
+        rare = np.array([s[1] for s in scores if len(s) > 1])
         report[family] = {"easy": easy.tolist(), "rare": rare.tolist()}
-        if args.json:
-            continue
-        print(
-            f"{family:18} standard errors: rms {np.sqrt(np.mean(easy**2)):.2f}, greatest"
-            f" {np.abs(easy).max():.2f}{note}",
-            flush=True,
-        )
-    if args.json:
-        print(json.dumps(report))
+        note = f", rare: {off(rare)} ({len(rare)} seeds)" if len(rare) else ""
+        say(f"{family:18} standard errors: {off(easy)}{note}")
+    show(args, report)
 
 
 if __name__ == "__main__":

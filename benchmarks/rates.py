@@ -7,23 +7,18 @@ numbers by `jax.random.normal`, put through ``step`` and ``evaluate`` and counte
 before (the second call of each is timed), and all in this process, one after the other.
 """
 
-import argparse
-import json
-import os
 import time
 import warnings
 from collections.abc import Callable
 from functools import partial
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+from jax import lax
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-from jax import lax  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.closed_loops import JUDGED, RARE, TUNED  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
+import jast
+from benchmarks.closed_loops import JUDGED, RARE, TUNED
+from benchmarks.sizes import options, printer, show, size, some_of
 
 __all__ = ["SYSTEMS", "rates"]
 
@@ -88,23 +83,18 @@ def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, flo
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "three systems")
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
+    parser = options(__doc__, "three systems")
+    some_of(parser, "--systems", SYSTEMS)
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
-    rows = []
+    say, rows = printer(args), []
     for name in names:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations)))
-        if not args.json:
-            shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
-            print(
-                f"{name:12s} bare loop {rows[-1]['bare']:9.0f} a CPU second; {shares}", flush=True
-            )
-    if args.json:
-        print(json.dumps(dict(episodes=episodes, evaluations=evaluations, rows=rows)))
+        shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
+        say(f"{name:12s} bare loop {rows[-1]['bare']:9.0f} a CPU second; {shares}")
+    show(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
 
 
 if __name__ == "__main__":

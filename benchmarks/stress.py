@@ -9,9 +9,6 @@ whose evaluations the others then have. The cases named "... loop" are those of
 `benchmarks.closed_loops`.
 """
 
-import argparse
-import importlib.util
-import json
 import time
 import warnings
 from functools import partial
@@ -23,7 +20,7 @@ import numpy as np
 
 import jast
 from benchmarks import cma_es as driver
-from benchmarks.sizes import options, size
+from benchmarks.sizes import installed, options, show, size, some_of
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
 from jast.estimate.batches import resampled
 from jast.estimate.descents import SETTINGS, cooled
@@ -185,8 +182,7 @@ def run(cases, methods, budget, seeds):
         for method in methods:
             begin, found = time.process_time(), []
             for seed in range(seeds):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
+                with warnings.catch_warnings(action="ignore"):
                     found.append(calls[method](jax.random.key(seed), sim, budget))
             best = [b for b, _, _ in found if b is not None]
             rows[method] = dict(
@@ -225,28 +221,24 @@ def table(report):
 
 
 def main(argv=None):
-    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, few evaluations")
-    parser.add_argument("--cases", nargs="+", choices=CASES | LOOPS, help="default: all but loops")
-    help = f"default: all but {', '.join(SINGLE)}; cma_es needs the package cma (extra `benchmark`)"
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help=help)
+    parser = options(__doc__, "two systems, few evaluations")
+    some_of(parser, "--cases", CASES | LOOPS, "all but loops")
+    some_of(parser, "--methods", METHODS, f"all but {', '.join(SINGLE)}")
     help = "stress with and without each of its explorers, in place of --methods"
     parser.add_argument("--leave-out", action="store_true", help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
-    absent = () if importlib.util.find_spec("cma") else ("cma_es",)
+    absent = () if installed("cma") else ("cma_es",)
     there = [m for m in METHODS if m not in (*SINGLE, *absent)]
     methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
     methods = ["stress", *LEFT_OUT] if args.leave_out else methods
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)
     report = run(cases, methods, budget, seeds)
-    if args.json:
-        settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
-        print(json.dumps(dict(settings=settings, systems=report)))
-    else:
-        print(table(report))
+    settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
+    show(args, dict(settings=settings, systems=report), table(report))
 
 
 if __name__ == "__main__":

@@ -176,9 +176,7 @@ def pedestrians():
         a, b, t = s
         hit = ((t == when_a) & (a <= 0)) | ((t == when_b) & (b <= 0))
         near = jnp.where(
-            t == when_a,
-            jnp.maximum(a, 0.0),
-            jnp.where(t == when_b, jnp.maximum(b, 0.0), away_b),
+            t == when_a, jnp.maximum(a, 0.0), jnp.where(t == when_b, jnp.maximum(b, 0.0), away_b)
         )
         return hit, near
 

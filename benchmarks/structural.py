@@ -274,10 +274,7 @@ PROBLEMS: dict[str, Problem] = {
         lambda d, x: 1 - _product(d, x, 146.14),
     ),
     "RP31": averaged(
-        TWO,
-        lambda x, np: 2 - x[1] + 256 * x[0] ** 4,
-        lambda d, x: d.sf(2 + 256 * x[0] ** 4),
-        1,
+        TWO, lambda x, np: 2 - x[1] + 256 * x[0] ** 4, lambda d, x: d.sf(2 + 256 * x[0] ** 4), 1
     ),
     "RP33": averaged(
         [normal()] * 3,
@@ -334,9 +331,7 @@ PROBLEMS: dict[str, Problem] = {
     ),
     "RP110": Problem(TWO, _rp110, lambda p: 1 - stats.norm.cdf(4) * stats.norm.cdf(5)),
     "RP111": averaged(
-        TWO,
-        lambda x, np: 12.5 - np.abs(x[0] * x[1]),
-        lambda d, x: 2 * _product(d, x, 12.5),
+        TWO, lambda x, np: 12.5 - np.abs(x[0] * x[1]), lambda d, x: 2 * _product(d, x, 12.5)
     ),
     "axial": averaged(
         [log_normal(300, 30), normal(75_000, 5000)],

@@ -11,9 +11,7 @@ with common random numbers for as many CPU seconds; how many intervals hold the 
 programs that the first sweep compiles.
 """
 
-import argparse
 import functools
-import json
 import math
 import time
 from statistics import NormalDist
@@ -23,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.ferry import timed
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size, timed
 from benchmarks.stress_systems import lane
 from jast.distributions import Normal
 from jast.estimate import failure_probability
@@ -223,21 +220,19 @@ def _solved(rising, low, high):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__)
-    args = options(parser, quick="4 values; 3 keys of one joined case").parse_args(argv)
+    args = options(__doc__, "4 values; 3 keys of one joined case").parse_args(argv)
     n, budget = size(args, 50, 4, 2), size(args, 10_000, 10_000, 5000)
     names = size(args, list(CASES), list(CASES), ["filter"])
     report = {name: run(name, n, budget) for name in names}
     n, keys = size(args, (10, 20), (8, 3), (3, 1))
     for name in size(args, list(JOINED), list(JOINED)[:1], list(JOINED)[:1]):
         report[name] = run_joined(name, n, keys, 300_000)
-    if args.json:
-        print(json.dumps(report))
-        return
+    say = printer(args)
     for name, numbers in report.items():
-        print(name)
+        say(name)
         for what, value in numbers.items():
-            print(f"  {what:<24}{value if isinstance(value, tuple) else f'{value:.5g}'}")
+            say(f"  {what:<24}{value if isinstance(value, tuple) else f'{value:.5g}'}")
+    show(args, report)
 
 
 if __name__ == "__main__":

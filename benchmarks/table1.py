@@ -7,7 +7,6 @@ included, without compilation: a call before each row (`warm_up`) compiles the s
 """
 
 import functools
-import json
 from typing import NamedTuple
 
 import jax
@@ -15,8 +14,8 @@ import numpy as np
 
 import jast
 from benchmarks import engine
-from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
-from benchmarks.sizes import size
+from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome
+from benchmarks.sizes import printer, show, size, timed
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.search.tree.memory import LANES
@@ -228,10 +227,7 @@ def block(title, searches, seeds, say, table1=False):
     say(f"\n{title}")
     rows = {}
     for name, search in searches.items():
-        row = measure(
-            search if isinstance(search, list) else [search] * len(seeds),
-            seeds,
-        )
+        row = measure(search if isinstance(search, list) else [search] * len(seeds), seeds)
         plain = next(iter(rows.values()), row)
         row["cpu_ratio"] = plain["simulations_per_cpu_s"] / row["simulations_per_cpu_s"]
         if table1:
@@ -377,7 +373,7 @@ def report(args):
             warm_trees=max(1, args.trees // 5),
         )
     seeds = range(args.seed, args.seed + (args.seeds or sizes.seeds))
-    say = (lambda text: None) if args.json else functools.partial(print, flush=True)
+    say = printer(args)
     rows = published()
     out = {"golden": golden(), "seeds": list(seeds), "sizes": sizes._asdict(), "published": rows}
     say(f"golden episodes: {out['golden'] or 'data not found'}\n{LEGEND}\n")
@@ -420,5 +416,4 @@ def report(args):
     if args.picture:
         out["slow_simulator"] = slowed(sizes, seeds, say)
         draw(out, args.picture)
-    if args.json:
-        print(json.dumps(out, indent=1))
+    show(args, out)

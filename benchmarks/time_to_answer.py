@@ -9,27 +9,22 @@ installed. ``first`` is the first call in this process, with compilation. A sile
 unflagged answer more than 4 standard errors off, of itself and the truth.
 """
 
-import argparse
-import json
 import math
-import os
 import time
 import warnings
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.tree_util import Partial  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.closed_loops import JUDGED, RARE, TUNED, system  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast.judge import judged  # noqa: E402
-from jast.limit_state import dimension  # noqa: E402
-from jast.simulators import limit_state  # noqa: E402
+import jast
+from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
+from benchmarks.sizes import options, percent, printer, show, size, some_of
+from jast.judge import judged
+from jast.limit_state import dimension
+from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
 
@@ -139,8 +134,7 @@ METHODS = ("failure_probability", "stress", "subset")
 def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
     """The `Estimate` of a method (of OpenTURNS (log mean, relative error)), and CPU seconds."""
     begun, key = time.process_time(), jax.random.key(seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         if method == "stress":
             found = jast.stress(key, about.simulator, about.budget).probability
         elif method == "failure_probability":
@@ -230,28 +224,25 @@ def plain_draws(about: System, seconds: float) -> float | None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, one key")
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
+    parser = options(__doc__, "two systems, one key")
+    some_of(parser, "--systems", SYSTEMS)
+    some_of(parser, "--methods", METHODS)
     parser.add_argument("--seeds", type=int, help="keys (default: 20)")
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "piecewise"], ["piecewise"])
     methods = args.methods or size(args, METHODS, METHODS[:2], METHODS[:1])
-    seeds, rows = args.seeds or size(args, 20, 2, 1), []
+    say, seeds, rows = printer(args), args.seeds or size(args, 20, 2, 1), []
     for name in names:
         for method in methods:
             row = row_of(name, SYSTEMS[name], method, seeds)
             if method == "failure_probability":
                 row["plain"] = plain_draws(SYSTEMS[name], row["warm"] or row["first"])
             rows.append(row)
-            if not args.json:
-                print(_line(row), flush=True)
-    if args.json:
-        print(json.dumps(dict(seeds=seeds, rows=rows)))
+            say(_line(row))
+    show(args, dict(seeds=seeds, rows=rows))
 
 
 def _line(r):
-    percent = lambda v: "-" if v is None else f"{100 * v:.1f} %"
     warm = "-" if r["warm"] is None else f"{r['warm']:.1f}"
     plain = f"  plain draws {percent(r['plain'])}" if "plain" in r else ""
     return (

@@ -15,7 +15,6 @@ not seen their outcome; candidates: as many as 627 of 10,000. Seconds are of one
 first with compilation.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -28,9 +27,8 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
-from benchmarks.ferry import timed
 from benchmarks.fms import mean
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, printer, show, size, timed
 from jast import plot, weakness
 from jast.weakness.measures import precision_recall
 from jast.weakness.thesis import halves
@@ -202,7 +200,7 @@ def table(result, failed, replacement):
     )
 
 
-def tables(systems, seeds, out):
+def tables(systems, seeds, out, say):
     """Table 4.1 without and with replacement, of each system."""
     for name, images, labels, predicted in systems:
         failed = predicted != labels
@@ -217,10 +215,9 @@ def tables(systems, seeds, out):
                 ]
             )
             out[f"{name}, replacement={replacement}"] = rows
-            print(
+            say(
                 f"  {name}, replacement={replacement}: "
-                + ", ".join(f"{k} {say(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
-                flush=True,
+                + ", ".join(f"{k} {spread(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
             )
 
 
@@ -241,7 +238,7 @@ def thesis(result, failed):
     )
 
 
-def say(v, digits=3):
+def spread(v, digits=3):
     return (
         f"{v:.{digits}f}"
         if not isinstance(v, dict)
@@ -251,23 +248,23 @@ def say(v, digits=3):
 
 
 def line(name, row):
-    text = f"  {name:11} {'  '.join(f'{say(f):>14}' for f in row['found'])}"
+    text = f"  {name:11} {'  '.join(f'{spread(f):>14}' for f in row['found'])}"
     if "auc" in row:
-        text += f"  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
+        text += f"  {spread(row['auc'], 4):>16} {spread(row['precision']):>15}"
     if "expected" in row:
         text += (
-            f"  expected left {say(row['expected'], 1)}, true {say(row['left'], 1)};"
-            f" {row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+            f"  expected left {spread(row['expected'], 1)}, true {spread(row['left'], 1)};"
+            f" {row['seconds_first']:.1f} s, then {spread(row['seconds'], 1)} s"
         )
     return text
 
 
-def study(images, labels, predicted, seeds, quick, picture):
+def study(images, labels, predicted, seeds, quick, picture, say):
     """All rows of one system, printed as they come."""
     failed, budget = predicted != labels, int(len(labels) * SHARES[-1])
     system = images, labels, predicted
     budgets = [f"{int(len(labels) * s)} calls" for s in SHARES]
-    print(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
+    say(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
     own, chance = runs(*system, "default", seeds, budget), runs(*system, "random", seeds, budget)
     rows = {
         "default": over([adaptive(r, failed) for r, *_ in own]) | seconds(own),
@@ -276,59 +273,47 @@ def study(images, labels, predicted, seeds, quick, picture):
         "random": over([{"found": found(r.order, failed)} for r, *_ in chance]),
     }
     for name, row in rows.items():
-        print(line(name, row), flush=True)
+        say(line(name, row))
     results = {"default": [r for r, *_ in own], "random": [r for r, *_ in chance]}
     if not quick:
         published = runs(*system, "thesis", seeds)
         rows["thesis"] = t = over([thesis(r, failed) for r, *_ in published]) | seconds(published)
         results["thesis"] = [r for r, *_ in published]
-        print(
-            "  thesis      AUC "
-            + " ".join(f"{a['mean']:.3f}" for a in t["auc"])
-            + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})"
-        )
-        print(
-            "              at 0.5: "
-            + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS)
-        )
-        print(
-            f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True
-        )
+        aucs = " ".join(f"{a['mean']:.3f}" for a in t["auc"])
+        say(f"  thesis      AUC {aucs} (the last +- {t['auc'][-1]['se'] or 0:.3f})")
+        digits = {name: 0 if name in ("candidates", "calls") else 3 for name in ROWS}
+        at_half = ", ".join(f"{name} {spread(t[name], digits[name])}" for name in ROWS)
+        say(f"              at 0.5: {at_half}")
+        say(f"              {t['seconds_first']:.1f} s, then {spread(t['seconds'], 1)} s")
     if picture:
         plot.failures_found(results, failed).figure.savefig(picture, dpi=150)
     return rows | {"inputs": len(labels), "failures": int(failed.sum())}
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, "one system, 2 seeds, without the thesis's mode")
     parser.add_argument(
         "--data", help="folder with the MNIST test images and the published classifier"
     )
-    options(parser, "one system, 2 seeds, without the thesis's mode")
-    parser.add_argument("--seeds", type=int, default=None, help="default 10")
+    parser.add_argument("--seeds", type=int, help="default 10")
     parser.add_argument(
         "--picture", help="draw the first system's failures found against calls into this file"
     )
     parser.add_argument("--table", action="store_true", help="only Table 4.1 of the thesis")
-    given = parser.parse_args(argv)
-    seeds = given.seeds or size(given, 10, 2, 1)
-    one = given.quick or given.smoke
-    systems = mnist(given.data, one) if given.data else digits(one)
-    out = {}
-    if given.table:
-        tables([next(iter(systems))], seeds, out)
-        if given.json:
-            print(json.dumps(out))
-        return
+    args = parser.parse_args(argv)
+    say, out, seeds = printer(args), {}, args.seeds or size(args, 10, 2, 1)
+    one = args.quick or args.smoke
+    systems = mnist(args.data, one) if args.data else digits(one)
+    if args.table:
+        tables([next(iter(systems))], seeds, out, say)
+        return show(args, out)
     for name, images, labels, predicted in systems:
-        if given.smoke:
+        if args.smoke:
             images, labels, predicted = images[:80], labels[:80], predicted[:80]
-        print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
-        out[name] = study(
-            images, labels, predicted, seeds, given.quick, None if out else given.picture
-        )
-    if given.json:
-        print(json.dumps(out))
+        say(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}")
+        picture = None if out else args.picture
+        out[name] = study(images, labels, predicted, seeds, args.quick, picture, say)
+    show(args, out)
 
 
 if __name__ == "__main__":
