@@ -145,7 +145,10 @@ def run(cases, methods, seeds, budget=None):
 
 def table(report):
     """The report as text."""
-    number = lambda v: f"{'-':>8}" if v is None else f"{v:8.1f}"
+
+    def number(v):
+        return f"{'-':>8}" if v is None else f"{v:8.1f}"
+
     lines = [
         f"{'':<5} {'budget':>6} {'method':<9} {'falsified':>9} {'mean':>8} {'median':>8}"
         f" {'CPU s':>7}"

@@ -108,7 +108,7 @@ def speedup(repeats, lanes=64):
     return out
 
 
-def bare(repeats, pieces=100):
+def two_processes(repeats, pieces=100):
     """Of 2 n pieces of computing in one process, to n in each of two."""
     code = (
         f"import time\nfor _ in range({pieces}):\n end = time.perf_counter() + {SECONDS}\n while"
@@ -132,7 +132,7 @@ def main(argv=None):
         "processors": processors(),
         "overhead_ms": overhead(repeats, **({"batches": [(2, 2)]} if args.smoke else {})),
         "speedup": speedup(repeats, 4 if args.smoke else 64)
-        | {"bare": bare(repeats, 2 if args.smoke else 100)},
+        | {"two_processes": two_processes(repeats, 2 if args.smoke else 100)},
     }
     show(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 

@@ -4,8 +4,8 @@ computes them.
 
 `TUNED` are loops that settings may be chosen on, `JUDGED` those on which nothing was: 80 to 400
 random numbers an episode. `RARE` are three more to judge on, of about one in a million. Truths are
-plain draws by jast's own player, with JAX's Threefry, which a bare loop (`bare`) repeats; those of
-`RARE`, of breaker, tank, store and oven are exact (`benchmarks.operators`).
+plain draws by jast, with JAX's Threefry, which a minimal loop (`independent_draws`) repeats; those
+of `RARE`, of breaker, tank, store and oven are exact (`benchmarks.operators`).
 
 Tank, store and oven were judged on until the move that draws anew all after a level was found on
 them; freezer and packets were made after it.
@@ -253,19 +253,19 @@ def _failing(sim, key, blocks):
     return lax.fori_loop(0, blocks, block, jnp.zeros((), jnp.int32))
 
 
-def bare(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
+def independent_draws(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
     """As `plain`, by a loop that uses the simulator's functions only, with other draws."""
     blocks = min(max(draws // LANES, 1), 1024)
     failing = done = 0
     while done < draws:
         key = jax.random.key(seed * 100_000 + done // (blocks * LANES), impl="rbg")
-        failing += int(_bare(loop.simulator, key, blocks))
+        failing += int(_independent_failures(loop.simulator, key, blocks))
         done += blocks * LANES
     return failing, done
 
 
 @partial(jax.jit, static_argnames="blocks")
-def _bare(sim, key, blocks):
+def _independent_failures(sim, key, blocks):
     def fails(key):
         first, rest = jax.random.split(key)
         state = sim.init(sim.start().sample(seed=first))
@@ -395,11 +395,11 @@ def main(argv: list[str] | None = None) -> None:
         row |= dict(recomputed=p, apart=apart, cpu_seconds=time.process_time() - begun)
         text = f"recomputed {p:.4g}  {apart:.1f} standard errors apart"
         if loop.how == DRAWS:
-            failing, drawn = bare(loop, draws // 10)
+            failing, drawn = independent_draws(loop, draws // 10)
             other = failing / drawn
             both = math.hypot(math.sqrt(loop.truth / drawn), loop.error * loop.truth)
-            row |= dict(bare=other, bare_apart=abs(other - loop.truth) / both)
-            text += f"  bare loop {other:.3g}, {row['bare_apart']:.1f} apart"
+            row |= dict(independent=other, independent_apart=abs(other - loop.truth) / both)
+            text += f"  minimal loop {other:.3g}, {row['independent_apart']:.1f} apart"
         else:
             row |= dict(relative=p / loop.truth - 1)
             text = f"recomputed {p:.5g}, {row['relative']:+.1e} of it"

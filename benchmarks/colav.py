@@ -23,7 +23,8 @@ from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
-PRUNES, SIMULATIONS = 22, 50  # published
+PRUNES = 22  # published
+SIMULATIONS = 50  # of a root: published
 ALL = ("delay", "steering", "noise")
 SUBSTEPS = (1, 3, 10, 30, 100, 300)
 
@@ -68,7 +69,8 @@ def share(failing):
 def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     """Trees of the default search that find a collision."""
     sim = colav(scenario, kind, substeps=substeps)
-    grow = lambda: jast.search.forest(
+    grow = functools.partial(
+        jast.search.forest,
         jax.random.key(0),
         sim,
         trees=trees,
@@ -90,9 +92,12 @@ def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
 def random_search(scenario, kind, runs, substeps, episodes=PRUNES * SIMULATIONS):
     """Random searches of as many episodes as a tree has simulations that find a collision."""
     sim = colav(scenario, kind, substeps=substeps)
-    one = lambda key: jast.search.monte_carlo(
-        key, sim, episodes=episodes, reward=REWARD
-    ).failing_per_tree[0]
+
+    def one(key):
+        return jast.search.monte_carlo(key, sim, episodes=episodes, reward=REWARD).failing_per_tree[
+            0
+        ]
+
     return share(
         jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
     )
@@ -179,9 +184,11 @@ def main(argv=None):
     parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
     args = parser.parse_args(argv)
     say = printer(args)
-    percent = lambda r, name: (
-        f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
-    )
+
+    def percent(r, name):
+        low, high = (100 * v for v in r[f"{name}_95"])
+        return f"{100 * r[name]:6.1f} % [{low:.1f}, {high:.1f}]"
+
     report = {"nominal": {}, "searches": {}, "memoization": []}
     measure = here if args.smoke else alone
 

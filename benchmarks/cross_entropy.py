@@ -80,7 +80,7 @@ def row(values, distances=None, sierra=True):
     return out | {"hit": float(np.mean(np.asarray(values, float) < BASIN))} if sierra else out
 
 
-def ours(method, case, seeds, **settings):
+def run_jast(method, case, seeds, **settings):
     c = CASES[case]
     result = runs(method, case, seeds, **settings)
     far = (
@@ -91,7 +91,7 @@ def ours(method, case, seeds, **settings):
     return row(result.best_value, far, case in SIERRA) | {"invalid": int(np.sum(result.invalid))}
 
 
-def theirs(peer, case, seeds):
+def run_peer(peer, case, seeds):
     found = peers.run(peer, case, range(seeds))
     return row(found["values"], found["distances"], case in SIERRA) | {
         "cpu_s": float(found["cpu_s"].mean())
@@ -137,13 +137,13 @@ def schedules(seeds, rates=(0.1, 0.2, 0.3), forms=("before", "after"), modes=("t
         for p in rates
     ]
     for mode in modes:
-        out[f"uniform, {mode}"] = ours("ce_surrogate", "sierra 1B", seeds, mode=mode)
+        out[f"uniform, {mode}"] = run_jast("ce_surrogate", "sierra 1B", seeds, mode=mode)
         for name, counts in uneven:
-            out[f"{name}, {mode}"] = ours(
+            out[f"{name}, {mode}"] = run_jast(
                 "ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts
             )
     for name, counts in uneven[: len(rates)]:
-        out[f"{name}, thesis with ratchet"] = ours(
+        out[f"{name}, thesis with ratchet"] = run_jast(
             "ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True
         )
     return out
@@ -159,7 +159,7 @@ def surrogates(seeds, cases=("sierra 1A", "paraboloid 2")):
         f"polynomial, degree {k}": dict(surrogate="polynomial", degree=k) for k in (1, 2, 3, 4)
     }
     return {
-        f"{case}, {name}": ours("ce_surrogate", case, seeds, mode="thesis", **how)
+        f"{case}, {name}": run_jast("ce_surrogate", case, seeds, mode="thesis", **how)
         for case in cases
         for name, how in models.items()
     }
@@ -221,13 +221,13 @@ def main(argv=None):
             for method in methods:
                 if args.quick and (method, mode) == ("ce_mixture", "thesis"):
                     continue
-                r = ours(method, case, seeds, mode=mode)
+                r = run_jast(method, case, seeds, mode=mode)
                 report["sierra"][f"{case}, {method}, {mode}"] = r
                 published = TABLE[method][i] if mode == "thesis" else None
                 say(row_text(f"{method}, {mode}", r, published))
         for peer in (*cheap, *size(args, ("expected_improvement",), (), ())):
             n = args.slow_seeds if peer == "expected_improvement" else seeds
-            report["peers"][f"{case}, {peer}"] = r = theirs(peer, case, n)
+            report["peers"][f"{case}, {peer}"] = r = run_peer(peer, case, n)
             say(row_text(peer, r))
 
     if not args.quick:
@@ -237,7 +237,7 @@ def main(argv=None):
         )
         jax.config.update("jax_enable_x64", False)
         for case in SIERRA[: 1 if args.smoke else 2]:
-            report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours(
+            report["sierra"][f"{case}, ce_surrogate, float32"] = r = run_jast(
                 "ce_surrogate", case, seeds, dtype=np.float32
             )
             say(row_text(f"{case}, float32", r))
@@ -266,15 +266,15 @@ def main(argv=None):
     others = [case for case in CASES if case not in SIERRA]
     for case in size(args, others, ("branin", "ackley 5", "levy 5"), ("paraboloid 2",)):
         rows = {
-            method: ours(method, case, seeds)
+            method: run_jast(method, case, seeds)
             for method in size(args, METHODS, METHODS[:2], METHODS[:1])
         }
         rows |= (
-            {"ce_surrogate, thesis": ours("ce_surrogate", case, seeds, mode="thesis")}
+            {"ce_surrogate, thesis": run_jast("ce_surrogate", case, seeds, mode="thesis")}
             if not args.quick
             else {}
         )
-        rows |= {peer: theirs(peer, case, seeds) for peer in cheap}
+        rows |= {peer: run_peer(peer, case, seeds) for peer in cheap}
         report["others"][case] = rows
         say(
             f"  {case:13} "

@@ -58,9 +58,10 @@ def rollouts(problem, keys, simulations):
 
         def roll(carry):
             level, at = carry
-            draw = lambda k, tree_key, t, p: take(
-                problem, t, p, choose_rollout(problem, k, tree_key, t, p.state)
-            )
+
+            def draw(k, tree_key, t, p):
+                return take(problem, t, p, choose_rollout(problem, k, tree_key, t, p.state))
+
             after = jax.vmap(draw)(key, keys, level, at)
             kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at[1:], after[1:])
             return level + 1, Progress(after.state, *kept)._replace(log_prob=at.log_prob)
@@ -145,7 +146,8 @@ def capacity(repeats, lanes=200, few=500, many=10_000):
 
 def cores(repeats, trees=200, prunes=6, simulations=500):
     """How many times faster two threads, of half of the trees each, are than one, in wall time."""
-    search = lambda threads: jast.search.forest(
+    search = functools.partial(
+        jast.search.forest,
         jax.random.key(0),
         jast.simulators.ferry(),
         trees=trees,
@@ -154,13 +156,12 @@ def cores(repeats, trees=200, prunes=6, simulations=500):
         reward=REWARD,
         actions=BOX,
         mode="paper",
-        threads=threads,
         lanes=trees // 2,
     )
     pairs = [
         (
-            cpu(lambda: search(1).best_reward_per_tree)[1],
-            cpu(lambda: search(2).best_reward_per_tree)[1],
+            cpu(lambda: search(threads=1).best_reward_per_tree)[1],
+            cpu(lambda: search(threads=2).best_reward_per_tree)[1],
         )
         for _ in range(repeats + 1)
     ][1:]
@@ -307,7 +308,10 @@ def main(argv=None):
     args = options(__doc__, "fewer repetitions, smaller memoization runs").parse_args(argv)
     repeats = size(args, 5, 2, 1)
     measure = functools.partial(here if args.smoke else alone, module="engine")
-    least = lambda *arguments: arguments if args.smoke else ()
+
+    def least(*arguments):
+        return arguments if args.smoke else ()
+
     one = run.bytes_per_tree(problem(9000), run.Plan(18, 500, 1, "node"))
     smallest = (2, 2, 45, [(1, "1 substep")], ["node", "none"])
     systems = size(args, (100, 18, 100), (32, 4, 100), smallest)

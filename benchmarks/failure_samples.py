@@ -32,7 +32,8 @@ from jast.judge import judged
 
 __all__ = ["density_and_coverage", "run"]
 
-NEIGHBOURS, LANES = 5, 50_000
+NEIGHBOURS = 5  # whose distance is the radius of a ball: Naeem et al.
+LANES = 50_000  # points that are judged side by side
 
 
 def density_and_coverage(true: np.ndarray, found: np.ndarray) -> tuple[float, float]:
@@ -42,7 +43,7 @@ def density_and_coverage(true: np.ndarray, found: np.ndarray) -> tuple[float, fl
     return float(within.sum() / (NEIGHBOURS * len(found))), float(within.any(axis=1).mean())
 
 
-def beyond(limit: Limit) -> Callable:
+def beyond_half_spaces(limit: Limit) -> Callable:
     """Draws failures of half-spaces that do not overlap, exactly."""
     directions, beta, _ = limit.parameters
 
@@ -59,11 +60,14 @@ def beyond(limit: Limit) -> Callable:
 
 def both_planes(rng, n):
     """Of the half-planes, exactly."""
-    tail = lambda: stats.norm.isf(rng.random(n) * stats.norm.sf(3))
+
+    def tail():
+        return stats.norm.isf(rng.random(n) * stats.norm.sf(3))
+
     return np.stack([rng.choice((-1, 1), n) * tail(), tail()], axis=1)
 
 
-def rejected(sim: jast.Simulator) -> Callable:
+def by_rejection(sim: jast.Simulator) -> Callable:
     """Draws failures by drawing until there are enough."""
 
     def draw(rng, n):
@@ -77,12 +81,12 @@ def rejected(sim: jast.Simulator) -> Callable:
 
 
 def _static(name):
-    return LIMITS[name].simulator(), beyond(LIMITS[name])
+    return LIMITS[name].simulator(), beyond_half_spaces(LIMITS[name])
 
 
 def _rejected(make):
     sim = make()
-    return sim, rejected(sim)
+    return sim, by_rejection(sim)
 
 
 CASES: dict[str, Callable[[], tuple[jast.Simulator, Callable]]] = {
@@ -147,7 +151,10 @@ def main(argv=None):
     args = parser.parse_args(argv)
     say, report, seeds = printer(args), {}, args.seeds or size(args, 10, 3, 2)
     n, budget = size(args, 1000, 1000, 50), size(args, 100_000, 50_000, 5000)
-    spread = lambda v: f"{np.mean(v):.3f} +- {np.std(v, ddof=1) if len(v) > 1 else 0:.3f}"
+
+    def spread(v):
+        return f"{np.mean(v):.3f} +- {np.std(v, ddof=1) if len(v) > 1 else 0:.3f}"
+
     for name in args.cases or list(CASES)[: size(args, None, 4, 1)]:
         report[name] = run(name, seeds, n, budget, size(args, None, None, ["failure_samples"]))
         for method, r in report[name].items():

@@ -34,7 +34,8 @@ __all__ = ["SYSTEMS", "calls"]
 MARK = "the_users_step"
 """Stands in the text of each program that contains the step."""
 TIMES = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
-LANES, TIMES_PLAYED = 128, 10
+LANES = 128  # episodes side by side
+TIMES_PLAYED = 10  # after compilation
 IMPORTS = 5
 """Fresh processes, of which the quickest counts."""
 
@@ -47,7 +48,9 @@ def lane() -> jast.Simulator:
         speed = 0.8 * speed - 0.3 * offset + 0.1 * gust
         return jnp.stack([offset + speed, speed])
 
-    off = lambda car: jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)
+    def off(car):
+        return jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)
+
     return jast.Simulator(
         init=lambda x0: jnp.zeros(2),
         step=step,
@@ -83,7 +86,10 @@ def calls(name: str, least: bool) -> list[dict[str, float]]:
     sim = dataclasses.replace(sim, step=lambda s, x: named(s, x))
     one, other = jax.random.split(jax.random.key(0))
     rows, events = [], []
-    heard = lambda event, seconds, **_: events.append((event.rsplit("/", 1)[1], seconds))
+
+    def heard(event, seconds, **_):
+        return events.append((event.rsplit("/", 1)[1], seconds))
+
     jax.monitoring.register_event_duration_secs_listener(heard)
     with tempfile.TemporaryDirectory() as folder:
         for key, evaluations in ((one, budget), (one, budget), (other, budget), (one, another)):

@@ -43,13 +43,19 @@ def searches(evaluations, seeds):
     near = Independent(
         Normal(jnp.asarray(MEANS).at[1].set(1.0), jnp.asarray(SIGMAS).at[1].set(3.0)), 1
     )
-    monte_carlo = lambda key, sim: jast.search.monte_carlo(
-        key, sim, episodes=evaluations * seeds, reward=safe, record=True
-    )
+
+    def monte_carlo(key, sim):
+        return jast.search.monte_carlo(
+            key, sim, episodes=evaluations * seeds, reward=safe, record=True
+        )
+
     plain = jast.actions.samples()
-    mcts = lambda key, sim, **of: jast.search.mcts(
-        key, sim, trees=seeds, simulations=evaluations, record=True, actions=plain, **of
-    )
+
+    def mcts(key, sim, **of):
+        return jast.search.mcts(
+            key, sim, trees=seeds, simulations=evaluations, record=True, actions=plain, **of
+        )
+
     cem = dict(
         samples=evaluations // 10,
         elites=evaluations // 100,
@@ -180,12 +186,15 @@ def spread(shares):
 
 def line(name, row):
     """A row of the table in words."""
-    of = lambda v, digits=1: (
-        "-"
-        if v is None
-        else f"{v['mean']:.{digits}f}"
-        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
-    )
+
+    def of(v, digits=1):
+        return (
+            "-"
+            if v is None
+            else f"{v['mean']:.{digits}f}"
+            + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+        )
+
     return (
         f"{name:15} {of(row['failures']):>16} {row['failures_median']:7.0f}"
         f" {100 * row['share_of_simulations']:6.2f}% {row['first_failure_median']:7.0f}"

@@ -27,7 +27,10 @@ from benchmarks.sizes import options, printer, show, size
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
 READINGS = ("episode", "root", "level", "edge", "visited", "none")
-DEPTH, EXPLORATION, WIDENING, BONUS = 12, 10.0, (10.0, 0.3), 100.0
+DEPTH = 12  # waypoints of a route
+EXPLORATION = 10.0  # Table 3.2
+WIDENING = (10.0, 0.3)  # Table 3.2
+BONUS = 100.0  # of a failure: eq. 3.2
 
 
 class Node:

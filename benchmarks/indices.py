@@ -30,7 +30,10 @@ def plane(a: Any, beta: float) -> tuple[Any, float, list, list]:
     z = np.linspace(-9, 9, 4001)
     weight = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * (z[1] - z[0])
     p = float(PHI(-beta))
-    square = lambda r: float(weight @ PHI((r * z - beta) / np.sqrt(1 - r * r)) ** 2)
+
+    def square(r):
+        return float(weight @ PHI((r * z - beta) / np.sqrt(1 - r * r)) ** 2)
+
     first = [(square(r) - p * p) / (p - p * p) for r in a]
     total = [1 - (square(np.sqrt(1 - r * r)) - p * p) / (p - p * p) for r in a]
     given = Partial(_plane, jnp.asarray(a, float), jnp.asarray(beta))

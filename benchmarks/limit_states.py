@@ -116,9 +116,10 @@ def sphere_probability(offset, radius, side, d):
     - 1 others.
     """
     y, rest = lambda t: offset + radius * np.sin(t), stats.chi2.cdf if side < 0 else stats.chi2.sf
-    within = lambda t: (
-        stats.norm.pdf(y(t)) * rest((radius * np.cos(t)) ** 2, d - 1) * radius * np.cos(t)
-    )
+
+    def within(t):
+        return stats.norm.pdf(y(t)) * rest((radius * np.cos(t)) ** 2, d - 1) * radius * np.cos(t)
+
     beyond = stats.norm.sf(offset + radius) + stats.norm.cdf(offset - radius) if side > 0 else 0.0
     return _simpson(within, -np.pi / 2, np.pi / 2) + beyond
 
@@ -143,10 +144,12 @@ def first_passage(decay, spread, threshold, steps, two_sided=False, nodes=300):
     )
     x, w = np.polynomial.legendre.leggauss(nodes)
     x, w = low + (x + 1) * (threshold - low) / 2, w * (threshold - low) / 2
-    passes = lambda s: (
-        stats.norm.sf((threshold - decay * s) / spread)
-        + (stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0)
-    )
+
+    def passes(s):
+        return stats.norm.sf((threshold - decay * s) / spread) + (
+            stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0
+        )
+
     kernel, out = stats.norm.pdf((x[:, None] - decay * x) / spread) / spread * w, w * passes(x)
     density, total = stats.norm.pdf(x / spread) / spread, passes(0.0)
     for _ in range(steps - 1):
@@ -179,7 +182,10 @@ def _solve(probability, target, low, high):
     """The parameter with this probability, which falls with it; where its range does not contain
     it, the nearer end.
     """
-    gap = lambda v: np.log(max(probability(v), 1e-300)) - np.log(target)
+
+    def gap(v):
+        return np.log(max(probability(v), 1e-300)) - np.log(target)
+
     return (
         low
         if gap(low) <= 0
@@ -463,7 +469,10 @@ def main(argv=None):
     args = parser.parse_args(argv)
     seeds, n = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000)
     say, report = printer(args), {}
-    off = lambda z: f"rms {np.sqrt(np.mean(z**2)):.2f}, greatest {np.abs(z).max():.2f}"
+
+    def off(z):
+        return f"rms {np.sqrt(np.mean(z**2)):.2f}, greatest {np.abs(z).max():.2f}"
+
     for family in FAMILIES:
         scores = [check(family, seed, n) for seed in range(seeds)]
         easy = np.array([s[0] for s in scores])

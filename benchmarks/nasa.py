@@ -69,7 +69,6 @@ def main(argv=None):
         samples = min(samples, 10**5)
         return show(args, by_cells(sim, truth, args.cells, episodes, samples, args.seed, say))
     keys = jax.random.split(jax.random.key(args.seed), 4)
-    other = lambda key: jax.random.fold_in(key, 1)
     as_printed = dict(hidden=(100, 100), learning_rate=1e-4)
     if args.smoke:
         as_printed |= dict(batch=16, updates=1, hidden=(8,))
@@ -77,16 +76,19 @@ def main(argv=None):
     say(f"{episodes} episodes of training, {cpu:.0f} CPU s; {samples} traces an estimate")
     learn = jast.policies.q_learning
     cells = (1, 100)
-    table, table_cpu, _ = timed(lambda: learn(other(keys[0]), sim, episodes=episodes, cells=cells))
+    table, table_cpu, _ = timed(
+        lambda: learn(jax.random.fold_in(keys[0], 1), sim, episodes=episodes, cells=cells)
+    )
     say(f"Q-learning: as many episodes of training, {table_cpu:.0f} CPU s")
     in_table = policy_proposal(sim, table, 0.05)
     untilted = policy_proposal(sim, policy, 0.05, tilt_start=False)
     tilted = policy_proposal(sim, policy, 0.05)
+    key = jax.random.fold_in(keys[3], 1)
     calls = {
         "Algorithm 2, as printed": lambda: importance(keys[1], sim, untilted, samples),
         "double loop": lambda: double_loop(keys[2], sim, untilted, samples // 100, 100),
         "start moved": lambda: importance(keys[3], sim, tilted, samples),
-        "Q-learning, start moved": lambda: importance(other(keys[3]), sim, in_table, samples),
+        "Q-learning, start moved": lambda: importance(key, sim, in_table, samples),
     }
     out = {"published": PUBLISHED, "truth": truth, "training_cpu_s": cpu, "table_cpu_s": table_cpu}
     for name, call in calls.items():

@@ -58,10 +58,11 @@ def cma_es(seed, objective, mean, sd, budget):
     """
     rng = np.random.default_rng(seed)
 
+    def restart():
+        return mean + sd * rng.standard_normal(len(mean))
+
     def search(evaluate):
-        again = lambda: mean + sd * rng.standard_normal(len(mean))
-        each = lambda points: [evaluate(p) for p in points]
-        driver.cma_es(rng, each, mean, sd, again, tolfun=0, tolfunhist=0)
+        driver.cma_es(rng, partial(map, evaluate), mean, sd, restart, tolfun=0, tolfunhist=0)
 
     return _record(objective, budget, len(mean), search)
 
@@ -92,9 +93,12 @@ def direct(seed, objective, mean, sd, budget, jitter=0.25):
 
     centre = mean + jitter * sd * np.random.default_rng(seed).uniform(-1, 1, len(mean))
     bounds = list(zip(centre - 2 * sd, centre + 2 * sd))
-    search = lambda evaluate: optimize.direct(
-        evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0
-    )
+
+    def search(evaluate):
+        return optimize.direct(
+            evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0
+        )
+
     return _record(objective, budget, len(mean), search)
 
 
@@ -175,7 +179,10 @@ def summary(values, distances=None):
     square distance, ``rms``.
     """
     values, n = np.asarray(values, float), len(values)
-    se = lambda sample: float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
+
+    def se(sample):
+        return float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
+
     report = {
         "seeds": n,
         "best": float(values.mean()),

@@ -259,7 +259,9 @@ def main(argv=None):
     parts = args.only or [part for part in PARTS if part not in slow]
     say, budget = printer(args), args.budget or size(args, 100_000, 100_000, 5000)
     report, quick = {"budget": budget}, args.quick
-    seeds = lambda *n: args.seeds or size(args, *n)
+
+    def seeds(*n):
+        return args.seeds or size(args, *n)
 
     if "landing" in parts:
         report["landing"] = landing(*size(args, (200,), (5,), (1, 1000, 1000)))

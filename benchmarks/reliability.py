@@ -172,8 +172,8 @@ def row(method, case, budget, seeds):
     limit = (LIMITS | PROBLEMS)[case]
     starts, levels = CASES[case] if case in CASES else ((), _levels(limit.truth))
     about = method, limit.batch, limit.dimension, budget
-    one = lambda seed: run(*about, seed, levels.get(method), starts)
-    runs, cpu, _ = timed(lambda: [one(seed) for seed in range(seeds)])
+    more = levels.get(method), starts
+    runs, cpu, _ = timed(lambda: [run(*about, seed, *more) for seed in range(seeds)])
     error = np.array([r["estimate"] for r in runs]) / limit.truth - 1
     # none where nothing was found
     cov = [r["reported_cov"] for r in runs if r["reported_cov"] >= 0]

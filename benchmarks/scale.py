@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -38,7 +39,8 @@ from jast.ledger import records
 from jast.simulators import ferry, landing
 from jast.weakness import default
 
-KEY, WAIT = jax.random.key(0), 0.005
+KEY = jax.random.key(0)
+WAIT = 0.005  # s that a black box takes
 
 
 def waits(disturbances):
@@ -157,8 +159,8 @@ def black_box(episodes):
 def same(a, b):
     """Whether two results are the same to the bit; their settings and functions aside."""
     a, b = (jax.tree.leaves(_numbers(r)) for r in (a, b))
-    equal = lambda x, y: np.asarray(x).tobytes() == np.asarray(y).tobytes()
-    return len(a) == len(b) and all(map(equal, a, b))
+    as_bytes = [[np.asarray(x).tobytes() for x in leaves] for leaves in (a, b)]
+    return as_bytes[0] == as_bytes[1]
 
 
 def _numbers(result):
@@ -207,7 +209,10 @@ def killed(name, sizes, moment, folder, programs):
     command = [sys.executable, "-W", "ignore", "-c", CHILD, ended, name, checkpoint, *sizes]
     env = os.environ | {"JAX_COMPILATION_CACHE_DIR": programs} | ALL
     process = subprocess.Popen([str(word) for word in command], env=env)
-    begun = lambda: parts(checkpoint) or (checkpoint / "state.jast").exists()
+
+    def begun():
+        return parts(checkpoint) or (checkpoint / "state.jast").exists()
+
     while not begun() and process.poll() is None:
         time.sleep(0.002)
     try:
@@ -262,7 +267,7 @@ def report(args):
         return found
     if not args.smoke:
         n, episodes, repeats = size(args, (4_000_000, 1280, 5), (1_000_000, 640, 1), None)
-        of_ferry = lambda **how: jast.nominal(KEY, ferry(), n, **how)
+        of_ferry = partial(jast.nominal, KEY, ferry(), n)
         waiting = speedup(black_box(episodes), repeats)
         found["workers"] = {"S0": speedup(of_ferry, repeats), "black box, 5 ms": waiting}
     each = names or size(args, list(calls(*sizes)), ["nominal", "forest"], None)

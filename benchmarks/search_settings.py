@@ -70,10 +70,13 @@ def main(argv=None):
     base = answers(SETTINGS, problems, args.budget)
     out = {"as it is": line(base, base) | {"problems": len(problems)}}
     say = printer(args)
-    text = lambda name: (
-        f"{name:32} flagged {out[name]['flagged']:3d}  error {out[name]['error']:5.2f}"
-        f"  far {out[name]['far']}"
-    )
+
+    def text(name):
+        return (
+            f"{name:32} flagged {out[name]['flagged']:3d}  error {out[name]['error']:5.2f}"
+            f"  far {out[name]['far']}"
+        )
+
     say(f"{len(problems)} problems, {args.budget} evaluations, jast {jast.__version__}")
     say(text("as it is"))
     for name in names:

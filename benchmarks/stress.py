@@ -87,8 +87,8 @@ def cma_es(key, sim, budget):
         if spent + size > budget:
             raise driver.Stop
         each = jax.device_get(_scored(centre, jnp.asarray(points, normal_numbers(sim))))
-        both = lambda a, b: np.concatenate([a, b])
-        known = each if known is None else jax.tree.map(both, known, each)
+        parts = [each] if known is None else [known, each]
+        known = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
         value = np.where(known.failure, known.reward, -np.inf)
         order = np.argsort(-value, kind="stable")[:64]
         known = jax.tree.map(lambda a: a[order], known)
@@ -96,10 +96,8 @@ def cma_es(key, sim, budget):
         worth = np.where(each.failure, -1 / (1 + np.abs(each.reward)), each.distance)
         return np.nan_to_num(worth, nan=1e30, posinf=1e30)
 
-    again = lambda: zeros
-    driver.cma_es(
-        rng, evaluate, zeros, np.ones(len(zeros)), again, popsize=size, tolflatfitness=10**9
-    )
+    settings = dict(popsize=size, tolflatfitness=10**9)
+    driver.cma_es(rng, evaluate, zeros, np.ones(len(zeros)), lambda: zeros, **settings)
     known = jax.tree.map(lambda a: a[known.failure], known)
     if not len(known.length):
         return None, spent, None
@@ -124,8 +122,12 @@ def slow_cooling(key, sim, budget):
 @jax.jit
 def _scored(sim, z):
     """The episodes [n] of the normal numbers ``z`` [n, D], by log p relative to the mode."""
-    play = lambda z: jast.rollout(jax.random.key(0), sim, policy_of(sim, z), likelihood(sim))
-    return jax.vmap(lambda z: play(z)._replace(states=None))(z)
+
+    def play(z):
+        policy = policy_of(sim, z)
+        return jast.rollout(jax.random.key(0), sim, policy, likelihood(sim))._replace(states=None)
+
+    return jax.vmap(play)(z)
 
 
 METHODS = {
@@ -148,7 +150,10 @@ METHODS = {
 def _without(name, key, sim, budget):
     """`stress` where one of its explorers is not called."""
     few = {k: v for k, v in explorers.LEAST.items() if k != name}
-    nothing = lambda *_: explorers.Haul(empty(sim).episodes, 0, 0, 0)
+
+    def nothing(*_):
+        return explorers.Haul(empty(sim).episodes, 0, 0, 0)
+
     with (
         mock.patch.object(explorers, "LEAST", few),
         mock.patch.dict(explorers.EXPLORERS, {name: nothing}),
@@ -200,7 +205,10 @@ def run(cases, methods, budget, seeds):
 
 def table(report):
     """The report as text."""
-    number = lambda v: f"{'-':>9}" if v is None else f"{v:9.3f}"
+
+    def number(v):
+        return f"{'-':>9}" if v is None else f"{v:9.3f}"
+
     lines = [
         f"{'system':<16} {'optimum':>9} {'method':<23} {'found':>7} {'median':>9} {'worst':>9}"
         f" {'evaluations':>12} {'modes':>12} {'CPU s':>7}"

@@ -20,7 +20,9 @@ from jast import distributions as D
 
 __all__ = ["PROBLEMS", "Problem", "structural_cases"]
 
-POINTS, REACH, SOBOL = 200_001, 9.0, 20
+POINTS = 200_001  # of a quadrature
+REACH = 9.0  # standard deviations to either side of it
+SOBOL = 20  # the binary logarithm of the points of a sequence
 
 
 def normal(mean=0.0, sd=1.0):
@@ -168,14 +170,20 @@ def _rp57_given(d, x):
     """Two intervals, of which the parts they share count once."""
     low, high = (2 - x[0]) / 8, np.cbrt(x[0] ** 2 - 3)
     half = np.sqrt(np.maximum(4 - (x[0] + 3) ** 2, 0))
-    length = lambda a, b: np.where(b > a, d.cdf(b) - d.cdf(a), 0)
+
+    def length(a, b):
+        return np.where(b > a, d.cdf(b) - d.cdf(a), 0)
+
     shared = length(np.maximum(low, -3 - half), np.minimum(high, -3 + half))
     return length(low, high) + length(-3 - half, -3 + half) - shared
 
 
 def _rp60(x, np):
     x1, x2, x3, x4, x5 = x
-    three = lambda f, a, b, c: f(f(a, b), c)
+
+    def three(f, a, b, c):
+        return f(f(a, b), c)
+
     half = three(np.minimum, x2 - x5 / 2, x3 - x5 / 2, x4 - x5 / 2)
     whole = np.maximum(x4 - x5, np.minimum(x2 - x5, x3 - x5))
     return np.minimum(x1 - x5, np.maximum(half, whole))

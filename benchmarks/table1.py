@@ -158,7 +158,7 @@ def warm_up(search):
     return timed(lambda: search(jax.random.key(0), **more))[1]
 
 
-def settled(search, seed):
+def warm_run(search, seed):
     """`timed`; a short call is made twice and the second one counts, as some small programs depend
     on what was found.
     """
@@ -169,7 +169,7 @@ def settled(search, seed):
 def measure(searches, seeds):
     """The row of a search, given for each seed."""
     warm = warm_up(searches[0])
-    runs = [settled(search, seed) for search, seed in zip(searches, seeds, strict=True)]
+    runs = [warm_run(search, seed) for search, seed in zip(searches, seeds, strict=True)]
     results, cpu, wall = zip(*runs, strict=True)
     bests = [np.asarray(r.best_reward_per_tree, np.float64) for r in results]
     row = outcome(np.concatenate(bests))
@@ -199,13 +199,16 @@ def published():
     if (found := data("table1_per_tree.json")) is not None:
         bests = found["best_reward_per_tree"]
         return {name: outcome(np.array(bests[name])) for name in VARIANTS}
-    row = lambda rate, mean, best: dict(
-        trees=200,
-        rate=rate / 100,
-        rate_95=list(clopper_pearson(round(2 * rate), 200)),
-        mean_best=mean,
-        best=best,
-    )
+
+    def row(rate, mean, best):
+        return dict(
+            trees=200,
+            rate=rate / 100,
+            rate_95=list(clopper_pearson(round(2 * rate), 200)),
+            mean_best=mean,
+            best=best,
+        )
+
     return {name: row(*TABLE[name]) for name in VARIANTS}
 
 

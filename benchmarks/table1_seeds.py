@@ -54,10 +54,13 @@ def search(row, trees, simulations):
 def summary(bests, cpu):
     """The row of several seeds, by the best rewards [seeds, trees]."""
     rates = np.mean(bests > 0, axis=1)
-    over = lambda values: {
-        "mean": float(values.mean()),
-        "sd": float(values.std(ddof=1)) if len(values) > 1 else None,
-    }
+
+    def over(values):
+        return {
+            "mean": float(values.mean()),
+            "sd": float(values.std(ddof=1)) if len(values) > 1 else None,
+        }
+
     return {
         "rates": rates.tolist(),
         "rate": over(rates),

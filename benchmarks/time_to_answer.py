@@ -89,7 +89,9 @@ def toy_step(steps, s, w):
 
 
 def _toy(z, steps):
-    gap = lambda s: z - s[0] - 2 * s[1]
+    def gap(s):
+        return z - s[0] - 2 * s[1]
+
     return system([0.0, 0.0], Partial(toy_step, steps), gap, 2, steps, episodic=True)
 
 
@@ -102,7 +104,10 @@ def well_step(s, w):
 
 def well_distance(s):
     """Of the progress from one well to the other, to .95."""
-    bump = lambda x: 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
+
+    def bump(x):
+        return 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
+
     return 0.95 - (0.5 - bump(-1.0) + bump(1.0))
 
 
@@ -193,7 +198,10 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     off = logs - math.log(about.truth)
     z = np.abs(off) / np.hypot(errors, about.error)
     known = reliable & np.isfinite(off)
-    rms = lambda a: float(np.sqrt(np.mean(a**2))) if a.size else None
+
+    def rms(a):
+        return float(np.sqrt(np.mean(a**2))) if a.size else None
+
     warm = float(np.mean(seconds[1:])) if seeds > 1 else None
     return dict(
         system=name,
@@ -215,7 +223,10 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
 def plain_draws(about: System, seconds: float) -> float | None:
     """The relative standard error of plain draws in so many CPU seconds."""
     n = 2**15
-    count = lambda seed: jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
+
+    def count(seed):
+        return jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
+
     count(0)
     begun = time.process_time()
     count(1)

@@ -34,7 +34,8 @@ from jast.weakness.measures import precision_recall
 from jast.weakness.thesis import halves
 from jast.weakness.validation import iteration_key
 
-SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
+SHARES = (0.05, 0.1, 0.25)  # of the inputs: budgets
+CANDIDATES = 0.0627  # of the inputs, as many as in the thesis
 ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precision")
 
 
@@ -44,11 +45,9 @@ class Answers:
     """
 
     def __init__(self, inputs, predicted):
-        self.index, self.predicted, self.asked = (
-            {x.tobytes(): i for i, x in enumerate(inputs)},
-            np.asarray(predicted),
-            np.zeros(len(inputs), int),
-        )
+        self.index = {x.tobytes(): i for i, x in enumerate(inputs)}
+        self.predicted = np.asarray(predicted)
+        self.asked = np.zeros(len(inputs), int)
 
     def __call__(self, batch):
         at = np.asarray([self.index[x.tobytes()] for x in batch])
@@ -126,10 +125,8 @@ def runs(images, labels, predicted, selector, seeds, budget=None):
     """[(result, CPU seconds, wall seconds)], one a seed."""
     out = []
     for seed in range(seeds):
-        system, given = (
-            Answers(images, predicted),
-            dict(budget=budget, selector=selector, classes=int(labels.max()) + 1),
-        )
+        system = Answers(images, predicted)
+        given = dict(budget=budget, selector=selector, classes=int(labels.max()) + 1)
         out.append(
             timed(
                 lambda seed=seed, system=system, given=given: weakness.validate(

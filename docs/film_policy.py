@@ -33,7 +33,10 @@ def played():
             exec("".join(cell["source"]), names)
     sim, failure = names["sim"], names["report"].failures[0]
     both = jast.rollout(jax.random.key(1), sim), jast.replay(sim, failure)
-    path = lambda s, n: np.stack([s.x, s.theta], -1)[: n + 1]
+
+    def path(s, n):
+        return np.stack([s.x, s.theta], -1)[: n + 1]
+
     return [path(e.states.state, int(e.length)) for e in both]
 
 

@@ -114,7 +114,9 @@ def test_ships_point_where_they_head():
 
 
 def test_moments():
-    times = lambda axes: [ax.get_title(loc="left").split(" s,")[0] for ax in axes]
+    def times(axes):
+        return [ax.get_title(loc="left").split(" s,")[0] for ax in axes]
+
     expected = [f"t = {3 * round(NEAREST * share):g}" for share in (1 / 3, 2 / 3, 1)]
     assert times(plot.colav(EPISODE)) == expected
     assert times(plot.colav(EPISODE, moments=1)) == expected[2:]
@@ -227,7 +229,10 @@ def test_the_story_tells_the_kinds_of_disturbance(three):
         "speed (m/s)",
     ]
     shown = [patch.get_data()[0] for ax in axes[:3] for patch in ax.patches]
-    size = lambda a: np.linalg.norm(a, axis=1)
+
+    def size(a):
+        return np.linalg.norm(a, axis=1)
+
     for values, expected in zip(
         shown,
         (40 * x["delay"], x["steering"] - 0.5, size(x["noise"][:, :2]), size(x["noise"][:, 2:])),
@@ -267,7 +272,10 @@ def test_animation_goes_from_the_first_state_to_the_last():
     [ax] = animation._fig.axes
     frames = list(animation.new_frame_seq())
     np.testing.assert_array_equal(frames, np.arange(9) / 2)
-    believed = lambda: labelled(ax)["adversary as believed"].get_xydata()
+
+    def believed():
+        return labelled(ax)["adversary as believed"].get_xydata()
+
     for t in (0, 2, 4):
         animation._func(frames[2 * t])
         np.testing.assert_allclose(believed(), ways(SHORT, t)[2], rtol=1e-6)
@@ -275,9 +283,10 @@ def test_animation_goes_from_the_first_state_to_the_last():
         for moving, standing in zip(
             (*ax.lines, *ax.patches), (*still.lines, *still.patches), strict=True
         ):
-            get = lambda artist: (
-                artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
-            )
+
+            def get(artist):
+                return artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
+
             np.testing.assert_array_equal(get(moving), get(standing))
         assert ax.get_title(loc="left") == still.get_title(loc="left")
     animation._func(1.5)
