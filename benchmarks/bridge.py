@@ -6,6 +6,8 @@ Then the failure probability that `failure_proposal` leads to: by importance sam
 new episodes, over the truth, where one is known; each of several seeds with a proposal of its own.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,23 +27,13 @@ def found(runs, samples=100, iterations=10, methods=("ce_method", "ce_surrogate"
     sizes = dict(samples=samples, elites=3 * samples // 10, iterations=iterations)
     sim, actions = jast.simulators.ferry(), jast.actions.quantiles()
     stress = ce.over(sim, actions=actions)
+    common = dict(reward=REWARD, actions=actions)
+    random = partial(jast.search.monte_carlo, sim=sim, episodes=samples * iterations, **common)
+    plan = dict(samples=samples, elites=samples // 10, iterations=iterations)
+    cem = partial(jast.search.cem, sim=sim, **plan, **common)
     searches = {
-        "random search": (
-            lambda key: jast.search.monte_carlo(
-                key, sim, episodes=samples * iterations, reward=REWARD, actions=actions
-            ).failing_per_tree[0]
-        ),
-        "search.cem": (
-            lambda key: jast.search.cem(
-                key,
-                sim,
-                samples=samples,
-                elites=samples // 10,
-                iterations=iterations,
-                reward=REWARD,
-                actions=actions,
-            ).failing_per_tree[0]
-        ),
+        "random search": lambda key: random(key).failing_per_tree[0],
+        "search.cem": lambda key: cem(key).failing_per_tree[0],
     }
     for name in methods:
         searches[name] = lambda key, name=name: (

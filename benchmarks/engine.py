@@ -95,18 +95,11 @@ def rates(repeats, lanes=200, prunes=18, simulations=500, plain_trees=3):
     children = {mode: int(p.settings.widths.max()) for mode, p in problems.items()}
     runs = {
         "rollouts": lambda: rollouts(problems["paper"], keys, 2 * simulations),
-        "forest, paper": lambda: whole(
-            problems["paper"], keys, prunes, simulations, children["paper"]
-        ),
-        "forest, default": lambda: whole(
-            problems["default"], keys, prunes, simulations, children["default"]
-        ),
     }
-    episodes = {
-        "rollouts": 2 * simulations * lanes,
-        "forest, paper": total * lanes,
-        "forest, default": total * lanes,
-    }
+    for mode in ("paper", "default"):
+        of_mode = problems[mode], keys, prunes, simulations, children[mode]
+        runs[f"forest, {mode}"] = functools.partial(whole, *of_mode)
+    episodes = {name: total * lanes for name in runs} | {"rollouts": 2 * simulations * lanes}
     best = {name: float("inf") for name in runs}
     ratio = {name: 0.0 for name in runs}
     plain = 0.0

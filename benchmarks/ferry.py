@@ -9,6 +9,7 @@ that table, networks included, and where they pay (`benchmarks.table1`).
 
 import json
 import pathlib
+from functools import partial
 
 import jax
 import numpy as np
@@ -46,13 +47,9 @@ def golden():
     for bits in (32, 64):
         with jax.enable_x64(bits == 64):
             sim = jast.simulators.ferry()
-            found = [
-                float(jast.replay(sim, np.array(e["seeds"]), reward=REWARD).reward)
-                for e in episodes
-            ]
-        errors[f"float{bits}"] = float(
-            np.max(np.abs(np.array(found) - [e["reward"] for e in episodes]))
-        )
+            replayed = [jast.replay(sim, np.array(e["seeds"]), reward=REWARD) for e in episodes]
+        off = [float(r.reward) - e["reward"] for r, e in zip(replayed, episodes, strict=True)]
+        errors[f"float{bits}"] = float(np.abs(off).max())
     return {"episodes": len(episodes), "greatest_error": errors}
 
 
@@ -90,27 +87,15 @@ def rows(trees, prunes=18, simulations=500):
     """Name -> search of S0 (and S0b)."""
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
 
+    common = dict(trees=trees, reward=REWARD, actions=BOX)
+
     def forest(sim=s0, **settings):
-        return lambda key: jast.search.forest(
-            key,
-            sim,
-            trees=trees,
-            prunes=prunes,
-            simulations=simulations,
-            reward=REWARD,
-            **dict(actions=BOX) | settings,
-        )
+        sizes = dict(prunes=prunes, simulations=simulations)
+        return partial(jast.search.forest, sim=sim, **(common | sizes | settings))
 
     def mcts(**settings):
-        return lambda key: jast.search.mcts(
-            key,
-            s0,
-            trees=trees,
-            simulations=prunes * simulations,
-            reward=REWARD,
-            actions=BOX,
-            **settings,
-        )
+        total = prunes * simulations
+        return partial(jast.search.mcts, sim=s0, simulations=total, **common, **settings)
 
     return {
         "forest, paper": forest(mode="paper"),

@@ -103,35 +103,20 @@ def forest(sim, heads=None, mode="default", trees=200, simulations=500, **settin
     `warm_up` can have the same with fewer trees.
     """
     settings = dict(round=max(1, min(trees // 5, LANES))) | settings
-    more = (
-        {}
-        if heads is None
-        else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
-    )
-    return functools.partial(
-        jast.search.forest,
-        sim=sim,
-        trees=trees,
-        simulations=simulations,
-        mode=mode,
-        reward=REWARD,
-        actions=BOX,
-        **more,
-    )
+    more = dict(trees=trees, simulations=simulations, mode=mode, reward=REWARD, actions=BOX)
+    if heads is not None:
+        more |= dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
+    return functools.partial(jast.search.forest, sim=sim, **more)
 
 
 def variant(name, mode, sizes):
     """A row of Table 1."""
     s0, heads = jast.simulators.ferry(), VARIANTS[name]
     if name == "MCTS-SA":
+        more = dict(mode=mode, reward=REWARD, actions=BOX)
+        total = 18 * sizes.published
         return functools.partial(
-            jast.search.mcts,
-            sim=s0,
-            trees=sizes.trees,
-            simulations=18 * sizes.published,
-            mode=mode,
-            reward=REWARD,
-            actions=BOX,
+            jast.search.mcts, sim=s0, trees=sizes.trees, simulations=total, **more
         )
     # alone, the paper's value network is not trained
     published = dict(train=False) if heads == "value" else dict(round=sizes.round)
@@ -148,12 +133,9 @@ def warm_up(search):
         raise KeyboardInterrupt
 
     heads, trees = search.keywords.get("head_settings"), search.keywords["trees"]
-    learns = heads is not None and heads.train
-    more = (
-        dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1)))
-        if learns
-        else dict(callback=end)
-    )
+    more = dict(callback=end)
+    if heads is not None and heads.train:
+        more = dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1)))
     tree_keys(jax.random.key(0), trees)[: more.get("trees")]
     return timed(lambda: search(jax.random.key(0), **more))[1]
 
@@ -173,11 +155,9 @@ def measure(searches, seeds):
     results, cpu, wall = zip(*runs, strict=True)
     bests = [np.asarray(r.best_reward_per_tree, np.float64) for r in results]
     row = outcome(np.concatenate(bests))
-    heads, episodes, a_second = (
-        searches[0].keywords.get("head_settings"),
-        sum(r.episodes for r in results),
-        row["trees"] / sum(cpu),
-    )
+    heads = searches[0].keywords.get("head_settings")
+    episodes = sum(r.episodes for r in results)
+    a_second = row["trees"] / sum(cpu)
     return row | {
         "B": heads.round if heads is not None and heads.train else None,
         "rates": [float((b > 0).mean()) for b in bests],
@@ -277,11 +257,8 @@ def warm_start(sizes, seeds, say):
 def episode_cost(sim, simulations):
     """CPU microseconds of one random episode, of 200 in lockstep."""
     problem, keys = engine.problem(9000, sim=sim), tree_keys(jax.random.key(0), 200)
-    return (
-        min(engine.cpu(lambda: engine.rollouts(problem, keys, simulations))[0] for _ in range(3))
-        / (simulations * 200)
-        * 1e6
-    )
+    play = functools.partial(engine.rollouts, problem, keys, simulations)
+    return min(engine.cpu(play)[0] for _ in range(3)) / (simulations * 200) * 1e6
 
 
 def slowed(sizes, seeds, say):
@@ -384,34 +361,22 @@ def report(args):
     say("published")
     for name, row in rows.items():
         say(line(name, row))
+    measured = functools.partial(block, seeds=seeds, say=say)
     for mode in sizes.modes:
-        out[mode] = block(
-            f"S0, {mode} mode",
-            {name: variant(name, mode, sizes) for name in sizes.variants},
-            seeds,
-            say,
-            table1=True,
-        )
+        searches = {name: variant(name, mode, sizes) for name in sizes.variants}
+        out[mode] = measured(f"S0, {mode} mode", searches, table1=True)
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
-    out["S0b"] = block(
-        f"S0b, default mode, 18 x {sizes.simulations}",
-        kinds(sizes.heads, s0b, trees=sizes.trees, simulations=sizes.simulations),
-        seeds,
-        say,
-    )
-    out["small"] = block(
-        f"S0, default mode, 18 x {sizes.small}",
-        kinds(sizes.heads, s0, trees=sizes.trees, simulations=sizes.small),
-        seeds,
-        say,
-    )
+    for label, system, key, n in (
+        ("S0b", s0b, "S0b", sizes.simulations),
+        ("S0", s0, "small", sizes.small),
+    ):
+        searches = kinds(sizes.heads, system, trees=sizes.trees, simulations=n)
+        out[key] = measured(f"{label}, default mode, 18 x {n}", searches)
     names, trees = [name for name in sizes.heads if name != "value"], sizes.budget_trees
     out["equal_cpu_time"] = {
-        n: block(
+        n: measured(
             f"S0, default mode, 18 x {n}, {trees} trees",
             kinds(names, s0, trees=trees, simulations=n),
-            seeds,
-            say,
         )
         for n in sizes.budgets
     }
