@@ -21,7 +21,8 @@ import jast
 from jast.plot import style
 
 NOTEBOOK = Path(__file__).parents[1] / "notebooks/trained_policy.ipynb"
-EVERY, HOLD = 2, 8  # steps of 20 ms a frame; frames that the end stays
+EVERY = 2  # steps of 20 ms a frame
+HOLD = 8  # frames that the end stays
 POLE = 1.0  # twice the half length that the environment's formula has
 
 
