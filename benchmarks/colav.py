@@ -82,11 +82,8 @@ def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     )
     result, seconds, _ = timed(grow)
     best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
-    return (
-        share(result.failing_per_tree)
-        | best
-        | {"episodes": result.episodes, "steps": result.steps, "cpu_s": seconds}
-    )
+    cost = {"episodes": result.episodes, "steps": result.steps, "cpu_s": seconds}
+    return share(result.failing_per_tree) | best | cost
 
 
 def random_search(scenario, kind, runs, substeps, episodes=PRUNES * SIMULATIONS):
@@ -111,20 +108,15 @@ def memoization(
     """
     total = prunes * simulations
     sim, reward = colav("sharp turn", substeps=substeps), published if mode == "paper" else REWARD
-    p, keys = (
-        problem(total, mode, sim, reward, jast.actions.samples()),
-        tree_keys(jax.random.key(0), trees),
-    )
+    p = problem(total, mode, sim, reward, jast.actions.samples())
+    keys = tree_keys(jax.random.key(0), trees)
     children = int(p.settings.widths.max())
     runs = {
         name: functools.partial(whole, p, keys, prunes, simulations, children, name)
         for name in memoize
     }
     runs["MCTS-SA"] = functools.partial(whole, p, keys, 1, total, children, "none")
-    steps = {
-        name: float(np.mean(jax.device_get(function().steps))) / total
-        for name, function in runs.items()
-    }
+    steps = {name: float(np.mean(play().steps)) / total for name, play in runs.items()}
     seconds = {name: float("inf") for name in runs}
     for _ in range(repeats):
         for name, function in runs.items():
@@ -133,15 +125,8 @@ def memoization(
     ratios = {
         f"{a}/{b}": us[a] / us[b] for a, b in itertools.product(memoize[:-1], ("none", "MCTS-SA"))
     }
-    return {
-        "mode": mode,
-        "simulations": simulations,
-        "trees": trees,
-        "substeps": substeps,
-        "us": us,
-        "steps": steps,
-        "ratios": ratios,
-    }
+    about = dict(mode=mode, simulations=simulations, trees=trees, substeps=substeps)
+    return about | dict(us=us, steps=steps, ratios=ratios)
 
 
 def picture(rows, path):
@@ -224,29 +209,25 @@ def main(argv=None):
             r["forest, heads"] = search(scenario, kind, trees, args.substeps, heads="both")
         report["searches"][f"{scenario}, {kind}"] = r
         for name, row in r.items():
-            more = (
-                f"best {row['best']:8.2f}, {row['best_distance_m']:.2f} m, {row['cpu_s']:.0f} CPU s"
-                if "best" in row
-                else ""
-            )
+            more = ""
+            if "best" in row:
+                near, cpu_s = row["best_distance_m"], row["cpu_s"]
+                more = f"best {row['best']:8.2f}, {near:.2f} m, {cpu_s:.0f} CPU s"
             say(f"  {scenario + ', ' + kind:26} {name:14} {percent(row, 'share'):24} {more}")
 
     say("\nCPU time of a simulation (us) and its steps, by where states are kept")
     if args.smoke:
-        calls = [
-            (1, "default", SIMULATIONS, 4, 1, 2, ["node", "none"])
-        ]  # the program of the search
+        # the program of the search
+        calls = [(1, "default", SIMULATIONS, 4, 1, 2, ["node", "none"])]
     elif args.quick:
         calls = [(30, "paper", 20, 64, 1)]
     else:
-        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [
-            (n, "paper", 20, 64, 2) for n in SUBSTEPS
-        ]
+        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)]
+        calls += [(n, "paper", 20, 64, 2) for n in SUBSTEPS]
     for call in calls:
         report["memoization"].append(r := measure("memoization", *call, module="colav"))
-        cells = ", ".join(
-            f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"]
-        )
+        us, steps = r["us"], r["steps"]
+        cells = ", ".join(f"{name} {us[name]:.1f} ({steps[name]:.1f})" for name in us)
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in r["ratios"].items())
         say(
             f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']},"

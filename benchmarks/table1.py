@@ -56,15 +56,33 @@ class Sizes(NamedTuple):
     """Simulations a root, where that is few."""
 
 
-QUICK = Sizes(100, 24, 1, 8, ("none", "both"), 50, (), 100, (15.0,), 100, (0, 30, 300))
-SMOKE = Sizes(
-    *(2, 2, 1, 1, ("both",), 5, (), 2, (15.0,), 2, (0,)),
+QUICK = Sizes(
+    trees=100,
+    taught_trees=24,
+    seeds=1,
+    round=8,
+    heads=("none", "both"),
+    simulations=50,
+    budgets=(),
+    budget_trees=100,
+    starts=(15.0,),
+    warm_trees=100,
+    substeps=(0, 30, 300),
+)
+SMOKE = QUICK._replace(
+    trees=2,
+    taught_trees=2,
+    round=1,
+    heads=("both",),
+    simulations=5,
+    budget_trees=2,
+    warm_trees=2,
+    substeps=(0,),
     modes=("paper",),
     variants=("MCTS-SA",),
     published=5,
     small=5,
 )
-
 COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "B": (3, lambda r: r["B"] or "-"),
     "trees": (5, lambda r: r["trees"]),

@@ -16,6 +16,7 @@ first with compilation.
 """
 
 import json
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -65,16 +66,10 @@ def mnist(folder, quick):
             out = np.maximum(flat @ w["W1"] + w["b1"], 0) @ w["W2"] + w["b2"]
         yield "published", images, labels, out.argmax(1)
     if not quick:
-        for name, model in (
-            ("nearest", KNeighborsClassifier(3)),
-            ("forest", RandomForestClassifier(50, random_state=0)),
-        ):
-            yield (
-                name,
-                images[half:],
-                labels[half:],
-                model.fit(flat[:half], labels[:half]).predict(flat[half:]),
-            )
+        nearest, forest = KNeighborsClassifier(3), RandomForestClassifier(50, random_state=0)
+        for name, model in (("nearest", nearest), ("forest", forest)):
+            predicted = model.fit(flat[:half], labels[:half]).predict(flat[half:])
+            yield name, images[half:], labels[half:], predicted
 
 
 def digits(quick):
@@ -88,12 +83,8 @@ def digits(quick):
         "network": MLPClassifier((32,), max_iter=2000, random_state=0),
     }
     for name, model in list(models.items())[: 1 if quick else 3]:
-        yield (
-            name,
-            images[test],
-            labels[test],
-            model.fit(flat[train], labels[train]).predict(flat[test]),
-        )
+        predicted = model.fit(flat[train], labels[train]).predict(flat[test])
+        yield name, images[test], labels[test], predicted
 
 
 def ranked(scores, failed):
@@ -111,13 +102,8 @@ def pixels(images, labels):
     components.
     """
     z = PCA(min(64, images[0].size), random_state=0).fit_transform(images.reshape(len(images), -1))
-    p = cross_val_predict(
-        LogisticRegression(max_iter=300),
-        z,
-        labels,
-        cv=KFold(5, shuffle=True, random_state=0),
-        method="predict_proba",
-    )
+    model, folds = LogisticRegression(max_iter=300), KFold(5, shuffle=True, random_state=0)
+    p = cross_val_predict(model, z, labels, cv=folds, method="predict_proba")
     return 1 - p[np.arange(len(labels)), labels]
 
 
@@ -127,13 +113,8 @@ def runs(images, labels, predicted, selector, seeds, budget=None):
     for seed in range(seeds):
         system = Answers(images, predicted)
         given = dict(budget=budget, selector=selector, classes=int(labels.max()) + 1)
-        out.append(
-            timed(
-                lambda seed=seed, system=system, given=given: weakness.validate(
-                    jax.random.key(seed), system, images, labels, **given
-                )
-            )
-        )
+        about = jax.random.key(seed), system, images, labels
+        out.append(timed(partial(weakness.validate, *about, **given)))
         if system.asked.max() > 1 or system.asked.sum() != out[-1][0].calls:
             raise AssertionError("an input was asked twice, or a call was not counted")
     return out
@@ -204,14 +185,12 @@ def tables(systems, seeds, out, say):
         for replacement in (False, True):
             chosen = weakness.thesis(replacement=replacement)
             done = runs(images, labels, predicted, chosen, seeds)
-            rows = over(
-                [
-                    table(r, failed, replacement)
-                    | {"all_precision": weakness.judge(r, failed).precision[-1], "calls": r.calls}
-                    for r, *_ in done
-                ]
-            )
-            out[f"{name}, replacement={replacement}"] = rows
+            each = []
+            for r, *_ in done:
+                precision = weakness.judge(r, failed).precision[-1]
+                row = table(r, failed, replacement)
+                each.append(row | dict(all_precision=precision, calls=r.calls))
+            rows = out[f"{name}, replacement={replacement}"] = over(each)
             say(
                 f"  {name}, replacement={replacement}: "
                 + ", ".join(f"{k} {spread(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
@@ -236,12 +215,10 @@ def thesis(result, failed):
 
 
 def spread(v, digits=3):
-    return (
-        f"{v:.{digits}f}"
-        if not isinstance(v, dict)
-        else f"{v['mean']:.{digits}f}"
-        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
-    )
+    if not isinstance(v, dict):
+        return f"{v:.{digits}f}"
+    error = "" if v["se"] is None else f" +- {v['se']:.{digits}f}"
+    return f"{v['mean']:.{digits}f}{error}"
 
 
 def line(name, row):
