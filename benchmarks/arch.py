@@ -20,7 +20,7 @@ import numpy as np
 import jast
 from benchmarks import arch_flights, arch_probability, peers
 from benchmarks.cma_es import Stop
-from benchmarks.sizes import installed, options, show, size, some_of
+from benchmarks.sizes import add_choices, installed, options, print_report, size
 from jast import limit_state
 from jast.simulators.arch import automatic_transmission, chasing_cars, ground_collision_avoidance
 
@@ -166,8 +166,8 @@ def table(report):
 
 def main(argv=None):
     parser = options(__doc__, "one requirement, three seeds")
-    some_of(parser, "--cases", CASES)
-    some_of(parser, "--methods", METHODS, "all but bayesian")
+    add_choices(parser, "--cases", CASES)
+    add_choices(parser, "--methods", METHODS, "all but bayesian")
     parser.add_argument("--seeds", type=int, help="default: 50")
     parser.add_argument("--budget", type=int, help="simulations (default: 300; CC4 and AT 1500)")
     parser.add_argument(
@@ -185,19 +185,21 @@ def main(argv=None):
     settings = dict(jast=jast.__version__)
     if args.flights:
         found = arch_flights.rows(size(args, 20_000, 2_000, 20))
-        return show(args, dict(settings=settings, rows=found), arch_flights.table(found))
+        return print_report(args, dict(settings=settings, rows=found), arch_flights.table(found))
     if args.probability:
         budget = args.budget or size(args, 20_000, 5_000, 500)
         crude = size(args, 1_000_000, 20_000, 500)
         found = arch_probability.rows(system(args.probability), budget, crude)
         settings |= dict(case=args.probability)
-        return show(args, dict(settings=settings, rows=found), arch_probability.table(found))
+        return print_report(
+            args, dict(settings=settings, rows=found), arch_probability.table(found)
+        )
     usual = [m for m in METHODS if m != "bayesian" and installed(NEEDED.get(m, "jast"))]
     cases = args.cases or size(args, list(CASES), ["CC2"], ["CC1"])
     methods = args.methods or size(args, usual, ["falsify", "cem"], ["falsify"])
     seeds = args.seeds or size(args, 50, 3, 2)
     report = run(cases, methods, seeds, args.budget or size(args, None, None, 20))
-    show(args, dict(settings=settings | dict(seeds=seeds), systems=report), table(report))
+    print_report(args, dict(settings=settings | dict(seeds=seeds), systems=report), table(report))
 
 
 if __name__ == "__main__":

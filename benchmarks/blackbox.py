@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from benchmarks.sizes import options, processors, show, size, timed
+from benchmarks.sizes import options, print_report, processors, size, timed
 from jast import blackbox
 from jast.distributions import Normal
 
@@ -134,7 +134,7 @@ def main(argv=None):
         "speedup": speedup(repeats, 4 if args.smoke else 64)
         | {"two_processes": two_processes(repeats, 2 if args.smoke else 100)},
     }
-    show(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
+    print_report(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.ferry import REWARD
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast import cross_entropy as ce
 from jast.estimate import clopper_pearson, importance
 
@@ -105,7 +105,7 @@ def main(argv=None):
             f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to"
             f" {100 * max(r['relative_error']):.1f} %   (crude {100 * r['crude']:.3g} %)"
         )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

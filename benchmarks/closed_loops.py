@@ -23,7 +23,7 @@ from jax import lax
 
 import jast
 from benchmarks.operators import OPERATORS, SYSTEMS, easier
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.distributions import Bernoulli, Independent, Joint, Normal
 from jast.limit_state import outcome
 
@@ -414,7 +414,7 @@ def main(argv: list[str] | None = None) -> None:
             f"{name:10s} made easier: operator {row['operator']:.4g}, drawn {row['drawn']:.4g},"
             f" {row['apart']:.1f} standard errors apart"
         )
-    show(args, dict(loops=rows, easier=checked))
+    print_report(args, dict(loops=rows, easier=checked))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,15 @@ import numpy as np
 
 import jast
 from benchmarks.engine import cpu, problem, whole
-from benchmarks.sizes import alone, here, options, printer, show, size, timed
+from benchmarks.sizes import (
+    in_fresh_process,
+    in_this_process,
+    options,
+    print_report,
+    printer,
+    size,
+    timed,
+)
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
@@ -175,7 +183,7 @@ def main(argv=None):
         return f"{100 * r[name]:6.1f} % [{low:.1f}, {high:.1f}]"
 
     report = {"nominal": {}, "searches": {}, "memoization": []}
-    measure = here if args.smoke else alone
+    measure = in_this_process if args.smoke else in_fresh_process
 
     say(
         "nominal: least distance undisturbed, and failures when disturbances are drawn from their"
@@ -235,7 +243,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(report["memoization"][-len(SUBSTEPS) :], args.picture)
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

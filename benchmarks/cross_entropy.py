@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.cases import CASES
 from benchmarks.engine import cpu
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import cross_entropy as ce
 from jast.cross_entropy.surrogates import RADIAL
 
@@ -197,7 +197,7 @@ def main(argv=None):
         for name, r in report.items():
             other = f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
             say(row_text(name, r) if name.startswith("sierra") else other)
-        return show(args, report)
+        return print_report(args, report)
     report = {
         "seeds": seeds,
         "speed": speed(seeds, methods),
@@ -282,7 +282,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(args.picture, report)
-    show(args, report)
+    print_report(args, report)
 
 
 def picture(path, report):

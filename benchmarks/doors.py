@@ -22,14 +22,14 @@ import jast
 from benchmarks import BEGUN
 from benchmarks.sizes import (
     NO_CACHE,
-    alone,
+    add_choices,
+    in_fresh_process,
     installed,
     options,
     percent,
+    print_report,
     printer,
-    show,
     size,
-    some_of,
 )
 from jast.distributions import Normal
 
@@ -141,7 +141,7 @@ def lines(block: str) -> dict[str, int]:
 
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "those of gymnax, two keys")
-    some_of(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--systems", SYSTEMS)
     parser.add_argument("--seeds", type=int, help="keys (default: 20 of gymnax, 2 of the others)")
     parser.add_argument("--truth", action="store_true", help="only draw the truths again")
     parser.add_argument("--lines", action="store_true", help="only count the lines of the guide")
@@ -164,14 +164,16 @@ def main(argv: list[str] | None = None) -> None:
             door = SYSTEMS[name]
             budget = size(args, door.budget, door.budget, 300_000)
             keys = args.seeds or size(args, door.keys, 2, 1)
-            report[name] = alone("figures", name, budget, keys, module="doors", settings=NO_CACHE)
+            report[name] = in_fresh_process(
+                "figures", name, budget, keys, module="doors", settings=NO_CACHE
+            )
             say(_row(report[name]))
     if not args.truth:
         report["lines"] = {name: lines(block) for name, block in EXAMPLES.items()}
         say(HEADS[1])
         for name, count in report["lines"].items():
             say(f"| {name} | {count['lines']} | {count['call']} |")
-    show(args, report)
+    print_report(args, report)
 
 
 def _row(r):

@@ -20,7 +20,16 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks import reference
-from benchmarks.sizes import NO_CACHE, alone, here, options, processors, show, size, timed
+from benchmarks.sizes import (
+    NO_CACHE,
+    in_fresh_process,
+    in_this_process,
+    options,
+    print_report,
+    processors,
+    size,
+    timed,
+)
 from jast.counter import tree_keys
 from jast.progress import Progress, begin
 from jast.rewards import as_pytree
@@ -300,7 +309,9 @@ def peer(repeats, lanes=200, simulations=500):
 def main(argv=None):
     args = options(__doc__, "fewer repetitions, smaller memoization runs").parse_args(argv)
     repeats = size(args, 5, 2, 1)
-    measure = functools.partial(here if args.smoke else alone, module="engine")
+    measure = functools.partial(
+        in_this_process if args.smoke else in_fresh_process, module="engine"
+    )
 
     def least(*arguments):
         return arguments if args.smoke else ()
@@ -319,7 +330,7 @@ def main(argv=None):
         "compile_s": measure("compile_time", *least(90, 2), settings=NO_CACHE),
         "memoization": measure("memoization", *systems),
     }
-    show(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
+    print_report(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from jax.tree_util import Partial
 import jast
 from benchmarks import stress_systems
 from benchmarks.explain_systems import PLANTED, SIDE, lane, planted, version, walk
-from benchmarks.sizes import options, show, size, some_of
+from benchmarks.sizes import add_choices, options, print_report, size
 from jast import explain
 from jast.distributions import Normal
 
@@ -361,7 +361,7 @@ QUICK = [part for part in PARTS if part not in ("rules_of_estimates", "sensitivi
 
 def main(argv=None):
     parser = options(__doc__, "two seeds, fewer evaluations")
-    some_of(parser, "--parts", PARTS)
+    add_choices(parser, "--parts", PARTS)
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     parts = args.parts or size(args, list(PARTS), QUICK, ["criticality"])
@@ -369,7 +369,7 @@ def main(argv=None):
     budget = size(args, 20_000, 10_000, 2000)
     report = run(parts, seeds, budget)
     settings = dict(budget=budget, seeds=seeds)
-    show(args, dict(settings=settings, parts=report), "\n".join(lines(report)))
+    print_report(args, dict(settings=settings, parts=report), "\n".join(lines(report)))
 
 
 if __name__ == "__main__":

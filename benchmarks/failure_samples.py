@@ -24,7 +24,7 @@ from scipy.spatial.distance import cdist
 import jast
 from benchmarks.limit_states import DYNAMIC, LIMITS, Limit
 from benchmarks.literature import CASES as LITERATURE
-from benchmarks.sizes import options, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast import limit_state as latent
 from jast.estimate import failure_probability, failure_samples
 from jast.estimate.populations import settled
@@ -146,7 +146,7 @@ def run(name: str, seeds: int, n: int, budget: int, methods: list[str] | None = 
 
 def main(argv=None):
     parser = options(__doc__, "3 seeds of four systems")
-    some_of(parser, "--cases", CASES)
+    add_choices(parser, "--cases", CASES)
     parser.add_argument("--seeds", type=int, help="default 10")
     args = parser.parse_args(argv)
     say, report, seeds = printer(args), {}, args.seeds or size(args, 10, 3, 2)
@@ -163,7 +163,7 @@ def main(argv=None):
                 f" {spread(r['coverage'])}  evaluations {np.median(r['evaluations']):.0f}"
                 f"  CPU {np.median(r['cpu_s']):.1f} s"
             )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 import jast
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
@@ -160,7 +160,7 @@ def main(argv=None):
         if name in PUBLISHED:
             rate, mean, best = PUBLISHED[name]
             say(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from jax.tree_util import Partial
 
 from benchmarks.limit_states import four_branch, four_branch_probability
 from benchmarks.probability import summary
-from benchmarks.sizes import options, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast.blackbox import from_python
 from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
 from jast.estimate import failure_probability
@@ -152,7 +152,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "3 seeds")
     parser.add_argument("--seeds", type=int, help="20")
     parser.add_argument("--budget", type=int, help="of each system; default 200, of Booth 999")
-    some_of(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--systems", SYSTEMS)
     args = parser.parse_args(argv)
     say, report, seeds = printer(args), {}, args.seeds or size(args, 20, 3, 1)
     budget = args.budget or size(args, None, None, 50)
@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> None:
             f" {seeds:<2d}{r['covers']:7d}{r['flagged']:9d}{r['far_unflagged']:8d}"
             f"{r['cpu_s']:8.1f} ({r['cpu_s_first']:.1f}){r['wall_s']:10.1f}"
         )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,16 @@ import jax.numpy as jnp
 
 import jast
 from benchmarks.doors import simulator
-from benchmarks.sizes import NO_CACHE, alone, installed, options, printer, show, size, some_of
+from benchmarks.sizes import (
+    NO_CACHE,
+    add_choices,
+    in_fresh_process,
+    installed,
+    options,
+    print_report,
+    printer,
+    size,
+)
 from jast import _jax
 from jast.distributions import Normal
 from jast.limit_state import dimension, outcome
@@ -155,7 +164,7 @@ def command_line(arguments: list[str]) -> list[float]:
 
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "lane and plane, without the command line")
-    some_of(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--systems", SYSTEMS)
     parser.add_argument(
         "--ways", action="store_true", help="what each way of compiling costs and gives, alone"
     )
@@ -168,7 +177,7 @@ def main(argv: list[str] | None = None) -> None:
         say(f"{'':32}{'as JAX does':>20}{'briefly':>20}{'quickly':>20}   compile s, us an episode")
         for name, rows in found.items():
             say(f"{name:32}" + "".join(f"{c:10.2f}{us:10.1f}" for c, us in rows))
-        return show(args, found)
+        return print_report(args, found)
     results = {}
     say(f"{'call':32}{'CPU s':>8}{'wall s':>8}{'programs':>10}{'compile s':>11}{'step in':>9}")
     for name in names:
@@ -176,7 +185,9 @@ def main(argv: list[str] | None = None) -> None:
         if name in absent:
             say(f"{name:32}{SYSTEMS[name][3]} is not installed")
             continue
-        results[name] = alone("calls", name, args.smoke, module="first_minute", settings=NO_CACHE)
+        results[name] = in_fresh_process(
+            "calls", name, args.smoke, module="first_minute", settings=NO_CACHE
+        )
         which = ("first", "again", "another key", "another budget")
         for kind, row in zip(which, results[name], strict=True):
             cpu, wall, programs, compilation, steps = row.values()
@@ -188,7 +199,7 @@ def main(argv: list[str] | None = None) -> None:
     if not (args.quick or args.smoke):
         first, second = results["python -m jast"] = command_line([])
         say(f"python -m jast: {first:.1f} s, then {second:.1f} s")
-    show(args, results)
+    print_report(args, results)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast.distributions import Independent, Normal
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
@@ -218,7 +218,7 @@ def main(argv=None):
     controls = ", ".join(f"{name} {row['control_failures']}" for name, row in table.items())
     say(f"on the predictor without its defect: {controls} failures")
     sizes = dict(evaluations=evaluations, seeds=seeds)
-    show(args, sizes | dict(published=PUBLISHED, methods=table))
+    print_report(args, sizes | dict(published=PUBLISHED, methods=table))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.fms import quantiles, spread
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
 READINGS = ("episode", "root", "level", "edge", "visited", "none")
@@ -169,7 +169,7 @@ def main(argv=None):
                 f"  {reading:8} {spread(row['with_repetitions'])}   {row['distinct_mean']:.0f},"
                 f" {row['distinct_median']:.0f}"
             )
-    show(args, out)
+    print_report(args, out)
 
 
 if __name__ == "__main__":

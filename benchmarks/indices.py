@@ -15,7 +15,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 import jast
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators import limit_state
 
 __all__ = ["CASES", "run"]
@@ -111,7 +111,7 @@ def main(argv: list[str] | None = None) -> None:
             f"  {100 * r['cover_first']:3.0f} %  {r['total']:6.3f}  {100 * r['error_total']:4.1f} %"
             f"  {100 * r['cover_total']:3.0f} %  {r['cpu_seconds']:.2f}"
         )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from jax.tree_util import Partial
 from scipy import integrate, optimize, stats
 
 import jast
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators import autoregression, landing, limit_state, pendulum, ruin, walk1d
 
 __all__ = ["FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
@@ -435,7 +435,7 @@ def main(argv=None):
         report[family] = {"easy": easy.tolist(), "rare": rare.tolist()}
         note = f", rare: {off(rare)} ({len(rare)} seeds)" if len(rare) else ""
         say(f"{family:18} standard errors: {off(easy)}{note}")
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

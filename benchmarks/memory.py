@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 
 import jast
-from benchmarks.sizes import alone, options, printer, show, size, timed
+from benchmarks.sizes import in_fresh_process, options, print_report, printer, size, timed
 from benchmarks.stress_systems import CASES, TUNED
 from jast import memory
 from jast.simulators import ferry
@@ -55,7 +55,7 @@ def peaks(sizes):
     """(name, what `peak` says) of each call of each size, each in a process of its own."""
     for name, each in sizes.items():
         for n in each:
-            yield name, alone("peak", name, n, module="memory", settings={})
+            yield name, in_fresh_process("peak", name, n, module="memory", settings={})
 
 
 def held():
@@ -85,7 +85,7 @@ def long(args):
         what = f"{name}, {LONG[name][0]}"
         numbers = f"{row['n']:>11}{row['seconds']:>7.0f}{row['before']:>11}{row['most']:>9}"
         say(f"{what:<48}{numbers}")
-    show(args, rows)
+    print_report(args, rows)
 
 
 def main(argv=None):
@@ -105,7 +105,7 @@ def main(argv=None):
             say("{:<16}{:>9}{:>11}".format(name, *numbers))
     finally:
         memory.MAPS = kept
-    show(args, rows)
+    print_report(args, rows)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import math
 import jax
 
 import jast
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast.estimate import double_loop, importance, normal, policy_proposal
 
 PUBLISHED = dict(mean=3.253e-13, standard_deviation=1.378e-13)
@@ -67,7 +67,9 @@ def main(argv=None):
     sim, truth = jast.simulators.landing(), math.erfc(1 / math.sqrt(2 * 0.019))
     if args.cells:
         samples = min(samples, 10**5)
-        return show(args, by_cells(sim, truth, args.cells, episodes, samples, args.seed, say))
+        return print_report(
+            args, by_cells(sim, truth, args.cells, episodes, samples, args.seed, say)
+        )
     keys = jax.random.split(jax.random.key(args.seed), 4)
     as_printed = dict(hidden=(100, 100), learning_rate=1e-4)
     if args.smoke:
@@ -104,7 +106,7 @@ def main(argv=None):
             )
         word = "" if r["reliable"] else ", UNRELIABLE"
         say(f"  {name:24} {text}, ESS {r['ess']:.0f}{word}, {cpu:.0f} CPU s")
-    show(args, out)
+    print_report(args, out)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import cma_es as driver
 from benchmarks.cases import CASES
-from benchmarks.sizes import options, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 
 __all__ = ["PEERS", "run", "summary"]
 
@@ -212,8 +212,8 @@ def main(argv=None):
     parser = options(__doc__, "4 runs of each pair")
     parser.add_argument("--seeds", type=int, help="runs of each pair (default 64)")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    some_of(parser, "--cases", CASES)
-    some_of(parser, "--peers", PEERS, "all but expected_improvement")
+    add_choices(parser, "--cases", CASES)
+    add_choices(parser, "--peers", PEERS, "all but expected_improvement")
     args = parser.parse_args(argv)
     say, seeds = printer(args), args.seeds or size(args, 64, 4, 1)
     cases = args.cases or size(args, list(CASES), list(CASES), ["branin"])
@@ -238,7 +238,7 @@ def main(argv=None):
         )
         raw = {k: None if v is None else v.tolist() for k, v in result.items()}
         report["results"].append({"case": name, "peer": peer, **s, "runs": raw})
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.sizes import options, printer, show, size
+from benchmarks.sizes import options, print_report, printer, size
 from benchmarks.time_to_answer import SYSTEMS
 from jast.estimate.descents import SETTINGS, WAYS
 from jast.estimate.particles import SMALL, WINDOW
@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> None:
                 f" {r['work'] or 0:8.0f}  by genealogy {r['told'] or 0:8.0f}"
                 f"  mean / truth {r['of_truth']:.3f}"
             )
-    show(args, dict(keys=keys, particles=particles, rows=rows))
+    print_report(args, dict(keys=keys, particles=particles, rows=rows))
 
 
 if __name__ == "__main__":

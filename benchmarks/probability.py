@@ -26,7 +26,7 @@ from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
 from benchmarks.literature import literature_cases
 from benchmarks.markov_systems import markov_cases
-from benchmarks.sizes import options, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from benchmarks.structural import structural_cases
 from jast.distributions import Normal
 from jast.distributions.mixtures import blend
@@ -238,11 +238,11 @@ def _chosen(args):
 
 def main(argv=None):
     parser = options(__doc__, "under two minutes: few seeds, no learned policies, two families")
-    some_of(parser, "--only", PARTS)
+    add_choices(parser, "--only", PARTS)
     parser.add_argument(
         "--seeds", type=int, help="seeds of each family in coverage (20), and of default (50)"
     )
-    some_of(parser, "--families", FAMILIES)
+    add_choices(parser, "--families", FAMILIES)
     parser.add_argument(
         "--first", type=int, default=50_000, help="number of the first problem of a family"
     )
@@ -332,7 +332,7 @@ def main(argv=None):
             f" {interval[1]:.3f}]; {flagged} of {n} flagged; of the others {far} are far,"
             f" {off} off by more than 10 %"
         )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

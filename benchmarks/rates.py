@@ -18,7 +18,7 @@ from jax import lax
 
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED
-from benchmarks.sizes import options, printer, show, size, some_of
+from benchmarks.sizes import add_choices, options, print_report, printer, size
 
 __all__ = ["SYSTEMS", "rates"]
 
@@ -84,7 +84,7 @@ def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, flo
 
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "three systems")
-    some_of(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--systems", SYSTEMS)
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
@@ -94,7 +94,7 @@ def main(argv: list[str] | None = None) -> None:
             rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations)))
         shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
         say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
-    show(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
+    print_report(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
 
 
 if __name__ == "__main__":

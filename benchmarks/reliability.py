@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 
 from benchmarks.limit_states import LIMITS
-from benchmarks.sizes import options, percent, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, percent, print_report, printer, size, timed
 from benchmarks.structural import PROBLEMS
 
 __all__ = ["METHODS", "run"]
@@ -193,8 +193,8 @@ def main(argv=None):
     parser.add_argument("--seeds", type=int, help="runs of each row; 20, or 4 with --quick")
     parser.add_argument("--budget", type=int, help="evaluations of a run (default 100,000)")
     fixed = f"{', '.join(CASES)}; the others have no starts by hand"
-    some_of(parser, "--cases", CASES | PROBLEMS, fixed)
-    some_of(parser, "--methods", METHODS)
+    add_choices(parser, "--cases", CASES | PROBLEMS, fixed)
+    add_choices(parser, "--methods", METHODS)
     args = parser.parse_args(argv)
     say, seeds = printer(args), args.seeds or size(args, 20, 4, 1)
     budget = args.budget or size(args, 100_000, 100_000, 2000)
@@ -214,7 +214,7 @@ def main(argv=None):
             f"{case:17}{method:14}{errors}{100 * r['beyond_20']:7.0f}"
             f" %{r['evaluations']:13.0f}{r['cpu_s']:8.2f}"
         )
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import jax
 import numpy as np
 
 import jast
-from benchmarks.sizes import options, show, size, timed
+from benchmarks.sizes import options, print_report, size, timed
 from jast import places, units
 from jast.blackbox import from_python
 from jast.checkpoints import PARTS
@@ -315,7 +315,7 @@ def main(argv=None):
     parser.add_argument("--calls", nargs="+", metavar="NAME", help="of these calls; default: all")
     args = parser.parse_args(argv)
     found = report(args) if args.kills is None else dict(kills=many_kills(args.kills, args.calls))
-    show(args, found, tables(found))
+    print_report(args, found, tables(found))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import jax
 
 import jast
 from benchmarks.limit_states import FAMILIES, draw
-from benchmarks.sizes import options, printer, show, size, some_of
+from benchmarks.sizes import add_choices, options, print_report, printer, size
 from jast.estimate import by_proposal
 from jast.estimate.search_settings import SETTINGS
 
@@ -58,8 +58,8 @@ def main(argv=None):
     parser.add_argument("--seeds", type=int, help="problems of each family (3)")
     parser.add_argument("--budget", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=830_000, help="number of the first problem")
-    some_of(parser, "--families", FAMILIES)
-    some_of(parser, "--only", SETTINGS._fields)
+    add_choices(parser, "--families", FAMILIES)
+    add_choices(parser, "--only", SETTINGS._fields)
     args = parser.parse_args(argv)
     seeds = args.seeds or size(args, 3, 1, 1)
     every = tuple(n for n in SETTINGS._fields if n not in FIXED)
@@ -85,7 +85,7 @@ def main(argv=None):
             said = f"{name} {getattr(at, name):g}"
             out[said] = line(answers(at, problems, args.budget), base)
             say(text(said))
-    show(args, out)
+    print_report(args, out)
     return out
 
 

@@ -20,16 +20,16 @@ import jax
 __all__ = [
     "NO_CACHE",
     "ONE_THREAD",
-    "alone",
-    "here",
+    "in_fresh_process",
+    "in_this_process",
     "installed",
     "options",
     "percent",
     "printer",
     "processors",
-    "show",
+    "print_report",
     "size",
-    "some_of",
+    "add_choices",
     "timed",
 ]
 
@@ -70,7 +70,7 @@ def printer(args: argparse.Namespace) -> Callable[..., None]:
     return say
 
 
-def show(args: argparse.Namespace, report: Any, text: str = "") -> None:
+def print_report(args: argparse.Namespace, report: Any, text: str = "") -> None:
     """Print the report: as JSON, or its text."""
     if args.json or text:
         print(json.dumps(report) if args.json else text)
@@ -90,7 +90,9 @@ def processors() -> int | None:
     return os.cpu_count()
 
 
-def alone(name: str, *arguments: Any, module: str, settings: dict[str, str] = ONE_THREAD) -> Any:
+def in_fresh_process(
+    name: str, *arguments: Any, module: str, settings: dict[str, str] = ONE_THREAD
+) -> Any:
     """What a function of a benchmark returns, as JSON has it, in a process of its own with these
     environment variables.
     """
@@ -102,12 +104,12 @@ def alone(name: str, *arguments: Any, module: str, settings: dict[str, str] = ON
     return json.loads(said.splitlines()[-1])
 
 
-def here(name: str, *arguments: Any, module: str, **_: Any) -> Any:
+def in_this_process(name: str, *arguments: Any, module: str, **_: Any) -> Any:
     """The same in this process: compiled programs are shared, figures mean less."""
     return getattr(importlib.import_module(f"benchmarks.{module}"), name)(*arguments)
 
 
-def some_of(
+def add_choices(
     parser: argparse.ArgumentParser, name: str, choices: Iterable[str], default: str = "all"
 ) -> None:
     """Add an option ``name`` that takes some of ``choices``."""

@@ -20,7 +20,7 @@ import numpy as np
 
 import jast
 from benchmarks import cma_es as driver
-from benchmarks.sizes import installed, options, show, size, some_of
+from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
 from jast.estimate.batches import resampled
 from jast.estimate.descents import SETTINGS, cooled
@@ -230,8 +230,8 @@ def table(report):
 
 def main(argv=None):
     parser = options(__doc__, "two systems, few evaluations")
-    some_of(parser, "--cases", CASES | LOOPS, "all but loops")
-    some_of(parser, "--methods", METHODS, f"all but {', '.join(SINGLE)}")
+    add_choices(parser, "--cases", CASES | LOOPS, "all but loops")
+    add_choices(parser, "--methods", METHODS, f"all but {', '.join(SINGLE)}")
     help = "stress with and without each of its explorers, in place of --methods"
     parser.add_argument("--leave-out", action="store_true", help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
@@ -246,7 +246,7 @@ def main(argv=None):
     seeds = args.seeds or size(args, 20, 1, 1)
     report = run(cases, methods, budget, seeds)
     settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
-    show(args, dict(settings=settings, systems=report), table(report))
+    print_report(args, dict(settings=settings, systems=report), table(report))
 
 
 if __name__ == "__main__":

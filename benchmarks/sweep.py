@@ -22,7 +22,7 @@ import numpy as np
 
 import jast
 from benchmarks.closed_loops import system
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from benchmarks.stress_systems import lane
 from jast.distributions import Normal
 from jast.estimate import failure_probability
@@ -221,7 +221,7 @@ def main(argv=None):
         say(name)
         for what, value in numbers.items():
             say(f"  {what:<24}{value if isinstance(value, tuple) else f'{value:.5g}'}")
-    show(args, report)
+    print_report(args, report)
 
 
 if __name__ == "__main__":

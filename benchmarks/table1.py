@@ -15,7 +15,7 @@ import numpy as np
 import jast
 from benchmarks import engine
 from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome
-from benchmarks.sizes import printer, show, size, timed
+from benchmarks.sizes import print_report, printer, size, timed
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.search.tree.memory import LANES
@@ -402,4 +402,4 @@ def report(args):
     if args.picture:
         out["slow_simulator"] = slowed(sizes, seeds, say)
         draw(out, args.picture)
-    show(args, out)
+    print_report(args, out)

@@ -16,7 +16,7 @@ import numpy as np
 
 import jast
 from benchmarks.ferry import BOX, REWARD, TABLE
-from benchmarks.sizes import options, printer, show, size, some_of, timed
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 
 VARIANTS = {"mcts": "MCTS-SA", "none": "-/-", "rollout": "RP/-", "value": "-/VN", "both": "RP/VN"}
 """The search or its heads: the paper's name of the row."""
@@ -74,7 +74,7 @@ def main(argv=None):
     parser = options(__doc__, "2 seeds of 8 trees: under two minutes")
     parser.add_argument("--seeds", type=int, help="default 10")
     parser.add_argument("--trees", type=int, help="of a seed; default 200, as published")
-    some_of(parser, "--rows", ROWS)
+    add_choices(parser, "--rows", ROWS)
     args = parser.parse_args(argv)
     seeds, trees = args.seeds or size(args, 10, 2, 2), args.trees or size(args, 200, 8, 2)
     rows = args.rows or size(args, [*ROWS], [*ROWS], ["rollout, code, tree"])
@@ -104,7 +104,7 @@ def main(argv=None):
             f" printed {printed[0]}, {printed[1]:.2f}, {printed[2]:.2f};"
             f" {r['cpu_s_a_seed']:.0f} CPU s a seed"
         )
-    show(args, out)
+    print_report(args, out)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
-from benchmarks.sizes import options, percent, printer, show, size, some_of
+from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
 from jast.judge import judged
 from jast.limit_state import dimension
 from jast.simulators import limit_state
@@ -236,8 +236,8 @@ def plain_draws(about: System, seconds: float) -> float | None:
 
 def main(argv: list[str] | None = None) -> None:
     parser = options(__doc__, "two systems, one key")
-    some_of(parser, "--systems", SYSTEMS)
-    some_of(parser, "--methods", METHODS)
+    add_choices(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--methods", METHODS)
     parser.add_argument("--seeds", type=int, help="keys (default: 20)")
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "piecewise"], ["piecewise"])
@@ -250,7 +250,7 @@ def main(argv: list[str] | None = None) -> None:
                 row["plain"] = plain_draws(SYSTEMS[name], row["warm"] or row["first"])
             rows.append(row)
             say(_line(row))
-    show(args, dict(seeds=seeds, rows=rows))
+    print_report(args, dict(seeds=seeds, rows=rows))
 
 
 def _line(r):

@@ -29,7 +29,7 @@ from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
 from benchmarks.fms import mean
-from benchmarks.sizes import options, printer, show, size, timed
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
 from jast.weakness.measures import precision_recall
 from jast.weakness.thesis import halves
@@ -280,14 +280,14 @@ def main(argv=None):
     systems = mnist(args.data, one) if args.data else digits(one)
     if args.table:
         tables([next(iter(systems))], seeds, out, say)
-        return show(args, out)
+        return print_report(args, out)
     for name, images, labels, predicted in systems:
         if args.smoke:
             images, labels, predicted = images[:80], labels[:80], predicted[:80]
         say(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}")
         picture = None if out else args.picture
         out[name] = study(images, labels, predicted, seeds, args.quick, picture, say)
-    show(args, out)
+    print_report(args, out)
 
 
 if __name__ == "__main__":
