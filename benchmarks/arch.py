@@ -10,9 +10,6 @@ improvement (bayesian-optimization: a minute and more a run, so only where it is
 those of `benchmarks.peers`, over the levels of the inputs.
 """
 
-import argparse
-import importlib.util
-import json
 import time
 import warnings
 
@@ -23,13 +20,9 @@ import numpy as np
 import jast
 from benchmarks import arch_flights, arch_probability, peers
 from benchmarks.cma_es import Stop
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, installed, options, print_report, size
 from jast import limit_state
-from jast.simulators.arch import (
-    automatic_transmission,
-    chasing_cars,
-    ground_collision_avoidance,
-)
+from jast.simulators.arch import automatic_transmission, chasing_cars, ground_collision_avoidance
 
 __all__ = ["METHODS", "run"]
 
@@ -134,8 +127,7 @@ def run(cases, methods, seeds, budget=None):
         for method in methods:
             begin, took = time.process_time(), []
             for seed in range(seeds):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
+                with warnings.catch_warnings(action="ignore"):
                     took.append(METHODS[method](jax.random.key(seed), sim, limit))
             found = [int(n) for n in took if n is not None]
             rows[method] = dict(
@@ -153,7 +145,10 @@ def run(cases, methods, seeds, budget=None):
 
 def table(report):
     """The report as text."""
-    number = lambda v: f"{'-':>8}" if v is None else f"{v:8.1f}"
+
+    def number(v):
+        return f"{'-':>8}" if v is None else f"{v:8.1f}"
+
     lines = [
         f"{'':<5} {'budget':>6} {'method':<9} {'falsified':>9} {'mean':>8} {'median':>8}"
         f" {'CPU s':>7}"
@@ -170,9 +165,9 @@ def table(report):
 
 
 def main(argv=None):
-    parser = options(argparse.ArgumentParser(description=__doc__), "one requirement, three seeds")
-    parser.add_argument("--cases", nargs="+", choices=CASES, help="default: all")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all but bayesian")
+    parser = options(__doc__, "one requirement, three seeds")
+    add_choices(parser, "--cases", CASES)
+    add_choices(parser, "--methods", METHODS, "all but bayesian")
     parser.add_argument("--seeds", type=int, help="default: 50")
     parser.add_argument("--budget", type=int, help="simulations (default: 300; CC4 and AT 1500)")
     parser.add_argument(
@@ -187,29 +182,24 @@ def main(argv=None):
         "--flights", action="store_true", help="instead: how low F-16s come, by altitude"
     )
     args = parser.parse_args(argv)
+    settings = dict(jast=jast.__version__)
     if args.flights:
         found = arch_flights.rows(size(args, 20_000, 2_000, 20))
-        said = json.dumps(dict(settings=dict(jast=jast.__version__), rows=found))
-        print(said if args.json else arch_flights.table(found))
-        return
+        return print_report(args, dict(settings=settings, rows=found), arch_flights.table(found))
     if args.probability:
         budget = args.budget or size(args, 20_000, 5_000, 500)
         crude = size(args, 1_000_000, 20_000, 500)
         found = arch_probability.rows(system(args.probability), budget, crude)
-        settings = dict(case=args.probability, jast=jast.__version__)
-        said = json.dumps(dict(settings=settings, rows=found))
-        print(said if args.json else arch_probability.table(found))
-        return
-    there = lambda m: m not in NEEDED or importlib.util.find_spec(NEEDED[m])
-    installed = [m for m in METHODS if there(m) and m != "bayesian"]
+        settings |= dict(case=args.probability)
+        return print_report(
+            args, dict(settings=settings, rows=found), arch_probability.table(found)
+        )
+    usual = [m for m in METHODS if m != "bayesian" and installed(NEEDED.get(m, "jast"))]
     cases = args.cases or size(args, list(CASES), ["CC2"], ["CC1"])
-    methods = args.methods or size(args, installed, ["falsify", "cem"], ["falsify"])
+    methods = args.methods or size(args, usual, ["falsify", "cem"], ["falsify"])
     seeds = args.seeds or size(args, 50, 3, 2)
     report = run(cases, methods, seeds, args.budget or size(args, None, None, 20))
-    if args.json:
-        print(json.dumps(dict(settings=dict(seeds=seeds, jast=jast.__version__), systems=report)))
-    else:
-        print(table(report))
+    print_report(args, dict(settings=settings | dict(seeds=seeds), systems=report), table(report))
 
 
 if __name__ == "__main__":

@@ -19,8 +19,12 @@ ALTITUDES = 4040.0, 2338.0, 2330.0, 2270.0, 2262.0
 def _least(starts, altitude, steps=1):
     """ft: the least altitude of each flight [n] from ``starts`` [n, 3]."""
     samples = round(gcas.DURATION / gcas.DT)
-    flight = lambda attitude: gcas.drive(gcas.start(attitude, altitude), samples, steps)[1]
-    return jax.vmap(lambda attitude: flight(attitude).altitude.min())(starts)
+
+    def least(attitude):
+        _, flight = gcas.drive(gcas.start(attitude, altitude), samples, steps)
+        return flight.altitude.min()
+
+    return jax.vmap(least)(starts)
 
 
 def rows(flights, seed=0):
@@ -30,7 +34,10 @@ def rows(flights, seed=0):
     low, high = np.array(BOX)
     u = np.random.default_rng(seed).uniform(size=(flights, 3))
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    to = lambda u: jnp.asarray(low + u * (high - low), jnp.zeros(()).dtype)
+
+    def to(u):
+        return jnp.asarray(low + u * (high - low), jnp.zeros(()).dtype)
+
     found = {}
     for altitude in ALTITUDES:
         begin = time.process_time()

@@ -23,8 +23,7 @@ def rows(sim, budget, crude, seed=0):
     found = {}
     for name, method in methods.items():
         begin = time.process_time()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             r = method()
         found[name] = dict(
             probability=float(r.mean),

@@ -7,23 +7,20 @@ for 5 ms and one that computes for as long, in batches of 64; repetitions of the
 Medians, with quartiles.
 """
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import time
+from functools import partial
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from jax import lax  # noqa: E402
-
-from benchmarks.sizes import options, size  # noqa: E402
-from jast import blackbox  # noqa: E402
-from jast.distributions import Normal  # noqa: E402
+from benchmarks.sizes import options, print_report, processors, size, timed
+from jast import blackbox
+from jast.distributions import Normal
 
 HORIZON = 10
 SECONDS = 0.005
@@ -72,9 +69,7 @@ def loop(sim, lanes):
 
 
 def wall(function, *args):
-    start = time.perf_counter()
-    function(*args)
-    return time.perf_counter() - start
+    return timed(partial(function, *args))[2]
 
 
 def middle(values):
@@ -113,7 +108,7 @@ def speedup(repeats, lanes=64):
     return out
 
 
-def bare(repeats, pieces=100):
+def two_processes(repeats, pieces=100):
     """Of 2 n pieces of computing in one process, to n in each of two."""
     code = (
         f"import time\nfor _ in range({pieces}):\n end = time.perf_counter() + {SECONDS}\n while"
@@ -131,25 +126,15 @@ def bare(repeats, pieces=100):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.blackbox", description=__doc__.splitlines()[0]
-    )
-    args = options(parser, "fewer repetitions").parse_args(argv)
+    args = options(__doc__, "fewer repetitions").parse_args(argv)
     repeats = size(args, 15, 3, 1)
-    processors = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    )
     report = {
-        "processors": processors,
+        "processors": processors(),
         "overhead_ms": overhead(repeats, **({"batches": [(2, 2)]} if args.smoke else {})),
         "speedup": speedup(repeats, 4 if args.smoke else 64)
-        | {"bare": bare(repeats, 2 if args.smoke else 100)},
+        | {"two_processes": two_processes(repeats, 2 if args.smoke else 100)},
     }
-    if args.json:
-        print(json.dumps(report, indent=1))
-        return
-    for part, figures in report.items():
-        print(f"{part}: {json.dumps(figures)}")
+    print_report(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ Then the failure probability that `failure_proposal` leads to: by importance sam
 new episodes, over the truth, where one is known; each of several seeds with a proposal of its own.
 """
 
-import argparse
-import json
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks.ferry import REWARD
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast import cross_entropy as ce
 from jast.estimate import clopper_pearson, importance
 
@@ -28,23 +27,13 @@ def found(runs, samples=100, iterations=10, methods=("ce_method", "ce_surrogate"
     sizes = dict(samples=samples, elites=3 * samples // 10, iterations=iterations)
     sim, actions = jast.simulators.ferry(), jast.actions.quantiles()
     stress = ce.over(sim, actions=actions)
+    common = dict(reward=REWARD, actions=actions)
+    random = partial(jast.search.monte_carlo, sim=sim, episodes=samples * iterations, **common)
+    plan = dict(samples=samples, elites=samples // 10, iterations=iterations)
+    cem = partial(jast.search.cem, sim=sim, **plan, **common)
     searches = {
-        "random search": (
-            lambda key: jast.search.monte_carlo(
-                key, sim, episodes=samples * iterations, reward=REWARD, actions=actions
-            ).failing_per_tree[0]
-        ),
-        "search.cem": (
-            lambda key: jast.search.cem(
-                key,
-                sim,
-                samples=samples,
-                elites=samples // 10,
-                iterations=iterations,
-                reward=REWARD,
-                actions=actions,
-            ).failing_per_tree[0]
-        ),
+        "random search": lambda key: random(key).failing_per_tree[0],
+        "search.cem": lambda key: cem(key).failing_per_tree[0],
     }
     for name in methods:
         searches[name] = lambda key, name=name: (
@@ -95,11 +84,8 @@ def proposals(name, seeds, iterations=20):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.bridge", description=__doc__.splitlines()[0]
-    )
-    args = options(parser, "under two minutes: fewer runs").parse_args(argv)
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
+    args = options(__doc__, "under two minutes: fewer runs").parse_args(argv)
+    say = printer(args)
     report = {"found": found(*size(args, (20,), (5,), (1, 10, 2, ["ce_method"]))), "proposals": {}}
     say("runs of 1000 episodes that find a collision on the ferry")
     for name, r in report["found"].items():
@@ -119,8 +105,7 @@ def main(argv=None):
             f"  {name:27} {ratios}   {100 * min(r['relative_error']):.1f} to"
             f" {100 * max(r['relative_error']):.1f} %   (crude {100 * r['crude']:.3g} %)"
         )
-    if args.json:
-        print(json.dumps(report))
+    print_report(args, report)
 
 
 if __name__ == "__main__":

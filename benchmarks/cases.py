@@ -133,9 +133,9 @@ class Case(NamedTuple):
 
 
 def _case(objective, d, mean, sd, minimum, minimiser, budgets):
-    fill = lambda value: (
-        None if value is None else np.broadcast_to(np.asarray(value, float), (d,)).copy()
-    )
+    def fill(value):
+        return None if value is None else np.broadcast_to(np.asarray(value, float), (d,)).copy()
+
     return Case(objective, d, fill(mean), fill(sd), minimum, fill(minimiser), budgets)
 
 

@@ -4,15 +4,13 @@ computes them.
 
 `TUNED` are loops that settings may be chosen on, `JUDGED` those on which nothing was: 80 to 400
 random numbers an episode. `RARE` are three more to judge on, of about one in a million. Truths are
-plain draws by jast's own player, with JAX's Threefry, which a bare loop (`bare`) repeats; those of
-`RARE`, of breaker, tank, store and oven are exact (`benchmarks.operators`).
+plain draws by jast, with JAX's Threefry, which a minimal loop (`independent_draws`) repeats; those
+of `RARE`, of breaker, tank, store and oven are exact (`benchmarks.operators`).
 
 Tank, store and oven were judged on until the move that draws anew all after a level was found on
 them; freezer and packets were made after it.
 """
 
-import argparse
-import json
 import math
 import time
 from collections.abc import Callable
@@ -25,16 +23,11 @@ from jax import lax
 
 import jast
 from benchmarks.operators import OPERATORS, SYSTEMS, easier
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.distributions import Bernoulli, Independent, Joint, Normal
 from jast.limit_state import outcome
 
-__all__ = [
-    "JUDGED",
-    "RARE",
-    "TUNED",
-    "Loop",
-]
+__all__ = ["JUDGED", "RARE", "TUNED", "Loop"]
 
 LANES = 128
 """Episodes that are drawn side by side."""
@@ -260,19 +253,19 @@ def _failing(sim, key, blocks):
     return lax.fori_loop(0, blocks, block, jnp.zeros((), jnp.int32))
 
 
-def bare(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
+def independent_draws(loop: Loop, draws: int, seed: int = 0) -> tuple[int, int]:
     """As `plain`, by a loop that uses the simulator's functions only, with other draws."""
     blocks = min(max(draws // LANES, 1), 1024)
     failing = done = 0
     while done < draws:
         key = jax.random.key(seed * 100_000 + done // (blocks * LANES), impl="rbg")
-        failing += int(_bare(loop.simulator, key, blocks))
+        failing += int(_independent_failures(loop.simulator, key, blocks))
         done += blocks * LANES
     return failing, done
 
 
 @partial(jax.jit, static_argnames="blocks")
-def _bare(sim, key, blocks):
+def _independent_failures(sim, key, blocks):
     def fails(key):
         first, rest = jax.random.split(key)
         state = sim.init(sim.start().sample(seed=first))
@@ -373,11 +366,7 @@ JUDGED = (
         **_ARM,
     ),
 )
-RARE = (
-    _exact("rail", 9.1717e-07),
-    _exact("freezer", 3.2289e-06),
-    _exact("packets", 6.9634e-06),
-)
+RARE = (_exact("rail", 9.1717e-07), _exact("freezer", 3.2289e-06), _exact("packets", 6.9634e-06))
 
 
 def truth_of(loop: Loop, draws: int, cells: int) -> tuple[float, float]:
@@ -389,11 +378,11 @@ def truth_of(loop: Loop, draws: int, cells: int) -> tuple[float, float]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "200,000 draws a loop")
+    parser = options(__doc__, "200,000 draws a loop")
     parser.add_argument("--loops", nargs="+", help="default: all")
     args = parser.parse_args(argv)
     draws, cells = size(args, 10_000_000, 200_000, LANES), size(args, 2400, 600, 100)
-    rows = []
+    say, rows = printer(args), []
     for loop in TUNED + JUDGED + RARE:
         if args.loops and loop.name not in args.loops:
             continue
@@ -406,29 +395,26 @@ def main(argv: list[str] | None = None) -> None:
         row |= dict(recomputed=p, apart=apart, cpu_seconds=time.process_time() - begun)
         text = f"recomputed {p:.4g}  {apart:.1f} standard errors apart"
         if loop.how == DRAWS:
-            failing, drawn = bare(loop, draws // 10)
+            failing, drawn = independent_draws(loop, draws // 10)
             other = failing / drawn
             both = math.hypot(math.sqrt(loop.truth / drawn), loop.error * loop.truth)
-            row |= dict(bare=other, bare_apart=abs(other - loop.truth) / both)
-            text += f"  bare loop {other:.3g}, {row['bare_apart']:.1f} apart"
+            row |= dict(independent=other, independent_apart=abs(other - loop.truth) / both)
+            text += f"  minimal loop {other:.3g}, {row['independent_apart']:.1f} apart"
         else:
             row |= dict(relative=p / loop.truth - 1)
             text = f"recomputed {p:.5g}, {row['relative']:+.1e} of it"
         rows.append(row)
-        if not args.json:
-            print(
-                f"{loop.name:10s} {loop.numbers:4d} numbers  truth {loop.truth:.4g}"
-                f" +- {loop.error:.1%}  {text}",
-                flush=True,
-            )
+        say(
+            f"{loop.name:10s} {loop.numbers:4d} numbers  truth {loop.truth:.4g}"
+            f" +- {loop.error:.1%}  {text}"
+        )
     checked = easier(size(args, 1_000_000, 200_000, 1000), cells)
-    for name, row in ({} if args.json else checked).items():
-        print(
+    for name, row in checked.items():
+        say(
             f"{name:10s} made easier: operator {row['operator']:.4g}, drawn {row['drawn']:.4g},"
             f" {row['apart']:.1f} standard errors apart"
         )
-    if args.json:
-        print(json.dumps(dict(loops=rows, easier=checked)))
+    print_report(args, dict(loops=rows, easier=checked))
 
 
 if __name__ == "__main__":

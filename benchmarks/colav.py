@@ -8,25 +8,31 @@ compilation excluded, the best of alternated runs (of one with ``--quick``), in 
 has one thread.
 """
 
-import argparse
 import functools
 import itertools
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.engine import alone, cpu, here, problem, whole
-from benchmarks.ferry import timed
-from benchmarks.sizes import options, size
+from benchmarks.engine import cpu, problem, whole
+from benchmarks.sizes import (
+    in_fresh_process,
+    in_this_process,
+    options,
+    print_report,
+    printer,
+    size,
+    timed,
+)
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.simulators.colav import SCENARIOS, colav
 
 REWARD = jast.rewards.standard(event_bonus=200.0, density="mode")
-PRUNES, SIMULATIONS = 22, 50  # published
+PRUNES = 22  # published
+SIMULATIONS = 50  # of a root: published
 ALL = ("delay", "steering", "noise")
 SUBSTEPS = (1, 3, 10, 30, 100, 300)
 
@@ -71,7 +77,8 @@ def share(failing):
 def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     """Trees of the default search that find a collision."""
     sim = colav(scenario, kind, substeps=substeps)
-    grow = lambda: jast.search.forest(
+    grow = functools.partial(
+        jast.search.forest,
         jax.random.key(0),
         sim,
         trees=trees,
@@ -83,23 +90,19 @@ def search(scenario, kind, trees, substeps, heads=None, prunes=PRUNES):
     )
     result, seconds, _ = timed(grow)
     best = {"best": float(result.best.reward), "best_distance_m": float(result.best.distance)}
-    return (
-        share(result.failing_per_tree)
-        | best
-        | {
-            "episodes": result.episodes,
-            "steps": result.steps,
-            "cpu_s": seconds,
-        }
-    )
+    cost = {"episodes": result.episodes, "steps": result.steps, "cpu_s": seconds}
+    return share(result.failing_per_tree) | best | cost
 
 
 def random_search(scenario, kind, runs, substeps, episodes=PRUNES * SIMULATIONS):
     """Random searches of as many episodes as a tree has simulations that find a collision."""
     sim = colav(scenario, kind, substeps=substeps)
-    one = lambda key: jast.search.monte_carlo(
-        key, sim, episodes=episodes, reward=REWARD
-    ).failing_per_tree[0]
+
+    def one(key):
+        return jast.search.monte_carlo(key, sim, episodes=episodes, reward=REWARD).failing_per_tree[
+            0
+        ]
+
     return share(
         jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(1), runs))
     )
@@ -113,20 +116,15 @@ def memoization(
     """
     total = prunes * simulations
     sim, reward = colav("sharp turn", substeps=substeps), published if mode == "paper" else REWARD
-    p, keys = (
-        problem(total, mode, sim, reward, jast.actions.samples()),
-        tree_keys(jax.random.key(0), trees),
-    )
+    p = problem(total, mode, sim, reward, jast.actions.samples())
+    keys = tree_keys(jax.random.key(0), trees)
     children = int(p.settings.widths.max())
     runs = {
         name: functools.partial(whole, p, keys, prunes, simulations, children, name)
         for name in memoize
     }
     runs["MCTS-SA"] = functools.partial(whole, p, keys, 1, total, children, "none")
-    steps = {
-        name: float(np.mean(jax.device_get(function().steps))) / total
-        for name, function in runs.items()
-    }
+    steps = {name: float(np.mean(play().steps)) / total for name, play in runs.items()}
     seconds = {name: float("inf") for name in runs}
     for _ in range(repeats):
         for name, function in runs.items():
@@ -135,15 +133,8 @@ def memoization(
     ratios = {
         f"{a}/{b}": us[a] / us[b] for a, b in itertools.product(memoize[:-1], ("none", "MCTS-SA"))
     }
-    return {
-        "mode": mode,
-        "simulations": simulations,
-        "trees": trees,
-        "substeps": substeps,
-        "us": us,
-        "steps": steps,
-        "ratios": ratios,
-    }
+    about = dict(mode=mode, simulations=simulations, trees=trees, substeps=substeps)
+    return about | dict(us=us, steps=steps, ratios=ratios)
 
 
 def picture(rows, path):
@@ -173,10 +164,7 @@ def picture(rows, path):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.colav", description=__doc__.splitlines()[0]
-    )
-    options(parser, "fewer episodes, trees and rows: under two minutes")
+    parser = options(__doc__, "fewer episodes, trees and rows: under two minutes")
     parser.add_argument(
         "--memoization", action="store_true", help="only what keeping states is worth"
     )
@@ -188,12 +176,14 @@ def main(argv=None):
     )
     parser.add_argument("--picture", help="draw the CPU time by substeps to this file")
     args = parser.parse_args(argv)
-    say = (lambda *a: None) if args.json else functools.partial(print, flush=True)
-    percent = lambda r, name: (
-        f"{100 * r[name]:6.1f} % [{100 * r[name + '_95'][0]:.1f}, {100 * r[name + '_95'][1]:.1f}]"
-    )
+    say = printer(args)
+
+    def percent(r, name):
+        low, high = (100 * v for v in r[f"{name}_95"])
+        return f"{100 * r[name]:6.1f} % [{low:.1f}, {high:.1f}]"
+
     report = {"nominal": {}, "searches": {}, "memoization": []}
-    measure = here if args.smoke else alone
+    measure = in_this_process if args.smoke else in_fresh_process
 
     say(
         "nominal: least distance undisturbed, and failures when disturbances are drawn from their"
@@ -227,29 +217,25 @@ def main(argv=None):
             r["forest, heads"] = search(scenario, kind, trees, args.substeps, heads="both")
         report["searches"][f"{scenario}, {kind}"] = r
         for name, row in r.items():
-            more = (
-                f"best {row['best']:8.2f}, {row['best_distance_m']:.2f} m, {row['cpu_s']:.0f} CPU s"
-                if "best" in row
-                else ""
-            )
+            more = ""
+            if "best" in row:
+                near, cpu_s = row["best_distance_m"], row["cpu_s"]
+                more = f"best {row['best']:8.2f}, {near:.2f} m, {cpu_s:.0f} CPU s"
             say(f"  {scenario + ', ' + kind:26} {name:14} {percent(row, 'share'):24} {more}")
 
     say("\nCPU time of a simulation (us) and its steps, by where states are kept")
     if args.smoke:
-        calls = [
-            (1, "default", SIMULATIONS, 4, 1, 2, ["node", "none"])
-        ]  # the program of the search
+        # the program of the search
+        calls = [(1, "default", SIMULATIONS, 4, 1, 2, ["node", "none"])]
     elif args.quick:
         calls = [(30, "paper", 20, 64, 1)]
     else:
-        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)] + [
-            (n, "paper", 20, 64, 2) for n in SUBSTEPS
-        ]
+        calls = [(30, mode, n, 128, 2) for mode in ("default", "paper") for n in (20, 50)]
+        calls += [(n, "paper", 20, 64, 2) for n in SUBSTEPS]
     for call in calls:
         report["memoization"].append(r := measure("memoization", *call, module="colav"))
-        cells = ", ".join(
-            f"{name} {r['us'][name]:.1f} ({r['steps'][name]:.1f})" for name in r["us"]
-        )
+        us, steps = r["us"], r["steps"]
+        cells = ", ".join(f"{name} {us[name]:.1f} ({steps[name]:.1f})" for name in us)
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in r["ratios"].items())
         say(
             f"  {r['substeps']:3d} substeps, {r['mode']}, {PRUNES} x {r['simulations']},"
@@ -257,8 +243,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(report["memoization"][-len(SUBSTEPS) :], args.picture)
-    if args.json:
-        print(json.dumps(report, indent=1))
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -8,24 +8,18 @@ no other minimum is). The table of the thesis is R. J. Moss's Table 2.1. Peers (
 have the same budgets. ``--picture PATH`` draws the runs on 1A, 1B and 1C.
 """
 
-import argparse
 import functools
-import json
-import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks import peers  # noqa: E402
-from benchmarks.cases import CASES  # noqa: E402
-from benchmarks.engine import cpu  # noqa: E402
-from benchmarks.ferry import timed  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast import cross_entropy as ce  # noqa: E402
-from jast.cross_entropy.surrogates import RADIAL  # noqa: E402
+from benchmarks import peers
+from benchmarks.cases import CASES
+from benchmarks.engine import cpu
+from benchmarks.sizes import options, print_report, printer, size, timed
+from jast import cross_entropy as ce
+from jast.cross_entropy.surrogates import RADIAL
 
 SIERRA = ("sierra 1A", "sierra 1B", "sierra 1C")
 METHODS = ("ce_method", "ce_surrogate", "ce_mixture")
@@ -86,7 +80,7 @@ def row(values, distances=None, sierra=True):
     return out | {"hit": float(np.mean(np.asarray(values, float) < BASIN))} if sierra else out
 
 
-def ours(method, case, seeds, **settings):
+def run_jast(method, case, seeds, **settings):
     c = CASES[case]
     result = runs(method, case, seeds, **settings)
     far = (
@@ -97,7 +91,7 @@ def ours(method, case, seeds, **settings):
     return row(result.best_value, far, case in SIERRA) | {"invalid": int(np.sum(result.invalid))}
 
 
-def theirs(peer, case, seeds):
+def run_peer(peer, case, seeds):
     found = peers.run(peer, case, range(seeds))
     return row(found["values"], found["distances"], case in SIERRA) | {
         "cpu_s": float(found["cpu_s"].mean())
@@ -143,13 +137,13 @@ def schedules(seeds, rates=(0.1, 0.2, 0.3), forms=("before", "after"), modes=("t
         for p in rates
     ]
     for mode in modes:
-        out[f"uniform, {mode}"] = ours("ce_surrogate", "sierra 1B", seeds, mode=mode)
+        out[f"uniform, {mode}"] = run_jast("ce_surrogate", "sierra 1B", seeds, mode=mode)
         for name, counts in uneven:
-            out[f"{name}, {mode}"] = ours(
+            out[f"{name}, {mode}"] = run_jast(
                 "ce_surrogate", "sierra 1B", seeds, mode=mode, schedule=counts
             )
     for name, counts in uneven[: len(rates)]:
-        out[f"{name}, thesis with ratchet"] = ours(
+        out[f"{name}, thesis with ratchet"] = run_jast(
             "ce_surrogate", "sierra 1B", seeds, mode="thesis", schedule=counts, ratchet=True
         )
     return out
@@ -165,27 +159,23 @@ def surrogates(seeds, cases=("sierra 1A", "paraboloid 2")):
         f"polynomial, degree {k}": dict(surrogate="polynomial", degree=k) for k in (1, 2, 3, 4)
     }
     return {
-        f"{case}, {name}": ours("ce_surrogate", case, seeds, mode="thesis", **how)
+        f"{case}, {name}": run_jast("ce_surrogate", case, seeds, mode="thesis", **how)
         for case in cases
         for name, how in models.items()
     }
 
 
-def say_row(name, r, published=None):
+def row_text(name, r, published=None):
     far = f"   d {r['distance']:6.2f}   F {r['F']:6.1f}" if "F" in r else ""
     note = f"   thesis {published[0]:.4f} / {published[1]:.2f}" if published else ""
-    print(
+    return (
         f"  {name:34} {r['best']:.4f} +- {r['best_se']:.4f}{far}   hit {r['hit']:.2f}  "
-        f" ({r['seeds']} seeds){note}",
-        flush=True,
+        f" ({r['seeds']} seeds){note}"
     )
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.cross_entropy", description=__doc__.splitlines()[0]
-    )
-    options(parser, "under two minutes: 64 seeds, fewer cases and peers")
+    parser = options(__doc__, "under two minutes: 64 seeds, fewer cases and peers")
     parser.add_argument("--seeds", type=int, help="runs of each row; 256, or 64 with --quick")
     parser.add_argument(
         "--slow-seeds",
@@ -201,17 +191,13 @@ def main(argv=None):
     methods, modes = METHODS, ("thesis", "default")
     if args.smoke:  # the others differ in their names alone
         methods, modes = ("ce_surrogate",), ("default",)
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    show = (lambda *a: None) if args.json else say_row
+    say = printer(args)
     if args.surrogates:
         report = surrogates(seeds, *(((SIERRA[0],),) if args.smoke else ()))
         for name, r in report.items():
-            show(name, r) if name.startswith("sierra") else say(
-                f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
-            )
-        if args.json:
-            print(json.dumps(report))
-        return
+            other = f"  {name:34} median {r['median']:.3g}, mean {r['best']:.3g}"
+            say(row_text(name, r) if name.startswith("sierra") else other)
+        return print_report(args, report)
     report = {
         "seeds": seeds,
         "speed": speed(seeds, methods),
@@ -235,14 +221,14 @@ def main(argv=None):
             for method in methods:
                 if args.quick and (method, mode) == ("ce_mixture", "thesis"):
                     continue
-                report["sierra"][f"{case}, {method}, {mode}"] = r = ours(
-                    method, case, seeds, mode=mode
-                )
-                show(f"{method}, {mode}", r, TABLE[method][i] if mode == "thesis" else None)
+                r = run_jast(method, case, seeds, mode=mode)
+                report["sierra"][f"{case}, {method}, {mode}"] = r
+                published = TABLE[method][i] if mode == "thesis" else None
+                say(row_text(f"{method}, {mode}", r, published))
         for peer in (*cheap, *size(args, ("expected_improvement",), (), ())):
             n = args.slow_seeds if peer == "expected_improvement" else seeds
-            report["peers"][f"{case}, {peer}"] = r = theirs(peer, case, n)
-            show(peer, r)
+            report["peers"][f"{case}, {peer}"] = r = run_peer(peer, case, n)
+            say(row_text(peer, r))
 
     if not args.quick:
         say(
@@ -251,10 +237,10 @@ def main(argv=None):
         )
         jax.config.update("jax_enable_x64", False)
         for case in SIERRA[: 1 if args.smoke else 2]:
-            report["sierra"][f"{case}, ce_surrogate, float32"] = r = ours(
+            report["sierra"][f"{case}, ce_surrogate, float32"] = r = run_jast(
                 "ce_surrogate", case, seeds, dtype=np.float32
             )
-            show(f"{case}, float32", r)
+            say(row_text(f"{case}, float32", r))
             logged = program("ce_surrogate", ce.sierra(log=True), *CASES[case].budgets, ())
             c = CASES[case]
             found = logged(
@@ -266,28 +252,29 @@ def main(argv=None):
             report["sierra"][f"{case}, ce_surrogate, float32, log"] = r = row(
                 c.objective(x), np.linalg.norm(x, axis=-1)
             )
-            show(f"{case}, float32, log=True", r)
+            say(row_text(f"{case}, float32, log=True", r))
         jax.config.update("jax_enable_x64", True)
         say("\nexperiment 2: schedules, CE-surrogate from 1B")
         report["schedules"] = schedules(
             seeds, *((0.1,), ("before",), ("default",)) if args.smoke else ()
         )
         for name, r in report["schedules"].items():
-            show(name, r, SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None)
+            published = SCHEDULES[name.split(",")[0]] if name.endswith("thesis") else None
+            say(row_text(name, r, published))
 
     say("\nother objectives: median best value (mean)")
     others = [case for case in CASES if case not in SIERRA]
     for case in size(args, others, ("branin", "ackley 5", "levy 5"), ("paraboloid 2",)):
         rows = {
-            method: ours(method, case, seeds)
+            method: run_jast(method, case, seeds)
             for method in size(args, METHODS, METHODS[:2], METHODS[:1])
         }
         rows |= (
-            {"ce_surrogate, thesis": ours("ce_surrogate", case, seeds, mode="thesis")}
+            {"ce_surrogate, thesis": run_jast("ce_surrogate", case, seeds, mode="thesis")}
             if not args.quick
             else {}
         )
-        rows |= {peer: theirs(peer, case, seeds) for peer in cheap}
+        rows |= {peer: run_peer(peer, case, seeds) for peer in cheap}
         report["others"][case] = rows
         say(
             f"  {case:13} "
@@ -295,8 +282,7 @@ def main(argv=None):
         )
     if args.picture:
         picture(args.picture, report)
-    if args.json:
-        print(json.dumps(report))
+    print_report(args, report)
 
 
 def picture(path, report):

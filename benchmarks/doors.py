@@ -9,27 +9,29 @@ of a warm call. ``--truth`` draws the truths that stand below again; ``--lines``
 that a user writes. Systems whose library is not installed are named and left out.
 """
 
-import argparse
 import ast
-import importlib.util
-import json
 import math
-import os
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-BEGUN = time.perf_counter()
+import jax
 
-import jax  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast.distributions import Normal  # noqa: E402
+import jast
+from benchmarks import BEGUN
+from benchmarks.sizes import (
+    NO_CACHE,
+    add_choices,
+    in_fresh_process,
+    installed,
+    options,
+    percent,
+    print_report,
+    printer,
+    size,
+)
+from jast.distributions import Normal
 
 __all__ = ["EXAMPLES", "SYSTEMS", "Door"]
 
@@ -123,14 +125,6 @@ def figures(name: str, budget: int, keys: int) -> dict[str, Any]:
     return row | dict(budget=budget, to_first_failure=cold)
 
 
-def fresh(module: str, *arguments: str) -> Any:
-    """What a module prints as JSON in a fresh process, without a cache of compiled programs."""
-    command = [sys.executable, "-m", module, *arguments]
-    env = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "0"}
-    said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=env)
-    return json.loads(said.stdout.splitlines()[-1])
-
-
 def lines(block: str) -> dict[str, int]:
     """Lines of code from the first after the imports to the simulator, and those of the one
     statement that makes it; without blank ones.
@@ -145,29 +139,18 @@ def lines(block: str) -> dict[str, int]:
     return dict(lines=whole, call=call)
 
 
-def absent(name: str) -> bool:
-    """Whether the library of a system is not installed."""
-    library = SYSTEMS[name].library
-    parts = (library.partition(".")[0], library)  # what is absent has no parts to look for
-    return any(importlib.util.find_spec(part) is None for part in parts)
-
-
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "those of gymnax, two keys")
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
+    parser = options(__doc__, "those of gymnax, two keys")
+    add_choices(parser, "--systems", SYSTEMS)
     parser.add_argument("--seeds", type=int, help="keys (default: 20 of gymnax, 2 of the others)")
     parser.add_argument("--truth", action="store_true", help="only draw the truths again")
     parser.add_argument("--lines", action="store_true", help="only count the lines of the guide")
-    parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
-    if args.alone:
-        name, budget, keys = args.alone
-        print(json.dumps(figures(name, int(budget), int(keys))))
-        return
     names = args.systems or size(args, list(SYSTEMS), ["gymnax", "pendulum"], ["gymnax"])
     names = [] if args.lines else names
-    say = (lambda *_: None) if args.json else lambda *words: print(*words, flush=True)
-    report: dict[str, Any] = dict.fromkeys(filter(absent, names))
+    say = printer(args)
+    absent = [name for name in names if not installed(SYSTEMS[name].library)]
+    report: dict[str, Any] = dict.fromkeys(absent)
     for name in report:
         say(f"{name} is left out: {SYSTEMS[name].library} is not installed")
     names = [name for name in names if name not in report]
@@ -178,23 +161,22 @@ def main(argv: list[str] | None = None) -> None:
     elif names:
         say(HEADS[0])
         for name in names:
-            about = SYSTEMS[name]
-            budget = size(args, about.budget, about.budget, 300_000)
-            keys = args.seeds or size(args, about.keys, 2, 1)
-            alone = "--alone", name, str(budget), str(keys)
-            report[name] = fresh("benchmarks.doors", *alone)
+            door = SYSTEMS[name]
+            budget = size(args, door.budget, door.budget, 300_000)
+            keys = args.seeds or size(args, door.keys, 2, 1)
+            report[name] = in_fresh_process(
+                "figures", name, budget, keys, module="doors", settings=NO_CACHE
+            )
             say(_row(report[name]))
     if not args.truth:
         report["lines"] = {name: lines(block) for name, block in EXAMPLES.items()}
         say(HEADS[1])
         for name, count in report["lines"].items():
             say(f"| {name} | {count['lines']} | {count['call']} |")
-    if args.json:
-        print(json.dumps(report))
+    print_report(args, report)
 
 
 def _row(r):
-    percent = lambda share: "-" if share is None else f"{100 * share:.1f} %"
     cold, warm = r["to_first_failure"], r["warm"]
     cells = (
         f"{r['system']}, {r['budget']:,}",

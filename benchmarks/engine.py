@@ -8,13 +8,8 @@ more it cuts kernels over threads, which wait for each other at the cost of CPU 
 own threads, which use all cores, are measured in ``cores``.
 """
 
-import argparse
 import functools
-import importlib
 import json
-import os
-import subprocess
-import sys
 import time
 from typing import NamedTuple
 
@@ -25,7 +20,16 @@ from jax.tree_util import Partial
 
 import jast
 from benchmarks import reference
-from benchmarks.sizes import options, size
+from benchmarks.sizes import (
+    NO_CACHE,
+    in_fresh_process,
+    in_this_process,
+    options,
+    print_report,
+    processors,
+    size,
+    timed,
+)
 from jast.counter import tree_keys
 from jast.progress import Progress, begin
 from jast.rewards import as_pytree
@@ -48,9 +52,7 @@ def problem(total, mode="paper", sim=None, reward=REWARD, actions=BOX):
 
 def cpu(function):
     """CPU and wall seconds of one call."""
-    start = time.process_time(), time.perf_counter()
-    jax.block_until_ready(function())
-    return time.process_time() - start[0], time.perf_counter() - start[1]
+    return timed(function)[1:]
 
 
 @functools.partial(jax.jit, static_argnames="simulations")
@@ -65,9 +67,10 @@ def rollouts(problem, keys, simulations):
 
         def roll(carry):
             level, at = carry
-            draw = lambda k, tree_key, t, p: take(
-                problem, t, p, choose_rollout(problem, k, tree_key, t, p.state)
-            )
+
+            def draw(k, tree_key, t, p):
+                return take(problem, t, p, choose_rollout(problem, k, tree_key, t, p.state))
+
             after = jax.vmap(draw)(key, keys, level, at)
             kept = jax.tree.map(lambda a, b: jnp.where(at.done, a, b), at[1:], after[1:])
             return level + 1, Progress(after.state, *kept)._replace(log_prob=at.log_prob)
@@ -101,18 +104,11 @@ def rates(repeats, lanes=200, prunes=18, simulations=500, plain_trees=3):
     children = {mode: int(p.settings.widths.max()) for mode, p in problems.items()}
     runs = {
         "rollouts": lambda: rollouts(problems["paper"], keys, 2 * simulations),
-        "forest, paper": lambda: whole(
-            problems["paper"], keys, prunes, simulations, children["paper"]
-        ),
-        "forest, default": lambda: whole(
-            problems["default"], keys, prunes, simulations, children["default"]
-        ),
     }
-    episodes = {
-        "rollouts": 2 * simulations * lanes,
-        "forest, paper": total * lanes,
-        "forest, default": total * lanes,
-    }
+    for mode in ("paper", "default"):
+        of_mode = problems[mode], keys, prunes, simulations, children[mode]
+        runs[f"forest, {mode}"] = functools.partial(whole, *of_mode)
+    episodes = {name: total * lanes for name in runs} | {"rollouts": 2 * simulations * lanes}
     best = {name: float("inf") for name in runs}
     ratio = {name: 0.0 for name in runs}
     plain = 0.0
@@ -152,7 +148,8 @@ def capacity(repeats, lanes=200, few=500, many=10_000):
 
 def cores(repeats, trees=200, prunes=6, simulations=500):
     """How many times faster two threads, of half of the trees each, are than one, in wall time."""
-    search = lambda threads: jast.search.forest(
+    search = functools.partial(
+        jast.search.forest,
         jax.random.key(0),
         jast.simulators.ferry(),
         trees=trees,
@@ -161,42 +158,16 @@ def cores(repeats, trees=200, prunes=6, simulations=500):
         reward=REWARD,
         actions=BOX,
         mode="paper",
-        threads=threads,
         lanes=trees // 2,
     )
     pairs = [
         (
-            cpu(lambda: search(1).best_reward_per_tree)[1],
-            cpu(lambda: search(2).best_reward_per_tree)[1],
+            cpu(lambda: search(threads=1).best_reward_per_tree)[1],
+            cpu(lambda: search(threads=2).best_reward_per_tree)[1],
         )
         for _ in range(repeats + 1)
     ][1:]
     return {"two_to_one": max(one / two for one, two in pairs), "pairs_wall_s": pairs}
-
-
-ONE_THREAD = {"PJRT_NPROC": "1"}
-NO_CACHE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-
-
-def alone(name, *arguments, module="engine", settings=ONE_THREAD):
-    """A measurement of this module, or of another benchmark, in a process of its own with these
-    environment variables: an XLA of one thread, say.
-    """
-    code = (
-        f"import json; from benchmarks import {module};"
-        f" print(json.dumps({module}.{name}(*{arguments!r})))"
-    )
-    env = os.environ | settings | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    return json.loads(
-        subprocess.run(
-            [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, env=env
-        ).stdout.splitlines()[-1]
-    )
-
-
-def here(name, *arguments, module="engine", **_):
-    """The same measurement in this process: compiled programs are shared, figures mean less."""
-    return getattr(importlib.import_module(f"benchmarks.{module}"), name)(*arguments)
 
 
 def compile_time(total=9000, lanes=100):
@@ -336,18 +307,20 @@ def peer(repeats, lanes=200, simulations=500):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.engine", description=__doc__.splitlines()[0]
+    args = options(__doc__, "fewer repetitions, smaller memoization runs").parse_args(argv)
+    repeats = size(args, 5, 2, 1)
+    measure = functools.partial(
+        in_this_process if args.smoke else in_fresh_process, module="engine"
     )
-    args = options(parser, "fewer repetitions, smaller memoization runs").parse_args(argv)
-    repeats, measure = size(args, 5, 2, 1), here if args.smoke else alone
-    least = lambda *arguments: arguments if args.smoke else ()
-    p = problem(9000)
-    one = run.bytes_per_tree(p, run.Plan(18, 500, 1, "node"))
+
+    def least(*arguments):
+        return arguments if args.smoke else ()
+
+    one = run.bytes_per_tree(problem(9000), run.Plan(18, 500, 1, "node"))
+    smallest = (2, 2, 45, [(1, "1 substep")], ["node", "none"])
+    systems = size(args, (100, 18, 100), (32, 4, 100), smallest)
     report = {
-        "processors": (
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        ),
+        "processors": processors(),
         "bytes_per_tree_of_9000": one,
         "bytes_per_node": one / 9000,
         **measure("rates", repeats, *least(2, 2, 45, 1)),
@@ -355,18 +328,9 @@ def main(argv=None):
         "cores": cores(repeats, *least(2, 2, 45)),
         "peer_at_200_x_500": measure("peer", repeats, *least(2, 20)),
         "compile_s": measure("compile_time", *least(90, 2), settings=NO_CACHE),
-        "memoization": measure(
-            "memoization",
-            *size(
-                args, (100, 18, 100), (32, 4, 100), (2, 2, 45, [(1, "1 substep")], ["node", "none"])
-            ),
-        ),
+        "memoization": measure("memoization", *systems),
     }
-    if args.json:
-        print(json.dumps(report, indent=1))
-        return
-    for name, value in report.items():
-        print(f"{name}: {json.dumps(value, default=str)}")
+    print_report(args, report, "\n".join(f"{k}: {json.dumps(v)}" for k, v in report.items()))
 
 
 if __name__ == "__main__":

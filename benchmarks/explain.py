@@ -10,9 +10,7 @@ are none; the area under the ROC curve of monitors; the CPU time of explaining a
 ferry.
 """
 
-import argparse
 import contextlib
-import json
 import math
 import time
 import warnings
@@ -26,14 +24,14 @@ from jax.tree_util import Partial
 import jast
 from benchmarks import stress_systems
 from benchmarks.explain_systems import PLANTED, SIDE, lane, planted, version, walk
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, options, print_report, size
 from jast import explain
 from jast.distributions import Normal
 
 __all__ = ["PARTS", "run"]
 
-GIVEN, FRESH = 400, 1000
-"""Failures that rules are told; fresh failures of each cause, and fresh others."""
+GIVEN = 400  # failures that rules learn from
+FRESH = 1000  # failures of each cause that judge them, and others
 
 
 def minimal(seeds, budget):
@@ -65,16 +63,18 @@ ANY = {(None, "gust"), (None, "delay")}
 
 def rules(seeds, budget):
     """Precision and recall of the rules for each planted cause, on fresh episodes."""
-    return _ruled(seeds, lambda p, seed: p.episodes(p.sample(np.random.default_rng(seed), GIVEN)))
+    return _rules_of_causes(
+        seeds, lambda p, seed: p.episodes(p.sample(np.random.default_rng(seed), GIVEN))
+    )
 
 
 def rules_of_estimates(seeds, budget):
     """The same where the failures are those of an estimate, whose proposal may lack a cause."""
     estimate = jast.estimate.failure_probability
-    return _ruled(seeds, lambda p, seed: estimate(jax.random.key(seed), p.sim, budget))
+    return _rules_of_causes(seeds, lambda p, seed: estimate(jax.random.key(seed), p.sim, budget))
 
 
-def _ruled(seeds, given):
+def _rules_of_causes(seeds, given):
     out = {}
     for name in PLANTED:
         rows = {}
@@ -86,28 +86,28 @@ def _ruled(seeds, given):
                 found = explain.rules(p.sim, failures, key=key)
             cost = time.process_time() - begin
             for cause in range(len(p.causes)):
-                told = (0.0, 0.0, False) if found is None else _fresh(found, p, cause, seed)
+                told = (0.0, 0.0, False) if found is None else _on_fresh(found, p, cause, seed)
                 row = dict(zip(("precision", "recall", "named"), told))
                 row |= dict(cpu_seconds=cost, rules=0 if found is None else len(found.rules))
                 rows.setdefault(cause, []).append(row)
         for cause, each in rows.items():
             label = name if len(rows) == 1 else f"{name}: {'the rarer' if cause else 'the other'}"
-            column = lambda k, each=each: [float(row[k]) for row in each]
+            columns = {k: [float(row[k]) for row in each] for k in each[0]}
             out[label] = dict(
                 both_95=sum(r["precision"] >= 0.95 and r["recall"] >= 0.95 for r in each),
-                named=int(sum(column("named"))),
+                named=int(sum(columns["named"])),
                 seeds=seeds,
-                precision=float(np.median(column("precision"))),
-                worst_precision=min(column("precision")),
-                recall=float(np.median(column("recall"))),
-                worst_recall=min(column("recall")),
-                rules=float(np.mean(column("rules"))),
-                cpu_seconds=float(np.median(column("cpu_seconds"))),
+                precision=float(np.median(columns["precision"])),
+                worst_precision=min(columns["precision"]),
+                recall=float(np.median(columns["recall"])),
+                worst_recall=min(columns["recall"]),
+                rules=float(np.mean(columns["rules"])),
+                cpu_seconds=float(np.median(columns["cpu_seconds"])),
             )
     return out
 
 
-def _fresh(found, p, cause, seed):
+def _on_fresh(found, p, cause, seed):
     """(precision, recall, whether a rule speaks of just what was planted)."""
     rng = np.random.default_rng([seed, 1 + cause])
     bad = p.episodes(p.failing(rng, cause, FRESH))
@@ -116,7 +116,10 @@ def _fresh(found, p, cause, seed):
         jax.tree.map(lambda a, e=e: a[np.flatnonzero(~np.asarray(e.failure))[: FRESH // 2]], e)
         for e in (near, plain)
     ]
-    fails = lambda e: found.predict(e) == "fails"
+
+    def fails(e):
+        return found.predict(e) == "fails"
+
     assert np.asarray(bad.failure).all()
     hits, wrong = int(fails(bad).sum()), sum(int(fails(e).sum()) for e in calm)
     speaks = [{what for what, *_ in rule.conditions} for rule in found.rules]
@@ -157,7 +160,10 @@ def criticality(seeds, budget):
 
 def sensitivity(seeds, budget):
     """How many derivatives are within 2 standard errors of the truth."""
-    hazard = lambda b: NormalDist().pdf(b) / NormalDist().cdf(-b)
+
+    def hazard(b):
+        return NormalDist().pdf(b) / NormalDist().cdf(-b)
+
     beta = 4.0
     spread = math.sqrt(0.1**2 + 10 * 0.03**2)
     cases = {
@@ -170,8 +176,10 @@ def sensitivity(seeds, budget):
             },
         ),
     }
-    out = {name: _within(*case, seeds, budget) for name, case in cases.items()}
-    out["lane (finite differences)"] = _within(lane(0.1, 0.1), _differences(budget), seeds, budget)
+    out = {name: _within_2(*case, seeds, budget) for name, case in cases.items()}
+    out["lane (finite differences)"] = _within_2(
+        lane(0.1, 0.1), _finite_differences(budget), seeds, budget
+    )
     return out
 
 
@@ -195,7 +203,7 @@ def _above(limit, s):
     return s >= limit, jnp.maximum(limit - s, 0.0)
 
 
-def _differences(budget):
+def _finite_differences(budget):
     """(d log P, its standard error) of the lane, by central differences of large estimates."""
     h, out = 0.03, {}
     for i, name in enumerate(("disturbance[0]", "disturbance[1]")):
@@ -212,7 +220,7 @@ def _differences(budget):
     return out
 
 
-def _within(sim, truths, seeds, budget):
+def _within_2(sim, truths, seeds, budget):
     names, z = list(truths), []
     for seed in range(seeds):
         key = jax.random.key(seed)
@@ -328,8 +336,7 @@ PARTS = {
 
 def run(parts, seeds, budget):
     report = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for name in parts:
             report[name] = PARTS[name](seeds, budget)
     return report
@@ -338,7 +345,10 @@ def run(parts, seeds, budget):
 def lines(report, name=""):
     """The report as text, a line for each case."""
     if not any(isinstance(v, dict) for v in report.values()):
-        number = lambda v: f"{v:.4g}" if isinstance(v, float) else str(v)
+
+        def number(v):
+            return f"{v:.4g}" if isinstance(v, float) else str(v)
+
         yield f"{name:<52} " + ", ".join(f"{k} {number(v)}" for k, v in report.items())
         return
     for key, value in report.items():
@@ -350,19 +360,16 @@ QUICK = [part for part in PARTS if part not in ("rules_of_estimates", "sensitivi
 
 
 def main(argv=None):
-    quick = "two seeds, fewer evaluations"
-    parser = options(argparse.ArgumentParser(description=__doc__), quick)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, help="default: all")
+    parser = options(__doc__, "two seeds, fewer evaluations")
+    add_choices(parser, "--parts", PARTS)
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     parts = args.parts or size(args, list(PARTS), QUICK, ["criticality"])
     seeds = args.seeds or size(args, 20, 2, 1)
     budget = size(args, 20_000, 10_000, 2000)
     report = run(parts, seeds, budget)
-    if args.json:
-        print(json.dumps(dict(settings=dict(budget=budget, seeds=seeds), parts=report)))
-    else:
-        print("\n".join(lines(report)))
+    settings = dict(budget=budget, seeds=seeds)
+    print_report(args, dict(settings=settings, parts=report), "\n".join(lines(report)))
 
 
 if __name__ == "__main__":

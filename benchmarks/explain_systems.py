@@ -15,12 +15,14 @@ import numpy as np
 from jax.tree_util import Partial
 
 import jast
+from benchmarks.closed_loops import system
 from jast.distributions import Exponential, Joint, Normal
 
 __all__ = ["PLANTED", "Planted", "lane", "planted", "version", "walk"]
 
-STEPS, DELAY, FIELDS = 50, 0.2, ("delay", "gust")
-"""Steps of an episode, mean delay (s), and what a disturbance has."""
+STEPS = 50  # of an episode
+DELAY = 0.2  # s, the mean
+FIELDS = ("delay", "gust")  # of a disturbance
 PLANTED = (
     "one step of 50",
     "two causes, 1 to 20",
@@ -92,8 +94,13 @@ def planted(name: str, seed: int) -> Planted:
     """One of `PLANTED`, with steps drawn by ``seed``."""
     rng = np.random.default_rng([seed, PLANTED.index(name)])
     first, second = (int(t) for t in 1 + rng.choice(STEPS, 2, replace=False))
-    rare = lambda p: -NormalDist().inv_cdf(p)
-    late = lambda p: -DELAY * math.log(p)
+
+    def rare(p):
+        return -NormalDist().inv_cdf(p)
+
+    def late(p):
+        return -DELAY * math.log(p)
+
     if name == "one step of 50":
         causes = [{(first, "gust"): rare(3e-6)}]
     elif name == "two causes, 1 to 20":
@@ -127,11 +134,11 @@ def _row(x):
     return jnp.stack([x[field] for field in FIELDS])
 
 
-def _watch(limits, s, x):
+def _step_of_causes(limits, s, x):
     return Short(s.t + 1, jnp.maximum(s.short, jnp.max(limits[:, s.t] - _row(x)[None], axis=1)))
 
 
-def _missed(s):
+def _evaluate(s):
     near = jnp.maximum(jnp.min(s.short), 0.0)
     return near <= 0, near
 
@@ -139,35 +146,35 @@ def _missed(s):
 def _planted(limits):
     """Fails where at the end all limits of a cause [k, steps, fields] were passed."""
     return jast.Simulator(
-        init=_unseen,
-        step=Partial(_watch, limits),
+        init=_begin,
+        step=Partial(_step_of_causes, limits),
         disturbance=_weather,
-        evaluate=_missed,
+        evaluate=_evaluate,
         horizon=STEPS,
         episodic=True,
     )
 
 
-def _unseen(x0):
+def _begin(x0):
     return Short(jnp.zeros((), jnp.int32), jnp.full(2, NEVER))
 
 
 def _any_step(limits):
     """Fails at the first step at which all limits [fields] are passed."""
     return jast.Simulator(
-        init=_calm,
-        step=Partial(_at_once, limits),
+        init=_begin_at_once,
+        step=Partial(_step_of_any, limits),
         disturbance=_weather,
-        evaluate=_missed,
+        evaluate=_evaluate,
         horizon=STEPS,
     )
 
 
-def _calm(x0):
+def _begin_at_once(x0):
     return Short(jnp.zeros((), jnp.int32), jnp.full(2, 3.0))
 
 
-def _at_once(limits, s, x):
+def _step_of_any(limits, s, x):
     return Short(s.t + 1, jnp.full(2, jnp.max(limits - _row(x))))
 
 
@@ -175,14 +182,7 @@ def walk(limit, steps=20):
     """A random walk that fails above ``limit`` at its end: from s after t steps with the
     probability Phi((s - limit) / sqrt(steps - t)).
     """
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s >= limit, jnp.maximum(limit - s, 0.0)),
-        horizon=steps,
-        episodic=True,
-    )
+    return system(0.0, lambda s, x: s + x, lambda s: limit - s, 1, steps, episodic=True)
 
 
 class Car(NamedTuple):
@@ -220,16 +220,7 @@ def version(new: bool):
     standard deviations of the sum of two; the new one, by a wrong branch, below -`SIDE`, too.
     """
 
-    def evaluate(s):
-        above, below = 3.6 - s, s + SIDE
-        near = jnp.where(s > 0, above, jnp.maximum(below, 0.0) if new else 10.0)
-        return near <= 0, jnp.maximum(near, 0.0)
+    def distance(s):
+        return jnp.where(s > 0, 3.6 - s, s + SIDE if new else 10.0)
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x / math.sqrt(2),
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=evaluate,
-        horizon=2,
-        episodic=True,
-    )
+    return system(0.0, lambda s, x: s + x / math.sqrt(2), distance, 1, 2, episodic=True)

@@ -12,10 +12,8 @@ between the latent normal numbers of episodes.
 all from the likeliest failure that `jast.search.cem` found.
 """
 
-import argparse
-import json
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -26,7 +24,7 @@ from scipy.spatial.distance import cdist
 import jast
 from benchmarks.limit_states import DYNAMIC, LIMITS, Limit
 from benchmarks.literature import CASES as LITERATURE
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast import limit_state as latent
 from jast.estimate import failure_probability, failure_samples
 from jast.estimate.populations import settled
@@ -34,7 +32,8 @@ from jast.judge import judged
 
 __all__ = ["density_and_coverage", "run"]
 
-NEIGHBOURS, LANES = 5, 50_000
+NEIGHBOURS = 5  # whose distance is the radius of a ball: Naeem et al.
+LANES = 50_000  # points that are judged side by side
 
 
 def density_and_coverage(true: np.ndarray, found: np.ndarray) -> tuple[float, float]:
@@ -44,7 +43,7 @@ def density_and_coverage(true: np.ndarray, found: np.ndarray) -> tuple[float, fl
     return float(within.sum() / (NEIGHBOURS * len(found))), float(within.any(axis=1).mean())
 
 
-def beyond(limit: Limit) -> Callable:
+def beyond_half_spaces(limit: Limit) -> Callable:
     """Draws failures of half-spaces that do not overlap, exactly."""
     directions, beta, _ = limit.parameters
 
@@ -61,11 +60,14 @@ def beyond(limit: Limit) -> Callable:
 
 def both_planes(rng, n):
     """Of the half-planes, exactly."""
-    tail = lambda: stats.norm.isf(rng.random(n) * stats.norm.sf(3))
+
+    def tail():
+        return stats.norm.isf(rng.random(n) * stats.norm.sf(3))
+
     return np.stack([rng.choice((-1, 1), n) * tail(), tail()], axis=1)
 
 
-def rejected(sim: jast.Simulator) -> Callable:
+def by_rejection(sim: jast.Simulator) -> Callable:
     """Draws failures by drawing until there are enough."""
 
     def draw(rng, n):
@@ -79,12 +81,12 @@ def rejected(sim: jast.Simulator) -> Callable:
 
 
 def _static(name):
-    return LIMITS[name].simulator(), beyond(LIMITS[name])
+    return LIMITS[name].simulator(), beyond_half_spaces(LIMITS[name])
 
 
 def _rejected(make):
     sim = make()
-    return sim, rejected(sim)
+    return sim, by_rejection(sim)
 
 
 CASES: dict[str, Callable[[], tuple[jast.Simulator, Callable]]] = {
@@ -134,9 +136,8 @@ def run(name: str, seeds: int, n: int, budget: int, methods: list[str] | None = 
         for seed in range(seeds):
             rng = np.random.default_rng(seed)
             true = _numbers(sim, draw(rng, n).astype(latent.normal_numbers(sim)))
-            cpu = time.process_time()
-            found, evaluations = function(jax.random.key(seed), sim, n, budget)
-            cpu = time.process_time() - cpu
+            key = jax.random.key(seed)
+            (found, evaluations), cpu, _ = timed(partial(function, key, sim, n, budget))
             rows.append((*density_and_coverage(true, found), evaluations, cpu))
         names = "density", "coverage", "evaluations", "cpu_s"
         report[method] = dict(zip(names, np.array(rows).T.tolist(), strict=True))
@@ -144,32 +145,25 @@ def run(name: str, seeds: int, n: int, budget: int, methods: list[str] | None = 
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.failure_samples", description=__doc__.splitlines()[0]
-    )
-    options(parser, "3 seeds of four systems")
-    parser.add_argument("--cases", nargs="+", choices=CASES, metavar="CASE")
+    parser = options(__doc__, "3 seeds of four systems")
+    add_choices(parser, "--cases", CASES)
     parser.add_argument("--seeds", type=int, help="default 10")
     args = parser.parse_args(argv)
-    seeds = args.seeds or size(args, 10, 3, 2)
-    names = args.cases or list(CASES)[: size(args, None, 4, 1)]
-    report = {}
-    for name in names:
-        n, budget = size(args, 1000, 1000, 50), size(args, 100_000, 50_000, 5000)
+    say, report, seeds = printer(args), {}, args.seeds or size(args, 10, 3, 2)
+    n, budget = size(args, 1000, 1000, 50), size(args, 100_000, 50_000, 5000)
+
+    def spread(v):
+        return f"{np.mean(v):.3f} +- {np.std(v, ddof=1) if len(v) > 1 else 0:.3f}"
+
+    for name in args.cases or list(CASES)[: size(args, None, 4, 1)]:
         report[name] = run(name, seeds, n, budget, size(args, None, None, ["failure_samples"]))
         for method, r in report[name].items():
-            if not args.json:
-                spread = lambda v: (
-                    f"{np.mean(v):.3f} +- {np.std(v, ddof=1) if len(v) > 1 else 0:.3f}"
-                )
-                print(
-                    f"{name:20} {method:16} density {spread(r['density'])}  coverage"
-                    f" {spread(r['coverage'])}  evaluations {np.median(r['evaluations']):.0f}"
-                    f"  CPU {np.median(r['cpu_s']):.1f} s",
-                    flush=True,
-                )
-    if args.json:
-        print(json.dumps(report))
+            say(
+                f"{name:20} {method:16} density {spread(r['density'])}  coverage"
+                f" {spread(r['coverage'])}  evaluations {np.median(r['evaluations']):.0f}"
+                f"  CPU {np.median(r['cpu_s']):.1f} s"
+            )
+    print_report(args, report)
 
 
 if __name__ == "__main__":

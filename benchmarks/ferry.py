@@ -7,16 +7,15 @@ Lytskjold and Mengshoel, Table 1, 200 trees each. ``--table1 [--seeds N] [--pict
 that table, networks included, and where they pay (`benchmarks.table1`).
 """
 
-import argparse
 import json
 import pathlib
-import time
+from functools import partial
 
 import jax
 import numpy as np
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast.intervals import clopper_pearson
 
 DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data" / "ferry"
@@ -48,21 +47,10 @@ def golden():
     for bits in (32, 64):
         with jax.enable_x64(bits == 64):
             sim = jast.simulators.ferry()
-            found = [
-                float(jast.replay(sim, np.array(e["seeds"]), reward=REWARD).reward)
-                for e in episodes
-            ]
-        errors[f"float{bits}"] = float(
-            np.max(np.abs(np.array(found) - [e["reward"] for e in episodes]))
-        )
+            replayed = [jast.replay(sim, np.array(e["seeds"]), reward=REWARD) for e in episodes]
+        off = [float(r.reward) - e["reward"] for r, e in zip(replayed, episodes, strict=True)]
+        errors[f"float{bits}"] = float(np.abs(off).max())
     return {"episodes": len(episodes), "greatest_error": errors}
-
-
-def timed(function):
-    """What a function returns, its CPU and its wall seconds."""
-    start = time.process_time(), time.perf_counter()
-    result = function()
-    return result, time.process_time() - start[0], time.perf_counter() - start[1]
 
 
 def outcome(best):
@@ -99,27 +87,15 @@ def rows(trees, prunes=18, simulations=500):
     """Name -> search of S0 (and S0b)."""
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
 
+    common = dict(trees=trees, reward=REWARD, actions=BOX)
+
     def forest(sim=s0, **settings):
-        return lambda key: jast.search.forest(
-            key,
-            sim,
-            trees=trees,
-            prunes=prunes,
-            simulations=simulations,
-            reward=REWARD,
-            **dict(actions=BOX) | settings,
-        )
+        sizes = dict(prunes=prunes, simulations=simulations)
+        return partial(jast.search.forest, sim=sim, **(common | sizes | settings))
 
     def mcts(**settings):
-        return lambda key: jast.search.mcts(
-            key,
-            s0,
-            trees=trees,
-            simulations=prunes * simulations,
-            reward=REWARD,
-            actions=BOX,
-            **settings,
-        )
+        total = prunes * simulations
+        return partial(jast.search.mcts, sim=s0, simulations=total, **common, **settings)
 
     return {
         "forest, paper": forest(mode="paper"),
@@ -145,10 +121,7 @@ SMOKE = ("forest, paper", "mcts, paper", "monte carlo", "cem")
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.ferry", description=__doc__.splitlines()[0]
-    )
-    options(parser, "100 trees a row; of --table1 also fewer rows")
+    parser = options(__doc__, "100 trees a row; of --table1 also fewer rows")
     parser.add_argument("--trees", type=int, help="trees a row (default 1000; of --table1 200)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
@@ -167,33 +140,27 @@ def main(argv=None):
         from benchmarks import table1
 
         return table1.report(args)
-    trees = args.trees or size(args, 1000, 100, 2)
+    say, trees = printer(args), args.trees or size(args, 1000, 100, 2)
     report = {"golden": golden(), "seed": args.seed, "rows": {}}
-    if not args.json:
-        print("golden episodes:", report["golden"] or "data not found")
-        print(
-            f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
-            f" {'of 200: least, median':>21} {'CPU s':>7}"
-        )
+    say("golden episodes:", report["golden"] or "data not found")
+    say(
+        f"{'search':32} {'trees':>5} {'rate %':>7} {'95 %':>13} {'mean best':>15} {'best':>7}"
+        f" {'of 200: least, median':>21} {'CPU s':>7}"
+    )
     table = rows(trees, *((2, 45) if args.smoke else ()))
-    shown = size(args, [*table], [name for name in table if name not in QUICK], SMOKE)
-    for name in shown:
-        search = table[name]
-        report["rows"][name] = r = row(search, args.seed)
-        if not args.json:
-            low, high = (100 * v for v in r["rate_95"])
-            of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
-            mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
-            print(
-                f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f}"
-                f" {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}",
-                flush=True,
-            )
-            if name in PUBLISHED:
-                rate, mean, best = PUBLISHED[name]
-                print(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
-    if args.json:
-        print(json.dumps(report, indent=1))
+    for name in size(args, [*table], [name for name in table if name not in QUICK], SMOKE):
+        report["rows"][name] = r = row(table[name], args.seed)
+        low, high = (100 * v for v in r["rate_95"])
+        of_200 = "{:.3f}, {:.3f}".format(*r["best_of_200"][:2]) if r["best_of_200"] else "-"
+        mean = f"{r['mean_best']:.2f} +- {r['mean_best_95']:.2f}"
+        say(
+            f"{name:32} {r['trees']:5d} {100 * r['rate']:7.1f} {low:5.1f} to {high:5.1f}"
+            f" {mean:>15} {r['best']:7.3f} {of_200:>21} {r['cpu_s']:7.1f}"
+        )
+        if name in PUBLISHED:
+            rate, mean, best = PUBLISHED[name]
+            say(f"{'  published':32} {200:5d} {rate:7.1f} {'':14} {mean:14.2f} {best:7.3f}")
+    print_report(args, report)
 
 
 if __name__ == "__main__":

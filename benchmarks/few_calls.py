@@ -7,33 +7,25 @@ many estimates are flagged, and the silent misses: unflagged, and off by more th
 errors. CPU seconds are of the method, the first of a system compiles.
 """
 
-import argparse
-import json
 import math
-import os
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.tree_util import Partial  # noqa: E402
-
-from benchmarks.limit_states import four_branch, four_branch_probability  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast.blackbox import from_python  # noqa: E402
-from jast.distributions import (  # noqa: E402
-    Joint,
-    MultivariateNormalDiag,
-    Normal,
-    TruncatedNormal,
-)
-from jast.estimate import failure_probability  # noqa: E402
-from jast.simulator import Simulator  # noqa: E402
-from jast.simulators import limit_state  # noqa: E402
+from benchmarks.limit_states import four_branch, four_branch_probability
+from benchmarks.probability import summary
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
+from jast.blackbox import from_python
+from jast.distributions import Joint, MultivariateNormalDiag, Normal, TruncatedNormal
+from jast.estimate import failure_probability
+from jast.simulator import Simulator
+from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "System", "metaballs"]
 
@@ -137,30 +129,19 @@ SYSTEMS = {
 }
 
 
-def measured(system: System, seeds: int, budget: int | None) -> dict:
+def report_of(system: System, seeds: int, budget: int | None) -> dict:
     """The report of some seeds."""
     sim, runs, seconds, walls = system.make(), [], [], []
     for seed in range(seeds):
-        clock, wall = time.process_time(), time.perf_counter()
-        runs.append(failure_probability(jax.random.key(seed), sim, budget or system.budget))
-        seconds.append(time.process_time() - clock)
-        walls.append(time.perf_counter() - wall)
-    ratio = np.array([r.mean / system.truth for r in runs])
-    error = np.array([r.relative_error for r in runs])
-    reliable = np.array([r.reliable for r in runs])
-    covers = np.array([r.interval[0] <= system.truth <= r.interval[1] for r in runs])
-    near = np.abs(ratio - 1) < 0.1
-    silent = reliable & (np.abs(ratio - 1) > 4 * error)
-    return {
+        key = jax.random.key(seed)
+        run = timed(partial(failure_probability, key, sim, budget or system.budget))
+        for parts, part in zip((runs, seconds, walls), run, strict=True):
+            parts.append(part)
+    report = summary([(r, system.truth) for r in runs])
+    near = [abs(r.mean / system.truth - 1) < 0.1 for r in runs]
+    return report | {
         "budget": budget or system.budget,
-        "seeds": seeds,
-        "rms": float(np.sqrt(np.nanmean((ratio - 1) ** 2))),
-        "within_10": int(near.sum()),
-        "covers": int(covers.sum()),
-        "flagged": int((~reliable).sum()),
-        "silent": int(silent.sum()),
-        "ratios": ratio.tolist(),
-        "relative_errors": error.tolist(),
+        "within_10": sum(near),
         "cpu_s": float(np.median(seconds)),
         "cpu_s_first": seconds[0],
         "wall_s": float(np.median(walls)),
@@ -168,39 +149,22 @@ def measured(system: System, seeds: int, budget: int | None) -> dict:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.few_calls", description=__doc__.splitlines()[0]
-    )
-    options(parser, "3 seeds")
+    parser = options(__doc__, "3 seeds")
     parser.add_argument("--seeds", type=int, help="20")
     parser.add_argument("--budget", type=int, help="of each system; default 200, of Booth 999")
-    parser.add_argument(
-        "--systems",
-        nargs="+",
-        choices=SYSTEMS,
-        metavar="NAME",
-        help=", ".join(SYSTEMS),
-    )
+    add_choices(parser, "--systems", SYSTEMS)
     args = parser.parse_args(argv)
-    seeds, report = args.seeds or size(args, 20, 3, 1), {}
-    names = args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["hyperplane 10"])
+    say, report, seeds = printer(args), {}, args.seeds or size(args, 20, 3, 1)
     budget = args.budget or size(args, None, None, 50)
-    if not args.json:
-        print(
-            f"{'system':18}calls      rms  within 10 %  covers  flagged  silent"
-            "  CPU s (first)  wall s"
+    say(f"{'system':18}calls      rms  within 10 %  covers  flagged  silent  CPU s (first)  wall s")
+    for name in args.systems or size(args, list(SYSTEMS), list(SYSTEMS), ["hyperplane 10"]):
+        report[name] = r = report_of(SYSTEMS[name], seeds, budget)
+        say(
+            f"{name:18}{r['budget']:5d}{100 * r['rms']:8.1f} %{r['within_10']:8d} of"
+            f" {seeds:<2d}{r['covers']:7d}{r['flagged']:9d}{r['far_unflagged']:8d}"
+            f"{r['cpu_s']:8.1f} ({r['cpu_s_first']:.1f}){r['wall_s']:10.1f}"
         )
-    for name in names:
-        report[name] = r = measured(SYSTEMS[name], seeds, budget)
-        if not args.json:
-            print(
-                f"{name:18}{r['budget']:5d}{100 * r['rms']:8.1f} %{r['within_10']:8d} of"
-                f" {seeds:<2d}{r['covers']:7d}{r['flagged']:9d}{r['silent']:8d}"
-                f"{r['cpu_s']:8.1f} ({r['cpu_s_first']:.1f}){r['wall_s']:10.1f}",
-                flush=True,
-            )
-    if args.json:
-        print(json.dumps(report))
+    print_report(args, report)
 
 
 if __name__ == "__main__":

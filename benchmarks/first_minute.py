@@ -9,10 +9,7 @@ over that of importing JAX, and the first and the second ``python -m jast``, fro
 Systems of other people's libraries are left out where the library is not installed.
 """
 
-import argparse
 import dataclasses
-import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -22,24 +19,32 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.doors import fresh, simulator  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast import _jax  # noqa: E402
-from jast.distributions import Normal  # noqa: E402
-from jast.limit_state import dimension, outcome  # noqa: E402
+import jast
+from benchmarks.doors import simulator
+from benchmarks.sizes import (
+    NO_CACHE,
+    add_choices,
+    in_fresh_process,
+    installed,
+    options,
+    print_report,
+    printer,
+    size,
+)
+from jast import _jax
+from jast.distributions import Normal
+from jast.limit_state import dimension, outcome
 
 __all__ = ["SYSTEMS", "calls"]
 
 MARK = "the_users_step"
 """Stands in the text of each program that contains the step."""
 TIMES = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
-LANES, TIMES_PLAYED = 128, 10
+LANES = 128  # episodes side by side
+TIMES_PLAYED = 10  # after compilation
 IMPORTS = 5
 """Fresh processes, of which the quickest counts."""
 
@@ -52,7 +57,9 @@ def lane() -> jast.Simulator:
         speed = 0.8 * speed - 0.3 * offset + 0.1 * gust
         return jnp.stack([offset + speed, speed])
 
-    off = lambda car: jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)
+    def off(car):
+        return jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)
+
     return jast.Simulator(
         init=lambda x0: jnp.zeros(2),
         step=step,
@@ -79,15 +86,19 @@ SYSTEMS: dict[str, tuple[Callable, Callable, tuple, str]] = {
 """Name -> simulator, call, its budget and another one, and the library that it is made of."""
 
 
-def calls(make: Callable, call: Callable, budgets: tuple) -> list[dict[str, float]]:
-    """What each of the four calls takes, in this process."""
+def calls(name: str, least: bool) -> list[dict[str, float]]:
+    """What each of the four calls of a system takes, in this process."""
+    make, call, budgets, _ = SYSTEMS[name]
+    budget, another = (2000, 3000) if least else budgets
     sim = make()
     named = jax.named_scope(MARK)(sim.step)
     sim = dataclasses.replace(sim, step=lambda s, x: named(s, x))
     one, other = jax.random.split(jax.random.key(0))
-    budget, another = budgets
     rows, events = [], []
-    heard = lambda event, seconds, **_: events.append((event.rsplit("/", 1)[1], seconds))
+
+    def heard(event, seconds, **_):
+        return events.append((event.rsplit("/", 1)[1], seconds))
+
     jax.monitoring.register_event_duration_secs_listener(heard)
     with tempfile.TemporaryDirectory() as folder:
         for key, evaluations in ((one, budget), (one, budget), (other, budget), (one, another)):
@@ -152,57 +163,43 @@ def command_line(arguments: list[str]) -> list[float]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    options(parser, "lane and plane, without the command line")
-    parser.add_argument("--systems", nargs="+", choices=list(SYSTEMS))
+    parser = options(__doc__, "lane and plane, without the command line")
+    add_choices(parser, "--systems", SYSTEMS)
     parser.add_argument(
         "--ways", action="store_true", help="what each way of compiling costs and gives, alone"
     )
-    parser.add_argument("--call", choices=list(SYSTEMS), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
-    if args.call:
-        make, call, budgets, _ = SYSTEMS[args.call]
-        print(json.dumps(calls(make, call, (2000, 3000) if args.smoke else budgets)))
-        return
-    few = [name for name in SYSTEMS if name in ("lane", "plane of 20 numbers")]
+    say, few = printer(args), ["lane", "plane of 20 numbers"]
     names = args.systems or size(args, list(SYSTEMS), few, few[-1:])
-    absent = lambda name: SYSTEMS[name][3] and not importlib.util.find_spec(SYSTEMS[name][3])
+    absent = [name for name in names if not installed(SYSTEMS[name][3] or "jast")]
     if args.ways:
-        told = {name: ways(SYSTEMS[name][0]) for name in names if not absent(name)}
-        if args.json:
-            print(json.dumps(told))
-            return
-        print(
-            f"{'':32}{'as JAX does':>20}{'briefly':>20}{'quickly':>20}   compile s, us an episode"
-        )
-        for name, rows in told.items():
-            print(f"{name:32}" + "".join(f"{c:10.2f}{us:10.1f}" for c, us in rows))
-        return
-    alone = lambda name: ["--call", name, *["--smoke"] * args.smoke]
-    results = {
-        name: None if absent(name) else fresh("benchmarks.first_minute", *alone(name))
-        for name in names
-    }
-    times = size(args, IMPORTS, IMPORTS, 1)
-    results["import jast / import jax"] = importing("jast", times) / importing("jax", times)
-    if not (args.quick or args.smoke):
-        results["python -m jast"] = command_line([])
-    if args.json:
-        print(json.dumps(results))
-        return
-    print(f"{'call':32}{'CPU s':>8}{'wall s':>8}{'programs':>10}{'compile s':>11}{'step in':>9}")
+        found = {name: ways(SYSTEMS[name][0]) for name in names if name not in absent}
+        say(f"{'':32}{'as JAX does':>20}{'briefly':>20}{'quickly':>20}   compile s, us an episode")
+        for name, rows in found.items():
+            say(f"{name:32}" + "".join(f"{c:10.2f}{us:10.1f}" for c, us in rows))
+        return print_report(args, found)
+    results = {}
+    say(f"{'call':32}{'CPU s':>8}{'wall s':>8}{'programs':>10}{'compile s':>11}{'step in':>9}")
     for name in names:
+        results[name] = None
+        if name in absent:
+            say(f"{name:32}{SYSTEMS[name][3]} is not installed")
+            continue
+        results[name] = in_fresh_process(
+            "calls", name, args.smoke, module="first_minute", settings=NO_CACHE
+        )
         which = ("first", "again", "another key", "another budget")
-        for kind, row in zip(which, results[name] or (), strict=False):
+        for kind, row in zip(which, results[name], strict=True):
             cpu, wall, programs, compilation, steps = row.values()
             label = f"{name}, {kind}"
-            print(f"{label:32}{cpu:8.1f}{wall:8.1f}{programs:10}{compilation:11.1f}{steps:9}")
-        if results[name] is None:
-            print(f"{name:32}{SYSTEMS[name][3]} is not installed")
-    print(f"import jast / import jax: {results['import jast / import jax']:.2f}")
-    if "python -m jast" in results:
-        first, second = results["python -m jast"]
-        print(f"python -m jast: {first:.1f} s, then {second:.1f} s")
+            say(f"{label:32}{cpu:8.1f}{wall:8.1f}{programs:10}{compilation:11.1f}{steps:9}")
+    times = size(args, IMPORTS, IMPORTS, 1)
+    ratio = results["import jast / import jax"] = importing("jast", times) / importing("jax", times)
+    say(f"import jast / import jax: {ratio:.2f}")
+    if not (args.quick or args.smoke):
+        first, second = results["python -m jast"] = command_line([])
+        say(f"python -m jast: {first:.1f} s, then {second:.1f} s")
+    print_report(args, results)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ seeds. The control is the same search on the predictor without its defect. CPU t
 one call for all seeds, compilation included.
 """
 
-import argparse
-import json
 import warnings
 
 import jax
@@ -18,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.ferry import timed
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast.distributions import Independent, Normal
 from jast.simulators.fms import MEANS, SIGMAS, fms
 
@@ -39,20 +36,26 @@ SMOKE = ("monte carlo", "cross-entropy", "mcts", "forest")
 def searches(evaluations, seeds):
     """Name -> (the search of a simulator, settings of the simulator)."""
     safe = jast.rewards.episodic()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore"):
         warnings.simplefilter("ignore", UserWarning)  # as printed, for the comparison
         printed = jast.rewards.episodic(mode="thesis")
     # the thesis's proposal: distances of 1 nmi, give or take 3
     near = Independent(
         Normal(jnp.asarray(MEANS).at[1].set(1.0), jnp.asarray(SIGMAS).at[1].set(3.0)), 1
     )
-    monte_carlo = lambda key, sim: jast.search.monte_carlo(
-        key, sim, episodes=evaluations * seeds, reward=safe, record=True
-    )
+
+    def monte_carlo(key, sim):
+        return jast.search.monte_carlo(
+            key, sim, episodes=evaluations * seeds, reward=safe, record=True
+        )
+
     plain = jast.actions.samples()
-    mcts = lambda key, sim, **of: jast.search.mcts(
-        key, sim, trees=seeds, simulations=evaluations, record=True, actions=plain, **of
-    )
+
+    def mcts(key, sim, **of):
+        return jast.search.mcts(
+            key, sim, trees=seeds, simulations=evaluations, record=True, actions=plain, **of
+        )
+
     cem = dict(
         samples=evaluations // 10,
         elites=evaluations // 100,
@@ -142,7 +145,7 @@ def summary(result, seeds, baseline=None):
     }
 
 
-def run(evaluations, seeds, control_seeds, key=0, names=None):
+def run(evaluations, seeds, control_seeds, say, key=0, names=None):
     """The table; ``names``: of these searches alone."""
     keys, out, baseline = jax.random.split(jax.random.key(key), 7), {}, None
     for k, (name, (search, settings)) in zip(
@@ -158,7 +161,7 @@ def run(evaluations, seeds, control_seeds, key=0, names=None):
             t = result.trials
             baseline = float(t.log_prob[t.failure].mean())
             out[name] |= {"log_p_less_monte_carlo": mean([0.0])}
-        print(line(name, out[name]), flush=True)
+        say(line(name, out[name]))
     for k, (name, (search, settings)) in zip(
         keys, searches(evaluations, control_seeds).items(), strict=True
     ):
@@ -183,12 +186,15 @@ def spread(shares):
 
 def line(name, row):
     """A row of the table in words."""
-    of = lambda v, digits=1: (
-        "-"
-        if v is None
-        else f"{v['mean']:.{digits}f}"
-        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
-    )
+
+    def of(v, digits=1):
+        return (
+            "-"
+            if v is None
+            else f"{v['mean']:.{digits}f}"
+            + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
+        )
+
     return (
         f"{name:15} {of(row['failures']):>16} {row['failures_median']:7.0f}"
         f" {100 * row['share_of_simulations']:6.2f}% {row['first_failure_median']:7.0f}"
@@ -199,37 +205,20 @@ def line(name, row):
 
 
 def main(argv=None):
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    options(parser, "10 seeds, in under two minutes")
-    parser.add_argument(
-        "--seeds",
-        type=int,
-        default=None,
-        help="independent searches of each method (default 100, with --quick 10)",
-    )
+    parser = options(__doc__, "10 seeds, in under two minutes")
+    help = "independent searches of each method (default 100, with --quick 10)"
+    parser.add_argument("--seeds", type=int, help=help)
     args = parser.parse_args(argv)
-    seeds, evaluations = args.seeds or size(args, 100, 10, 2), 100 if args.smoke else EVALUATIONS
-    print(f"{evaluations} evaluations, {seeds} seeds\n{HEADER}")
+    say, seeds = printer(args), args.seeds or size(args, 100, 10, 2)
+    evaluations = 100 if args.smoke else EVALUATIONS
+    say(f"{evaluations} evaluations, {seeds} seeds\n{HEADER}")
+    names = SMOKE if args.smoke else None
     with jax.enable_x64(True):
-        table = run(evaluations, seeds, min(seeds, 10), names=SMOKE if args.smoke else None)
-    print(
-        "on the predictor without its defect: "
-        + ", ".join(f"{name} {row['control_failures']}" for name, row in table.items())
-        + " failures"
-    )
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "evaluations": evaluations,
-                    "seeds": seeds,
-                    "published": PUBLISHED,
-                    "methods": table,
-                },
-                indent=1,
-            )
-        )
+        table = run(evaluations, seeds, min(seeds, 10), say, names=names)
+    controls = ", ".join(f"{name} {row['control_failures']}" for name, row in table.items())
+    say(f"on the predictor without its defect: {controls} failures")
+    sizes = dict(evaluations=evaluations, seeds=seeds)
+    print_report(args, sizes | dict(published=PUBLISHED, methods=table))
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ first-order and the total ones are from the truth, and how often their 95 % inte
 keys; and the CPU time beyond that of the estimate.
 """
 
-import argparse
-import json
 import time
 from statistics import NormalDist
 from typing import Any
@@ -17,7 +15,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators import limit_state
 
 __all__ = ["CASES", "run"]
@@ -32,7 +30,10 @@ def plane(a: Any, beta: float) -> tuple[Any, float, list, list]:
     z = np.linspace(-9, 9, 4001)
     weight = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * (z[1] - z[0])
     p = float(PHI(-beta))
-    square = lambda r: float(weight @ PHI((r * z - beta) / np.sqrt(1 - r * r)) ** 2)
+
+    def square(r):
+        return float(weight @ PHI((r * z - beta) / np.sqrt(1 - r * r)) ** 2)
+
     first = [(square(r) - p * p) / (p - p * p) for r in a]
     total = [1 - (square(np.sqrt(1 - r * r)) - p * p) / (p - p * p) for r in a]
     given = Partial(_plane, jnp.asarray(a, float), jnp.asarray(beta))
@@ -100,19 +101,17 @@ def run(seeds: int, budget: int, draws: int) -> dict:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "fewer keys")
-    args = parser.parse_args(argv)
+    args = options(__doc__, "fewer keys").parse_args(argv)
+    say = printer(args)
     report = run(*size(args, (40, 20_000, 400), (10, 20_000, 400), (1, 5000, 20)))
-    if args.json:
-        print(json.dumps(report))
-        return
-    print("case                  P         first     error  cover   total  error  cover  CPU s")
+    say("case                  P         first     error  cover   total  error  cover  CPU s")
     for name, r in report.items():
-        print(
+        say(
             f"{name:<20} {r['probability']:9.3g} {r['first']:9.3g}  {100 * r['error_first']:5.1f} %"
             f"  {100 * r['cover_first']:3.0f} %  {r['total']:6.3f}  {100 * r['error_total']:4.1f} %"
             f"  {100 * r['cover_total']:3.0f} %  {r['cpu_seconds']:.2f}"
         )
+    print_report(args, report)
 
 
 if __name__ == "__main__":

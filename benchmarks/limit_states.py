@@ -9,9 +9,7 @@ compiled program. A limit state ``g(*parameters, x [..., d], np)`` fails where i
 I_d); it is written once for two array libraries.
 """
 
-import argparse
 import functools
-import json
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +21,7 @@ from jax.tree_util import Partial
 from scipy import integrate, optimize, stats
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size
 from jast.simulators import autoregression, landing, limit_state, pendulum, ruin, walk1d
 
 __all__ = ["FAMILIES", "LIMITS", "Case", "Limit", "cases", "draw", "limit"]
@@ -117,10 +115,12 @@ def sphere_probability(offset, radius, side, d):
     """By the coordinate y along the centre, y = offset + radius sin t, and the chi-square of the d
     - 1 others.
     """
-    y, rest = lambda t: offset + radius * np.sin(t), stats.chi2.cdf if side < 0 else stats.chi2.sf
-    within = lambda t: (
-        stats.norm.pdf(y(t)) * rest((radius * np.cos(t)) ** 2, d - 1) * radius * np.cos(t)
-    )
+    rest = stats.chi2.cdf if side < 0 else stats.chi2.sf
+
+    def within(t):
+        y, slope = offset + radius * np.sin(t), radius * np.cos(t)
+        return stats.norm.pdf(y) * rest(slope**2, d - 1) * slope
+
     beyond = stats.norm.sf(offset + radius) + stats.norm.cdf(offset - radius) if side > 0 else 0.0
     return _simpson(within, -np.pi / 2, np.pi / 2) + beyond
 
@@ -138,17 +138,16 @@ def first_passage(decay, spread, threshold, steps, two_sided=False, nodes=300):
     """P(s or abs(s) >= threshold within ``steps``), s' = decay s + spread N(0, 1) from 0, by
     Nystrom: the mass that passes is summed step by step.
     """
-    low = (
-        -threshold
-        if two_sided
-        else -9.0 * np.sqrt(spread**2 * np.sum(decay ** (2 * np.arange(steps))))
-    )
+    deviation = np.sqrt(spread**2 * np.sum(decay ** (2 * np.arange(steps))))
+    low = -threshold if two_sided else -9.0 * deviation
     x, w = np.polynomial.legendre.leggauss(nodes)
     x, w = low + (x + 1) * (threshold - low) / 2, w * (threshold - low) / 2
-    passes = lambda s: (
-        stats.norm.sf((threshold - decay * s) / spread)
-        + (stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0)
-    )
+
+    def passes(s):
+        return stats.norm.sf((threshold - decay * s) / spread) + (
+            stats.norm.cdf((-threshold - decay * s) / spread) if two_sided else 0.0
+        )
+
     kernel, out = stats.norm.pdf((x[:, None] - decay * x) / spread) / spread * w, w * passes(x)
     density, total = stats.norm.pdf(x / spread) / spread, passes(0.0)
     for _ in range(steps - 1):
@@ -162,9 +161,8 @@ def walk_probability(threshold, steps, two_sided, nodes=300):
 
 
 def autoregression_probability(rate, threshold, steps, nodes=300):
-    return first_passage(
-        np.exp(-rate), np.sqrt(-np.expm1(-2 * rate)), threshold, steps, nodes=nodes
-    )
+    spread = np.sqrt(-np.expm1(-2 * rate))
+    return first_passage(np.exp(-rate), spread, threshold, steps, nodes=nodes)
 
 
 def ruin_probability(up, start, goal, steps):
@@ -181,37 +179,28 @@ def _solve(probability, target, low, high):
     """The parameter with this probability, which falls with it; where its range does not contain
     it, the nearer end.
     """
-    gap = lambda v: np.log(max(probability(v), 1e-300)) - np.log(target)
-    return (
-        low
-        if gap(low) <= 0
-        else high
-        if gap(high) >= 0
-        else float(optimize.brentq(gap, low, high, rtol=1e-4))
-    )
+
+    def gap(v):
+        return np.log(max(probability(v), 1e-300)) - np.log(target)
+
+    if gap(low) <= 0:
+        return low
+    return high if gap(high) >= 0 else float(optimize.brentq(gap, low, high, rtol=1e-4))
 
 
 # fixed
 
 
 def _plane(d, beta=5.0):
-    return Limit(
-        half_spaces,
-        (np.full((1, d), d**-0.5), np.array([beta]), np.ones(1)),
-        d,
-        float(stats.norm.sf(beta)),
-    )
+    parameters = np.full((1, d), d**-0.5), np.array([beta]), np.ones(1)
+    return Limit(half_spaces, parameters, d, float(stats.norm.sf(beta)))
 
 
 def _landing_static():
     a = np.append(0.1, np.full(10, 0.03))
     size = np.sqrt(a @ a)
-    return Limit(
-        half_spaces,
-        (np.stack([a, -a]) / size, np.full(2, 1 / size), np.full(2, size)),
-        11,
-        4.0236721906842e-13,
-    )
+    parameters = np.stack([a, -a]) / size, np.full(2, 1 / size), np.full(2, size)
+    return Limit(half_spaces, parameters, 11, 4.0236721906842e-13)
 
 
 LIMITS = {
@@ -234,9 +223,8 @@ DYNAMIC = {
 def cases(names=None):
     """The fixed cases, all or those named: a list of `Case`."""
     make = {name: (l.simulator, l.truth) for name, l in LIMITS.items()} | DYNAMIC
-    return [
-        Case(name, make[name][0](), make[name][1]) for name in (make if names is None else names)
-    ]
+    chosen = make if names is None else names
+    return [Case(name, make[name][0](), make[name][1]) for name in chosen]
 
 
 # families: (rng, P) -> Limit, or (simulator, truth)
@@ -248,20 +236,14 @@ def _directions(rng, m, d):
 
 def two_sided(rng, P, dimensions=(2, 5, 20), spread=0.0):
     """Two half-spaces, opposite or at a right angle, the second with 2 to 50 % of the mass."""
-    d, opposite, share = (
-        int(rng.choice(dimensions)),
-        rng.random() < 0.5,
-        10 ** rng.uniform(np.log10(0.02), np.log10(0.5)),
-    )
+    d = int(rng.choice(dimensions))
+    opposite = rng.random() < 0.5
+    share = 10 ** rng.uniform(np.log10(0.02), np.log10(0.5))
     a, p = _directions(rng, 2, d), P * np.array([1 - share, share])
     if opposite:
         a[1] = -a[0]
-    return Limit(
-        half_spaces,
-        (a, stats.norm.isf(p), 10 ** rng.uniform(-spread, spread, 2)),
-        d,
-        float(p.sum()) if opposite else any_of(p),
-    )
+    parameters = a, stats.norm.isf(p), 10 ** rng.uniform(-spread, spread, 2)
+    return Limit(half_spaces, parameters, d, float(p.sum()) if opposite else any_of(p))
 
 
 def scaled(rng, P):
@@ -277,28 +259,18 @@ def high_dimensional(rng, P):
     """
     l = two_sided(rng, P, (50, 100, 200))
     a, beta, slope = l.parameters
+    truth = float(stats.norm.sf(beta).sum())
     if rng.random() < 0.5:
-        return Limit(
-            half_spaces,
-            (np.stack([a[0], -a[0]]), np.array([stats.norm.isf(P), 40.0]), slope),
-            l.dimension,
-            P,
-        )
-    return Limit(
-        half_spaces,
-        (np.stack([a[0], -a[0]]), beta, slope),
-        l.dimension,
-        float(stats.norm.sf(beta).sum()),
-    )
+        beta, truth = np.array([stats.norm.isf(P), 40.0]), P
+    return Limit(half_spaces, (np.stack([a[0], -a[0]]), beta, slope), l.dimension, truth)
 
 
 def union(rng, P):
     """2, 4 or 8 orthogonal half-spaces of unequal mass in 10 dimensions."""
     m = int(rng.choice((2, 4, 8)))
     p = P * rng.dirichlet(np.full(m, 2.0))
-    return Limit(
-        half_spaces, (_directions(rng, m, 10), stats.norm.isf(p), np.ones(m)), 10, any_of(p)
-    )
+    parameters = _directions(rng, m, 10), stats.norm.isf(p), np.ones(m)
+    return Limit(half_spaces, parameters, 10, any_of(p))
 
 
 def intersection(rng, P):
@@ -312,18 +284,16 @@ def curved(rng, P):
     """A parabola in 1 or 4 of the other coordinates, with k beta from -.35 (a wide region) to 1.5
     (a narrow one).
     """
-    m, d, c = (
-        int(rng.choice((1, 4))),
-        int(rng.choice((5, 20))),
-        rng.uniform(*((-0.35, -0.05) if rng.random() < 0.5 else (0.05, 1.5))),
-    )
+    m, d = int(rng.choice((1, 4))), int(rng.choice((5, 20)))
+    c = rng.uniform(*((-0.35, -0.05) if rng.random() < 0.5 else (0.05, 1.5)))
     beta = _solve(lambda b: parabola_probability(b, c / b, m), P, 0.5, 9.0)
-    return Limit(
-        parabola,
-        (_directions(rng, 1 + m, d), beta, c / beta),
-        d,
-        parabola_probability(beta, c / beta, m),
-    )
+    parameters = _directions(rng, 1 + m, d), beta, c / beta
+    return Limit(parabola, parameters, d, parabola_probability(beta, c / beta, m))
+
+
+def _sphere(rng, offset, radius, side, d):
+    parameters = offset * _directions(rng, 1, d)[0], radius, float(side)
+    return Limit(sphere, parameters, d, sphere_probability(offset, radius, side, d))
 
 
 def outside(rng, P):
@@ -332,24 +302,14 @@ def outside(rng, P):
     """
     d, offset = int(rng.choice((2, 5, 10))), rng.uniform(0.2, 2) * (rng.random() < 0.5)
     radius = _solve(lambda r: sphere_probability(offset, r, 1, d), P, 0.5, 14.0)
-    return Limit(
-        sphere,
-        (offset * _directions(rng, 1, d)[0], radius, 1.0),
-        d,
-        sphere_probability(offset, radius, 1, d),
-    )
+    return _sphere(rng, offset, radius, 1, d)
 
 
 def inside(rng, P):
     """Inside of a sphere of radius 1 to 4."""
     d, radius = int(rng.choice((2, 5))), rng.uniform(1, 4)
     offset = _solve(lambda c: sphere_probability(c, radius, -1, d), P, 0.0, 14.0)
-    return Limit(
-        sphere,
-        (offset * _directions(rng, 1, d)[0], radius, -1.0),
-        d,
-        sphere_probability(offset, radius, -1, d),
-    )
+    return _sphere(rng, offset, radius, -1, d)
 
 
 def branches(rng, P):
@@ -370,10 +330,9 @@ def walks(rng, P):
     """walk1d, either form, to a threshold of this probability."""
     form = str(rng.choice(("one-sided", "two-sided")))
     steps = walk1d(form).horizon
-    threshold = _solve(lambda c: walk_probability(c, steps, form == "two-sided", 150), P, 0.5, 60.0)
-    return walk1d(form, threshold=threshold), walk_probability(
-        threshold, steps, form == "two-sided"
-    )
+    both = form == "two-sided"
+    threshold = _solve(lambda c: walk_probability(c, steps, both, 150), P, 0.5, 60.0)
+    return walk1d(form, threshold=threshold), walk_probability(threshold, steps, both)
 
 
 def autoregressions(rng, P):
@@ -459,35 +418,24 @@ def check(family, seed, n=400_000):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.limit_states",
-        description="Check the truths of the families by sampling.",
-    )
+    """Check the truths of the families by sampling."""
+    parser = options(main.__doc__, "2 problems of a family")
     parser.add_argument("--seeds", type=int, help="problems of a family (default 8)")
-    args = options(parser, "2 problems of a family").parse_args(argv)
-    seeds, n, report = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000), {}
+    args = parser.parse_args(argv)
+    seeds, n = args.seeds or size(args, 8, 2, 1), size(args, 400_000, 400_000, 10_000)
+    say, report = printer(args), {}
+
+    def off(z):
+        return f"rms {np.sqrt(np.mean(z**2)):.2f}, greatest {np.abs(z).max():.2f}"
+
     for family in FAMILIES:
         scores = [check(family, seed, n) for seed in range(seeds)]
-        easy, rare = (
-            np.array([s[0] for s in scores]),
-            np.array([s[1] for s in scores if len(s) > 1]),
-        )
-        note = (
-            f", rare: rms {np.sqrt(np.mean(rare**2)):.2f}, greatest {np.abs(rare).max():.2f}"
-            f" ({len(rare)} seeds)"
-            if len(rare)
-            else ""
-        )
+        easy = np.array([s[0] for s in scores])
+        rare = np.array([s[1] for s in scores if len(s) > 1])
         report[family] = {"easy": easy.tolist(), "rare": rare.tolist()}
-        if args.json:
-            continue
-        print(
-            f"{family:18} standard errors: rms {np.sqrt(np.mean(easy**2)):.2f}, greatest"
-            f" {np.abs(easy).max():.2f}{note}",
-            flush=True,
-        )
-    if args.json:
-        print(json.dumps(report))
+        note = f", rare: {off(rare)} ({len(rare)} seeds)" if len(rare) else ""
+        say(f"{family:18} standard errors: {off(easy)}{note}")
+    print_report(args, report)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from jast import distributions as D
 __all__ = ["CASES", "collision_avoidance", "literature_cases", "table"]
 
 
-def once(noise: Any, g: Callable) -> jast.Simulator:
+def one_step(noise: Any, g: Callable) -> jast.Simulator:
     """One step, which fails where ``g`` of its disturbance is at most 0."""
 
     def evaluate(x):
@@ -40,30 +40,38 @@ def once(noise: Any, g: Callable) -> jast.Simulator:
     )
 
 
-def both(noise):
+def pair_of(noise):
     """Two numbers, each of them ``noise``."""
     return D.Independent(noise, 1)
 
 
 def simple_gaussian():
-    return once(D.Normal(0.0, 1.0), lambda x: x + 2)
+    return one_step(D.Normal(0.0, 1.0), lambda x: x + 2)
 
 
 def half_planes():
     """abs(x1) >= 3 and x2 >= 3."""
-    g = lambda x: jnp.maximum(3 - jnp.abs(x[0]), 3 - x[1])
-    return once(both(D.Normal(jnp.zeros(2), 1.0)), g)
+    return one_step(
+        pair_of(D.Normal(jnp.zeros(2), 1.0)), lambda x: jnp.maximum(3 - jnp.abs(x[0]), 3 - x[1])
+    )
 
 
 def squares():
     """Inside of a square of half width 1 at (2, 2) or of 1/2 at (8, 8)."""
-    inside = lambda x, centre, half: jnp.max(jnp.abs(x - centre)) - half
-    g = lambda x: jnp.minimum(inside(x, 2.0, 1.0), inside(x, 8.0, 0.5))
-    return once(both(D.Normal(jnp.full(2, 5.0), 1.0)), g)
+
+    def inside(x, centre, half):
+        return jnp.max(jnp.abs(x - centre)) - half
+
+    def g(x):
+        return jnp.minimum(inside(x, 2.0, 1.0), inside(x, 8.0, 0.5))
+
+    return one_step(pair_of(D.Normal(jnp.full(2, 5.0), 1.0)), g)
 
 
 def squares_probability():
-    p = lambda low, high: (stats.norm.cdf(high - 5) - stats.norm.cdf(low - 5)) ** 2
+    def p(low, high):
+        return (stats.norm.cdf(high - 5) - stats.norm.cdf(low - 5)) ** 2
+
     return p(1, 3) + p(7.5, 8.5)
 
 
@@ -71,7 +79,7 @@ def himmelblau():
     """Himmelblau's function at most 15, of two numbers around 2 or -2, cut at 6 and -6."""
     ways = D.TruncatedNormal(jnp.array([[2.0, -2.0]] * 2), 1.0, -6.0, 6.0)
     noise = D.MixtureSameFamily(D.Categorical(probs=jnp.full((2, 2), 0.5)), ways)
-    return once(both(noise), lambda x: _himmelblau(x[0], x[1]) - 15)
+    return one_step(pair_of(noise), lambda x: _himmelblau(x[0], x[1]) - 15)
 
 
 def _himmelblau(a, b):
@@ -87,9 +95,13 @@ def himmelblau_probability(nodes=6001):
 
 # collision avoidance
 
-ALTITUDES, RATES, ACTIONS = np.linspace(-200, 200, 21), np.linspace(-10, 10, 21), (-5.0, 0.0, 5.0)
-NOISE, CHANCES = (-2.0, 0.0, 2.0), (0.25, 0.5, 0.25)
-TIME, NEAR = 40, 50.0
+ALTITUDES = np.linspace(-200, 200, 21)  # m, of the course's grid
+RATES = np.linspace(-10, 10, 21)  # m/s
+ACTIONS = (-5.0, 0.0, 5.0)  # m/s, advised rates
+NOISE = (-2.0, 0.0, 2.0)  # m/s, of the rate, in the decision process
+CHANCES = (0.25, 0.5, 0.25)  # of these
+TIME = 40  # s to the closest point
+NEAR = 50.0  # m: a failure
 
 
 class Encounter(NamedTuple):

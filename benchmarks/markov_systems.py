@@ -161,8 +161,13 @@ def dropout_probability(rate, limit, steps, nodes=400):
     """By Nystrom on the values inside, with the sensor and without."""
     x, w = np.polynomial.legendre.leggauss(nodes)
     x, w = x * limit, w * limit
-    kernel = lambda a: stats.norm.pdf(x[:, None] - a * x) * w
-    passes = lambda a, at: stats.norm.sf(limit - a * at) + stats.norm.cdf(-limit - a * at)
+
+    def kernel(a):
+        return stats.norm.pdf(x[:, None] - a * x) * w
+
+    def passes(a, at):
+        return stats.norm.sf(limit - a * at) + stats.norm.cdf(-limit - a * at)
+
     kept, gone = kernel(0.5), kernel(1.0)
     with_it, without = (1 - rate) * stats.norm.pdf(x), rate * stats.norm.pdf(x)
     total = passes(0.0, 0.0)

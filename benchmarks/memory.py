@@ -4,18 +4,13 @@ compiled program go. ``--long``: instead, the most memory that long calls on the
 a process of its own, as they become longer.
 """
 
-import argparse
-import json
 import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import jax
 
 import jast
-from benchmarks.sizes import options, size
+from benchmarks.sizes import in_fresh_process, options, print_report, printer, size, timed
 from benchmarks.stress_systems import CASES, TUNED
 from jast import memory
 from jast.simulators import ferry
@@ -42,12 +37,12 @@ LONG = {
 
 
 def peak(name, n):
-    """Prints the CPU seconds, and the most resident megabytes of this process, after a call of
-    `LONG`, and before it.
+    """CPU seconds, and the most resident megabytes of this process, after a call of `LONG`, and
+    before it.
     """
-    before, begin = _most(), time.process_time()
-    LONG[name][1](n)
-    print(json.dumps(dict(n=n, seconds=time.process_time() - begin, before=before, most=_most())))
+    before = _most()
+    _, seconds, _ = timed(lambda: LONG[name][1](n))
+    return dict(n=n, seconds=seconds, before=before, most=_most())
 
 
 def _most():
@@ -60,9 +55,7 @@ def peaks(sizes):
     """(name, what `peak` says) of each call of each size, each in a process of its own."""
     for name, each in sizes.items():
         for n in each:
-            code = f"from benchmarks import memory; memory.peak({name!r}, {n})"
-            command = [sys.executable, "-W", "ignore", "-c", code]
-            yield name, json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+            yield name, in_fresh_process("peak", name, n, module="memory", settings={})
 
 
 def held():
@@ -85,19 +78,18 @@ def long(args):
     """`peaks` in print."""
     episodes, simulations = (10**6, 10**7, 10**8), (90, 900, 9000)
     sizes = size(args, (episodes, simulations), (episodes[:2], simulations[:2]), ((10**4,), ()))
-    rows = peaks(dict(zip(LONG, sizes)))
-    if args.json:
-        return print(json.dumps([[name, row] for name, row in rows]))
-    print(f"{'call':<48}{'number':>11}{'CPU s':>7}{'MB before':>11}{'MB most':>9}")
-    for name, row in rows:
+    say, rows = printer(args), []
+    say(f"{'call':<48}{'number':>11}{'CPU s':>7}{'MB before':>11}{'MB most':>9}")
+    for name, row in peaks(dict(zip(LONG, sizes))):
+        rows.append([name, row])
         what = f"{name}, {LONG[name][0]}"
         numbers = f"{row['n']:>11}{row['seconds']:>7.0f}{row['before']:>11}{row['most']:>9}"
-        print(f"{what:<48}{numbers}", flush=True)
+        say(f"{what:<48}{numbers}")
+    print_report(args, rows)
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__)
-    options(parser, quick="six systems")
+    parser = options(__doc__, "six systems")
     parser.add_argument("--keep", action="store_true", help="let no compiled program go")
     parser.add_argument("--long", action="store_true", help="long calls, each on its own")
     args = parser.parse_args(argv)
@@ -105,16 +97,15 @@ def main(argv=None):
         return long(args)
     names = size(args, list(CASES), list(TUNED), ["linear-10", "branches"])
     kept, memory.MAPS = memory.MAPS, 10**9 if args.keep else memory.MAPS
+    say, rows = printer(args), {}
+    say(f"{'after':<16}{'mappings':>9}{'megabytes':>11}")
     try:
-        rows = run(names, size(args, 5000, 1000, 300))
-        if args.json:
-            print(json.dumps(dict(rows)))
-            return
-        print(f"{'after':<16}{'mappings':>9}{'megabytes':>11}")
-        for name, (mappings, megabytes) in rows:
-            print(f"{name:<16}{mappings:>9}{megabytes:>11}", flush=True)
+        for name, numbers in run(names, size(args, 5000, 1000, 300)):
+            rows[name] = numbers
+            say("{:<16}{:>9}{:>11}".format(name, *numbers))
     finally:
         memory.MAPS = kept
+    print_report(args, rows)
 
 
 if __name__ == "__main__":

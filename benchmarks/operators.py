@@ -57,7 +57,10 @@ def tank_probability(cells: int = 2400) -> float:
     t = TANK
     edges = np.linspace(0, t["most"], cells + 1)
     middle = (edges[:-1] + edges[1:]) / 2
-    on_next = lambda pump: np.where(middle > t["high"], 1.0, np.where(middle < t["low"], 0.0, pump))
+
+    def on_next(pump):
+        return np.where(middle > t["high"], 1.0, np.where(middle < t["low"], 0.0, pump))
+
     # by the mode after the switch: where the level goes from each cell
     kernels = []
     for pump in (0.0, 1.0):

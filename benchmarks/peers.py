@@ -1,23 +1,22 @@
 """Peers of jast's cross-entropy optimisers on the same budgets, in NumPy and float64: ``python -m
-benchmarks.peers [--json] [--quick] [--cases ...] [--peers ...]``.
+benchmarks.peers [--json] [--quick | --smoke] [--cases ...] [--peers ...]``.
 
 A peer is ``peer(seed, objective, mean, sd, budget)`` and gives every true evaluation in order, ``(x
 [n, d], value [n])`` with ``n <= budget``. Methods that start from a distribution get N(mean, diag
 sd^2), methods on a box mean +- 2 sd. Needs scipy 1.15 and, for their peers, cma and
-bayesian-optimization. Set ``OPENBLAS_NUM_THREADS=1``: the matrices are small.
+bayesian-optimization.
 """
 
-import argparse
-import functools
 import importlib.metadata
-import json
-import time
+import itertools
 import warnings
+from functools import partial
 
 import numpy as np
 
 from benchmarks import cma_es as driver
 from benchmarks.cases import CASES
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 
 __all__ = ["PEERS", "run", "summary"]
 
@@ -36,8 +35,7 @@ def _record(objective, budget, dimension, search):
         n += 1
         return float(value[n - 1])
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             search(evaluate)
         except driver.Stop:
@@ -60,10 +58,11 @@ def cma_es(seed, objective, mean, sd, budget):
     """
     rng = np.random.default_rng(seed)
 
+    def restart():
+        return mean + sd * rng.standard_normal(len(mean))
+
     def search(evaluate):
-        again = lambda: mean + sd * rng.standard_normal(len(mean))
-        each = lambda points: [evaluate(p) for p in points]
-        driver.cma_es(rng, each, mean, sd, again, tolfun=0, tolfunhist=0)
+        driver.cma_es(rng, partial(map, evaluate), mean, sd, restart, tolfun=0, tolfunhist=0)
 
     return _record(objective, budget, len(mean), search)
 
@@ -94,9 +93,12 @@ def direct(seed, objective, mean, sd, budget, jitter=0.25):
 
     centre = mean + jitter * sd * np.random.default_rng(seed).uniform(-1, 1, len(mean))
     bounds = list(zip(centre - 2 * sd, centre + 2 * sd))
-    search = lambda evaluate: optimize.direct(
-        evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0
-    )
+
+    def search(evaluate):
+        return optimize.direct(
+            evaluate, bounds, maxfun=2 * budget, maxiter=budget, vol_tol=0, len_tol=0
+        )
+
     return _record(objective, budget, len(mean), search)
 
 
@@ -157,9 +159,9 @@ def run(peer, case, seeds):
     budget = case.budgets[0] * case.budgets[1]
     values, points, seconds = [], [], []
     for seed in seeds:
-        start = time.process_time()
-        x, value = peer(seed, case.objective, case.mean, case.sd, budget)
-        seconds.append(time.process_time() - start)
+        search = partial(peer, seed, case.objective, case.mean, case.sd, budget)
+        (x, value), cpu, _ = timed(search)
+        seconds.append(cpu)
         assert 0 < len(value) <= budget, (peer, len(value))
         best = np.argmin(value)
         values.append(value[best])
@@ -177,7 +179,10 @@ def summary(values, distances=None):
     square distance, ``rms``.
     """
     values, n = np.asarray(values, float), len(values)
-    se = lambda sample: float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
+
+    def se(sample):
+        return float(np.std(sample, ddof=1) / n**0.5) if n > 1 else float("nan")
+
     report = {
         "seeds": n,
         "best": float(values.mean()),
@@ -204,57 +209,36 @@ def _version(package):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.peers", description=__doc__.splitlines()[0]
-    )
+    parser = options(__doc__, "4 runs of each pair")
     parser.add_argument("--seeds", type=int, help="runs of each pair (default 64)")
-    parser.add_argument("--quick", action="store_true", help="4 runs of each pair")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument(
-        "--cases",
-        nargs="+",
-        choices=CASES,
-        default=list(CASES),
-        metavar="CASE",
-        help=", ".join(CASES),
-    )
-    parser.add_argument(
-        "--peers",
-        nargs="+",
-        choices=PEERS,
-        default=[p for p in PEERS if p != "expected_improvement"],
-        metavar="PEER",
-        help=", ".join(PEERS),
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object, with all runs")
+    add_choices(parser, "--cases", CASES)
+    add_choices(parser, "--peers", PEERS, "all but expected_improvement")
     args = parser.parse_args(argv)
-    say = (lambda text: None) if args.json else functools.partial(print, flush=True)
-    seeds = args.seeds or (4 if args.quick else 64)
+    say, seeds = printer(args), args.seeds or size(args, 64, 4, 1)
+    cases = args.cases or size(args, list(CASES), list(CASES), ["branin"])
+    usual = [p for p in PEERS if p != "expected_improvement"]
+    peers = args.peers or size(args, usual, usual, ["random_search", "differential_evolution"])
     packages = ("numpy", "scipy", "scikit-learn", "cma", "bayesian-optimization")
     report = {"versions": {p: _version(p) for p in packages}, "results": []}
     say(
         f"{'case':14}{'peer':24}{'mean best':>12}{'se':>10}{'median':>12}{'distance':>10}"
         f"{'se':>8}{'F':>8}{'CPU s':>9}"
     )
-    for name in args.cases:
-        for peer in args.peers:
-            result = run(peer, name, range(args.first, args.first + seeds))
-            s = summary(result["values"], result["distances"]) | {
-                "cpu_s": float(result["cpu_s"].mean())
-            }
-            where = (
-                f"{s['distance']:10.3f}{s['distance_se']:8.3f}{s['F']:8.1f}"
-                if "F" in s
-                else f"{'-':>10}{'-':>8}{'-':>8}"
-            )
-            say(
-                f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}"
-                f"{s['cpu_s']:9.4f}"
-            )
-            raw = {k: None if v is None else v.tolist() for k, v in result.items()}
-            report["results"].append({"case": name, "peer": peer, **s, "runs": raw})
-    if args.json:
-        print(json.dumps(report))
+    for name, peer in itertools.product(cases, peers):
+        result = run(peer, name, range(args.first, args.first + seeds))
+        s = summary(result["values"], result["distances"])
+        s["cpu_s"] = float(result["cpu_s"].mean())
+        where = f"{'-':>10}{'-':>8}{'-':>8}"
+        if "F" in s:
+            where = f"{s['distance']:10.3f}{s['distance_se']:8.3f}{s['F']:8.1f}"
+        say(
+            f"{name:14}{peer:24}{s['best']:12.5g}{s['best_se']:10.2g}{s['median']:12.5g}{where}"
+            f"{s['cpu_s']:9.4f}"
+        )
+        raw = {k: None if v is None else v.tolist() for k, v in result.items()}
+        report["results"].append({"case": name, "peer": peer, **s, "runs": raw})
+    print_report(args, report)
 
 
 if __name__ == "__main__":

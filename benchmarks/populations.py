@@ -7,21 +7,16 @@ changed, on systems that settings may be chosen on. Beside it stands what the ge
 figure over n keys has a relative standard error of about sqrt(2 / n).
 """
 
-import argparse
-import json
-import os
 from dataclasses import replace
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import numpy as np
 
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks.sizes import options, size  # noqa: E402
-from benchmarks.time_to_answer import SYSTEMS  # noqa: E402
-from jast.estimate.descents import SETTINGS, WAYS  # noqa: E402
-from jast.estimate.particles import SMALL, WINDOW  # noqa: E402
+from benchmarks.sizes import options, print_report, printer, size
+from benchmarks.time_to_answer import SYSTEMS
+from jast.estimate.descents import SETTINGS, WAYS
+from jast.estimate.particles import SMALL, WINDOW
 
 __all__ = ["CHANGES", "work"]
 
@@ -71,11 +66,11 @@ def work(name: str, way: str, keys: int, particles: int, changes: dict[str, Any]
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "8 keys of 1024 points")
+    parser = options(__doc__, "8 keys of 1024 points")
     parser.add_argument("--systems", nargs="+", help="default: all")
     args = parser.parse_args(argv)
     keys, particles = size(args, (40, 2048), (8, 1024), (2, 128))
-    rows = []
+    say, rows = printer(args), []
     for name, way in size(args, CASES, CASES[4:6], CASES[5:6]):
         if args.systems and name not in args.systems:
             continue
@@ -86,16 +81,13 @@ def main(argv: list[str] | None = None) -> None:
                 continue
             row = dict(system=name, way=way, settings=words)
             rows.append(row | work(name, way, keys, particles, changes))
-            if not args.json:
-                r = rows[-1]
-                print(
-                    f"{name:14s} by {way:8s} {words:16s} variance x evaluations"
-                    f" {r['work'] or 0:8.0f}  by genealogy {r['told'] or 0:8.0f}"
-                    f"  mean / truth {r['of_truth']:.3f}",
-                    flush=True,
-                )
-    if args.json:
-        print(json.dumps(dict(keys=keys, particles=particles, rows=rows)))
+            r = rows[-1]
+            say(
+                f"{name:14s} by {way:8s} {words:16s} variance x evaluations"
+                f" {r['work'] or 0:8.0f}  by genealogy {r['told'] or 0:8.0f}"
+                f"  mean / truth {r['of_truth']:.3f}"
+            )
+    print_report(args, dict(keys=keys, particles=particles, rows=rows))
 
 
 if __name__ == "__main__":

@@ -11,10 +11,9 @@ how often an estimate is flagged, and how often an interval misses without a fla
 throughout.
 """
 
-import argparse
 import itertools
-import json
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,7 @@ from benchmarks import reliability
 from benchmarks.limit_states import FAMILIES, cases, draw
 from benchmarks.literature import literature_cases
 from benchmarks.markov_systems import markov_cases
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from benchmarks.structural import structural_cases
 from jast.distributions import Normal
 from jast.distributions.mixtures import blend
@@ -71,7 +70,7 @@ def _two_starts(s0):
     return blend(jnp.array([0.5, 0.5]), Normal(s0, 0.1), Normal(-s0, 0.1))
 
 
-def landing(seeds, samples=100_000, timed=2_000_000):
+def landing(seeds, samples=100_000, many=2_000_000):
     sim, traces = both_traces()
     policy = Policy(Partial(_two_starts, jnp.float32(0.526)), _to_the_edge)
     proposals = {
@@ -82,12 +81,11 @@ def landing(seeds, samples=100_000, timed=2_000_000):
     out = {}
     for name, proposal in proposals.items():
         runs = [importance(jax.random.key(seed), sim, proposal, samples) for seed in range(seeds)]
-        cpu, wall = time.process_time(), time.perf_counter()
-        importance(jax.random.key(seeds), sim, proposal, timed)
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        key = jax.random.key(seeds)
+        _, cpu, wall = timed(partial(importance, key, sim, proposal, many))
         out[name] = summary([(r, LANDING) for r in runs]) | {
-            "traces_per_cpu_s": timed / cpu,
-            "traces_per_s": timed / wall,
+            "traces_per_cpu_s": many / cpu,
+            "traces_per_s": many / wall,
         }
     return out
 
@@ -239,22 +237,12 @@ def _chosen(args):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.probability", description=__doc__.splitlines()[0]
-    )
-    options(parser, "under two minutes: few seeds, no learned policies, two families")
-    parser.add_argument("--only", nargs="+", choices=PARTS, help="parts to run; default: all")
+    parser = options(__doc__, "under two minutes: few seeds, no learned policies, two families")
+    add_choices(parser, "--only", PARTS)
     parser.add_argument(
         "--seeds", type=int, help="seeds of each family in coverage (20), and of default (50)"
     )
-    parser.add_argument(
-        "--families",
-        nargs="+",
-        choices=FAMILIES,
-        default=list(FAMILIES),
-        metavar="FAMILY",
-        help=", ".join(FAMILIES),
-    )
+    add_choices(parser, "--families", FAMILIES)
     parser.add_argument(
         "--first", type=int, default=50_000, help="number of the first problem of a family"
     )
@@ -266,15 +254,14 @@ def main(argv=None):
         help="names of fixed cases, or fixed, markov, literature, structural; default: all",
     )
     args = parser.parse_args(argv)
-    parts = args.only or [
-        part for part in PARTS if not (args.quick and part in ("policy", "cases"))
-    ]
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
-    if args.smoke:  # policies need minutes
-        parts = [part for part in parts if part != "policy" or args.only]
-    budget = args.budget or size(args, 100_000, 100_000, 5000)
+    # learned policies need minutes, and so do all cases
+    slow = size(args, (), ("policy", "cases"), ("policy",))
+    parts = args.only or [part for part in PARTS if part not in slow]
+    say, budget = printer(args), args.budget or size(args, 100_000, 100_000, 5000)
     report, quick = {"budget": budget}, args.quick
-    seeds = lambda *n: args.seeds or size(args, *n)
+
+    def seeds(*n):
+        return args.seeds or size(args, *n)
 
     if "landing" in parts:
         report["landing"] = landing(*size(args, (200,), (5,), (1, 1000, 1000)))
@@ -326,37 +313,26 @@ def main(argv=None):
             say(line(c.name, r))
     if "coverage" in parts:
         report["coverage"], total = {}, []
-        for family in size(args, args.families, ("two_sided", "branches"), ("branches",)):
+        families = args.families or list(FAMILIES)
+        families = size(args, families, ("two_sided", "branches"), ("branches",))
+        for family in families:
             problems = [draw(family, args.first + seed)[1:] for seed in range(seeds(20, 3, 1))]
             report["coverage"][family] = r = ours(problems, budget)
             total.append(r)
             say(line(family, r))
-        names = (
-            "seeds",
-            "flagged",
-            "covers_of_reliable",
-            "misses_unflagged",
-            "far_unflagged",
-            "beyond_10_unflagged",
-        )
-        n, flagged, covers, missed, far, off = (sum(r[k] for r in total) for k in names)
+        names = "flagged", "misses_unflagged", "far_unflagged", "beyond_10_unflagged"
+        sums = {name: sum(r[name] for r in total) for name in names}
+        n, covers = (sum(r[name] for r in total) for name in ("seeds", "covers_of_reliable"))
+        flagged, _, far, off = sums.values()
         interval = clopper_pearson(covers, n - flagged) if n > flagged else (0.0, 1.0)
-        report["coverage_total"] = {
-            "problems": n,
-            "flagged": flagged,
-            "covers": covers,
-            "misses_unflagged": missed,
-            "far_unflagged": far,
-            "beyond_10_unflagged": off,
-            "coverage_95": list(interval),
-        }
+        counts = dict(problems=n, covers=covers, coverage_95=list(interval))
+        report["coverage_total"] = counts | sums
         say(
             f"  all: {covers} of {n - flagged} unflagged intervals cover [{interval[0]:.3f},"
             f" {interval[1]:.3f}]; {flagged} of {n} flagged; of the others {far} are far,"
             f" {off} off by more than 10 %"
         )
-    if args.json:
-        print(json.dumps(report))
+    print_report(args, report)
 
 
 if __name__ == "__main__":

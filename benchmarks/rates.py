@@ -2,41 +2,36 @@
 [--systems NAME ...]``.
 
 `jast.estimate.monte_carlo`, `jast.estimate.failure_probability` and `jast.stress`, the last two
-with 2,097,152 evaluations, beside a bare loop in one program: blocks of 128 vectors of normal
+with 2,097,152 evaluations, beside a minimal loop in one program: blocks of 128 vectors of normal
 numbers by `jax.random.normal`, put through ``step`` and ``evaluate`` and counted. All were compiled
 before (the second call of each is timed), and all in this process, one after the other.
 """
 
-import argparse
-import json
-import os
 import time
 import warnings
 from collections.abc import Callable
 from functools import partial
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+from jax import lax
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-from jax import lax  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.closed_loops import JUDGED, RARE, TUNED  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
+import jast
+from benchmarks.closed_loops import JUDGED, RARE, TUNED
+from benchmarks.sizes import add_choices, options, print_report, printer, size
 
 __all__ = ["SYSTEMS", "rates"]
 
 SYSTEMS = {a.name: a.simulator for a in (*TUNED, *JUDGED, *RARE) if a.name not in ("camera", "arm")}
 """Closed loops all of whose random numbers are standard normal ones"""
 BLOCK = 128
-"""Episodes that the bare loop runs side by side."""
+"""Episodes that the minimal loop runs side by side."""
 EVALUATIONS = 2**21
 METHODS = ("monte_carlo", "failure_probability", "stress")
 
 
 @partial(jax.jit, static_argnames="blocks")
-def bare(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
+def minimal_loop(key: jax.Array, sim: jast.Simulator, blocks: int) -> jax.Array:
     """Failures among so many blocks of episodes."""
     start = sim.init(sim.start().sample(seed=key))
     like = sim.disturbance(start).sample(seed=key)
@@ -68,11 +63,11 @@ def _rate(work: Callable[[int], float]) -> float:
 
 
 def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, float]:
-    """Episodes a CPU second of the bare loop, and the share of it that each method reaches."""
+    """Episodes a CPU second of the minimal loop, and the share of it that each method reaches."""
     blocks = max(episodes // BLOCK, 1)
 
     def loop(seed):
-        bare(jax.random.key(seed), sim, blocks).block_until_ready()
+        minimal_loop(jax.random.key(seed), sim, blocks).block_until_ready()
         return blocks * BLOCK
 
     calls = dict(
@@ -84,27 +79,22 @@ def rates(sim: jast.Simulator, episodes: int, evaluations: int) -> dict[str, flo
     )
     alone = _rate(loop)
     shares = {m: _rate(lambda seed, m=m: calls[m](jax.random.key(seed))) / alone for m in METHODS}
-    return dict(bare=alone, **shares)
+    return dict(minimal_loop=alone, **shares)
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "three systems")
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
+    parser = options(__doc__, "three systems")
+    add_choices(parser, "--systems", SYSTEMS)
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "grid", "cart-pole"], ["grid"])
     episodes, evaluations = size(args, (2**20, EVALUATIONS), (2**19, EVALUATIONS), (2**12, 2**12))
-    rows = []
+    say, rows = printer(args), []
     for name in names:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             rows.append(dict(system=name, **rates(SYSTEMS[name], episodes, evaluations)))
-        if not args.json:
-            shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
-            print(
-                f"{name:12s} bare loop {rows[-1]['bare']:9.0f} a CPU second; {shares}", flush=True
-            )
-    if args.json:
-        print(json.dumps(dict(episodes=episodes, evaluations=evaluations, rows=rows)))
+        shares = "  ".join(f"{m} {rows[-1][m]:.3f}" for m in METHODS)
+        say(f"{name:12s} minimal loop {rows[-1]['minimal_loop']:9.0f} a CPU second; {shares}")
+    print_report(args, dict(episodes=episodes, evaluations=evaluations, rows=rows))
 
 
 if __name__ == "__main__":

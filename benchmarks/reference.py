@@ -18,8 +18,11 @@ from math import cos, log, pi, sin, sqrt
 
 __all__ = ["forest", "interval"]
 
-FERRY_Y, SPEED, COLLISION, STEPS = 50.0, 5.0, 5.0, 21
-START = (16.0, 0.0)
+FERRY_Y = 50.0  # where the ferry crosses
+SPEED = 5.0  # of both vessels, a step
+COLLISION = 5.0  # distance of the centres
+STEPS = 21  # of an episode
+START = (16.0, 0.0)  # of the steered vessel
 TURN = pi / 100
 
 

@@ -5,20 +5,16 @@
 are counted in ``g_batch``, those of finite-difference gradients too. The table is over seeds: rms
 relative error, median of the reported coefficient of variation, evaluations, share of the runs that
 are off by more than 20 %, CPU time. What a method is told beyond g stands in its docstring. Needs
-openturns; set ``OPENBLAS_NUM_THREADS=1``.
+openturns.
 """
 
-import argparse
-import json
-import os
-import time
+import itertools
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import numpy as np
 
-import numpy as np  # noqa: E402
-
-from benchmarks.limit_states import LIMITS  # noqa: E402
-from benchmarks.structural import PROBLEMS  # noqa: E402
+from benchmarks.limit_states import LIMITS
+from benchmarks.sizes import add_choices, options, percent, print_report, printer, size, timed
+from benchmarks.structural import PROBLEMS
 
 __all__ = ["METHODS", "run"]
 
@@ -92,10 +88,7 @@ def _form(ot, event, budget, count, search, starts):
         algorithm = search(solver, event)
         try:
             algorithm.run()
-        except (
-            TypeError,
-            RuntimeError,
-        ):  # OpenTURNS's own: no convergence, or a point that is not on the limit state
+        except (TypeError, RuntimeError):  # no convergence, or not on the limit state
             continue
         found = algorithm.getResult()
         found = found.getFORMResultCollection() if search is ot.MultiFORM else [found]
@@ -178,12 +171,9 @@ def row(method, case, budget, seeds):
     """The report of several seeds."""
     limit = (LIMITS | PROBLEMS)[case]
     starts, levels = CASES[case] if case in CASES else ((), _levels(limit.truth))
-    cpu = time.process_time()
-    runs = [
-        run(method, limit.batch, limit.dimension, budget, seed, levels.get(method), starts)
-        for seed in range(seeds)
-    ]
-    cpu = (time.process_time() - cpu) / seeds
+    about = method, limit.batch, limit.dimension, budget
+    more = levels.get(method), starts
+    runs, cpu, _ = timed(lambda: [run(*about, seed, *more) for seed in range(seeds)])
     error = np.array([r["estimate"] for r in runs]) / limit.truth - 1
     # none where nothing was found
     cov = [r["reported_cov"] for r in runs if r["reported_cov"] >= 0]
@@ -193,64 +183,38 @@ def row(method, case, budget, seeds):
         "cov": float(np.median(cov)) if cov else None,
         "beyond_20": float(np.mean(~(np.abs(error) < 0.2))),
         "evaluations": float(np.median([r["evaluations"] for r in runs])),
-        "cpu_s": cpu,
+        "cpu_s": cpu / seeds,
         "seeds": seeds,
     }
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.reliability", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the report as JSON, and nothing else"
-    )
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="4 seeds, and no NAIS in 20 dimensions, which takes minutes",
-    )
+    parser = options(__doc__, "4 seeds, and no NAIS in 20 dimensions, which takes minutes")
     parser.add_argument("--seeds", type=int, help="runs of each row; 20, or 4 with --quick")
-    parser.add_argument("--budget", type=int, default=100_000, help="evaluations of a run")
-    parser.add_argument(
-        "--cases",
-        nargs="+",
-        choices=CASES | PROBLEMS,
-        default=list(CASES),
-        metavar="CASE",
-        help=", ".join(CASES) + "; " + ", ".join(PROBLEMS) + " (no starts by hand)",
-    )
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        choices=METHODS,
-        default=list(METHODS),
-        metavar="METHOD",
-        help=", ".join(METHODS),
-    )
+    parser.add_argument("--budget", type=int, help="evaluations of a run (default 100,000)")
+    fixed = f"{', '.join(CASES)}; the others have no starts by hand"
+    add_choices(parser, "--cases", CASES | PROBLEMS, fixed)
+    add_choices(parser, "--methods", METHODS)
     args = parser.parse_args(argv)
-    seeds = args.seeds or (4 if args.quick else 20)
-    report = {"budget": args.budget, "seeds": seeds, "results": {}}
-    say = (lambda *a: None) if args.json else lambda *a: print(*a, flush=True)
+    say, seeds = printer(args), args.seeds or size(args, 20, 4, 1)
+    budget = args.budget or size(args, 100_000, 100_000, 2000)
+    cases = args.cases or size(args, list(CASES), list(CASES), ["parallel"])
+    methods = args.methods or size(args, list(METHODS), list(METHODS), ["subset", "form_16"])
+    report = {"budget": budget, "seeds": seeds, "results": {}}
     say(
         f"{'case':17}{'method':14}{'rms':>10}{'median':>10}{'reported':>10}{'> 20 %':>9}"
         f"{'evaluations':>13}{'CPU s':>8}"
     )
-    for case in args.cases:
-        for method in args.methods:
-            if args.quick and (case, method) == ("hyperplane 20", "nais"):
-                continue
-            report["results"][f"{case}, {method}"] = r = row(method, case, args.budget, seeds)
-            errors = "".join(
-                f"{'-':>10}" if r[name] is None else f"{100 * r[name]:8.2f} %"
-                for name in ("rms", "median_error", "cov")
-            )
-            say(
-                f"{case:17}{method:14}{errors}{100 * r['beyond_20']:7.0f}"
-                f" %{r['evaluations']:13.0f}{r['cpu_s']:8.2f}"
-            )
-    if args.json:
-        print(json.dumps(report))
+    for case, method in itertools.product(cases, methods):
+        if args.quick and (case, method) == ("hyperplane 20", "nais"):
+            continue
+        report["results"][f"{case}, {method}"] = r = row(method, case, budget, seeds)
+        errors = "".join(f"{percent(r[k]):>10}" for k in ("rms", "median_error", "cov"))
+        say(
+            f"{case:17}{method:14}{errors}{100 * r['beyond_20']:7.0f}"
+            f" %{r['evaluations']:13.0f}{r['cpu_s']:8.2f}"
+        )
+    print_report(args, report)
 
 
 if __name__ == "__main__":

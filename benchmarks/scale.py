@@ -14,8 +14,6 @@ many units that had ended were not on disk.
 steps depend on one another: a forest with heads, a training, a validation.
 """
 
-import argparse
-import json
 import multiprocessing
 import os
 import random
@@ -25,24 +23,24 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import numpy as np
 
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
+import jast
+from benchmarks.sizes import options, print_report, size, timed
+from jast import places, units
+from jast.blackbox import from_python
+from jast.checkpoints import PARTS
+from jast.distributions import Normal
+from jast.ledger import records
+from jast.simulators import ferry, landing
+from jast.weakness import default
 
-import jast  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast import places, units  # noqa: E402
-from jast.blackbox import from_python  # noqa: E402
-from jast.checkpoints import PARTS  # noqa: E402
-from jast.distributions import Normal  # noqa: E402
-from jast.ledger import records  # noqa: E402
-from jast.simulators import ferry, landing  # noqa: E402
-from jast.weakness import default  # noqa: E402
-
-KEY, WAIT = jax.random.key(0), 0.005
+KEY = jax.random.key(0)
+WAIT = 0.005  # s that a black box takes
 
 
 def waits(disturbances):
@@ -132,9 +130,7 @@ def ratio(one, other, repeats):
     for _ in range(repeats):
         times = []
         for run in (one, other):
-            begin = time.process_time()
-            run()
-            times.append(time.process_time() - begin)
+            times.append(timed(run)[1])
         ratios.append(times[0] / times[1] - 1)
         seconds.append(times[1])
     return dict(seconds=statistics.median(seconds), more=statistics.median(ratios))
@@ -147,11 +143,7 @@ def speedup(call, repeats):
         with ProcessPoolExecutor(workers, mp_context=spawn) as executor:
             call(executor=executor)  # compile
             call(executor=executor)
-            each = []
-            for _ in range(repeats):
-                begin = time.perf_counter()
-                call(executor=executor)
-                each.append(time.perf_counter() - begin)
+            each = [timed(lambda: call(executor=executor))[2] for _ in range(repeats)]
             times.append(statistics.median(each))
     return dict(seconds=times[0], speedup=times[0] / times[1])
 
@@ -167,8 +159,8 @@ def black_box(episodes):
 def same(a, b):
     """Whether two results are the same to the bit; their settings and functions aside."""
     a, b = (jax.tree.leaves(_numbers(r)) for r in (a, b))
-    equal = lambda x, y: np.asarray(x).tobytes() == np.asarray(y).tobytes()
-    return len(a) == len(b) and all(map(equal, a, b))
+    as_bytes = [[np.asarray(x).tobytes() for x in leaves] for leaves in (a, b)]
+    return as_bytes[0] == as_bytes[1]
 
 
 def _numbers(result):
@@ -217,7 +209,10 @@ def killed(name, sizes, moment, folder, programs):
     command = [sys.executable, "-W", "ignore", "-c", CHILD, ended, name, checkpoint, *sizes]
     env = os.environ | {"JAX_COMPILATION_CACHE_DIR": programs} | ALL
     process = subprocess.Popen([str(word) for word in command], env=env)
-    begun = lambda: parts(checkpoint) or (checkpoint / "state.jast").exists()
+
+    def begun():
+        return parts(checkpoint) or (checkpoint / "state.jast").exists()
+
     while not begun() and process.poll() is None:
         time.sleep(0.002)
     try:
@@ -240,9 +235,8 @@ def kills(name, sizes, runs):
     """``runs`` calls, each killed once, at a moment of the time that it takes, and made again."""
     call, rng = (calls(*sizes) | chains())[name], random.Random(0)
     whole = call()
-    begin = time.perf_counter()
-    call()  # compiled
-    longest, met, lost, equal = time.perf_counter() - begin, 0, 0, 0
+    _, _, longest = timed(call)  # compiled by now
+    met, lost, equal = 0, 0, 0
     with tempfile.TemporaryDirectory() as all_folders:
         for i in range(runs):
             folder = Path(all_folders, str(i))
@@ -273,7 +267,7 @@ def report(args):
         return found
     if not args.smoke:
         n, episodes, repeats = size(args, (4_000_000, 1280, 5), (1_000_000, 640, 1), None)
-        of_ferry = lambda **how: jast.nominal(KEY, ferry(), n, **how)
+        of_ferry = partial(jast.nominal, KEY, ferry(), n)
         waiting = speedup(black_box(episodes), repeats)
         found["workers"] = {"S0": speedup(of_ferry, repeats), "black box, 5 ms": waiting}
     each = names or size(args, list(calls(*sizes)), ["nominal", "forest"], None)
@@ -315,14 +309,13 @@ def tables(found):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options(parser, "less of everything: two kills of two calls")
+    parser = options(__doc__, "less of everything: two kills of two calls")
     parser.add_argument("--costs", action="store_true", help="only the driver and a checkpoint")
     parser.add_argument("--kills", type=int, metavar="N", help="only kills, N in all")
     parser.add_argument("--calls", nargs="+", metavar="NAME", help="of these calls; default: all")
     args = parser.parse_args(argv)
     found = report(args) if args.kills is None else dict(kills=many_kills(args.kills, args.calls))
-    print(json.dumps(found, indent=1) if args.json else tables(found))
+    print_report(args, found, tables(found))
 
 
 if __name__ == "__main__":

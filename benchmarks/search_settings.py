@@ -7,15 +7,13 @@ mean over problems that both answer), and how many unflagged ones are off by mor
 their standard errors.
 """
 
-import argparse
-import json
 import math
 
 import jax
 
 import jast
 from benchmarks.limit_states import FAMILIES, draw
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, options, print_report, printer, size
 from jast.estimate import by_proposal
 from jast.estimate.search_settings import SETTINGS
 
@@ -56,12 +54,12 @@ def line(of, base):
 
 
 def main(argv=None):
-    parser = options(argparse.ArgumentParser(description=__doc__), "two numbers, on two families")
+    parser = options(__doc__, "two numbers, on two families")
     parser.add_argument("--seeds", type=int, help="problems of each family (3)")
     parser.add_argument("--budget", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=830_000, help="number of the first problem")
-    parser.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY")
-    parser.add_argument("--only", nargs="+", choices=SETTINGS._fields, metavar="NUMBER")
+    add_choices(parser, "--families", FAMILIES)
+    add_choices(parser, "--only", SETTINGS._fields)
     args = parser.parse_args(argv)
     seeds = args.seeds or size(args, 3, 1, 1)
     every = tuple(n for n in SETTINGS._fields if n not in FIXED)
@@ -71,23 +69,23 @@ def main(argv=None):
     problems = [(first + i, draw(f, first + i)) for i in range(seeds) for f in families]
     base = answers(SETTINGS, problems, args.budget)
     out = {"as it is": line(base, base) | {"problems": len(problems)}}
-    show = lambda name: print(
-        f"{name:32} flagged {out[name]['flagged']:3d}  error {out[name]['error']:5.2f}"
-        f"  far {out[name]['far']}",
-        flush=True,
-    )
-    if not args.json:
-        print(f"{len(problems)} problems, {args.budget} evaluations, jast {jast.__version__}")
-        show("as it is")
+    say = printer(args)
+
+    def text(name):
+        return (
+            f"{name:32} flagged {out[name]['flagged']:3d}  error {out[name]['error']:5.2f}"
+            f"  far {out[name]['far']}"
+        )
+
+    say(f"{len(problems)} problems, {args.budget} evaluations, jast {jast.__version__}")
+    say(text("as it is"))
     for name in names:
         for by in (0.5, 2.0):
             at = changed(name, by)
             said = f"{name} {getattr(at, name):g}"
             out[said] = line(answers(at, problems, args.budget), base)
-            if not args.json:
-                show(said)
-    if args.json:
-        print(json.dumps(out))
+            say(text(said))
+    print_report(args, out)
     return out
 
 

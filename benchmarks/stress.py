@@ -9,9 +9,6 @@ whose evaluations the others then have. The cases named "... loop" are those of
 `benchmarks.closed_loops`.
 """
 
-import argparse
-import importlib.util
-import json
 import time
 import warnings
 from functools import partial
@@ -23,7 +20,7 @@ import numpy as np
 
 import jast
 from benchmarks import cma_es as driver
-from benchmarks.sizes import options, size
+from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
 from jast.estimate.batches import resampled
 from jast.estimate.descents import SETTINGS, cooled
@@ -90,8 +87,8 @@ def cma_es(key, sim, budget):
         if spent + size > budget:
             raise driver.Stop
         each = jax.device_get(_scored(centre, jnp.asarray(points, normal_numbers(sim))))
-        both = lambda a, b: np.concatenate([a, b])
-        known = each if known is None else jax.tree.map(both, known, each)
+        parts = [each] if known is None else [known, each]
+        known = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
         value = np.where(known.failure, known.reward, -np.inf)
         order = np.argsort(-value, kind="stable")[:64]
         known = jax.tree.map(lambda a: a[order], known)
@@ -99,10 +96,8 @@ def cma_es(key, sim, budget):
         worth = np.where(each.failure, -1 / (1 + np.abs(each.reward)), each.distance)
         return np.nan_to_num(worth, nan=1e30, posinf=1e30)
 
-    again = lambda: zeros
-    driver.cma_es(
-        rng, evaluate, zeros, np.ones(len(zeros)), again, popsize=size, tolflatfitness=10**9
-    )
+    settings = dict(popsize=size, tolflatfitness=10**9)
+    driver.cma_es(rng, evaluate, zeros, np.ones(len(zeros)), lambda: zeros, **settings)
     known = jax.tree.map(lambda a: a[known.failure], known)
     if not len(known.length):
         return None, spent, None
@@ -127,8 +122,12 @@ def slow_cooling(key, sim, budget):
 @jax.jit
 def _scored(sim, z):
     """The episodes [n] of the normal numbers ``z`` [n, D], by log p relative to the mode."""
-    play = lambda z: jast.rollout(jax.random.key(0), sim, policy_of(sim, z), likelihood(sim))
-    return jax.vmap(lambda z: play(z)._replace(states=None))(z)
+
+    def play(z):
+        policy = policy_of(sim, z)
+        return jast.rollout(jax.random.key(0), sim, policy, likelihood(sim))._replace(states=None)
+
+    return jax.vmap(play)(z)
 
 
 METHODS = {
@@ -151,7 +150,10 @@ METHODS = {
 def _without(name, key, sim, budget):
     """`stress` where one of its explorers is not called."""
     few = {k: v for k, v in explorers.LEAST.items() if k != name}
-    nothing = lambda *_: explorers.Haul(empty(sim).episodes, 0, 0, 0)
+
+    def nothing(*_):
+        return explorers.Haul(empty(sim).episodes, 0, 0, 0)
+
     with (
         mock.patch.object(explorers, "LEAST", few),
         mock.patch.dict(explorers.EXPLORERS, {name: nothing}),
@@ -185,8 +187,7 @@ def run(cases, methods, budget, seeds):
         for method in methods:
             begin, found = time.process_time(), []
             for seed in range(seeds):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
+                with warnings.catch_warnings(action="ignore"):
                     found.append(calls[method](jax.random.key(seed), sim, budget))
             best = [b for b, _, _ in found if b is not None]
             rows[method] = dict(
@@ -204,7 +205,10 @@ def run(cases, methods, budget, seeds):
 
 def table(report):
     """The report as text."""
-    number = lambda v: f"{'-':>9}" if v is None else f"{v:9.3f}"
+
+    def number(v):
+        return f"{'-':>9}" if v is None else f"{v:9.3f}"
+
     lines = [
         f"{'system':<16} {'optimum':>9} {'method':<23} {'found':>7} {'median':>9} {'worst':>9}"
         f" {'evaluations':>12} {'modes':>12} {'CPU s':>7}"
@@ -225,28 +229,24 @@ def table(report):
 
 
 def main(argv=None):
-    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, few evaluations")
-    parser.add_argument("--cases", nargs="+", choices=CASES | LOOPS, help="default: all but loops")
-    help = f"default: all but {', '.join(SINGLE)}; cma_es needs the package cma (extra `benchmark`)"
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help=help)
+    parser = options(__doc__, "two systems, few evaluations")
+    add_choices(parser, "--cases", CASES | LOOPS, "all but loops")
+    add_choices(parser, "--methods", METHODS, f"all but {', '.join(SINGLE)}")
     help = "stress with and without each of its explorers, in place of --methods"
     parser.add_argument("--leave-out", action="store_true", help=help)
     parser.add_argument("--budget", type=int, help="evaluations (default: 100,000)")
     parser.add_argument("--seeds", type=int, help="default: 20")
     args = parser.parse_args(argv)
     cases = args.cases or size(args, list(CASES), ["pedestrians", "latch"], ["branches"])
-    absent = () if importlib.util.find_spec("cma") else ("cma_es",)
+    absent = () if installed("cma") else ("cma_es",)
     there = [m for m in METHODS if m not in (*SINGLE, *absent)]
     methods = args.methods or size(args, there, there, ["stress", "monte_carlo"])
     methods = ["stress", *LEFT_OUT] if args.leave_out else methods
     budget = args.budget or size(args, 100_000, 10_000, 600)
     seeds = args.seeds or size(args, 20, 1, 1)
     report = run(cases, methods, budget, seeds)
-    if args.json:
-        settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
-        print(json.dumps(dict(settings=settings, systems=report)))
-    else:
-        print(table(report))
+    settings = dict(budget=budget, seeds=seeds, judged=list(JUDGED), jast=jast.__version__)
+    print_report(args, dict(settings=settings, systems=report), table(report))
 
 
 if __name__ == "__main__":

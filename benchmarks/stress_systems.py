@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 import jast
 from benchmarks import closed_loops
+from benchmarks.closed_loops import system
 from jast import simulators
 from jast.distributions import Categorical, MultivariateNormalDiag, Normal
 
@@ -33,20 +34,12 @@ def linear(steps, beta=4.55, sides=1, decay=0.95):
     """A first-order filter of white noise leaves its band: log p - log p(mode) = -beta^2 / 2, at
     the last step.
     """
-    gain = math.sqrt(sum(decay ** (2 * i) for i in range(steps)))
-    limit = beta * gain
+    limit = beta * math.sqrt(sum(decay ** (2 * i) for i in range(steps)))
 
-    def evaluate(y):
-        out = jnp.abs(y) if sides == 2 else y
-        return out >= limit, jnp.maximum(limit - out, 0.0)
+    def distance(y):
+        return limit - (jnp.abs(y) if sides == 2 else y)
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda y, x: decay * y + x,
-        disturbance=lambda y: Normal(0.0, 1.0),
-        evaluate=evaluate,
-        horizon=steps,
-    )
+    return system(0.0, lambda y, x: decay * y + x, distance, 1, steps)
 
 
 def lane(gain=0.3):
@@ -57,13 +50,7 @@ def lane(gain=0.3):
         speed = 0.8 * speed - gain * offset + 0.1 * gust
         return jnp.stack([offset + speed, speed])
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(2),
-        step=step,
-        disturbance=lambda car: Normal(0.0, 1.0),
-        evaluate=lambda car: (jnp.abs(car[0]) >= 1.4, jnp.maximum(1.4 - jnp.abs(car[0]), 0.0)),
-        horizon=30,
-    )
+    return system([0.0, 0.0], step, lambda car: 1.4 - jnp.abs(car[0]), 1, 30)
 
 
 def car():
@@ -120,13 +107,7 @@ def relay():
         v = 0.97 * v + 0.1 * (u + 0.5 * x) + 0.06 * push
         return jnp.stack([x + 0.2 * v, v])
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(2),
-        step=step,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (jnp.abs(s[0]) >= 1.8, jnp.maximum(1.8 - jnp.abs(s[0]), 0.0)),
-        horizon=60,
-    )
+    return system([0.0, 0.0], step, lambda s: 1.8 - jnp.abs(s[0]), 1, 60)
 
 
 def slips():
@@ -176,9 +157,7 @@ def pedestrians():
         a, b, t = s
         hit = ((t == when_a) & (a <= 0)) | ((t == when_b) & (b <= 0))
         near = jnp.where(
-            t == when_a,
-            jnp.maximum(a, 0.0),
-            jnp.where(t == when_b, jnp.maximum(b, 0.0), away_b),
+            t == when_a, jnp.maximum(a, 0.0), jnp.where(t == when_b, jnp.maximum(b, 0.0), away_b)
         )
         return hit, near
 
@@ -217,13 +196,7 @@ def wander():
         v = 0.9 * v - 0.05 * late + 0.05 * wave
         return jnp.stack([y + v, v, 0.5 * late + 0.5 * y])
 
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(3),
-        step=step,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (jnp.abs(s[0]) >= 7.5, jnp.maximum(7.5 - jnp.abs(s[0]), 0.0)),
-        horizon=200,
-    )
+    return system([0.0, 0.0, 0.0], step, lambda s: 7.5 - jnp.abs(s[0]), 1, 200)
 
 
 def _cost(steps, away, noise):

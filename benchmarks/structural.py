@@ -20,7 +20,9 @@ from jast import distributions as D
 
 __all__ = ["PROBLEMS", "Problem", "structural_cases"]
 
-POINTS, REACH, SOBOL = 200_001, 9.0, 20
+POINTS = 200_001  # of a quadrature
+REACH = 9.0  # standard deviations to either side of it
+SOBOL = 20  # the binary logarithm of the points of a sequence
 
 
 def normal(mean=0.0, sd=1.0):
@@ -168,14 +170,20 @@ def _rp57_given(d, x):
     """Two intervals, of which the parts they share count once."""
     low, high = (2 - x[0]) / 8, np.cbrt(x[0] ** 2 - 3)
     half = np.sqrt(np.maximum(4 - (x[0] + 3) ** 2, 0))
-    length = lambda a, b: np.where(b > a, d.cdf(b) - d.cdf(a), 0)
+
+    def length(a, b):
+        return np.where(b > a, d.cdf(b) - d.cdf(a), 0)
+
     shared = length(np.maximum(low, -3 - half), np.minimum(high, -3 + half))
     return length(low, high) + length(-3 - half, -3 + half) - shared
 
 
 def _rp60(x, np):
     x1, x2, x3, x4, x5 = x
-    three = lambda f, a, b, c: f(f(a, b), c)
+
+    def three(f, a, b, c):
+        return f(f(a, b), c)
+
     half = three(np.minimum, x2 - x5 / 2, x3 - x5 / 2, x4 - x5 / 2)
     whole = np.maximum(x4 - x5, np.minimum(x2 - x5, x3 - x5))
     return np.minimum(x1 - x5, np.maximum(half, whole))
@@ -274,10 +282,7 @@ PROBLEMS: dict[str, Problem] = {
         lambda d, x: 1 - _product(d, x, 146.14),
     ),
     "RP31": averaged(
-        TWO,
-        lambda x, np: 2 - x[1] + 256 * x[0] ** 4,
-        lambda d, x: d.sf(2 + 256 * x[0] ** 4),
-        1,
+        TWO, lambda x, np: 2 - x[1] + 256 * x[0] ** 4, lambda d, x: d.sf(2 + 256 * x[0] ** 4), 1
     ),
     "RP33": averaged(
         [normal()] * 3,
@@ -334,9 +339,7 @@ PROBLEMS: dict[str, Problem] = {
     ),
     "RP110": Problem(TWO, _rp110, lambda p: 1 - stats.norm.cdf(4) * stats.norm.cdf(5)),
     "RP111": averaged(
-        TWO,
-        lambda x, np: 12.5 - np.abs(x[0] * x[1]),
-        lambda d, x: 2 * _product(d, x, 12.5),
+        TWO, lambda x, np: 12.5 - np.abs(x[0] * x[1]), lambda d, x: 2 * _product(d, x, 12.5)
     ),
     "axial": averaged(
         [log_normal(300, 30), normal(75_000, 5000)],

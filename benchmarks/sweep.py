@@ -11,11 +11,9 @@ with common random numbers for as many CPU seconds; how many intervals hold the 
 programs that the first sweep compiles.
 """
 
-import argparse
-import functools
-import json
 import math
 import time
+from functools import partial
 from statistics import NormalDist
 
 import jax
@@ -23,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jast
-from benchmarks.ferry import timed
-from benchmarks.sizes import options, size
+from benchmarks.closed_loops import system
+from benchmarks.sizes import options, print_report, printer, size, timed
 from benchmarks.stress_systems import lane
 from jast.distributions import Normal
 from jast.estimate import failure_probability
@@ -33,20 +31,15 @@ from jast.limit_state import dimension
 
 __all__ = ["run"]
 
-STEPS, LIMIT, LEVEL = 10, 7.0, 1e-5
-NUMBERS = 200
+STEPS = 10  # of the filter and of the walk
+LIMIT = 7.0  # of the filter
+LEVEL = 1e-5  # the probability whose crossing is looked for
+NUMBERS = 200  # that are squared and added
 
 
 def filtered(decay):
     """A filter of white noise, which must be below a limit at the end."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda y, x: decay * y + x,
-        disturbance=lambda y: Normal(0.0, 1.0),
-        evaluate=lambda y: (y >= LIMIT, jnp.maximum(LIMIT - y, 0.0)),
-        horizon=STEPS,
-        episodic=True,
-    )
+    return system(0.0, lambda y, x: decay * y + x, lambda y: LIMIT - y, 1, STEPS, episodic=True)
 
 
 def of_filter(decay):
@@ -64,12 +57,15 @@ def run(name, n, budget):
     """Numbers of one case: CPU seconds, and what the rows are worth."""
     make, setting, low, high, truth = CASES[name]
     values, key = np.linspace(low, high, n), jax.random.key(0)
-    swept = lambda **how: jast.sweep(key, make, {setting: values}, budget=budget, **how)
+    swept = partial(jast.sweep, key, make, {setting: values}, budget=budget)
     table, seconds, _ = timed(swept)
-    calls = lambda: [
-        failure_probability(jax.random.fold_in(key, i), make(v), budget)
-        for i, v in enumerate(values)
-    ]
+
+    def calls():
+        return [
+            failure_probability(jax.random.fold_in(key, i), make(v), budget)
+            for i, v in enumerate(values)
+        ]
+
     apart, of_calls, _ = timed(calls)
     report = dict(
         values=n,
@@ -77,12 +73,12 @@ def run(name, n, budget):
         sweep_seconds=seconds,
         calls_seconds=of_calls,
         times=of_calls / seconds,
-        **_worth("sweep", table.results, values, truth),
-        **_worth("calls", apart, values, truth),
+        **_quality("sweep", table.results, values, truth),
+        **_quality("calls", apart, values, truth),
     )
     if truth is not None and truth(low) < LEVEL < truth(high):
         found = table.crossing(LEVEL, unreliable=True)
-        exact = _solved(truth, low, high)
+        exact = _root_of(truth, low, high)
         report |= dict(crossing=found.value, crossing_interval=found.interval, exact=exact)
     return report
 
@@ -106,14 +102,7 @@ def of_walk(limit):
 
 def squared(limit):
     """The sum of the squares of so many normal numbers is above ``limit``: no Gaussians serve."""
-    return jast.Simulator(
-        init=lambda x0: jnp.zeros(()),
-        step=lambda s, x: s + x * x,
-        disturbance=lambda s: Normal(0.0, 1.0),
-        evaluate=lambda s: (s > limit, jnp.maximum(limit - s, 0.0)),
-        horizon=NUMBERS,
-        episodic=True,
-    )
+    return system(0.0, lambda s, x: s + x * x, lambda s: limit - s, 1, NUMBERS, episodic=True)
 
 
 def of_squares(limit):
@@ -124,13 +113,7 @@ def of_squares(limit):
 
 JOINED = {
     "limit of a walk": (walked, "limit", 12.0, 14.0, of_walk),
-    "scale of its noise": (
-        functools.partial(walked, 13.0),
-        "scale",
-        0.93,
-        1.08,
-        lambda v: of_walk(13.0 / v),
-    ),
+    "scale of its noise": (partial(walked, 13.0), "scale", 0.93, 1.08, lambda v: of_walk(13.0 / v)),
     "sum of 200 squares": (squared, "limit", 280.0, 296.0, of_squares),
 }
 
@@ -140,16 +123,19 @@ def run_joined(name, n, keys, budget):
     make, setting, low, high, truth = JOINED[name]
     values = np.linspace(low, high, n)
     log_p, compiled = np.log([truth(v) for v in values]), []
-    heard = lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
-    swept = lambda i: timed(
-        lambda: jast.sweep(jax.random.key(i), make, {setting: values}, budget=budget)
-    )
+
+    def heard(name, *_, **__):
+        return compiled.append(name) if "backend_compile" in name else None
+
+    def swept(i):
+        return timed(lambda: jast.sweep(jax.random.key(i), make, {setting: values}, budget=budget))
+
     jax.monitoring.register_event_duration_secs_listener(heard)
     first = swept(0)
     jax.monitoring.clear_event_listeners()
     tables, spent, _ = zip(first, *map(swept, range(1, keys)), strict=True)
     seconds = float(np.median(spent))  # the first one compiles
-    plain = [_plainly(tables[0].simulators, i, seconds) for i in range(keys)]
+    plain = [_plain_shares(tables[0].simulators, i, seconds) for i in range(keys)]
     alone = np.array([[r.log_mean for r in t.results] for t in tables])
     own = np.array([[r.interval for r in t.results] for t in tables])
     curve, ratios = (
@@ -168,9 +154,9 @@ def run_joined(name, n, keys, budget):
         ratio_error_alone=_rms(np.diff(alone) - steps),
         ratio_error_joined=_rms(np.log(ratios[..., 0]) - steps),
         ratio_error_plain=_rms(np.diff(np.log(plain)) - steps),
-        hold_alone=_held(own[..., 0], own[..., 1], np.exp(log_p)),
-        hold_joined=_held(curve[..., 1], curve[..., 2], np.exp(log_p)),
-        hold_ratios=_held(ratios[..., 1], ratios[..., 2], np.exp(steps)),
+        hold_alone=_coverage(own[..., 0], own[..., 1], np.exp(log_p)),
+        hold_joined=_coverage(curve[..., 1], curve[..., 2], np.exp(log_p)),
+        hold_ratios=_coverage(ratios[..., 1], ratios[..., 2], np.exp(steps)),
         apart=sum(len(t.settings.get("apart", ())) for t in tables),
         seconds=seconds,
         first_seconds=spent[0],
@@ -178,7 +164,7 @@ def run_joined(name, n, keys, budget):
     )
 
 
-def _plainly(sims, seed, seconds):
+def _plain_shares(sims, seed, seconds):
     """The share of plain draws that fail, the same for all systems, within so many CPU seconds."""
     rng, failing, n, d = np.random.default_rng(seed), np.zeros(len(sims)), 0, dimension(sims[0])
     [judged(s, np.zeros((1, d), np.float32)) for s in sims[:1]]  # compiled
@@ -194,12 +180,12 @@ def _rms(errors):
     return float(np.sqrt(np.nanmean(np.square(errors))))
 
 
-def _held(low, high, truth):
+def _coverage(low, high, truth):
     """Share of the intervals, of those that there are, that hold the truth."""
     return float(((low <= truth) & (truth <= high)).sum() / np.isfinite(low).sum())
 
 
-def _worth(who, results, values, truth):
+def _quality(who, results, values, truth):
     """How many rows are reliable, the median of their standard errors, and how many intervals hold
     the truth: of all rows, and of the reliable ones.
     """
@@ -215,7 +201,7 @@ def _worth(who, results, values, truth):
     return out
 
 
-def _solved(rising, low, high):
+def _root_of(rising, low, high):
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if rising(middle) < LEVEL else (low, middle)
@@ -223,21 +209,19 @@ def _solved(rising, low, high):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__)
-    args = options(parser, quick="4 values; 3 keys of one joined case").parse_args(argv)
+    args = options(__doc__, "4 values; 3 keys of one joined case").parse_args(argv)
     n, budget = size(args, 50, 4, 2), size(args, 10_000, 10_000, 5000)
     names = size(args, list(CASES), list(CASES), ["filter"])
     report = {name: run(name, n, budget) for name in names}
     n, keys = size(args, (10, 20), (8, 3), (3, 1))
     for name in size(args, list(JOINED), list(JOINED)[:1], list(JOINED)[:1]):
         report[name] = run_joined(name, n, keys, 300_000)
-    if args.json:
-        print(json.dumps(report))
-        return
+    say = printer(args)
     for name, numbers in report.items():
-        print(name)
+        say(name)
         for what, value in numbers.items():
-            print(f"  {what:<24}{value if isinstance(value, tuple) else f'{value:.5g}'}")
+            say(f"  {what:<24}{value if isinstance(value, tuple) else f'{value:.5g}'}")
+    print_report(args, report)
 
 
 if __name__ == "__main__":

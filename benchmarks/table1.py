@@ -7,7 +7,6 @@ included, without compilation: a call before each row (`warm_up`) compiles the s
 """
 
 import functools
-import json
 from typing import NamedTuple
 
 import jax
@@ -15,8 +14,8 @@ import numpy as np
 
 import jast
 from benchmarks import engine
-from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome, timed
-from benchmarks.sizes import size
+from benchmarks.ferry import BOX, REWARD, TABLE, data, golden, outcome
+from benchmarks.sizes import print_report, printer, size, timed
 from jast.counter import tree_keys
 from jast.intervals import clopper_pearson
 from jast.search.tree.memory import LANES
@@ -57,15 +56,33 @@ class Sizes(NamedTuple):
     """Simulations a root, where that is few."""
 
 
-QUICK = Sizes(100, 24, 1, 8, ("none", "both"), 50, (), 100, (15.0,), 100, (0, 30, 300))
-SMOKE = Sizes(
-    *(2, 2, 1, 1, ("both",), 5, (), 2, (15.0,), 2, (0,)),
+QUICK = Sizes(
+    trees=100,
+    taught_trees=24,
+    seeds=1,
+    round=8,
+    heads=("none", "both"),
+    simulations=50,
+    budgets=(),
+    budget_trees=100,
+    starts=(15.0,),
+    warm_trees=100,
+    substeps=(0, 30, 300),
+)
+SMOKE = QUICK._replace(
+    trees=2,
+    taught_trees=2,
+    round=1,
+    heads=("both",),
+    simulations=5,
+    budget_trees=2,
+    warm_trees=2,
+    substeps=(0,),
     modes=("paper",),
     variants=("MCTS-SA",),
     published=5,
     small=5,
 )
-
 COLUMNS = {  # name -> width and text of a row; "-" where it has no such number
     "B": (3, lambda r: r["B"] or "-"),
     "trees": (5, lambda r: r["trees"]),
@@ -104,35 +121,20 @@ def forest(sim, heads=None, mode="default", trees=200, simulations=500, **settin
     `warm_up` can have the same with fewer trees.
     """
     settings = dict(round=max(1, min(trees // 5, LANES))) | settings
-    more = (
-        {}
-        if heads is None
-        else dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
-    )
-    return functools.partial(
-        jast.search.forest,
-        sim=sim,
-        trees=trees,
-        simulations=simulations,
-        mode=mode,
-        reward=REWARD,
-        actions=BOX,
-        **more,
-    )
+    more = dict(trees=trees, simulations=simulations, mode=mode, reward=REWARD, actions=BOX)
+    if heads is not None:
+        more |= dict(heads=heads, head_settings=jast.heads.settings(mode, **settings))
+    return functools.partial(jast.search.forest, sim=sim, **more)
 
 
 def variant(name, mode, sizes):
     """A row of Table 1."""
     s0, heads = jast.simulators.ferry(), VARIANTS[name]
     if name == "MCTS-SA":
+        more = dict(mode=mode, reward=REWARD, actions=BOX)
+        total = 18 * sizes.published
         return functools.partial(
-            jast.search.mcts,
-            sim=s0,
-            trees=sizes.trees,
-            simulations=18 * sizes.published,
-            mode=mode,
-            reward=REWARD,
-            actions=BOX,
+            jast.search.mcts, sim=s0, trees=sizes.trees, simulations=total, **more
         )
     # alone, the paper's value network is not trained
     published = dict(train=False) if heads == "value" else dict(round=sizes.round)
@@ -149,17 +151,14 @@ def warm_up(search):
         raise KeyboardInterrupt
 
     heads, trees = search.keywords.get("head_settings"), search.keywords["trees"]
-    learns = heads is not None and heads.train
-    more = (
-        dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1)))
-        if learns
-        else dict(callback=end)
-    )
+    more = dict(callback=end)
+    if heads is not None and heads.train:
+        more = dict(trees=min(heads.round, trees), head_settings=heads._replace(steps=(1, 1)))
     tree_keys(jax.random.key(0), trees)[: more.get("trees")]
     return timed(lambda: search(jax.random.key(0), **more))[1]
 
 
-def settled(search, seed):
+def warm_run(search, seed):
     """`timed`; a short call is made twice and the second one counts, as some small programs depend
     on what was found.
     """
@@ -170,15 +169,13 @@ def settled(search, seed):
 def measure(searches, seeds):
     """The row of a search, given for each seed."""
     warm = warm_up(searches[0])
-    runs = [settled(search, seed) for search, seed in zip(searches, seeds, strict=True)]
+    runs = [warm_run(search, seed) for search, seed in zip(searches, seeds, strict=True)]
     results, cpu, wall = zip(*runs, strict=True)
     bests = [np.asarray(r.best_reward_per_tree, np.float64) for r in results]
     row = outcome(np.concatenate(bests))
-    heads, episodes, a_second = (
-        searches[0].keywords.get("head_settings"),
-        sum(r.episodes for r in results),
-        row["trees"] / sum(cpu),
-    )
+    heads = searches[0].keywords.get("head_settings")
+    episodes = sum(r.episodes for r in results)
+    a_second = row["trees"] / sum(cpu)
     return row | {
         "B": heads.round if heads is not None and heads.train else None,
         "rates": [float((b > 0).mean()) for b in bests],
@@ -200,13 +197,16 @@ def published():
     if (found := data("table1_per_tree.json")) is not None:
         bests = found["best_reward_per_tree"]
         return {name: outcome(np.array(bests[name])) for name in VARIANTS}
-    row = lambda rate, mean, best: dict(
-        trees=200,
-        rate=rate / 100,
-        rate_95=list(clopper_pearson(round(2 * rate), 200)),
-        mean_best=mean,
-        best=best,
-    )
+
+    def row(rate, mean, best):
+        return dict(
+            trees=200,
+            rate=rate / 100,
+            rate_95=list(clopper_pearson(round(2 * rate), 200)),
+            mean_best=mean,
+            best=best,
+        )
+
     return {name: row(*TABLE[name]) for name in VARIANTS}
 
 
@@ -228,10 +228,7 @@ def block(title, searches, seeds, say, table1=False):
     say(f"\n{title}")
     rows = {}
     for name, search in searches.items():
-        row = measure(
-            search if isinstance(search, list) else [search] * len(seeds),
-            seeds,
-        )
+        row = measure(search if isinstance(search, list) else [search] * len(seeds), seeds)
         plain = next(iter(rows.values()), row)
         row["cpu_ratio"] = plain["simulations_per_cpu_s"] / row["simulations_per_cpu_s"]
         if table1:
@@ -278,11 +275,8 @@ def warm_start(sizes, seeds, say):
 def episode_cost(sim, simulations):
     """CPU microseconds of one random episode, of 200 in lockstep."""
     problem, keys = engine.problem(9000, sim=sim), tree_keys(jax.random.key(0), 200)
-    return (
-        min(engine.cpu(lambda: engine.rollouts(problem, keys, simulations))[0] for _ in range(3))
-        / (simulations * 200)
-        * 1e6
-    )
+    play = functools.partial(engine.rollouts, problem, keys, simulations)
+    return min(engine.cpu(play)[0] for _ in range(3)) / (simulations * 200) * 1e6
 
 
 def slowed(sizes, seeds, say):
@@ -377,7 +371,7 @@ def report(args):
             warm_trees=max(1, args.trees // 5),
         )
     seeds = range(args.seed, args.seed + (args.seeds or sizes.seeds))
-    say = (lambda text: None) if args.json else functools.partial(print, flush=True)
+    say = printer(args)
     rows = published()
     out = {"golden": golden(), "seeds": list(seeds), "sizes": sizes._asdict(), "published": rows}
     say(f"golden episodes: {out['golden'] or 'data not found'}\n{LEGEND}\n")
@@ -385,34 +379,22 @@ def report(args):
     say("published")
     for name, row in rows.items():
         say(line(name, row))
+    measured = functools.partial(block, seeds=seeds, say=say)
     for mode in sizes.modes:
-        out[mode] = block(
-            f"S0, {mode} mode",
-            {name: variant(name, mode, sizes) for name in sizes.variants},
-            seeds,
-            say,
-            table1=True,
-        )
+        searches = {name: variant(name, mode, sizes) for name in sizes.variants}
+        out[mode] = measured(f"S0, {mode} mode", searches, table1=True)
     s0, s0b = jast.simulators.ferry(), jast.simulators.ferry(adversary=(17.0, 0.0))
-    out["S0b"] = block(
-        f"S0b, default mode, 18 x {sizes.simulations}",
-        kinds(sizes.heads, s0b, trees=sizes.trees, simulations=sizes.simulations),
-        seeds,
-        say,
-    )
-    out["small"] = block(
-        f"S0, default mode, 18 x {sizes.small}",
-        kinds(sizes.heads, s0, trees=sizes.trees, simulations=sizes.small),
-        seeds,
-        say,
-    )
+    for label, system, key, n in (
+        ("S0b", s0b, "S0b", sizes.simulations),
+        ("S0", s0, "small", sizes.small),
+    ):
+        searches = kinds(sizes.heads, system, trees=sizes.trees, simulations=n)
+        out[key] = measured(f"{label}, default mode, 18 x {n}", searches)
     names, trees = [name for name in sizes.heads if name != "value"], sizes.budget_trees
     out["equal_cpu_time"] = {
-        n: block(
+        n: measured(
             f"S0, default mode, 18 x {n}, {trees} trees",
             kinds(names, s0, trees=trees, simulations=n),
-            seeds,
-            say,
         )
         for n in sizes.budgets
     }
@@ -420,5 +402,4 @@ def report(args):
     if args.picture:
         out["slow_simulator"] = slowed(sizes, seeds, say)
         draw(out, args.picture)
-    if args.json:
-        print(json.dumps(out, indent=1))
+    print_report(args, out)

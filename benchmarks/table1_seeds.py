@@ -9,16 +9,14 @@ whose head stays as it was made), so they are not independent: a run is one figu
 18 x 500 simulations.
 """
 
-import argparse
-import json
 import sys
 
 import jax
 import numpy as np
 
 import jast
-from benchmarks.ferry import BOX, REWARD, TABLE, timed
-from benchmarks.sizes import options, size
+from benchmarks.ferry import BOX, REWARD, TABLE
+from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 
 VARIANTS = {"mcts": "MCTS-SA", "none": "-/-", "rollout": "RP/-", "value": "-/VN", "both": "RP/VN"}
 """The search or its heads: the paper's name of the row."""
@@ -56,10 +54,13 @@ def search(row, trees, simulations):
 def summary(bests, cpu):
     """The row of several seeds, by the best rewards [seeds, trees]."""
     rates = np.mean(bests > 0, axis=1)
-    over = lambda values: {
-        "mean": float(values.mean()),
-        "sd": float(values.std(ddof=1)) if len(values) > 1 else None,
-    }
+
+    def over(values):
+        return {
+            "mean": float(values.mean()),
+            "sd": float(values.std(ddof=1)) if len(values) > 1 else None,
+        }
+
     return {
         "rates": rates.tolist(),
         "rate": over(rates),
@@ -70,19 +71,16 @@ def summary(bests, cpu):
 
 
 def main(argv=None):
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.table1_seeds", description=__doc__.splitlines()[0]
-    )
-    options(parser, "2 seeds of 8 trees: under two minutes")
+    parser = options(__doc__, "2 seeds of 8 trees: under two minutes")
     parser.add_argument("--seeds", type=int, help="default 10")
     parser.add_argument("--trees", type=int, help="of a seed; default 200, as published")
-    parser.add_argument("--rows", nargs="+", choices=[*ROWS], help="only these")
+    add_choices(parser, "--rows", ROWS)
     args = parser.parse_args(argv)
     seeds, trees = args.seeds or size(args, 10, 2, 2), args.trees or size(args, 200, 8, 2)
     rows = args.rows or size(args, [*ROWS], [*ROWS], ["rollout, code, tree"])
     simulations = 10 if args.smoke else 500
-    print(f"{seeds} seeds of {trees} trees, 18 x {simulations} simulations; % of failing trees")
+    say = printer(args)
+    say(f"{seeds} seeds of {trees} trees, 18 x {simulations} simulations; % of failing trees")
     out = {}
     for row in rows:
         find, bests, cpu = search(row, trees, simulations), [], 0.0
@@ -99,16 +97,14 @@ def main(argv=None):
         r = out[row] = summary(np.stack(bests), cpu)
         spread = "" if r["rate"]["sd"] is None else f" +- {100 * r['rate']['sd']:.1f} (SD)"
         printed = TABLE[VARIANTS[row.split(",")[0]]]
-        print(
+        say(
             f"  {row:20} {100 * r['rate']['mean']:5.1f}{spread},"
             f" {100 * min(r['rates']):.1f} to {100 * max(r['rates']):.1f};"
             f" mean best {r['mean_best']['mean']:.2f}, best {r['best']:.2f};"
             f" printed {printed[0]}, {printed[1]:.2f}, {printed[2]:.2f};"
-            f" {r['cpu_s_a_seed']:.0f} CPU s a seed",
-            flush=True,
+            f" {r['cpu_s_a_seed']:.0f} CPU s a seed"
         )
-    if args.json:
-        print(json.dumps(out))
+    print_report(args, out)
 
 
 if __name__ == "__main__":

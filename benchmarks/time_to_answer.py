@@ -9,27 +9,22 @@ installed. ``first`` is the first call in this process, with compilation. A sile
 unflagged answer more than 4 standard errors off, of itself and the truth.
 """
 
-import argparse
-import json
 import math
-import os
 import time
 import warnings
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.tree_util import Partial  # noqa: E402
-
-import jast  # noqa: E402
-from benchmarks.closed_loops import JUDGED, RARE, TUNED, system  # noqa: E402
-from benchmarks.sizes import options, size  # noqa: E402
-from jast.judge import judged  # noqa: E402
-from jast.limit_state import dimension  # noqa: E402
-from jast.simulators import limit_state  # noqa: E402
+import jast
+from benchmarks.closed_loops import JUDGED, RARE, TUNED, system
+from benchmarks.sizes import add_choices, options, percent, print_report, printer, size
+from jast.judge import judged
+from jast.limit_state import dimension
+from jast.simulators import limit_state
 
 __all__ = ["SYSTEMS", "System", "plain_draws", "row_of"]
 
@@ -94,7 +89,9 @@ def toy_step(steps, s, w):
 
 
 def _toy(z, steps):
-    gap = lambda s: z - s[0] - 2 * s[1]
+    def gap(s):
+        return z - s[0] - 2 * s[1]
+
     return system([0.0, 0.0], Partial(toy_step, steps), gap, 2, steps, episodic=True)
 
 
@@ -107,7 +104,10 @@ def well_step(s, w):
 
 def well_distance(s):
     """Of the progress from one well to the other, to .95."""
-    bump = lambda x: 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
+
+    def bump(x):
+        return 0.5 * jnp.exp(-8 * ((s[0] - x) ** 2 + s[1] ** 2))
+
     return 0.95 - (0.5 - bump(-1.0) + bump(1.0))
 
 
@@ -139,8 +139,7 @@ METHODS = ("failure_probability", "stress", "subset")
 def answers(method: str, about: System, seed: int) -> tuple[Any, float]:
     """The `Estimate` of a method (of OpenTURNS (log mean, relative error)), and CPU seconds."""
     begun, key = time.process_time(), jax.random.key(seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         if method == "stress":
             found = jast.stress(key, about.simulator, about.budget).probability
         elif method == "failure_probability":
@@ -199,7 +198,10 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
     off = logs - math.log(about.truth)
     z = np.abs(off) / np.hypot(errors, about.error)
     known = reliable & np.isfinite(off)
-    rms = lambda a: float(np.sqrt(np.mean(a**2))) if a.size else None
+
+    def rms(a):
+        return float(np.sqrt(np.mean(a**2))) if a.size else None
+
     warm = float(np.mean(seconds[1:])) if seeds > 1 else None
     return dict(
         system=name,
@@ -221,7 +223,10 @@ def row_of(name: str, about: System, method: str, seeds: int) -> dict[str, Any]:
 def plain_draws(about: System, seconds: float) -> float | None:
     """The relative standard error of plain draws in so many CPU seconds."""
     n = 2**15
-    count = lambda seed: jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
+
+    def count(seed):
+        return jast.estimate.monte_carlo(jax.random.key(seed), about.simulator, n)
+
     count(0)
     begun = time.process_time()
     count(1)
@@ -230,28 +235,25 @@ def plain_draws(about: System, seconds: float) -> float | None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = options(argparse.ArgumentParser(description=__doc__), "two systems, one key")
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, help="default: all")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
+    parser = options(__doc__, "two systems, one key")
+    add_choices(parser, "--systems", SYSTEMS)
+    add_choices(parser, "--methods", METHODS)
     parser.add_argument("--seeds", type=int, help="keys (default: 20)")
     args = parser.parse_args(argv)
     names = args.systems or size(args, list(SYSTEMS), ["drone", "piecewise"], ["piecewise"])
     methods = args.methods or size(args, METHODS, METHODS[:2], METHODS[:1])
-    seeds, rows = args.seeds or size(args, 20, 2, 1), []
+    say, seeds, rows = printer(args), args.seeds or size(args, 20, 2, 1), []
     for name in names:
         for method in methods:
             row = row_of(name, SYSTEMS[name], method, seeds)
             if method == "failure_probability":
                 row["plain"] = plain_draws(SYSTEMS[name], row["warm"] or row["first"])
             rows.append(row)
-            if not args.json:
-                print(_line(row), flush=True)
-    if args.json:
-        print(json.dumps(dict(seeds=seeds, rows=rows)))
+            say(_line(row))
+    print_report(args, dict(seeds=seeds, rows=rows))
 
 
 def _line(r):
-    percent = lambda v: "-" if v is None else f"{100 * v:.1f} %"
     warm = "-" if r["warm"] is None else f"{r['warm']:.1f}"
     plain = f"  plain draws {percent(r['plain'])}" if "plain" in r else ""
     return (

@@ -15,8 +15,8 @@ not seen their outcome; candidates: as many as 627 of 10,000. Seconds are of one
 first with compilation.
 """
 
-import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -28,15 +28,15 @@ from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
 
-from benchmarks.ferry import timed
 from benchmarks.fms import mean
-from benchmarks.sizes import options, size
+from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
 from jast.weakness.measures import precision_recall
 from jast.weakness.thesis import halves
 from jast.weakness.validation import iteration_key
 
-SHARES, CANDIDATES = (0.05, 0.1, 0.25), 0.0627
+SHARES = (0.05, 0.1, 0.25)  # of the inputs: budgets
+CANDIDATES = 0.0627  # of the inputs, as many as in the thesis
 ROWS = ("precision", "recall", "candidates", "calls", "found", "sampled_precision")
 
 
@@ -46,11 +46,9 @@ class Answers:
     """
 
     def __init__(self, inputs, predicted):
-        self.index, self.predicted, self.asked = (
-            {x.tobytes(): i for i, x in enumerate(inputs)},
-            np.asarray(predicted),
-            np.zeros(len(inputs), int),
-        )
+        self.index = {x.tobytes(): i for i, x in enumerate(inputs)}
+        self.predicted = np.asarray(predicted)
+        self.asked = np.zeros(len(inputs), int)
 
     def __call__(self, batch):
         at = np.asarray([self.index[x.tobytes()] for x in batch])
@@ -68,16 +66,10 @@ def mnist(folder, quick):
             out = np.maximum(flat @ w["W1"] + w["b1"], 0) @ w["W2"] + w["b2"]
         yield "published", images, labels, out.argmax(1)
     if not quick:
-        for name, model in (
-            ("nearest", KNeighborsClassifier(3)),
-            ("forest", RandomForestClassifier(50, random_state=0)),
-        ):
-            yield (
-                name,
-                images[half:],
-                labels[half:],
-                model.fit(flat[:half], labels[:half]).predict(flat[half:]),
-            )
+        nearest, forest = KNeighborsClassifier(3), RandomForestClassifier(50, random_state=0)
+        for name, model in (("nearest", nearest), ("forest", forest)):
+            predicted = model.fit(flat[:half], labels[:half]).predict(flat[half:])
+            yield name, images[half:], labels[half:], predicted
 
 
 def digits(quick):
@@ -91,12 +83,8 @@ def digits(quick):
         "network": MLPClassifier((32,), max_iter=2000, random_state=0),
     }
     for name, model in list(models.items())[: 1 if quick else 3]:
-        yield (
-            name,
-            images[test],
-            labels[test],
-            model.fit(flat[train], labels[train]).predict(flat[test]),
-        )
+        predicted = model.fit(flat[train], labels[train]).predict(flat[test])
+        yield name, images[test], labels[test], predicted
 
 
 def ranked(scores, failed):
@@ -114,13 +102,8 @@ def pixels(images, labels):
     components.
     """
     z = PCA(min(64, images[0].size), random_state=0).fit_transform(images.reshape(len(images), -1))
-    p = cross_val_predict(
-        LogisticRegression(max_iter=300),
-        z,
-        labels,
-        cv=KFold(5, shuffle=True, random_state=0),
-        method="predict_proba",
-    )
+    model, folds = LogisticRegression(max_iter=300), KFold(5, shuffle=True, random_state=0)
+    p = cross_val_predict(model, z, labels, cv=folds, method="predict_proba")
     return 1 - p[np.arange(len(labels)), labels]
 
 
@@ -128,17 +111,10 @@ def runs(images, labels, predicted, selector, seeds, budget=None):
     """[(result, CPU seconds, wall seconds)], one a seed."""
     out = []
     for seed in range(seeds):
-        system, given = (
-            Answers(images, predicted),
-            dict(budget=budget, selector=selector, classes=int(labels.max()) + 1),
-        )
-        out.append(
-            timed(
-                lambda seed=seed, system=system, given=given: weakness.validate(
-                    jax.random.key(seed), system, images, labels, **given
-                )
-            )
-        )
+        system = Answers(images, predicted)
+        given = dict(budget=budget, selector=selector, classes=int(labels.max()) + 1)
+        about = jax.random.key(seed), system, images, labels
+        out.append(timed(partial(weakness.validate, *about, **given)))
         if system.asked.max() > 1 or system.asked.sum() != out[-1][0].calls:
             raise AssertionError("an input was asked twice, or a call was not counted")
     return out
@@ -202,25 +178,22 @@ def table(result, failed, replacement):
     )
 
 
-def tables(systems, seeds, out):
+def tables(systems, seeds, out, say):
     """Table 4.1 without and with replacement, of each system."""
     for name, images, labels, predicted in systems:
         failed = predicted != labels
         for replacement in (False, True):
             chosen = weakness.thesis(replacement=replacement)
             done = runs(images, labels, predicted, chosen, seeds)
-            rows = over(
-                [
-                    table(r, failed, replacement)
-                    | {"all_precision": weakness.judge(r, failed).precision[-1], "calls": r.calls}
-                    for r, *_ in done
-                ]
-            )
-            out[f"{name}, replacement={replacement}"] = rows
-            print(
+            each = []
+            for r, *_ in done:
+                precision = weakness.judge(r, failed).precision[-1]
+                row = table(r, failed, replacement)
+                each.append(row | dict(all_precision=precision, calls=r.calls))
+            rows = out[f"{name}, replacement={replacement}"] = over(each)
+            say(
                 f"  {name}, replacement={replacement}: "
-                + ", ".join(f"{k} {say(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
-                flush=True,
+                + ", ".join(f"{k} {spread(v, 0 if k == 'calls' else 3)}" for k, v in rows.items()),
             )
 
 
@@ -241,33 +214,31 @@ def thesis(result, failed):
     )
 
 
-def say(v, digits=3):
-    return (
-        f"{v:.{digits}f}"
-        if not isinstance(v, dict)
-        else f"{v['mean']:.{digits}f}"
-        + (f" +- {v['se']:.{digits}f}" if v["se"] is not None else "")
-    )
+def spread(v, digits=3):
+    if not isinstance(v, dict):
+        return f"{v:.{digits}f}"
+    error = "" if v["se"] is None else f" +- {v['se']:.{digits}f}"
+    return f"{v['mean']:.{digits}f}{error}"
 
 
 def line(name, row):
-    text = f"  {name:11} {'  '.join(f'{say(f):>14}' for f in row['found'])}"
+    text = f"  {name:11} {'  '.join(f'{spread(f):>14}' for f in row['found'])}"
     if "auc" in row:
-        text += f"  {say(row['auc'], 4):>16} {say(row['precision']):>15}"
+        text += f"  {spread(row['auc'], 4):>16} {spread(row['precision']):>15}"
     if "expected" in row:
         text += (
-            f"  expected left {say(row['expected'], 1)}, true {say(row['left'], 1)};"
-            f" {row['seconds_first']:.1f} s, then {say(row['seconds'], 1)} s"
+            f"  expected left {spread(row['expected'], 1)}, true {spread(row['left'], 1)};"
+            f" {row['seconds_first']:.1f} s, then {spread(row['seconds'], 1)} s"
         )
     return text
 
 
-def study(images, labels, predicted, seeds, quick, picture):
+def study(images, labels, predicted, seeds, quick, picture, say):
     """All rows of one system, printed as they come."""
     failed, budget = predicted != labels, int(len(labels) * SHARES[-1])
     system = images, labels, predicted
     budgets = [f"{int(len(labels) * s)} calls" for s in SHARES]
-    print(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
+    say(f"  {'':11} {'  '.join(f'{b:>14}' for b in budgets)}  {'AUC':>16} {'precision':>15}")
     own, chance = runs(*system, "default", seeds, budget), runs(*system, "random", seeds, budget)
     rows = {
         "default": over([adaptive(r, failed) for r, *_ in own]) | seconds(own),
@@ -276,59 +247,47 @@ def study(images, labels, predicted, seeds, quick, picture):
         "random": over([{"found": found(r.order, failed)} for r, *_ in chance]),
     }
     for name, row in rows.items():
-        print(line(name, row), flush=True)
+        say(line(name, row))
     results = {"default": [r for r, *_ in own], "random": [r for r, *_ in chance]}
     if not quick:
         published = runs(*system, "thesis", seeds)
         rows["thesis"] = t = over([thesis(r, failed) for r, *_ in published]) | seconds(published)
         results["thesis"] = [r for r, *_ in published]
-        print(
-            "  thesis      AUC "
-            + " ".join(f"{a['mean']:.3f}" for a in t["auc"])
-            + f" (the last +- {t['auc'][-1]['se'] or 0:.3f})"
-        )
-        print(
-            "              at 0.5: "
-            + ", ".join(f"{k} {say(t[k], 0 if k in ('candidates', 'calls') else 3)}" for k in ROWS)
-        )
-        print(
-            f"              {t['seconds_first']:.1f} s, then {say(t['seconds'], 1)} s", flush=True
-        )
+        aucs = " ".join(f"{a['mean']:.3f}" for a in t["auc"])
+        say(f"  thesis      AUC {aucs} (the last +- {t['auc'][-1]['se'] or 0:.3f})")
+        digits = {name: 0 if name in ("candidates", "calls") else 3 for name in ROWS}
+        at_half = ", ".join(f"{name} {spread(t[name], digits[name])}" for name in ROWS)
+        say(f"              at 0.5: {at_half}")
+        say(f"              {t['seconds_first']:.1f} s, then {spread(t['seconds'], 1)} s")
     if picture:
         plot.failures_found(results, failed).figure.savefig(picture, dpi=150)
     return rows | {"inputs": len(labels), "failures": int(failed.sum())}
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, "one system, 2 seeds, without the thesis's mode")
     parser.add_argument(
         "--data", help="folder with the MNIST test images and the published classifier"
     )
-    options(parser, "one system, 2 seeds, without the thesis's mode")
-    parser.add_argument("--seeds", type=int, default=None, help="default 10")
+    parser.add_argument("--seeds", type=int, help="default 10")
     parser.add_argument(
         "--picture", help="draw the first system's failures found against calls into this file"
     )
     parser.add_argument("--table", action="store_true", help="only Table 4.1 of the thesis")
-    given = parser.parse_args(argv)
-    seeds = given.seeds or size(given, 10, 2, 1)
-    one = given.quick or given.smoke
-    systems = mnist(given.data, one) if given.data else digits(one)
-    out = {}
-    if given.table:
-        tables([next(iter(systems))], seeds, out)
-        if given.json:
-            print(json.dumps(out))
-        return
+    args = parser.parse_args(argv)
+    say, out, seeds = printer(args), {}, args.seeds or size(args, 10, 2, 1)
+    one = args.quick or args.smoke
+    systems = mnist(args.data, one) if args.data else digits(one)
+    if args.table:
+        tables([next(iter(systems))], seeds, out, say)
+        return print_report(args, out)
     for name, images, labels, predicted in systems:
-        if given.smoke:
+        if args.smoke:
             images, labels, predicted = images[:80], labels[:80], predicted[:80]
-        print(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}", flush=True)
-        out[name] = study(
-            images, labels, predicted, seeds, given.quick, None if out else given.picture
-        )
-    if given.json:
-        print(json.dumps(out))
+        say(f"{name}: {int(np.sum(predicted != labels))} failures of {len(labels)}")
+        picture = None if out else args.picture
+        out[name] = study(images, labels, predicted, seeds, args.quick, picture, say)
+    print_report(args, out)
 
 
 if __name__ == "__main__":

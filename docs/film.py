@@ -18,7 +18,8 @@ import jast
 from jast.plot import style
 from jast.simulators.ferry import COLLISION
 
-ORDINARY, HOLD = 40, 14  # episodes by chance; frames that the end stays
+ORDINARY = 40  # episodes by chance
+HOLD = 14  # frames that the end stays
 
 
 def played():
@@ -31,7 +32,10 @@ def played():
     found = jast.search.cem(jax.random.key(0), sim)
     failure = jast.replay(sim, found.failures.best)
     steps = int(failure.length) + 1
-    path = lambda x, y: np.stack([x, y], -1)[..., :steps, :]
+
+    def path(x, y):
+        return np.stack([x, y], -1)[..., :steps, :]
+
     c, s = chance.states, failure.states
     hits = int(chance.failure.sum())
     return path(c.x, c.y), hits, path(s.x, s.y), path(s.ferry_x, s.ferry_y)

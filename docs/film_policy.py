@@ -21,7 +21,8 @@ import jast
 from jast.plot import style
 
 NOTEBOOK = Path(__file__).parents[1] / "notebooks/trained_policy.ipynb"
-EVERY, HOLD = 2, 8  # steps of 20 ms a frame; frames that the end stays
+EVERY = 2  # steps of 20 ms a frame
+HOLD = 8  # frames that the end stays
 POLE = 1.0  # twice the half length that the environment's formula has
 
 
@@ -33,7 +34,10 @@ def played():
             exec("".join(cell["source"]), names)
     sim, failure = names["sim"], names["report"].failures[0]
     both = jast.rollout(jax.random.key(1), sim), jast.replay(sim, failure)
-    path = lambda s, n: np.stack([s.x, s.theta], -1)[: n + 1]
+
+    def path(s, n):
+        return np.stack([s.x, s.theta], -1)[: n + 1]
+
     return [path(e.states.state, int(e.length)) for e in both]
 
 

@@ -114,7 +114,9 @@ def test_ships_point_where_they_head():
 
 
 def test_moments():
-    times = lambda axes: [ax.get_title(loc="left").split(" s,")[0] for ax in axes]
+    def times(axes):
+        return [ax.get_title(loc="left").split(" s,")[0] for ax in axes]
+
     expected = [f"t = {3 * round(NEAREST * share):g}" for share in (1 / 3, 2 / 3, 1)]
     assert times(plot.colav(EPISODE)) == expected
     assert times(plot.colav(EPISODE, moments=1)) == expected[2:]
@@ -223,7 +225,10 @@ def test_the_story_tells_the_kinds_of_disturbance(three):
         "speed (m/s)",
     ]
     shown = [patch.get_data()[0] for ax in axes[:3] for patch in ax.patches]
-    size = lambda a: np.linalg.norm(a, axis=1)
+
+    def size(a):
+        return np.linalg.norm(a, axis=1)
+
     for values, expected in zip(
         shown,
         (40 * x["delay"], x["steering"] - 0.5, size(x["noise"][:, :2]), size(x["noise"][:, 2:])),
@@ -263,7 +268,10 @@ def test_animation_goes_from_the_first_state_to_the_last():
     [ax] = animation._fig.axes
     frames = list(animation.new_frame_seq())
     np.testing.assert_array_equal(frames, np.arange(9) / 2)
-    believed = lambda: labelled(ax)["adversary as believed"].get_xydata()
+
+    def believed():
+        return labelled(ax)["adversary as believed"].get_xydata()
+
     for t in (0, 2, 4):
         animation._func(frames[2 * t])
         np.testing.assert_allclose(believed(), ways(SHORT, t)[2], rtol=1e-6)
@@ -271,9 +279,10 @@ def test_animation_goes_from_the_first_state_to_the_last():
         for moving, standing in zip(
             (*ax.lines, *ax.patches), (*still.lines, *still.patches), strict=True
         ):
-            get = lambda artist: (
-                artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
-            )
+
+            def get(artist):
+                return artist.get_xydata() if hasattr(artist, "get_xydata") else artist.get_xy()
+
             np.testing.assert_array_equal(get(moving), get(standing))
         assert ax.get_title(loc="left") == still.get_title(loc="left")
     animation._func(1.5)
@@ -379,3 +388,28 @@ def test_settings_of_matplotlib_are_left_alone():
     plot.colav_story(SHORT)
     plot.colav_animation(SHORT._replace(length=jnp.int32(1)), smooth=1).to_jshtml()
     assert dict(matplotlib.rcParams) == before
+
+
+def test_the_published_view_shows_what_is_perceived():
+    """Figures 2 and 3 of Lytskjold and Mengshoel: the zones, the circle and the heading are those
+    of the perceived adversary, and both tails end where the vessels are.
+    """
+    axes = drawn(plot.colav_published(EPISODE, moments=[7, N]))
+    for ax, t in zip(axes, (7, N), strict=True):
+        shown, track = labelled(ax), at(EPISODE, t).track
+        ferry, adversary, believed = ways(EPISODE, t)
+        np.testing.assert_allclose(shown["ferry, its path"].get_xydata(), ferry, rtol=1e-6)
+        np.testing.assert_allclose(shown["adversary, its path"].get_xydata(), adversary, rtol=1e-6)
+        np.testing.assert_allclose(shown["perceived position"].get_xydata(), believed[-1:])
+        start, end = shown["perceived heading"].get_xydata()
+        course = np.arctan2(track.v_e, track.v_n)
+        np.testing.assert_allclose(start, believed[-1])
+        np.testing.assert_allclose(end - start, 15 * np.array([np.sin(course), np.cos(course)]))
+        for zone in planner.ZONES:
+            edge = zone_outline(zone, track.n, track.e, course)
+            np.testing.assert_allclose(shown[zone.name].get_xy()[:200], edge, atol=1e-4)
+        assert shown["the ferry's desired path"].is_dashed()
+        assert ax.get_title(loc="left") == f"t = {3 * t} s"
+    assert len(plot.colav_published(EPISODE, moments=1)) == 1
+    with pytest.raises(ValueError, match="plot.colav_published: moments must be at least 1"):
+        plot.colav_published(EPISODE, moments=0)

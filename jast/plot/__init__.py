@@ -9,8 +9,8 @@ readers; what matters is told by shape or words as well.
 Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
 `trials`, `trial_distances`, and by how slow a simulator is `failing_trees`, `simulation_times`; of
 its tree `tree`, and `tree_page`, an HTML file. Of one simulator: `ferry`; `fms`; `colav`,
-`colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`, `proposal_contours`,
-`surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
+`colav_published`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
+`proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
 `exceedance`, `weights`, `levels`; against a setting: `sweep`. Of failure policies: `training`. Of
 weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's
 adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
@@ -24,6 +24,7 @@ from jast.plot.adversary import (
     threshold_sweep,
 )
 from jast.plot.colav import colav, colav_animation, colav_story
+from jast.plot.colav_published import colav_published
 from jast.plot.cost import failing_trees, simulation_times
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.exceedance import exceedance
@@ -52,6 +53,7 @@ __all__ = [
     "STYLE",
     "colav",
     "colav_animation",
+    "colav_published",
     "colav_story",
     "confusion",
     "contributions",

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import PathLike
 
-__all__ = ["colav", "colav_animation", "colav_story"]
+__all__ = ["colav", "colav_animation", "colav_story", "draw_moments", "zone_outline"]
 
 # m ahead and to the right of the centre
 HULL = np.array([(4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5)])
@@ -72,26 +72,7 @@ def colav(
         >>> len(jast.plot.colav(jast.rollout(jax.random.key(0), sim), moments=2))
         2
     """
-    states = _states("colav", episode, sim)
-    log, moments = _log(states), _moments(moments, states)
-    low, high = _limits(log, moments)
-    height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
-    with style.axes(
-        axes,
-        (0.7 + 3.7 * len(moments) + 2.2, height + 1.45),
-        1,
-        len(moments),
-        sharey=True,
-        layout="compressed",
-    ) as axes:
-        axes = style.panels("colav", axes, len(moments), "moment")[: len(moments)]
-        for ax, t in zip(axes, moments, strict=True):
-            _Panel(ax, log, low, high).show(t)
-            ax.set_xlabel("east (m)")
-        axes[0].set_ylabel("north (m)")
-        axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
-        axes[0].figure.suptitle(_headline(episode, states) + "\n", x=0.01, ha="left", fontsize=11)
-    return axes
+    return draw_moments("colav", episode, sim, moments, axes, _draw_panel)
 
 
 def colav_story(
@@ -258,6 +239,36 @@ def colav_animation(
     return animation
 
 
+def draw_moments(caller, episode, sim, moments, axes, draw_panel):
+    """The Axes of a panel a moment, each filled by ``draw_panel(ax, log, low, high, t)``: the
+    episode's `_Log`, the corners that all panels share, and the step number.
+    """
+    states = _states(caller, episode, sim)
+    log, moments = _log(states), _moments(caller, moments, states)
+    low, high = _limits(log, moments)
+    height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
+    with style.axes(
+        axes,
+        (0.7 + 3.7 * len(moments) + 2.2, height + 1.45),
+        1,
+        len(moments),
+        sharey=True,
+        layout="compressed",
+    ) as axes:
+        axes = style.panels(caller, axes, len(moments), "moment")[: len(moments)]
+        for ax, t in zip(axes, moments, strict=True):
+            draw_panel(ax, log, low, high, t)
+            ax.set_xlabel("east (m)")
+        axes[0].set_ylabel("north (m)")
+        axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+        axes[0].figure.suptitle(_headline(episode, states) + "\n", x=0.01, ha="left", fontsize=11)
+    return axes
+
+
+def _draw_panel(ax, log, low, high, t):
+    _Panel(ax, log, low, high).show(t)
+
+
 class _Log(NamedTuple):
     """What the pictures need of an episode's states, row by row."""
 
@@ -404,10 +415,10 @@ def _limits(log, moments):
     return points.min(0) - 5, points.max(0) + 5
 
 
-def _moments(moments, states):
+def _moments(caller, moments, states):
     last = len(states.step) - 1
     wrong = ValueError(
-        f"plot.colav: moments must be at least 1, or step numbers in 0 .. {last}, received"
+        f"plot.{caller}: moments must be at least 1, or step numbers in 0 .. {last}, received"
         f" {moments!r}"
     )
     try:
