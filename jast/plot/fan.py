@@ -73,32 +73,19 @@ def failure_fan(
         behind = _rows(caller, g.sim, some, value)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, line in enumerate(behind):
-            ax.plot(
-                line,
-                color=style.GREY,
-                linewidth=0.6,
-                alpha=0.5,
-                zorder=2,
-                label="_" if i else f"{len(behind)} nominal episodes",
-            )
+            words = "_" if i else f"{len(behind)} nominal episodes"
+            ax.plot(line, color=style.GREY, linewidth=0.6, alpha=0.5, zorder=2, label=words)
         for own, colour, marker, name in _groups(g, np.array([line[-1] for line in rows])):
             alpha = float(np.clip(12 / len(own), 0.12, 0.8))
             for i in own:
                 ax.plot(rows[i], color=colour, linewidth=0.8, alpha=alpha, zorder=3)
             ends = [len(rows[i]) - 1 for i in own], [rows[i][-1] for i in own]
-            ax.plot(
-                *ends,
-                linestyle="",
-                marker=marker,
-                markersize=3.5,
-                color=colour,
-                alpha=min(2 * alpha, 1),
-                zorder=4,
-            )
-            ax.plot([], [], color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
+            look = dict(color=colour, marker=marker)
+            ax.plot(*ends, linestyle="", markersize=3.5, alpha=min(2 * alpha, 1), zorder=4, **look)
+            ax.plot([], [], markersize=4, linewidth=1.2, label=name, **look)
         ax.set(xlabel="step", ylabel=label or _name(value, units), xlim=(0, None))
-        ax.xaxis.get_major_locator().set_params(integer=True)
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+        style.whole_steps(ax.xaxis)
+        style.legend_above(ax, fontsize=9)
     return ax
 
 
@@ -128,9 +115,12 @@ def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np
             )
         out = played.columns[names[0]]
     else:
-        number = value if value is not None else lambda s: sim.evaluate(s)[1]
-        each = lambda e: jax.vmap(number)((replay(sim, e) if e.states is None else e).states)
-        out = np.asarray(jax.jit(jax.vmap(each))(episodes), float)
+
+        def numbers(e: Episode) -> jax.Array:
+            states = (replay(sim, e) if e.states is None else e).states
+            return jax.vmap(lambda s: sim.evaluate(s)[1] if value is None else value(s))(states)
+
+        out = np.asarray(jax.jit(jax.vmap(numbers))(episodes), float)
     if out.ndim != 2:
         raise ValueError(
             f"plot.{caller}: value must return one number, received shape {out.shape[2:]}"
