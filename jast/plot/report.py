@@ -13,7 +13,7 @@ from jast.fields import fields
 from jast.incidents import hosted
 from jast.outline import outline
 from jast.plot import style
-from jast.plot.general import spreads
+from jast.plot.general import shade_deviations, spreads
 from jast.plot.played import (
     DISTANCE,
     Given,
@@ -318,8 +318,7 @@ def _pushes(ax: Any, sim: Any, failure: Any) -> None:
         (f"x0 {name}" if not at and "x0" not in name else name, at, v) for name, at, v in named
     ]
     if normal:
-        ax.axhspan(-2, 2, color=style.GREY, alpha=0.1, linewidth=0, zorder=0)
-        ax.axhspan(-1, 1, color=style.GREY, alpha=0.12, linewidth=0, zorder=0)
+        shade_deviations(ax)
     few = len(named) <= len(style.COLOURS)
     for i, (name, at, values) in enumerate(named):
         colour, marker = style.look(i) if few else (style.shade(i / (len(named) - 1)), "o")
