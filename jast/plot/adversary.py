@@ -58,8 +58,7 @@ def confusion(
     caller = "confusion"
     scores = np.asarray(checked_result(caller, result).scores)
     failed = checked_truth(caller, failed, len(scores))
-    within = "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 .. 1"
-    threshold = number(f"plot.{caller}", *within)
+    threshold = number(f"plot.{caller}", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 .. 1")
     chosen = scores >= threshold
     counts = np.array([[np.sum((failed == t) & (chosen == c)) for c in (0, 1)] for t in (0, 1)])
     precision, recall = precision_recall(chosen, failed)

@@ -10,7 +10,15 @@ import numpy as np
 
 from jast.episode import Episode, replay
 from jast.plot import style
-from jast.plot.played import DISTANCE, Given, chosen, given, kind_words, kinds, lines
+from jast.plot.played import (
+    DISTANCE,
+    Samples,
+    by_mode,
+    choose_fields,
+    mode_label,
+    samples_of,
+    series_of,
+)
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -65,11 +73,11 @@ def failure_fan(
         >>> ax = jast.plot.failure_fan(found, sim)
     """
     caller = "failure_fan"
-    g = given(caller, samples, sim, modes, most)
+    g = samples_of(caller, samples, sim, modes, most)
     rows = _rows(caller, g.sim, g.episodes, value)
     behind = []
     if nominal is not None:
-        some = given(caller, nominal, g.sim, None, most).episodes
+        some = samples_of(caller, nominal, g.sim, None, most).episodes
         behind = _rows(caller, g.sim, some, value)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, line in enumerate(behind):
@@ -89,10 +97,10 @@ def failure_fan(
     return ax
 
 
-def _groups(g: Given, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
+def _groups(g: Samples, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
     """(which episodes, colour, mark, words) of each kind of failure."""
     if g.mode is not None:
-        return [(own, *style.look(k), kind_words(g, k, len(own))) for k, own in kinds(g)]
+        return [(own, *style.look(k), mode_label(g, k, len(own))) for k, own in by_mode(g)]
     n = len(ends)
     if not ((ends > 0).any() and (ends < 0).any()):
         return [(np.arange(n), style.BLUE, "o", f"{n} failures")]
@@ -106,8 +114,8 @@ def _groups(g: Given, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]
 def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np.ndarray]:
     """[steps + 1] of the value for each episode."""
     if isinstance(value, str):
-        played = lines(sim, episodes)
-        names = chosen(caller, value, played, 1)
+        played = series_of(sim, episodes)
+        names = choose_fields(caller, value, played, 1)
         if len(names) > 1:
             raise ValueError(
                 f"plot.{caller}: value must name one number of {names}, received {value!r}, which"

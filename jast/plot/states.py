@@ -12,15 +12,15 @@ import numpy as np
 from jast.plot import style
 from jast.plot.played import (
     DISTANCE,
-    Given,
-    Lines,
-    chosen,
-    given,
-    kind_words,
-    kinds,
-    lines,
-    nominal_lines,
-    quiet_line,
+    Samples,
+    Series,
+    by_mode,
+    choose_fields,
+    mode_label,
+    nominal_series,
+    samples_of,
+    series_of,
+    undisturbed_series,
 )
 
 if TYPE_CHECKING:
@@ -82,10 +82,10 @@ def traces(
         True
     """
     caller = "traces"
-    g = given(caller, samples, sim, modes, most)
-    own = lines(g.sim, g.episodes)
-    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
-    names = chosen(caller, fields, own, PANELS, quiet)
+    g = samples_of(caller, samples, sim, modes, most)
+    own = series_of(g.sim, g.episodes)
+    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
+    names = choose_fields(caller, fields, own, PANELS, quiet)
     columns = 1 if len(names) < 4 else 2
     rows = -(-len(names) // columns)
     size = (6.8, 1.1 + 1.9 * rows) if columns == 1 else (9.6, 1.0 + 1.75 * rows)
@@ -106,10 +106,10 @@ def traces(
 def draw_traces(
     axes: list,
     names: list[str],
-    g: Given,
-    own: Lines,
-    behind: Lines | None,
-    quiet: Lines | None,
+    g: Samples,
+    own: Series,
+    behind: Series | None,
+    quiet: Series | None,
     units: dict | None = None,
 ) -> None:
     """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend."""
@@ -122,10 +122,10 @@ def draw_traces(
             ax.plot(
                 row, color=style.INK, linewidth=1.3, linestyle=style.DASHED, label="undisturbed"
             )
-        for kind, rows in kinds(g):
+        for kind, rows in by_mode(g):
             colour, marker = style.look(kind)
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
-            label = kind_words(g, kind, len(rows))
+            label = mode_label(g, kind, len(rows))
             mark = dict(color=colour, marker=marker, markersize=4.5)
             for i in rows:
                 line, n = own.columns[name][i], own.length[i]
@@ -184,10 +184,10 @@ def phase(
         >>> ax = jast.plot.phase(found, sim, nominal=20)
     """
     caller = "phase"
-    g = given(caller, samples, sim, modes, most)
-    own = lines(g.sim, g.episodes)
-    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
-    names = chosen(caller, fields, own, PANELS, quiet)
+    g = samples_of(caller, samples, sim, modes, most)
+    own = series_of(g.sim, g.episodes)
+    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
+    names = choose_fields(caller, fields, own, PANELS, quiet)
     if fields is None:
         names = [k for k in names if k != DISTANCE] + [DISTANCE] * (DISTANCE in names)
         names = names[:2]
@@ -205,7 +205,7 @@ def phase(
             row = [quiet.columns[k][0] for k in names]
             look = dict(color=style.INK, linewidth=1.3, linestyle=style.DASHED)
             ax.plot(*row, **look, label="undisturbed", zorder=3)
-        for kind, rows in kinds(g):
+        for kind, rows in by_mode(g):
             colour, marker = style.look(kind)
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
             mark = dict(color=colour, marker=marker, markersize=6)
@@ -217,7 +217,7 @@ def phase(
                 start = dict(color=style.INK, marker="s", markersize=4, zorder=5)
                 ax.plot(across[first], up[first], **start)
                 ax.plot(across[n], up[n], alpha=alpha, zorder=6, **mark)
-            ax.plot([], [], label=kind_words(g, kind, len(rows)), linewidth=1.4, **mark)
+            ax.plot([], [], label=mode_label(g, kind, len(rows)), linewidth=1.4, **mark)
         ax.set(xlabel=style.labelled(names[0], units), ylabel=style.labelled(names[1], units))
         style.legend_above(ax, fontsize=9)
     return ax
