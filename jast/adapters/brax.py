@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.kept import without_warp
-from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.adapters.kept import refuse_warp
+from jast.adapters.loop import (
+    Change,
+    Judgement,
+    Noise,
+    Outcome,
+    check_environment,
+    simulator,
+)
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["brax"]
 
@@ -46,14 +48,14 @@ def brax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    observation: Noise | None = None,
+    action: Noise | None = None,
+    force: Change | None = None,
+    parameters: Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: Judgement | None = None,
+    distance: Judgement | None = None,
+    observe: Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of brax or mujoco_playground: ``reset(key)`` and ``step(state,
     action)`` return a state with ``obs``, ``reward``, ``done`` and ``info``.
@@ -67,17 +69,14 @@ def brax(
         policy: observation -> action. A policy of brax's training is ``lambda seen: act(seen,
             key)[0]``.
         horizon: steps of an episode.
-        observation: noise on what the policy sees, as in `gymnax`.
-        action: noise on the action.
+        observation, action: noise on what the policy sees and on what it does, as in `gymnax`.
         force: a pair (distribution, function (state, draw) -> state): what happens to the whole
             state before each step, such as a change of ``state.pipeline_state``.
         parameters: a pair (distribution, function (env, draw) -> env), drawn once an episode. The
             function gets a copy of the environment that it may change, such as ``env.sys``.
         seed: of the key of ``reset``, from which an environment also draws later on: a number, or
             "episode" for one drawn for each episode.
-        failure: `Instant` -> bool.
-        distance: `Instant` -> float.
-        observe: `Instant` -> float vector, 64 numbers at most.
+        failure, distance, observe: functions of the `Instant`, as in `gymnax`.
 
     Returns:
         `Simulator`, whose states are `Instant`.
@@ -116,6 +115,6 @@ def brax(
     given = dict(locals())
     hint = "; brax.envs.get_environment(name) makes one"
     instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
-    without_warp("brax", getattr(env, "mjx_model", None), instead)
-    bare("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
+    refuse_warp("brax", getattr(env, "mjx_model", None), instead)
+    check_environment("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
     return simulator("brax", _Environment(given.pop("env")), **given)

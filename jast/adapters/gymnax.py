@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 
 from jast._jax import is_traced, without_stops
-from jast.adapters.loop import Instant, Outcome, simulator
+from jast.adapters.loop import Change, Judgement, Noise, Outcome, simulator
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["gymnax"]
 
@@ -50,14 +45,14 @@ def gymnax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: dict[str, Any] | tuple[Any, Callable[..., Any]] | None = None,
+    observation: Noise | None = None,
+    action: Noise | None = None,
+    force: Change | None = None,
+    parameters: dict[str, Any] | Change | None = None,
     seed: int | Literal["episode", "step"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: Judgement | None = None,
+    distance: Judgement | None = None,
+    observe: Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of gymnax, or of a library with the same ``reset(key, params)``
     and ``step_env(key, state, action, params)``, such as craftax; JaxMARL has them without params.

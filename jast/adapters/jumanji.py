@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.adapters.loop import (
+    Change,
+    Judgement,
+    Noise,
+    Outcome,
+    check_environment,
+    simulator,
+)
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["jumanji"]
 
@@ -42,14 +44,14 @@ def jumanji(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    observation: Noise | None = None,
+    action: Noise | None = None,
+    force: Change | None = None,
+    parameters: Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: Judgement | None = None,
+    distance: Judgement | None = None,
+    observe: Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of jumanji, or another whose ``reset(key)`` and ``step(state,
     action)`` return a state and a timestep with ``observation``, ``reward``, ``discount`` and
@@ -63,14 +65,11 @@ def jumanji(
         env: the environment, without a wrapper that starts anew by itself: ``jumanji.make(name)``.
         policy: observation, most often with fields such as ``seen.action_mask`` -> action.
         horizon: steps of an episode.
-        observation: noise on what the policy sees, as in `gymnax`.
-        action: noise on the action.
+        observation, action: noise on what the policy sees and on what it does, as in `gymnax`.
         force: a pair (distribution, function (state, draw) -> state).
         parameters: a pair (distribution, function (env, draw) -> env), as in `brax`.
         seed: of the key of ``reset``, from which an environment also draws later on.
-        failure: `Instant` -> bool.
-        distance: `Instant` -> float.
-        observe: `Instant` -> float vector, 64 numbers at most.
+        failure, distance, observe: functions of the `Instant`, as in `gymnax`.
 
     Returns:
         `Simulator`, whose states are `Instant`.
@@ -107,5 +106,5 @@ def jumanji(
         (20, 1)
     """
     given = dict(locals())
-    bare("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
+    check_environment("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
     return simulator("jumanji", _Environment(given.pop("env")), **given)
