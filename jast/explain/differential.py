@@ -25,13 +25,13 @@ class Both(NamedTuple):
 
     a: Any
     b: Any
-    failed_a: Any
-    failed_b: Any
-    over_a: Any
-    over_b: Any
-    nearest: Any
+    failed_a: chex.Array
+    failed_b: chex.Array
+    over_a: chex.Array
+    over_b: chex.Array
+    nearest: chex.Array
     """Miss distance of b so far"""
-    t: Any
+    t: chex.Array
     """int32: steps"""
 
 
@@ -103,13 +103,12 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
                 f"regression: {part} of sim_a and sim_b must have the same shapes, received"
                 f" {_shapes(one)} and {_shapes(other)}"
             )
-    horizon = max(sim_a.horizon, sim_b.horizon)
     return Simulator(
-        Partial(_init, sim_a, sim_b),
-        Partial(_step, sim_a, sim_b),
-        Partial(_disturbance, sim_a, sim_b),
-        Partial(_evaluate, sim_b),
-        horizon,
+        init=Partial(_init, sim_a, sim_b),
+        step=Partial(_step, sim_a, sim_b),
+        disturbance=Partial(_disturbance, sim_a, sim_b),
+        evaluate=Partial(_evaluate, sim_b),
+        horizon=max(sim_a.horizon, sim_b.horizon),
         start=sim_b.start,
         is_terminal=_is_terminal,
         observe=Partial(_observe, sim_a, sim_b),
@@ -135,7 +134,16 @@ def _init(sim_a, sim_b, x0):
     a, b = strong(sim_a.init(x0)), strong(sim_b.init(x0))
     failed_a, over_a, _ = _arrived(sim_a, a, t)
     failed_b, over_b, distance = _arrived(sim_b, b, t)
-    return Both(a, b, failed_a, failed_b, over_a, over_b, strong(distance), t)
+    return Both(
+        a=a,
+        b=b,
+        failed_a=failed_a,
+        failed_b=failed_b,
+        over_a=over_a,
+        over_b=over_b,
+        nearest=strong(distance),
+        t=t,
+    )
 
 
 def _step(sim_a, sim_b, s, x):
@@ -145,17 +153,15 @@ def _step(sim_a, sim_b, s, x):
     b = select(s.over_b, s.b, strong(sim_b.step(s.b, x)))
     failed_a, over_a, _ = _arrived(sim_a, a, t)
     failed_b, over_b, distance = _arrived(sim_b, b, t)
-    nearest = jnp.where(s.over_b, s.nearest, jnp.minimum(s.nearest, distance))
-    kept = lambda over, old, new: jnp.where(over, old, new)
     return Both(
-        a,
-        b,
-        kept(s.over_a, s.failed_a, failed_a),
-        kept(s.over_b, s.failed_b, failed_b),
-        s.over_a | over_a,
-        s.over_b | over_b,
-        nearest,
-        t,
+        a=a,
+        b=b,
+        failed_a=jnp.where(s.over_a, s.failed_a, failed_a),
+        failed_b=jnp.where(s.over_b, s.failed_b, failed_b),
+        over_a=s.over_a | over_a,
+        over_b=s.over_b | over_b,
+        nearest=jnp.where(s.over_b, s.nearest, jnp.minimum(s.nearest, distance)),
+        t=t,
     )
 
 

@@ -16,13 +16,12 @@ from jast.limit_state import side_by_side
 from jast.pytrees import bound
 from jast.simulator import Simulator
 
-__all__ = ["observed", "ordinary"]
+__all__ = ["draw_ordinary", "observations"]
 
-LANES = 256
-"""Episodes that are played at a time."""
+LANES = 256  # episodes that are played at a time
 
 
-def ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
+def draw_ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
     """At most ``n`` episodes of the model that do not fail."""
     at = np.arange(n, dtype=np.int32)
     e = side_by_side(sim, partial(_drawn, key, sim), at, lanes=LANES)
@@ -31,11 +30,10 @@ def ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
 
 @jit
 def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
-    one = lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None)
-    return jax.vmap(one)(at)
+    return jax.vmap(lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None))(at)
 
 
-def observed(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
+def observations(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
     """[n, horizon + 1, d] of the states."""
     watched, about = partial(_watched, sim, bound(observe)), (e.x0, e.disturbances, e.length)
     seen = side_by_side(sim, watched, *about, lanes=LANES)
