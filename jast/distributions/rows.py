@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.special import expit, log_ndtr, logit
 
 from jast.distributions import continuous, discrete, verbs
-from jast.distributions.families import both
+from jast.distributions.families import register_both
 from jast.distributions.numerics import cell, cells, fraction, inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 
@@ -28,7 +28,7 @@ def _normal_of_laplace(d, x):
     return -jnp.sign(v) * ndtri(jnp.exp(-jnp.abs(v)) / 2)
 
 
-both(
+register_both(
     continuous.Laplace,
     quantile=_quantile_laplace,
     cdf=_cdf_laplace,
@@ -42,7 +42,7 @@ def _normal_of_logistic(d, x):
     return -jnp.sign(v) * ndtri(jax.nn.sigmoid(-jnp.abs(v)))
 
 
-both(
+register_both(
     continuous.Logistic,
     quantile=lambda d, u: d.loc + d.scale * logit(inside(u)),
     cdf=lambda d, x: expit(standard(x - d.loc, d.scale)),
@@ -65,7 +65,7 @@ def _normal_of_uniform(d, x):
     return jnp.where(below < above, z, -z)
 
 
-both(
+register_both(
     continuous.Uniform,
     quantile=lambda d, u: d.low + u * (d.high - d.low),
     cdf=lambda d, x: fraction(x, d.low, d.high),
@@ -83,7 +83,7 @@ def _tilted_bernoulli(d, mean, deviation):
     return discrete.Bernoulli(probs=ndtr((mean - edge) / deviation), dtype=d.dtype)
 
 
-both(
+register_both(
     discrete.Bernoulli,
     quantile=lambda d, u: jnp.asarray(u >= 1 - d.probs, d.dtype),
     cdf=lambda d, x: cell(x, (1 - d.probs)[..., None]),
@@ -131,7 +131,7 @@ def _tilted_choice(d, mean, deviation):
     return discrete.Categorical(probs=p, dtype=d.dtype)
 
 
-both(
+register_both(
     discrete.Categorical,
     quantile=_chosen,
     cdf=lambda d, x: cell(x, jnp.cumsum(d.probs, axis=-1)[..., :-1]),

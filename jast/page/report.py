@@ -16,12 +16,11 @@ from jast.stress_testing.words import advice, belief, headline, mode_facts, verd
 
 __all__ = ["write_report"]
 
-NUMBERS, EXACT, PICTURES = 80_000, 900_000, 1_000_000
-"""Shared by the modes: numbers of traces, bytes of exact disturbances, bytes of pictures. Together
-they keep a page below 3 MB.
-"""
-MODES = 16
-"""Cards; further modes are counted."""
+# shared by the modes; together they keep a page below 3 MB
+NUMBERS = 80_000  # of traces
+EXACT = 900_000  # bytes of exact disturbances
+PICTURES = 1_000_000  # bytes of pictures
+MODES = 16  # cards; further modes are counted
 
 SNIPPET = """\
 import jast

@@ -25,10 +25,7 @@ __all__ = ["DRAWN", "draw"]
 
 HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
 """Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
-
-
-TRAIL = 60
-"""Places of a trail, at most."""
+TRAIL = 60  # places of a trail, at most
 
 
 def draw(state: chex.ArrayTree, past: chex.ArrayTree | None = None) -> str:
@@ -106,7 +103,10 @@ def _colav(s: ColavState, past: ColavState | None) -> str:
 def _pendulum(s: PendulumState, past: PendulumState | None) -> str:
     plane = svg.Plane((-1.3, -0.35), (1.3, 1.35), 330)
     theta, omega = float(s.theta), float(s.omega)
-    at = lambda angle, r: (r * math.sin(angle), r * math.cos(angle))
+
+    def at(angle: float, r: float) -> svg.Place:
+        return r * math.sin(angle), r * math.cos(angle)
+
     # where it will be in a tenth of a second at this speed
     ahead = [at(theta + 0.1 * omega * i / 10, 1.12) for i in range(11)]
     return plane.picture(

@@ -303,8 +303,8 @@ def _temporal(kind: str, f: Formula, a: Any, b: Any) -> Formula:
 def _joined(kind: str, *parts: Formula) -> Formula:
     for part in parts:
         _formula(kind, "each side", part)
-    flat = lambda p: p.parts if isinstance(p, Junction) and p.kind == kind else (p,)
-    return Junction(sum(map(flat, parts), ()), kind)
+    flat = [p.parts if isinstance(p, Junction) and p.kind == kind else (p,) for p in parts]
+    return Junction(sum(flat, ()), kind)
 
 
 def _inner(f: Formula) -> str:
@@ -323,8 +323,9 @@ def _formula(function: str, name: str, f: Any) -> Formula:
 
 
 def _window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, float | None]:
-    number = lambda v: isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)
-    if not (number(a) and (b is None or number(b)) and 0 <= a and (b is None or a <= b)):
+    ends = [a] if b is None else [a, b]
+    numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in ends)
+    if not (numbers and all(map(math.isfinite, ends)) and 0 <= a <= ends[-1]):
         raise ValueError(
             f"{function} {_inner(f)}: the window must be two numbers of seconds, 0 <= a <= b (b may"
             f" be left out: to the trace's end), received a={a!r}, b={b!r}"

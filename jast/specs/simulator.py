@@ -174,8 +174,10 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
     if samples is None:
         return states
     rows = jax.vmap(samples)(states)
-    flat = lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])])
-    return jax.tree.map(lambda a: flat(np.asarray(a)), rows)
+    rows = jax.tree.map(np.asarray, rows)
+    return jax.tree.map(
+        lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])]), rows
+    )
 
 
 def goes_on(episode: Episode) -> bool:

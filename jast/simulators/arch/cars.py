@@ -35,7 +35,7 @@ DURATION = 100.0
 INPUTS = (("throttle", 0.0, 1.0), ("brake", 0.0, 1.0))
 """Names and ranges of the inputs."""
 KEEP, CHASE, BRAKE = 0, 1, 2
-SECANTS = 3
+SECANTS = 3  # by which a switch is located
 
 
 class Cars(NamedTuple):
@@ -49,13 +49,13 @@ class Cars(NamedTuple):
         [0.0, 10.0, 20.0, 30.0, 40.0]
     """
 
-    gaps: Any
+    gaps: jax.Array
     """[4] m: y2 - y1, .., y5 - y4"""
-    speeds: Any
+    speeds: jax.Array
     """[5] m/s: v of each car; cars 2 to 5 that chase or brake move by -v"""
-    modes: Any
+    modes: jax.Array
     """[4] int32 of cars 2 to 5: 0 Keep, 1 Chase, 2 Brake"""
-    first: Any
+    first: jax.Array
     """m: y1"""
 
     @property
@@ -103,8 +103,8 @@ def drive(cars: Cars, inputs: jax.Array) -> tuple[Cars, Cars]:
         gaps.append(gap)
         speeds.append(speed)
         modes.append(mode)
-    stack = lambda columns: jnp.stack(columns, axis=-1)
-    samples = Cars(stack(gaps), stack(speeds), stack(modes), first)
+    gaps, speeds, modes = (jnp.stack(columns, axis=-1) for columns in (gaps, speeds, modes))
+    samples = Cars(gaps, speeds, modes, first)
     return jax.tree.map(lambda a: a[-1], samples), samples
 
 
@@ -138,7 +138,11 @@ def _followed(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     """
     gap, speed, mode = at
     law = _law(mode, speed)
-    free = lambda t: gap + _way(law, t) - _gone(ahead, t)
+
+    def free(t: Any) -> Any:
+        """The gap, as long as the car does not switch."""
+        return gap + _way(law, t) - _gone(ahead, t)
+
     up = jnp.where(mode == KEEP, 15.0, jnp.where(mode == BRAKE, 20.0, jnp.inf))
     down = jnp.where(mode == KEEP, 5.0, jnp.where(mode == CHASE, 10.0, -jnp.inf))
     up, down = up.astype(gap.dtype), down.astype(gap.dtype)
@@ -153,7 +157,11 @@ def _followed(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     sign = jnp.where(high, 1, -1).astype(gap.dtype)
     left = jnp.where(early, jnp.zeros_like(kink), kink)
     right = jnp.where(early, kink, jnp.asarray(DT, gap.dtype))
-    over = lambda t: sign * (free(t) - level)  # at least 0 from the switch on
+
+    def over(t: Any) -> Any:
+        """At least 0 from the switch on."""
+        return sign * (free(t) - level)
+
     for _ in range(SECANTS):
         a, b = jnp.minimum(over(left), 0), jnp.maximum(over(right), 0)
         share = jnp.where(b > a, -a / jnp.where(b > a, b - a, 1), 0)

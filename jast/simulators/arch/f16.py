@@ -25,8 +25,9 @@ __all__ = ["F16", "Controls", "Loads", "motion"]
 GRAVITY = 32.17
 MASS = 1 / 1.57e-3
 """slug; rounded as in the book, whose check values need it so"""
-AREA, SPAN, CHORD = 300.0, 30.0, 11.32
-"""ft2, ft, ft"""
+AREA = 300.0  # ft2
+SPAN = 30.0  # ft
+CHORD = 11.32  # ft
 CENTRE = 0.35
 """Of gravity, in chords: where the tables have it."""
 INERTIA = np.array([[9496.0, 0, -982], [0, 55814, 0], [-982, 0, 63100]])

@@ -38,7 +38,8 @@ STILL = 0.05  # m/s: published threshold of low velocity
 # candidates, m/s: published range
 SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])
 FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
-STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end: ours (published horizon: up to 600)
+STEP = 2.0  # s: of the prediction: ours
+AHEAD = 30.0  # s: its end: ours (published: up to 600)
 SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
 KEEP = 0.8  # the speed in force stays unless another costs less than this share of it ...
 KEEP_LEAST = 20.0  # ... and this much less
