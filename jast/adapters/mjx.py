@@ -23,12 +23,12 @@ __all__ = ["mjx"]
 class _Body(NamedTuple):
     """The numbers on which the next step depends: of the fields of a Data alone."""
 
-    qpos: Any
-    qvel: Any
-    act: Any
-    qacc_warmstart: Any
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    qacc_warmstart: jax.Array
     """Where the solver starts"""
-    time: Any
+    time: jax.Array
 
 
 @jax.tree_util.register_dataclass

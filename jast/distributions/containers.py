@@ -14,7 +14,7 @@ from jast.distributions.verbs import mode
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Independent", "Joint"]
+__all__ = ["Independent", "Joint", "accepted", "leaves"]
 
 
 class Independent(Distribution):

@@ -17,7 +17,7 @@ from jast.distributions.normal import Symmetric
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
+__all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
 
 LOG_2 = math.log(2.0)
 

@@ -14,6 +14,8 @@ from jast.distributions.numerics import inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 from jast.distributions.tilted import tilted
 
+__all__ = ["register_both"]
+
 
 def register_both(kind: type, **functions: Callable[..., Any]) -> None:
     """One row for jast's class ``kind`` and for distrax's of the same name."""

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Elementwise, float_array
-from jast.distributions.normal import HALF_LOG_2PI, LocationScale
+from jast.distributions.normal import LocationScale
 from jast.distributions.numerics import (
+    HALF_LOG_2PI,
     inside,
     log_one_less,
     log_tails,

@@ -14,14 +14,20 @@ if TYPE_CHECKING:
     import chex
 
 __all__ = [
+    "HALF_LOG_2PI",
+    "cell",
+    "cells",
     "float_dtype",
     "fraction",
+    "inside",
+    "log_one_less",
     "log_tails",
     "ndtr",
     "ndtri",
     "normal_of_log_tails",
     "normal_score",
     "phi",
+    "standard",
 ]
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)

@@ -14,8 +14,8 @@ from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, erfinv
 
 from jast.distributions.base import Distribution, float_array
-from jast.distributions.normal import HALF_LOG_2PI, Symmetric
-from jast.distributions.numerics import inside, log_tails, ndtri, normal_of_log_tails
+from jast.distributions.normal import Symmetric
+from jast.distributions.numerics import HALF_LOG_2PI, inside, log_tails, ndtri, normal_of_log_tails
 from jast.distributions.table import register
 from jast.distributions.tails import log_tails_of
 from jast.distributions.verbs import from_normal

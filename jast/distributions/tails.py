@@ -12,6 +12,8 @@ from jast.distributions.numerics import inside, log_tails, normal_of_log_tails
 from jast.distributions.table import row
 from jast.distributions.verbs import to_normal
 
+__all__ = ["log_tails_of", "of_log_tails"]
+
 
 def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
     """The functions of a row.

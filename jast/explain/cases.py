@@ -57,7 +57,13 @@ def simulate_cases(
     e = jax.tree.map(lambda a, b: np.concatenate([a, b[:near]]), v.failures, v.near)
     kind = np.concatenate([1 + v.label, np.zeros(near, int)])
     group = np.concatenate([v.group, v.near_group[:near]])
-    return Cases(e, kind, group, (OTHERS, *s.names), s.evaluations + v.evaluations)
+    return Cases(
+        episodes=e,
+        kind=kind,
+        group=group,
+        names=(OTHERS, *s.names),
+        evaluations=s.evaluations + v.evaluations,
+    )
 
 
 def given_cases(
@@ -87,4 +93,6 @@ def given_cases(
             )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b]), *parts)
     owner = np.concatenate(kind)
-    return Cases(e, owner, np.arange(len(owner)), (OTHERS, *names), 0)
+    return Cases(
+        episodes=e, kind=owner, group=np.arange(len(owner)), names=(OTHERS, *names), evaluations=0
+    )

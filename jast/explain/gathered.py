@@ -113,10 +113,12 @@ def play_to_horizon(
     """
     n = len(e.length)
     if not states and (e.length == sim.horizon).all():
-        return FullEpisodes(e.x0, e.disturbances, e.length, None, 0)
+        return FullEpisodes(
+            x0=e.x0, disturbances=e.disturbances, length=e.length, states=None, evaluations=0
+        )
     rows = np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length
     x, s = side_by_side(sim, partial(_played_on, sim, key), *rows, lanes=LANES)
-    return FullEpisodes(e.x0, x, e.length, s, n)
+    return FullEpisodes(x0=e.x0, disturbances=x, length=e.length, states=s, evaluations=n)
 
 
 @jit

@@ -280,7 +280,7 @@ class _Panel:
             east, north, course = now[2]
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
-            patch.set_xy(_placed(*HULL.T, *here))
+            patch.set_xy(_place(*HULL.T, *here))
         self.title.set_text(
             f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s"
         )
@@ -330,10 +330,10 @@ def zone_outline(zone, n, e, course, points=200):
     angle = np.linspace(0, 2 * np.pi, points)
     ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
     right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
-    return _placed(ahead, right, e, n, course)
+    return _place(ahead, right, e, n, course)
 
 
-def _placed(ahead, right, east, north, heading):
+def _place(ahead, right, east, north, heading):
     """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
     return np.stack(
         [

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from jast.episode import Episode
 
 
-__all__ = ["report"]
+__all__ = ["pictures", "report"]
 
 WIDTH = 8.27  # inches: of A4
 MARGIN = 0.55  # inches

@@ -256,7 +256,14 @@ def judged(route, track, speed, finished):
     # of each leg, to have room for the turns at its ends
     lack = np.maximum(np.append(0.0, lead[:-1]) + lead - length, 0.0)
     allowed = radius * (1 / np.cos(half) - 1) + lack + np.append(lack[1:], 0.0)
-    return Flight(route, track, turns, nearest(route[1:], track), allowed, finished)
+    return Flight(
+        route=route,
+        track=track,
+        turns=turns,
+        nearest=nearest(route[1:], track),
+        allowed=allowed,
+        finished=finished,
+    )
 
 
 def nearest(points, track):

@@ -85,7 +85,7 @@ def push(
             op = jnp.minimum if f.kind == "&" else jnp.maximum
             return functools.reduce(op, [bound(part, sign) for part in f.parts])
         news = tuple(next(left) for _ in predicates(f))
-        memory, found = _watched(f, sign, next(before), news, start, unknown, dt, total)
+        memory, found = _push_window(f, sign, next(before), news, start, unknown, dt, total)
         after.append(memory)
         return found
 
@@ -93,7 +93,7 @@ def push(
     return tuple(after), found
 
 
-def _watched(
+def _push_window(
     f: Formula,
     sign: int,
     memory: Memory,

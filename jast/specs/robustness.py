@@ -44,7 +44,7 @@ may come from float32.
 class Values(NamedTuple):
     """The robustness of a formula at every moment, and that of its parts."""
 
-    own: Any
+    own: jax.Array
     """[T]"""
     parts: tuple["Values", ...]
 

@@ -7,6 +7,7 @@ surfaces in degrees.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -39,15 +40,15 @@ ENGINE = 160.0
 class F16(NamedTuple):
     """The aircraft at a moment, over a flat earth."""
 
-    velocity: Any
+    velocity: jax.Array
     """[3] ft/s along the body's axes: forward, right, down"""
-    attitude: Any
+    attitude: jax.Array
     """[3] rad: roll, pitch, yaw"""
-    rates: Any
+    rates: jax.Array
     """[3] rad/s: p, q, r"""
-    position: Any
+    position: jax.Array
     """[3] ft: north, east, altitude"""
-    power: Any
+    power: jax.Array
     """Of the engine, 0 to 100"""
 
     @property
@@ -94,9 +95,9 @@ class Controls(NamedTuple):
 class Loads(NamedTuple):
     """Aerodynamic accelerations at the centre of gravity, in g."""
 
-    side: Any
+    side: jax.Array
     """To the right"""
-    normal: Any
+    normal: jax.Array
     """Up, 1 in level flight"""
 
 
@@ -116,7 +117,9 @@ def motion(now: F16, controls: Controls, centre: float = CENTRE) -> tuple[F16, L
     position = (now.velocity @ frame.T) * jnp.array([1, 1, -1], dtype)
     power = _spooling(now.power, controls.throttle)
     loads = Loads(force[1] / (MASS * GRAVITY), -force[2] / (MASS * GRAVITY))
-    return F16(velocity, _turning(now), rates, position, power), loads
+    return F16(
+        velocity=velocity, attitude=_turning(now), rates=rates, position=position, power=power
+    ), loads
 
 
 def _coefficients(now: F16, controls: Controls, centre: float) -> tuple[Any, Any]:

@@ -56,7 +56,13 @@ def level(speed: chex.Numeric, alpha: chex.Numeric, power: chex.Numeric) -> F16:
     """The aircraft in level flight at sea level."""
     zero = jnp.zeros(3)
     along = jnp.stack([jnp.cos(alpha), jnp.zeros(()), jnp.sin(alpha)])
-    return F16(speed * along, zero.at[1].set(alpha), zero, zero, jnp.asarray(power))
+    return F16(
+        velocity=speed * along,
+        attitude=zero.at[1].set(alpha),
+        rates=zero,
+        position=zero,
+        power=jnp.asarray(power),
+    )
 
 
 def trim(speed: chex.Numeric) -> tuple[jax.Array, Controls]:

@@ -76,11 +76,11 @@ class Flight(NamedTuple):
     """
 
     aircraft: F16
-    errors: Any
+    errors: jax.Array
     """[3] integrals of the errors of the normal load, the roll rate, and the side load + r"""
-    mode: Any
+    mode: jax.Array
     """int32: 0 Wait, 1 Roll, 2 Pull"""
-    since: Any
+    since: jax.Array
     """int32: samples in this mode"""
 
     @property
@@ -99,7 +99,13 @@ def start(attitude: jax.Array, altitude: Any) -> Flight:
     dtype = attitude.dtype
     velocity = SPEED * jnp.array([np.cos(ALPHA), 0, np.sin(ALPHA)], dtype)
     position = jnp.zeros(3, dtype).at[2].set(altitude)
-    aircraft = F16(velocity, attitude, jnp.zeros(3, dtype), position, jnp.asarray(POWER, dtype))
+    aircraft = F16(
+        velocity=velocity,
+        attitude=attitude,
+        rates=jnp.zeros(3, dtype),
+        position=position,
+        power=jnp.asarray(POWER, dtype),
+    )
     zero = jnp.zeros((), jnp.int32)
     return Flight(aircraft, jnp.zeros(3, dtype), zero, zero)
 

@@ -60,7 +60,7 @@ MPH = 2 * math.pi * 60 / 5280  # of a wheel's rpm
 GEARS = np.array([2.393, 1.45, 1.0, 0.677])
 
 
-def _even(step: float, at: Any, values: Any) -> np.ndarray:
+def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:
     """A table of numbers [n, ...] at the places ``at`` [n], as one of even spacing: all places are
     multiples of ``step``, from the first on.
     """
@@ -73,7 +73,7 @@ def _even(step: float, at: Any, values: Any) -> np.ndarray:
 
 
 # ft lb, by throttle (rows) and engine speed, 800, 1200, .. 4800 rpm
-TORQUE = _even(
+TORQUE = _evenly_spaced(
     10,
     [0, 20, 30, 40, 50, 60, 70, 80, 90, 100],
     [
@@ -90,7 +90,7 @@ TORQUE = _even(
     ],
 )
 # capacity K and torque ratio, by speed ratio
-CONVERTER = _even(
+CONVERTER = _evenly_spaced(
     0.01,
     [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, *np.arange(80, 91) / 100, 0.92, 0.94],
     np.transpose([
@@ -103,13 +103,13 @@ CONVERTER = _even(
 )  # fmt: skip
 # mph, by throttle (rows) and gear: above the first a shift up, below the second a shift down
 NEVER = 1e6
-UP = _even(
+UP = _evenly_spaced(
     5,
     [0, 25, 35, 50, 90, 100],
     np.transpose([[10, 10, 15, 23, 40, 40], [30, 30, 30, 41, 70, 70], [50, 50, 50, 60, 100, 100],
                   [NEVER] * 6]),
 )  # fmt: skip
-DOWN = _even(
+DOWN = _evenly_spaced(
     5,
     [0, 5, 40, 50, 90, 100],
     np.transpose([[0] * 6, [5, 5, 5, 5, 30, 30], [20, 20, 25, 30, 50, 50],
@@ -173,7 +173,7 @@ def drive(car: Transmission, inputs: jax.Array) -> tuple[Transmission, Transmiss
     """
 
     def body(car: Transmission, u: jax.Array) -> tuple[Transmission, Transmission]:
-        car = _moved(_shifted(car, u[0]), u)
+        car = _integrate(_shift_gear(car, u[0]), u)
         return car, car
 
     return lax.scan(body, car, inputs)
@@ -184,7 +184,7 @@ def observe(car: Transmission) -> tuple[Any, ...]:
     return car.rpm[None], car.speed[None], car.gear[None]
 
 
-def _shifted(car: Transmission, throttle: Any) -> Transmission:
+def _shift_gear(car: Transmission, throttle: Any) -> Transmission:
     """The car after the logic looked, where it is time to."""
     level = throttle / 5
     up, down = along(UP, level)[car.gear - 1], along(DOWN, level)[car.gear - 1]
@@ -205,7 +205,7 @@ def _shifted(car: Transmission, throttle: Any) -> Transmission:
     )
 
 
-def _moved(car: Transmission, u: jax.Array) -> Transmission:
+def _integrate(car: Transmission, u: jax.Array) -> Transmission:
     """The car `DT` later, in its gear, at throttle and brake ``u``."""
     dtype = car.rpm.dtype
     torques = along(TORQUE, u[0] / 10)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jast.simulators.fms.geodesic import inverse, wrap
 from jast.simulators.fms.lateral import LEAST
 
-__all__ = ["Misses", "extent", "misses"]
+__all__ = ["EVENTS", "FOOT", "Misses", "extent", "misses"]
 
 FOOT = 0.3048  # m
 RHO = 100.0  # eq. 3.4: the scale

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from jast.simulators.fms.geodesic import Earth, direct, inverse, wrap
 
-__all__ = ["Path"]
+__all__ = ["KNOT", "LEAST", "NMI", "Build", "Path", "lateral"]
 
 NMI = 1852.0  # m
 KNOT = NMI / 3600  # m/s
@@ -127,16 +127,16 @@ def lateral(build, waypoints, winds, count):
     )
     beta = jnp.abs(turn) * radius
     return Path(
-        waypoints,
-        legs,
-        needs & short,
-        turn,
-        start,
-        finish,
-        course_out,
-        centre,
-        side * radius,
-        beta,
-        ~overlap,
-        beta > LEAST,
+        waypoints=waypoints,
+        legs=legs,
+        skipped=needs & short,
+        turn=turn,
+        start=start,
+        end=finish,
+        course_out=course_out,
+        centre=centre,
+        radius=side * radius,
+        beta=beta,
+        straight=~overlap,
+        arc=beta > LEAST,
     )
