@@ -7,7 +7,6 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
 from jast import _checks, results
 from jast import limit_state as latent
@@ -219,6 +218,8 @@ def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, np.ndarray]:
     """E[f(z | F) / phi(z) | F] of one number, from failures ``z`` [m] with weights ``w`` of sum 1,
     and f(z | F) / phi(z) of each, by the others: [m].
     """
+    from scipy.special import ndtr
+
     cells, at = np.unique(np.floor(z.astype(np.float64) / WIDTH), return_inverse=True)
     # as a tail's own number: no difference of numbers near 1
     near = np.minimum(np.abs(cells), np.abs(cells + 1)) * WIDTH
