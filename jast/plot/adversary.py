@@ -34,7 +34,7 @@ def confusion(
     result: Result, failed: chex.Array, threshold: float = 0.5, ax: Axes | None = None
 ) -> Axes:
     """How many inputs a score of at least ``threshold`` calls failures, against the truth: the
-    confusion matrix of the adversary (figure 4.3b of the thesis). Returns the Axes.
+    confusion matrix of the adversary (figure 4.3b of the thesis).
 
     Args:
         result: a `jast.weakness.Result`, whose last scores are judged.
@@ -83,7 +83,7 @@ def threshold_sweep(
     ax: Axes | None = None,
 ) -> Axes:
     """Precision and recall of the scores against the threshold from which an input is called a
-    failure (figure 4.4b of the thesis). Returns the Axes.
+    failure (figure 4.4b of the thesis).
 
     Args:
         result, failed, ax: as for `confusion`.
@@ -196,7 +196,7 @@ def likely_failures(
 
 def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
     """A(E(x)) of images that are dark but for one pixel, which is 1: how suspect each pixel alone
-    makes an image (figure 4.6 of the thesis). Returns the Axes.
+    makes an image (figure 4.6 of the thesis).
 
     Args:
         networks: `jast.weakness.encoded` of a result on images [n, height, width].

@@ -59,9 +59,6 @@ def colav(
             that comes too soon for so many), the others are spread evenly before it.
         axes: one for each moment, whose figure gets the title; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for many episodes, states that are missing or another system's, moments outside
             the episode, and too few axes.
@@ -104,9 +101,6 @@ def colav_story(
         episode: as for `colav`.
         sim: its simulator. With it the delay is in seconds, else it is a share of the longest.
         axes: one for each panel; None: a new figure.
-
-    Returns:
-        The list of Axes.
 
     Raises:
         ValueError: as `colav`.

@@ -55,9 +55,6 @@ def proposal_contours(
             widest one's side.
         elites: how many of the best points so far are marked.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for many runs, dimensions other than 2, iterations that were not run, bounds
             that are none, elites below 1, and too few axes.
@@ -119,9 +116,6 @@ def surrogate_samples(
         iteration: which one, counted from 1.
         axes: two; None: a new figure.
         bounds: as for `proposal_contours`, but the default leaves out the farthest points.
-
-    Returns:
-        The list of two Axes.
 
     Raises:
         ValueError: as `proposal_contours`, and for a run without a surrogate.
@@ -186,9 +180,6 @@ def convergence(
         optimum: [d]: where the objective is least. With it, a second panel has the mean distance of
             the best point to it, on a logarithmic axis.
         axes: one or two; None: a new figure.
-
-    Returns:
-        The list of Axes.
 
     Raises:
         ValueError: for what is no batch of runs, an optimum of another dimension, and too few axes.

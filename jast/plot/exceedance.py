@@ -31,9 +31,6 @@ def exceedance(
         truth: threshold -> probability, of an array, where it is known: dots.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything else, an estimate without draws, and where nothing is known.
 

@@ -136,9 +136,6 @@ def contributions(
         background: of images, in grey, [height, width(, channels)]: for example the mean image.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for values of another shape or that are not finite, and names or a background
             that do not fit or are for the other kind of inputs.

@@ -59,9 +59,6 @@ def failure_fan(
         units: name -> unit, for the label of a field.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for samples of another kind, a value that is not one number or no field, and
             ``most`` below 1.

@@ -29,9 +29,6 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
         sim: its simulator. Default: `jast.simulators.ferry` S0.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for an episode of another system, or for many episodes.
 

@@ -49,9 +49,6 @@ def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) ->
         sim: its simulator.
         axes: two; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for another system's simulator, for many episodes, and for fewer than two axes.
 

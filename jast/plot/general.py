@@ -39,9 +39,6 @@ def history(
         total: draw the best over trees with the episodes of all trees, by which searches of
             different numbers of trees compare.
 
-    Returns:
-        The Axes.
-
     Example:
         >>> import jax, jast
         >>> sim = jast.simulators.walk1d()
@@ -99,9 +96,6 @@ def disturbances(
             stands at sqrt(2 (log p of the likeliest - log p)), which for a normal number is the
             same distance. Panels of x0, at step 0, come first. Grey: up to 1 and up to 2.
         units: name -> unit, for the labels; not where ``sim`` is given.
-
-    Returns:
-        The list of Axes.
 
     Raises:
         ValueError: for no or many episodes, too few axes, and a simulator with a distribution that
@@ -188,9 +182,6 @@ def distances(
         labels: one name for each batch.
         bins: of the histogram.
         ax: Axes to draw in; None: a new figure.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: where no episode or no label fits.

@@ -28,9 +28,6 @@ def training(
         policies: of `jast.policies.sac` or `ppo`, or a dict of name -> policy.
         axes: two, to draw into.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for what is no failure policy, and for too few axes.
 
@@ -63,9 +60,6 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
     Args:
         proposals: one run, or a dict of name -> run.
         ax: to draw into.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: for what is no such result, and a batch of runs.

@@ -32,9 +32,6 @@ def probability(
         truth: the known probability, a vertical line.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything else, a truth outside (0, 1], and estimates below the least double.
 
@@ -95,9 +92,6 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
     Args:
         traces: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`.
         ax: Axes to draw in; None: a new figure.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: for anything else, and with fewer than 2 failures.

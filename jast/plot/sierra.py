@@ -36,9 +36,6 @@ def sierra(
         axes: Axes to draw in, at least one for each pair; None: a new figure, three panels a row.
         others: further settings of `jast.cross_entropy.sierra`, of all panels, as ``spacing=3.0``.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for settings that are no pairs, those that sierra refuses, and too few axes.
 

@@ -68,9 +68,6 @@ def traces(
         most: failures drawn, evenly taken.
         axes: one for each field, or None for a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for samples of another kind, and a field that there is not.
 
@@ -170,9 +167,6 @@ def phase(
         fields: two names, across and up. Default: the first two numbers that go otherwise than
             undisturbed.
         ax: Axes to draw in; None: a new figure.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: as `traces`, and where there are not two fields.

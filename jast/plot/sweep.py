@@ -36,9 +36,6 @@ def sweep(
         truth: value of the setting -> probability, of an array, where it is known: dots.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything but a `Sweep`, one without a probability, and as
             `Sweep.crossing`.

@@ -33,9 +33,6 @@ def tree(
         tree: which of its trees; default: that of the best episode.
         levels: how far down the picture goes.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for a result that holds no trees, and a number that it does not have.
 

@@ -44,9 +44,6 @@ def trials(
             about the mean is one standard deviation of the episodes so far (of several trees: its
             mean).
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for a result without trials, and another mode.
 
@@ -115,9 +112,6 @@ def trial_distances(
         axes: two; None: a new figure.
         mode: "thesis" is figure 3.8 of Moss's thesis as printed: distances negated, and the event
             horizon at 0.
-
-    Returns:
-        The list of Axes.
 
     Raises:
         ValueError: as `trials`.

@@ -36,9 +36,6 @@ def failures_found(
             deviations (hypergeometric) to both sides.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for what is no result, for results of different n, and for a ``failed`` of
             another shape or type, or that contradicts what the calls found.
@@ -111,9 +108,6 @@ def roc(
         iterations: which ones, counted from 1 as ``print(result)`` does. Default: up to four,
             evenly, the last one included.
         ax: Axes to draw in; None: a new figure.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: for what is no `jast.weakness.Result`, one without iterations, iterations that
