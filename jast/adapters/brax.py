@@ -9,15 +9,8 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from jast.adapters import loop
 from jast.adapters.kept import refuse_warp
-from jast.adapters.loop import (
-    Change,
-    Judgement,
-    Noise,
-    Outcome,
-    check_environment,
-    simulator,
-)
 from jast.simulator import Simulator
 
 __all__ = ["brax"]
@@ -29,18 +22,20 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The environment"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return _outcome(self.subject.reset(key))
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         return _outcome(self.subject.step(push(state), action))
 
 
-def _outcome(state: Any) -> Outcome:
+def _outcome(state: Any) -> loop.Outcome:
     done = jnp.asarray(state.done)
     # what counts steps says so when the time is over, which is no failure
     late = state.info.get("truncation", 0.0) if isinstance(state.info, dict) else 0.0
-    return Outcome(state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool))
+    return loop.Outcome(
+        state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool)
+    )
 
 
 def brax(
@@ -48,14 +43,14 @@ def brax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: Noise | None = None,
-    action: Noise | None = None,
-    force: Change | None = None,
-    parameters: Change | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Judgement | None = None,
-    distance: Judgement | None = None,
-    observe: Judgement | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of brax or mujoco_playground: ``reset(key)`` and ``step(state,
     action)`` return a state with ``obs``, ``reward``, ``done`` and ``info``.
@@ -116,5 +111,5 @@ def brax(
     hint = "; brax.envs.get_environment(name) makes one"
     instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
     refuse_warp("brax", getattr(env, "mjx_model", None), instead)
-    check_environment("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
-    return simulator("brax", _Environment(given.pop("env")), **given)
+    loop.check_environment("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
+    return loop.simulator("brax", _Environment(given.pop("env")), **given)

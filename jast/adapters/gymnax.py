@@ -9,7 +9,7 @@ from typing import Any, Literal
 import jax
 
 from jast._jax import is_traced, without_stops
-from jast.adapters.loop import Change, Judgement, Noise, Outcome, simulator
+from jast.adapters import loop
 from jast.simulator import Simulator
 
 __all__ = ["gymnax"]
@@ -25,15 +25,17 @@ class _Environment:
     subject: Any
     """Its params"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         observation, state = self.env.reset(key, *self._given())
-        return Outcome(state, observation, 0.0, False)
+        return loop.Outcome(state, observation, 0.0, False)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         step = without_stops(self.env.step_env)
         observation, state, reward, done, _ = step(key, push(state), action, *self._given())
         # of several agents: those of each by its name
-        return Outcome(state, observation, reward, done["__all__"] if type(done) is dict else done)
+        return loop.Outcome(
+            state, observation, reward, done["__all__"] if type(done) is dict else done
+        )
 
     def _given(self) -> tuple[Any, ...]:
         return () if self.subject is None else (self.subject,)
@@ -45,14 +47,14 @@ def gymnax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: Noise | None = None,
-    action: Noise | None = None,
-    force: Change | None = None,
-    parameters: dict[str, Any] | Change | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: dict[str, Any] | loop.Change | None = None,
     seed: int | Literal["episode", "step"] = 0,
-    failure: Judgement | None = None,
-    distance: Judgement | None = None,
-    observe: Judgement | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of gymnax, or of a library with the same ``reset(key, params)``
     and ``step_env(key, state, action, params)``, such as craftax; JaxMARL has them without params.
@@ -137,4 +139,4 @@ def gymnax(
                 f"gymnax: horizon must be below {place}.{name}, which is {limit}: there step_env"
                 f" says that it has terminated; received {horizon}"
             )
-    return simulator("gymnax", _Environment(given.pop("env"), given.pop("params")), **given)
+    return loop.simulator("gymnax", _Environment(given.pop("env"), given.pop("params")), **given)

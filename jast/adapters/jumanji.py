@@ -9,14 +9,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.loop import (
-    Change,
-    Judgement,
-    Noise,
-    Outcome,
-    check_environment,
-    simulator,
-)
+from jast.adapters import loop
 from jast.simulator import Simulator
 
 __all__ = ["jumanji"]
@@ -28,15 +21,15 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The environment"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         state, first = self.subject.reset(key)
-        return Outcome(state, first.observation, 0.0, False)
+        return loop.Outcome(state, first.observation, 0.0, False)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         state, now = self.subject.step(push(state), action)
         # the end of the time, which is no failure, keeps a discount
         terminated = now.last() & jnp.all(jnp.asarray(now.discount) == 0)
-        return Outcome(state, now.observation, now.reward, terminated)
+        return loop.Outcome(state, now.observation, now.reward, terminated)
 
 
 def jumanji(
@@ -44,14 +37,14 @@ def jumanji(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: Noise | None = None,
-    action: Noise | None = None,
-    force: Change | None = None,
-    parameters: Change | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Judgement | None = None,
-    distance: Judgement | None = None,
-    observe: Judgement | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of jumanji, or another whose ``reset(key)`` and ``step(state,
     action)`` return a state and a timestep with ``observation``, ``reward``, ``discount`` and
@@ -106,5 +99,5 @@ def jumanji(
         (20, 1)
     """
     given = dict(locals())
-    check_environment("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
-    return simulator("jumanji", _Environment(given.pop("env")), **given)
+    loop.check_environment("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
+    return loop.simulator("jumanji", _Environment(given.pop("env")), **given)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._checks import whole
+from jast.adapters import loop
 from jast.adapters.kept import refuse_warp
-from jast.adapters.loop import Change, Instant, Judgement, Noise, Outcome, simulator
+from jast.adapters.loop import Instant
 from jast.adapters.noise import add
 from jast.pytrees import bound
 from jast.simulator import Simulator
@@ -41,10 +42,10 @@ class _Physics:
     advance: Any = field(metadata=dict(static=True))
     substeps: int = field(metadata=dict(static=True))
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return self._outcome(self.data)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         ctrl = jnp.asarray(action, self.data.ctrl.dtype).reshape(self.data.ctrl.shape)
         data = push(self.data.replace(ctrl=ctrl, **state._asdict()))
         data = jax.lax.fori_loop(
@@ -52,9 +53,9 @@ class _Physics:
         )
         return self._outcome(data)
 
-    def _outcome(self, data: Any) -> Outcome:
+    def _outcome(self, data: Any) -> loop.Outcome:
         body = _Body(*(getattr(data, name) for name in _Body._fields))
-        return Outcome(body, self.sense(data), 0.0, False)
+        return loop.Outcome(body, self.sense(data), 0.0, False)
 
 
 def mjx(
@@ -63,16 +64,16 @@ def mjx(
     controller: Callable[[Any], Any],
     *,
     horizon: int,
-    distance: Judgement,
-    failure: Judgement | None = None,
-    observation: Noise | None = None,
-    action: Noise | None = None,
-    force: Noise | None = None,
-    parameters: Change | None = None,
+    distance: loop.Judgement,
+    failure: loop.Judgement | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Noise | None = None,
+    parameters: loop.Change | None = None,
     sense: Callable[[Any], Any] | None = None,
     substeps: int = 1,
     step: Callable[[Any, Any], Any] | None = None,
-    observe: Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A controller of a model of MuJoCo, in ``mujoco.mjx``.
 
@@ -154,7 +155,7 @@ def mjx(
         advance=step,
         substeps=whole("mjx", "substeps", substeps),
     )
-    return simulator(
+    return loop.simulator(
         "mjx",
         physics,
         policy=controller,

@@ -10,15 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jast.adapters.loop import (
-    Change,
-    Instant,
-    Judgement,
-    Noise,
-    Outcome,
-    check_environment,
-    simulator,
-)
+from jast.adapters import loop
+from jast.adapters.loop import Instant
 from jast.simulator import Simulator
 
 __all__ = ["pgx"]
@@ -38,16 +31,16 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The game"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return _outcome(self.subject.init(key))
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         return _outcome(self.subject.step(push(state), action, key))
 
 
-def _outcome(state: Any) -> Outcome:
+def _outcome(state: Any) -> loop.Outcome:
     turn = _Turn(*(getattr(state, name) for name in _Turn._fields))
-    return Outcome(state, turn, jnp.ravel(state.rewards)[0], state.terminated)
+    return loop.Outcome(state, turn, jnp.ravel(state.rewards)[0], state.terminated)
 
 
 def pgx(
@@ -55,14 +48,14 @@ def pgx(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: Noise | None = None,
-    action: Noise | None = None,
-    force: Change | None = None,
-    parameters: Change | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode", "step"] = 0,
-    failure: Judgement | None = None,
-    distance: Judgement | None = None,
-    observe: Judgement | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in a game of pgx: ``init(key)`` and ``step(state, action, key)`` return a state.
 
@@ -125,10 +118,10 @@ def pgx(
         True
     """
     given = dict(locals())
-    check_environment("pgx", env, "init(key)", "step(state, action, key)", seed=seed)
+    loop.check_environment("pgx", env, "init(key)", "step(state, action, key)", seed=seed)
     if failure is None and getattr(env, "num_players", 1) > 1:
         given["failure"] = Partial(_lost)
-    return simulator("pgx", _Environment(given.pop("env")), **given)
+    return loop.simulator("pgx", _Environment(given.pop("env")), **given)
 
 
 def _lost(now: Instant) -> jax.Array:
