@@ -1,23 +1,36 @@
-"""Episodes in whatever form a user has them, as one batch; and what their ends left undrawn."""
+"""Episodes in whatever form a user has them, as one batch; what their ends left undrawn, what is
+observed at each of their steps; and ordinary ones.
+"""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast import rewards
 from jast._jax import jit
-from jast.episode import Episode, play_back
+from jast.episode import Episode, play_back, rollout
 from jast.failures import Failures, identity
 from jast.limit_state import side_by_side
 from jast.outline import outline
+from jast.pytrees import bound
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
-__all__ = ["FullEpisodes", "distinct_rows", "gather_episodes", "named_kinds", "play_to_horizon"]
+__all__ = [
+    "FullEpisodes",
+    "distinct_rows",
+    "draw_ordinary",
+    "gather_episodes",
+    "named_kinds",
+    "observations",
+    "play_to_horizon",
+]
 
 LANES = 256  # episodes that are played at a time
 
@@ -140,3 +153,36 @@ def _played_on(sim: Simulator, key: Any, at: Any, x0: Any, x: Any, length: Any) 
 def _plain(a: jax.Array) -> jax.Array:
     key = jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key)
     return jnp.zeros((len(a), 0)) if key else a
+
+
+def draw_ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
+    """At most ``n`` episodes of the model that do not fail."""
+    at = np.arange(n, dtype=np.int32)
+    e = side_by_side(sim, partial(_drawn, key, sim), at, lanes=LANES)
+    return jax.tree.map(lambda a: a[~e.failure], e)
+
+
+@jit
+def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
+    return jax.vmap(lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None))(at)
+
+
+def observations(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
+    """[n, horizon + 1, d] of the states."""
+    watched, about = partial(_watched, sim, bound(observe)), (e.x0, e.disturbances, e.length)
+    seen = side_by_side(sim, watched, *about, lanes=LANES)
+    if not isinstance(seen, np.ndarray) or seen.ndim != 3:
+        shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
+        raise ValueError(
+            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
+        )
+    return seen.astype(float)
+
+
+@jit
+def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
+    def one(x0, x, length):
+        states = play_back(sim, rewards.STANDARD, x0, x, length).states
+        return jax.tree.map(jnp.asarray, jax.vmap(observe)(states))
+
+    return jax.vmap(one)(x0, x, length)

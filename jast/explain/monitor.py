@@ -11,8 +11,8 @@ import numpy as np
 from jast import _checks, results
 from jast.counter import generator
 from jast.explain.cases import given_cases, simulate_cases
+from jast.explain.gathered import draw_ordinary, observations
 from jast.explain.learning import hold_out, sklearn_module
-from jast.explain.observed import draw_ordinary, observations
 from jast.intervals import clopper_pearson
 from jast.simulator import Simulator
 from jast.weakness.measures import Roc, roc
