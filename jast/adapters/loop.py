@@ -29,15 +29,7 @@ if TYPE_CHECKING:
 
     from jast.typing import DistributionLike
 
-__all__ = [
-    "Change",
-    "Instant",
-    "Judgement",
-    "Noise",
-    "Outcome",
-    "check_environment",
-    "simulator",
-]
+__all__ = ["Change", "Instant", "Judgement", "Noise", "Outcome", "check_environment", "simulator"]
 
 Change: TypeAlias = tuple[Any, Callable[..., Any]]
 """A distribution and what a draw of it does: (it, draw) -> it."""

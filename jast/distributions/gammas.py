@@ -120,6 +120,5 @@ def _tails_beta(d, x):
 
 
 register_both(
-    continuous.Beta,
-    **row_of_inverse(lambda d, z: jax.nn.sigmoid(_logit_beta(d, z)), _tails_beta),
+    continuous.Beta, **row_of_inverse(lambda d, z: jax.nn.sigmoid(_logit_beta(d, z)), _tails_beta)
 )

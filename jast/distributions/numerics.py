@@ -165,9 +165,7 @@ def log_one_less(log_p: jax.Array) -> jax.Array:
     near_one = log_p > -math.log(2.0)
     other = jnp.where(near_one, -1.0, log_p)
     return jnp.where(
-        near_one,
-        jnp.log(-jnp.expm1(jnp.where(near_one, log_p, -1.0))),
-        jnp.log1p(-jnp.exp(other)),
+        near_one, jnp.log(-jnp.expm1(jnp.where(near_one, log_p, -1.0))), jnp.log1p(-jnp.exp(other))
     )
 
 

@@ -115,9 +115,7 @@ def _normal_of_choice(d, x):
     low, high = (jnp.take_along_axis(e, i, axis=-1)[..., 0] for e in _with_infinite_ends(edges))
     # the middle in probability, from the side where the numbers are small
     return jnp.where(
-        low + high > 0,
-        -ndtri((ndtr(-low) + ndtr(-high)) / 2),
-        ndtri((ndtr(low) + ndtr(high)) / 2),
+        low + high > 0, -ndtri((ndtr(-low) + ndtr(-high)) / 2), ndtri((ndtr(low) + ndtr(high)) / 2)
     )
 
 

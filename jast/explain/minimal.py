@@ -69,12 +69,7 @@ class Minimal(NamedTuple):
 
 
 def minimal(
-    sim: Simulator,
-    episode: Episode,
-    *,
-    orders: int = 8,
-    slack: float = 0.1,
-    budget: int = 5000,
+    sim: Simulator, episode: Episode, *, orders: int = 8, slack: float = 0.1, budget: int = 5000
 ) -> Minimal:
     """Which disturbances of a failure are needed, and how large must they be?
 

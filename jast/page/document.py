@@ -48,11 +48,7 @@ def document(title: str, body: str, data: Any, *scripts: str) -> str:
         (HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js", *scripts)
     )
     return PAGE.format(
-        title=text(title),
-        style=style,
-        body=body,
-        data=embedded(data),
-        script="\n".join(code),
+        title=text(title), style=style, body=body, data=embedded(data), script="\n".join(code)
     )
 
 

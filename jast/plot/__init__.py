@@ -16,12 +16,7 @@ adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelih
 """
 
 from jast._doors import listed
-from jast.plot.adversary import (
-    confusion,
-    likely_failures,
-    pixel_likelihood,
-    threshold_sweep,
-)
+from jast.plot.adversary import confusion, likely_failures, pixel_likelihood, threshold_sweep
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.exceedance import exceedance

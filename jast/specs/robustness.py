@@ -50,12 +50,7 @@ class Values(NamedTuple):
 
 
 def robustness(
-    formula: Formula,
-    trace: Any,
-    dt: float,
-    *,
-    temperature: Any = None,
-    goes_on: bool = False,
+    formula: Formula, trace: Any, dt: float, *, temperature: Any = None, goes_on: bool = False
 ) -> jax.Array:
     """By how much a trace satisfies a formula; below 0, it violates it.
 

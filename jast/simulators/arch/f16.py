@@ -12,14 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.simulators.arch._table import along
-from jast.simulators.arch.f16_tables import (
-    DAMPING,
-    LIFT,
-    PITCHING,
-    SLIPPING,
-    STEERING,
-    THRUST,
-)
+from jast.simulators.arch.f16_tables import DAMPING, LIFT, PITCHING, SLIPPING, STEERING, THRUST
 
 __all__ = ["F16", "Controls", "Loads", "motion"]
 
