@@ -41,8 +41,8 @@ def simulate_cases(
     most: int | None = None,
 ) -> Cases:
     """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses."""
-    s = find_seeds(function, sim, failures, labels, DRAWS * episodes)
-    v = draw_variants(key, sim, s, episodes)
+    seeds = find_seeds(function, sim, failures, labels, DRAWS * episodes)
+    v = draw_variants(key, sim, seeds, episodes)
     if len(v.label) < 2 * DISTINCT:
         raise ValueError(
             f"{function}: failures must be such that small changes of them still fail, received"
@@ -61,8 +61,8 @@ def simulate_cases(
         episodes=e,
         kind=kind,
         group=group,
-        names=(OTHERS, *s.names),
-        evaluations=s.evaluations + v.evaluations,
+        names=(OTHERS, *seeds.names),
+        evaluations=seeds.evaluations + v.evaluations,
     )
 
 

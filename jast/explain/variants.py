@@ -125,29 +125,29 @@ def _holds_points(sim: Simulator, kept: Draws | None) -> bool:
     return of_model or fits(sim, kept.source)
 
 
-def _label_by_mode(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
-    """``s`` with the mode that each is most alike, where there are several; each mode has its
+def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> Seeds:
+    """``seeds`` with the mode that each is most alike, where there are several; each mode has its
     likeliest failure as a seed, too.
     """
     if modes is None or len(modes) < 2:
-        return s
+        return seeds
     best = gather_episodes(function, "modes", sim, modes[:MODES])
     heads = latent.normal_of(sim, best)
     judge = Judge(sim)
     o = judge(heads)
-    z = np.concatenate([s.z, heads[o.failure]]).astype(heads.dtype)
-    used = np.concatenate([s.used, o.used[o.failure]])
+    z = np.concatenate([seeds.z, heads[o.failure]]).astype(heads.dtype)
+    used = np.concatenate([seeds.used, o.used[o.failure]])
     label = owners(sim, latent.played(sim, z), best)
-    label[len(s.z) :] = np.flatnonzero(o.failure)
+    label[len(seeds.z) :] = np.flatnonzero(o.failure)
     # a mode's likeliest failure counts only where nothing else is known of the mode
-    log_w = np.concatenate([s.log_weight, np.full(int(o.failure.sum()), UNKNOWN_WEIGHT)])
+    log_w = np.concatenate([seeds.log_weight, np.full(int(o.failure.sum()), UNKNOWN_WEIGHT)])
     return Seeds(
         z=z,
         used=used,
         log_weight=log_w,
         label=label,
         names=_mode_names(len(best.length)),
-        evaluations=s.evaluations + judge.spent,
+        evaluations=seeds.evaluations + judge.spent,
     )
 
 
@@ -155,8 +155,8 @@ def _mode_names(k: int) -> tuple:
     return tuple(f"mode {i + 1}" for i in range(k))
 
 
-def draw_variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
-    """``n`` failures and at most as many near misses, from Markov chains that begin at ``s``.
+def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Variants:
+    """``n`` failures and at most as many near misses, from Markov chains that begin at ``seeds``.
 
     In each move of a chain some of the disturbances are drawn anew, or moved a little
     (`jast.markov.proposed`), or all come some steps later, so that the model stays as it is: where
@@ -166,11 +166,11 @@ def draw_variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     failures get the same number of chains.
     """
     rng, judge = generator(key), Judge(sim)
-    kinds = np.unique(s.label)
-    each = [_draw_seeds(rng, s, k, -(-n // len(kinds))) for k in kinds]
+    kinds = np.unique(seeds.label)
+    each = [_draw_seeds(rng, seeds, k, -(-n // len(kinds))) for k in kinds]
     seed = np.concatenate(each)
-    z = s.z[seed].astype(np.float64)
-    behind = np.arange(z.shape[1]) >= s.used[seed][:, None]
+    z = seeds.z[seed].astype(np.float64)
+    behind = np.arange(z.shape[1]) >= seeds.used[seed][:, None]
     z = np.where(behind, rng.standard_normal(z.shape), z)
     near, misses = np.zeros_like(z), np.zeros(len(z), int)
     for scale in SCALES:
@@ -186,7 +186,7 @@ def draw_variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     calm = latent.played(sim, near[missed]) if len(missed) else bad
     fails = np.flatnonzero(bad.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
-    label, group = s.label[seed[fails]], seed[fails]
+    label, group = seeds.label[seed[fails]], seed[fails]
     near_group = seed[missed[calm_rows]]
     crowded = any(
         np.unique(group[label == k], return_counts=True)[1].max() > CROWDED * np.sum(label == k)
@@ -222,7 +222,7 @@ def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> n
     return np.concatenate([z[:, :start], moved.reshape(n, -1)], axis=1)
 
 
-def _draw_seeds(rng: np.random.Generator, s: Seeds, kind: int, n: int) -> np.ndarray:
+def _draw_seeds(rng: np.random.Generator, seeds: Seeds, kind: int, n: int) -> np.ndarray:
     """Rows [n] of the seeds of one kind, by weight; all alike, so many times each."""
-    rows = np.flatnonzero(s.label == kind)
-    return rows[resampled(s.log_weight[rows], n, rng.random())]
+    rows = np.flatnonzero(seeds.label == kind)
+    return rows[resampled(seeds.log_weight[rows], n, rng.random())]
