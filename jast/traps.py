@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Var
 
 from jast import distributions as D
 from jast.incidents import hosted
@@ -24,6 +25,8 @@ program of 50 steps compiles in 4 to 14 CPU seconds for 3200 to 7000 of them (br
 ARCH-COMP), one with its gradient in 22 and 51 for 3200; `jast.stress` then compiles for 190 and 275
 seconds (an inverted pendulum of brax, the cars), for 63 with 700 (a transmission of ARCH-COMP).
 """
+CALLS = {"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "remat2", "checkpoint"}
+"""Primitives whose inputs and outputs are those of the program in them, as JAX names them."""
 
 
 def traps(sim: Simulator) -> list[str]:
@@ -32,9 +35,9 @@ def traps(sim: Simulator) -> list[str]:
     """
     if hosted(sim):
         return []
-    seen, about, (equations, level) = looked(sim), outline(sim), _program(sim)
+    seen, about, (equations, level, keys) = looked(sim), outline(sim), _program(sim)
     found = [f"step: {text}" for text in (words(seen), _jumps(seen)) if text is not None]
-    found += _keys(about.state, seen)
+    found += _fixed_keys(about.state, seen, keys)
     if seen.felt and level:
         found.append(
             "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
@@ -62,11 +65,16 @@ def _jumps(seen: Looked) -> str | None:
     )
 
 
-def _keys(state: Any, seen: Looked) -> Iterator[str]:
-    own = lambda leaf: isinstance(leaf, Key)  # a user of `jast.adapters` says what is random
-    leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=own)
-    for (path, leaf), still in zip(leaves, seen.still, strict=True):
-        if not own(leaf) and leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)) and still:
+def _is_ours(leaf: Any) -> bool:
+    """Whether it is a key of `jast.adapters`, whose user says what is random."""
+    return isinstance(leaf, Key)
+
+
+def _fixed_keys(state: Any, seen: Looked, keys: tuple[bool, ...]) -> Iterator[str]:
+    """A text for each of the leaves that are ``keys`` and that no disturbance reaches."""
+    leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=_is_ours)
+    for (path, leaf), key, still in zip(leaves, keys, seen.still, strict=True):
+        if key and still and not _is_ours(leaf):
             yield (
                 f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
                 " random key that no disturbance reaches: the simulator's own noise is the same in"
@@ -76,25 +84,62 @@ def _keys(state: Any, seen: Looked) -> Iterator[str]:
 
 
 @asked
-def _program(sim: Simulator, start: Any, state: Any, dist: Any) -> tuple[int, bool]:
-    """How many equations step and evaluate have, and whether `jax.lax.stop_gradient` is among them
-    and leaves no slope.
+def _program(
+    sim: Simulator, start: Any, state: Any, dist: Any
+) -> tuple[int, bool, tuple[bool, ...]]:
+    """How many equations step and evaluate have; whether `jax.lax.stop_gradient` is among them and
+    leaves no slope; which leaves of the state they make random keys of.
     """
     x = D.sample(dist, jax.random.key(0))
-    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(state, x)
-    names = [equation.primitive.name for equation in _equations(program.jaxpr)]
-    return len(names), "stop_gradient" in names and _level(sim)
+    program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(state, x).jaxpr
+    names = [equation.primitive.name for equation in _equations(program)]
+    level = "stop_gradient" in names and _level(sim)
+    leaves = jax.tree.leaves(state)
+    words = [a.dtype == jnp.uint32 and a.shape[-1:] in ((2,), (4,)) for a in leaves]
+    inputs = range(len(program.invars))
+    keys = (w and _makes_keys(program, [i == at for i in inputs])[0] for at, w in enumerate(words))
+    return len(names), level, tuple(keys)
+
+
+def _makes_keys(program: Any, given: list[bool]) -> tuple[bool, list[bool]]:
+    """Whether a jaxpr wraps, as the words of a random key, what depends on the inputs that are
+    ``given``; and which outputs depend on them.
+    """
+    known = {variable for variable, it in zip(program.invars, given, strict=True) if it}
+    found = False
+    for equation in program.eqns:
+        # numbers that are written in the program have no hash
+        inputs = [isinstance(v, Var) and v in known for v in equation.invars]
+        if not any(inputs):
+            continue
+        found |= equation.primitive.name == "random_wrap"
+        outputs = [True] * len(equation.outvars)
+        for inner in _programs(equation):
+            # of a loop or a branch, what steers it comes first
+            reached = inputs[len(inputs) - len(inner.invars) :]
+            inside, after = _makes_keys(inner, reached)
+            found |= inside
+            # what a loop carries may reach any of its outputs
+            outputs = after if equation.primitive.name in CALLS else outputs
+        known |= {v for v, it in zip(equation.outvars, outputs, strict=True) if it}
+    return found, [isinstance(v, Var) and v in known for v in program.outvars]
 
 
 def _equations(program: Any) -> Iterator[Any]:
     """Those of a jaxpr and of all in it; the body of a loop once."""
     for equation in program.eqns:
         yield equation
-        for value in equation.params.values():
-            for inner in value if isinstance(value, tuple | list) else (value,):
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    yield from _equations(inner)
+        for inner in _programs(equation):
+            yield from _equations(inner)
+
+
+def _programs(equation: Any) -> Iterator[Any]:
+    """The jaxprs in an equation."""
+    for value in equation.params.values():
+        for inner in value if isinstance(value, tuple | list) else (value,):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield inner
 
 
 def _level(sim: Simulator) -> bool:

@@ -532,6 +532,9 @@ WRONG = {
         1.0, (), len, horizon=1, distance=len, step=len
     ),
     "mjx: distance must be a function": lambda: body(distance=1.0),
+    "mjx: controller must be a function": lambda: mjx(
+        1.0, (), 1, horizon=1, distance=len, step=len
+    ),
     "mjx: sense must be a function": lambda: body(sense=1.0),
     "mjx: substeps must be a whole number of at least 1": lambda: body(substeps=0),
     "gymnax: policy holds arrays, received Weights: .*eqx.partition": lambda: gymnax(
@@ -540,8 +543,21 @@ WRONG = {
     r"leaf \[?.*state.* has dtype float32, expected int32": lambda: jast.check(
         gymnax(Whole(), Params(), lambda seen: seen * 0.6, horizon=3, **ANY)
     ),
-    r"noise of shape \(\) cannot be added to float32\[1\]": lambda: jast.check(
+    r"^step: raised ValueError: gymnax: observation must be a distribution of shape \(1,\), such as"
+    r" Normal\(jnp.zeros\(\(1,\)\), 0.1\), .*; received one of shape \(\)": lambda: jast.check(
         drift(observation=Normal(0.0, 1.0))
+    ),
+    r"gymnax: action must be .* of shape \(1,\), .*received one of shape \(3,\)": lambda: (
+        jast.check(drift(action=Normal(jnp.zeros(3), 1.0)))
+    ),
+    r"gymnax: action must be a pair .*noise cannot be added to int32\[1\]": lambda: jast.check(
+        gymnax(Drift(), Params(), lambda seen: seen.astype(int), horizon=3, action=Normal(0.0, 1.0))
+    ),
+    r"gymnax: observation must be .* of the structure PyTreeDef": lambda: jast.check(
+        drift(observation={"seen": Normal(jnp.zeros(1), 1.0)})
+    ),
+    r"mjx: force must be a distribution of shape \(1,\), .* received one of shape \(3,\)": lambda: (
+        jast.check(body(force=Normal(jnp.zeros(3), 1.0)))
     ),
 }
 

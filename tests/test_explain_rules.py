@@ -15,7 +15,7 @@ from benchmarks.explain_systems import planted
 from benchmarks.stress_systems import slips
 from jast import explain
 from jast.distributions import Joint, Normal, Uniform
-from jast.explain.learning import parted
+from jast.explain.learning import hold_out
 from jast.search import Mode, Modes
 
 pytest.importorskip("sklearn", reason="rules and monitors learn with scikit-learn")
@@ -159,12 +159,12 @@ def test_groups_are_held_out_as_a_whole():
     """Also where a group has episodes of several classes."""
     rng = np.random.default_rng(0)
     owner, group = rng.integers(0, 3, 300), rng.integers(0, 20, 300)
-    out = parted(rng, owner, group, 0.3)
+    out = hold_out(rng, owner, group, 0.3)
     assert not set(group[out]) & set(group[~out])
     assert all(0.1 < out[owner == k].mean() < 0.5 for k in range(3))
     # one great group among small ones stays where it is learned from
     group[:200] = 7
-    assert 0 < parted(rng, owner, group, 0.3).mean() < 0.35
+    assert 0 < hold_out(rng, owner, group, 0.3).mean() < 0.35
 
 
 def test_an_early_end_tells_nothing():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pictures import drawn, matplotlib, plt  # noqa: F401
 
-from jast import plot
+from benchmarks import costs
 from jast.search import SearchResult
 
 
@@ -20,7 +20,7 @@ SECONDS = {"forest": 2.0, "random": 1.0}
 
 
 def test_failing_trees_in_a_second():
-    ax = drawn(plot.failing_trees(RESULTS, SECONDS, costs=[1e-9, 1.0]))
+    ax = drawn(costs.failing_trees(RESULTS, SECONDS, costs=[1e-9, 1.0]))
     forest, random = (line.get_ydata() for line in ax.lines)
     # 2 of 4 trees in 2 s, and in 90,002 s
     np.testing.assert_allclose(forest, [1, 2 / 90_002], rtol=1e-4)
@@ -31,7 +31,7 @@ def test_failing_trees_in_a_second():
 
 def test_the_time_of_a_simulation():
     given = plt.figure().subplots()
-    ax = plot.simulation_times(RESULTS["forest"], 9.0, costs=[1e-12, 1.0], ax=given)
+    ax = costs.simulation_times(RESULTS["forest"], 9.0, costs=[1e-12, 1.0], ax=given)
     assert drawn(ax) is given
     np.testing.assert_allclose(ax.lines[0].get_ydata(), [1e-3, 10.001], rtol=1e-6)
     assert ax.get_legend().get_texts()[0].get_text() == "10.0 steps"
@@ -50,4 +50,4 @@ def test_the_time_of_a_simulation():
 )
 def test_errors_name_the_argument(results, seconds, more, said):
     with pytest.raises(ValueError, match=said):
-        plot.simulation_times(results, seconds, **more)
+        costs.simulation_times(results, seconds, **more)

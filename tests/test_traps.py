@@ -141,6 +141,26 @@ def test_a_key_in_the_state():
     assert traps(keyed(start=True)) == traps(keyed(fold=True)) == []
 
 
+def test_whole_numbers_that_are_no_key():
+    """A cell of a grid beside a key that a disturbance reaches, in a jitted step and in a loop."""
+
+    @jax.jit
+    def move(s, x):
+        def once(i, s):
+            at, cell, key = s
+            key = jax.random.fold_in(jax.random.wrap_key_data(key), i)
+            return at + jax.random.normal(key), cell + jnp.uint32(0), jax.random.key_data(key)
+
+        at, cell, key = jax.lax.fori_loop(0, 2, once, s)
+        return at + x + cell[0].astype(x.dtype), cell, key
+
+    key = jax.random.key_data(jax.random.key(0))
+    start = jnp.zeros(()), jnp.array([0, 3], jnp.uint32), key
+    gap = lambda s: 9 - s[0]
+    sim = line(init=lambda x0: start, step=move, evaluate=lambda s: (gap(s) < 0, gap(s)))
+    assert told(sim, "init: state leaf [2] looks like a random key")
+
+
 def test_a_step_that_is_large(monkeypatch):
     """What is in a loop counts once, what a loop of Python writes down counts each time."""
 

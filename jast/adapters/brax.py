@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.kept import without_warp
-from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.adapters import loop
+from jast.adapters.kept import refuse_warp
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["brax"]
 
@@ -27,18 +22,20 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The environment"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return _outcome(self.subject.reset(key))
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         return _outcome(self.subject.step(push(state), action))
 
 
-def _outcome(state: Any) -> Outcome:
+def _outcome(state: Any) -> loop.Outcome:
     done = jnp.asarray(state.done)
     # what counts steps says so when the time is over, which is no failure
     late = state.info.get("truncation", 0.0) if isinstance(state.info, dict) else 0.0
-    return Outcome(state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool))
+    return loop.Outcome(
+        state, state.obs, state.reward, done.astype(bool) & ~jnp.asarray(late, bool)
+    )
 
 
 def brax(
@@ -46,14 +43,14 @@ def brax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of brax or mujoco_playground: ``reset(key)`` and ``step(state,
     action)`` return a state with ``obs``, ``reward``, ``done`` and ``info``.
@@ -67,17 +64,14 @@ def brax(
         policy: observation -> action. A policy of brax's training is ``lambda seen: act(seen,
             key)[0]``.
         horizon: steps of an episode.
-        observation: noise on what the policy sees, as in `gymnax`.
-        action: noise on the action.
+        observation, action: noise on what the policy sees and on what it does, as in `gymnax`.
         force: a pair (distribution, function (state, draw) -> state): what happens to the whole
             state before each step, such as a change of ``state.pipeline_state``.
         parameters: a pair (distribution, function (env, draw) -> env), drawn once an episode. The
             function gets a copy of the environment that it may change, such as ``env.sys``.
         seed: of the key of ``reset``, from which an environment also draws later on: a number, or
             "episode" for one drawn for each episode.
-        failure: `Instant` -> bool.
-        distance: `Instant` -> float.
-        observe: `Instant` -> float vector, 64 numbers at most.
+        failure, distance, observe: functions of the `Instant`, as in `gymnax`.
 
     Returns:
         `Simulator`, whose states are `Instant`.
@@ -116,6 +110,6 @@ def brax(
     given = dict(locals())
     hint = "; brax.envs.get_environment(name) makes one"
     instead = 'of mujoco_playground, registry.load(name, config_overrides={"impl": "jax"})'
-    without_warp("brax", getattr(env, "mjx_model", None), instead)
-    bare("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
-    return simulator("brax", _Environment(given.pop("env")), **given)
+    refuse_warp("brax", getattr(env, "mjx_model", None), instead)
+    loop.check_environment("brax", env, "reset(key)", "step(state, action)", seed=seed, hint=hint)
+    return loop.simulator("brax", _Environment(given.pop("env")), **given)

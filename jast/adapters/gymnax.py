@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 
 from jast._jax import is_traced, without_stops
-from jast.adapters.loop import Instant, Outcome, simulator
+from jast.adapters import loop
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["gymnax"]
 
@@ -30,15 +25,17 @@ class _Environment:
     subject: Any
     """Its params"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         observation, state = self.env.reset(key, *self._given())
-        return Outcome(state, observation, 0.0, False)
+        return loop.Outcome(state, observation, 0.0, False)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         step = without_stops(self.env.step_env)
         observation, state, reward, done, _ = step(key, push(state), action, *self._given())
         # of several agents: those of each by its name
-        return Outcome(state, observation, reward, done["__all__"] if type(done) is dict else done)
+        return loop.Outcome(
+            state, observation, reward, done["__all__"] if type(done) is dict else done
+        )
 
     def _given(self) -> tuple[Any, ...]:
         return () if self.subject is None else (self.subject,)
@@ -50,14 +47,14 @@ def gymnax(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: dict[str, Any] | tuple[Any, Callable[..., Any]] | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: dict[str, Any] | loop.Change | None = None,
     seed: int | Literal["episode", "step"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of gymnax, or of a library with the same ``reset(key, params)``
     and ``step_env(key, state, action, params)``, such as craftax; JaxMARL has them without params.
@@ -142,4 +139,4 @@ def gymnax(
                 f"gymnax: horizon must be below {place}.{name}, which is {limit}: there step_env"
                 f" says that it has terminated; received {horizon}"
             )
-    return simulator("gymnax", _Environment(given.pop("env"), given.pop("params")), **given)
+    return loop.simulator("gymnax", _Environment(given.pop("env"), given.pop("params")), **given)

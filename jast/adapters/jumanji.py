@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.adapters import loop
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["jumanji"]
 
@@ -26,15 +21,15 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The environment"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         state, first = self.subject.reset(key)
-        return Outcome(state, first.observation, 0.0, False)
+        return loop.Outcome(state, first.observation, 0.0, False)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         state, now = self.subject.step(push(state), action)
         # the end of the time, which is no failure, keeps a discount
         terminated = now.last() & jnp.all(jnp.asarray(now.discount) == 0)
-        return Outcome(state, now.observation, now.reward, terminated)
+        return loop.Outcome(state, now.observation, now.reward, terminated)
 
 
 def jumanji(
@@ -42,14 +37,14 @@ def jumanji(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in an environment of jumanji, or another whose ``reset(key)`` and ``step(state,
     action)`` return a state and a timestep with ``observation``, ``reward``, ``discount`` and
@@ -63,14 +58,11 @@ def jumanji(
         env: the environment, without a wrapper that starts anew by itself: ``jumanji.make(name)``.
         policy: observation, most often with fields such as ``seen.action_mask`` -> action.
         horizon: steps of an episode.
-        observation: noise on what the policy sees, as in `gymnax`.
-        action: noise on the action.
+        observation, action: noise on what the policy sees and on what it does, as in `gymnax`.
         force: a pair (distribution, function (state, draw) -> state).
         parameters: a pair (distribution, function (env, draw) -> env), as in `brax`.
         seed: of the key of ``reset``, from which an environment also draws later on.
-        failure: `Instant` -> bool.
-        distance: `Instant` -> float.
-        observe: `Instant` -> float vector, 64 numbers at most.
+        failure, distance, observe: functions of the `Instant`, as in `gymnax`.
 
     Returns:
         `Simulator`, whose states are `Instant`.
@@ -107,5 +99,5 @@ def jumanji(
         (20, 1)
     """
     given = dict(locals())
-    bare("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
-    return simulator("jumanji", _Environment(given.pop("env")), **given)
+    loop.check_environment("jumanji", env, "reset(key)", "step(state, action)", seed=seed)
+    return loop.simulator("jumanji", _Environment(given.pop("env")), **given)

@@ -10,10 +10,10 @@ import numpy as np
 
 from jast.pytrees import Key
 
-__all__ = ["alike", "keyed", "numbers", "without_warp"]
+__all__ = ["as_numbers", "in_dtypes_of", "refuse_warp", "with_keys"]
 
 
-def numbers(tree: Any) -> Any:
+def as_numbers(tree: Any) -> Any:
     """Arrays of ``tree``, with typed keys as `Key`."""
 
     def number(a: Any) -> Any:
@@ -24,13 +24,16 @@ def numbers(tree: Any) -> Any:
     return jax.tree.map(number, tree)
 
 
-def keyed(tree: Any) -> Any:
+def with_keys(tree: Any) -> Any:
     """``tree`` as the environment knows it."""
-    made = lambda a: jax.random.wrap_key_data(a.data) if isinstance(a, Key) else a
+
+    def made(a: Any) -> Any:
+        return jax.random.wrap_key_data(a.data) if isinstance(a, Key) else a
+
     return jax.tree.map(made, tree, is_leaf=lambda a: isinstance(a, Key))
 
 
-def alike(tree: Any, like: Any) -> Any:
+def in_dtypes_of(tree: Any, like: Any) -> Any:
     """``tree`` in the dtypes of ``like``: many environments return others than at the start. Floats
     never become whole numbers.
     """
@@ -42,7 +45,7 @@ def alike(tree: Any, like: Any) -> Any:
     return jax.tree.map(cast, tree, like)
 
 
-def without_warp(name: str, model: Any, instead: str) -> None:
+def refuse_warp(name: str, model: Any, instead: str) -> None:
     """Refuses a model of MuJoCo whose data are shared by all episodes under `jax.vmap`."""
     if getattr(getattr(model, "impl", None), "value", None) == "warp":
         raise ValueError(

@@ -8,8 +8,9 @@ that are drawn once an episode change.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +18,23 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast.adapters.kept import alike, keyed, numbers
-from jast.adapters.noise import Random, add, model_of, random, replaced
+from jast.adapters.kept import as_numbers, in_dtypes_of, with_keys
+from jast.adapters.noise import Random, disturbed, model_of, random, replaced
 from jast.contract import OBSERVED
 from jast.pytrees import bound
 from jast.simulator import Simulator, fixed, ravel
 
-__all__ = ["Instant", "Outcome", "bare", "simulator"]
+if TYPE_CHECKING:
+    import chex
+
+    from jast.typing import DistributionLike
+
+__all__ = ["Change", "Instant", "Judgement", "Noise", "Outcome", "check_environment", "simulator"]
+
+Change: TypeAlias = tuple[Any, Callable[..., Any]]
+"""A distribution and what a draw of it does: (it, draw) -> it."""
+Noise: TypeAlias = "DistributionLike | Change"
+Judgement: TypeAlias = "Callable[[Instant], chex.Array]"
 
 
 class Instant(NamedTuple):
@@ -41,15 +52,15 @@ class Instant(NamedTuple):
     """The environment's own; typed keys in it as their numbers"""
     observation: Any
     """What it shows, before the noise"""
-    reward: Any
+    reward: chex.Array
     """Of the last step, the sum over agents; 0 at the start"""
-    total: Any
+    total: chex.Array
     """The sum of the rewards so far"""
-    terminated: Any
+    terminated: chex.Array
     """bool: the environment says that it has ended"""
-    time: Any
+    time: chex.Array
     """int32: steps so far"""
-    seed: Any
+    seed: chex.Array
     """uint32: of the environment's own key"""
     parameters: Any = ()
     """What was drawn for the episode"""
@@ -76,7 +87,9 @@ class _Loop:
     failure: Partial | None
     distance: Partial | None
     observe: Partial | None
-    seed: Any
+    seed: np.uint32
+    name: str = field(metadata=dict(static=True))
+    """Of the door"""
     drawn: str = field(metadata=dict(static=True))
     """What a seed is drawn for: an "episode", each "step", or nothing"""
 
@@ -108,10 +121,10 @@ def simulator(
                 f"{name}: {argument} holds arrays, received {type(value).__name__}: bind them,"
                 " jax.tree_util.Partial(function, arrays); of Equinox by eqx.partition"
             )
-    given = dict(observation=(observation, add), action=(action, add), force=(force, None))
+    given = dict(observation=observation, action=action, force=force)
     noise = {
-        place: random(name, place, value, apply)
-        for place, (value, apply) in given.items()
+        place: random(name, place, value, adds=place != "force")
+        for place, value in given.items()
         if value is not None
     }
     if parameters is not None:
@@ -130,7 +143,15 @@ def simulator(
         )
     number = np.uint32(0 if drawn or seed is None else seed)
     functions = {k: v if v is None else bound(v) for k, v in functions.items()}
-    loop = _Loop(system, noise=noise, parameters=parameters, seed=number, drawn=drawn, **functions)
+    loop = _Loop(
+        system=system,
+        noise=noise,
+        parameters=parameters,
+        seed=number,
+        name=name,
+        drawn=drawn,
+        **functions,
+    )
     return Simulator(
         init=Partial(_init, loop),
         step=Partial(_step, loop),
@@ -143,7 +164,9 @@ def simulator(
     )
 
 
-def bare(name: str, env: Any, start: str, step: str, *, seed: Any, hint: str = "") -> None:
+def check_environment(
+    name: str, env: Any, start: str, step: str, *, seed: Any, hint: str = ""
+) -> None:
     """Refuses an ``env`` without methods of these signatures or with a wrapper that starts anew by
     itself, and a seed a step where ``step`` takes no key.
     """
@@ -183,29 +206,33 @@ def _init(loop: _Loop, x0: Any) -> Instant:
     first = _of(loop, parameters).reset(jax.random.key(seed))
     zero = jnp.zeros(())
     return Instant(
-        numbers(first.state),
-        numbers(first.observation),
-        zero,
-        zero,
-        jnp.asarray(first.terminated, bool),
-        jnp.int32(0),
-        seed,
-        parameters,
+        state=as_numbers(first.state),
+        observation=as_numbers(first.observation),
+        reward=zero,
+        total=zero,
+        terminated=jnp.asarray(first.terminated, bool),
+        time=jnp.int32(0),
+        seed=seed,
+        parameters=parameters,
     )
 
 
 def _step(loop: _Loop, now: Instant, x: Any) -> Instant:
-    changed = lambda place, it: loop.noise[place].apply(it, x[place]) if place in loop.noise else it
+    def changed(place: str, it: Any) -> Any:
+        if place not in loop.noise:
+            return it
+        return disturbed(f"{loop.name}: {place}", loop.noise[place], it, x[place])
+
     action = changed("action", loop.policy(changed("observation", now.observation)))
     own = jax.random.fold_in(jax.random.key(now.seed), now.time + 1)
     key = jax.random.key(x["seed"]) if loop.drawn == "step" else own
     system = _of(loop, now.parameters)
-    after = system.step(key, keyed(now.state), action, lambda it: changed("force", it))
+    after = system.step(key, with_keys(now.state), action, lambda it: changed("force", it))
     rewards = [jnp.sum(jnp.asarray(a)) for a in jax.tree.leaves(after.reward)]
     reward = jnp.asarray(sum(rewards), now.reward.dtype)
     return now._replace(
-        state=alike(numbers(after.state), now.state),
-        observation=alike(numbers(after.observation), now.observation),
+        state=in_dtypes_of(as_numbers(after.state), now.state),
+        observation=in_dtypes_of(as_numbers(after.observation), now.observation),
         reward=reward,
         total=now.total + reward,
         terminated=jnp.asarray(after.terminated, bool),

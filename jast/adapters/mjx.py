@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast._checks import whole
-from jast.adapters.kept import without_warp
-from jast.adapters.loop import Instant, Outcome, simulator
+from jast.adapters import loop
+from jast.adapters.kept import refuse_warp
+from jast.adapters.loop import Instant
+from jast.adapters.noise import add
 from jast.pytrees import bound
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["mjx"]
 
@@ -27,12 +24,12 @@ __all__ = ["mjx"]
 class _Body(NamedTuple):
     """The numbers on which the next step depends: of the fields of a Data alone."""
 
-    qpos: Any
-    qvel: Any
-    act: Any
-    qacc_warmstart: Any
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    qacc_warmstart: jax.Array
     """Where the solver starts"""
-    time: Any
+    time: jax.Array
 
 
 @jax.tree_util.register_dataclass
@@ -45,18 +42,20 @@ class _Physics:
     advance: Any = field(metadata=dict(static=True))
     substeps: int = field(metadata=dict(static=True))
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return self._outcome(self.data)
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         ctrl = jnp.asarray(action, self.data.ctrl.dtype).reshape(self.data.ctrl.shape)
         data = push(self.data.replace(ctrl=ctrl, **state._asdict()))
-        once = lambda _, data: self.advance(self.subject, data)
-        return self._outcome(jax.lax.fori_loop(0, self.substeps, once, data))
+        data = jax.lax.fori_loop(
+            0, self.substeps, lambda _, data: self.advance(self.subject, data), data
+        )
+        return self._outcome(data)
 
-    def _outcome(self, data: Any) -> Outcome:
+    def _outcome(self, data: Any) -> loop.Outcome:
         body = _Body(*(getattr(data, name) for name in _Body._fields))
-        return Outcome(body, self.sense(data), 0.0, False)
+        return loop.Outcome(body, self.sense(data), 0.0, False)
 
 
 def mjx(
@@ -65,16 +64,16 @@ def mjx(
     controller: Callable[[Any], Any],
     *,
     horizon: int,
-    distance: Callable[[Instant], chex.Array],
-    failure: Callable[[Instant], chex.Array] | None = None,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    distance: loop.Judgement,
+    failure: loop.Judgement | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Noise | None = None,
+    parameters: loop.Change | None = None,
     sense: Callable[[Any], Any] | None = None,
     substeps: int = 1,
     step: Callable[[Any, Any], Any] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A controller of a model of MuJoCo, in ``mujoco.mjx``.
 
@@ -90,8 +89,7 @@ def mjx(
         distance: `Instant` -> float, from ``now.state.qpos``, ``now.state.qvel`` or
             ``now.observation``.
         failure: `Instant` -> bool. Default: the distance is 0 or less.
-        observation: noise on what the controller sees, as in `gymnax`.
-        action: noise on ``ctrl``.
+        observation, action: noise on what the controller sees and on ``ctrl``, as in `gymnax`.
         force: a distribution of the shape of ``qvel``, added to ``qfrc_applied`` in each step; or a
             pair (distribution, function (data, draw) -> data), such as one of ``xfrc_applied``.
         parameters: a pair (distribution, function (model, draw) -> model), drawn once an episode.
@@ -135,13 +133,12 @@ def mjx(
         >>> jast.rollout(jax.random.key(0), jast.check(sim)).disturbances["force"].shape
         (50, 1)
     """
-    without_warp("mjx", model, 'mjx.put_model(model, impl="jax")')
+    refuse_warp("mjx", model, 'mjx.put_model(model, impl="jax")')
     if step is None:
         from mujoco.mjx import step
-    if not callable(distance):
-        raise ValueError(f"mjx: distance must be a function, received {distance!r}")
-    for name, value in (("sense", sense), ("step", step)):
-        if not (callable(value) or value is None):
+    functions = dict(controller=controller, distance=distance, sense=sense or _joints, step=step)
+    for name, value in functions.items():
+        if not callable(value):
             raise ValueError(f"mjx: {name} must be a function, received {value!r}")
     lacking = [name for name in (*_Body._fields, "ctrl", "replace") if not hasattr(data, name)]
     if lacking:
@@ -151,9 +148,16 @@ def mjx(
         )
     if not (force is None or isinstance(force, tuple)):
         force = force, _push
-    return simulator(
+    physics = _Physics(
+        subject=model,
+        data=data,
+        sense=bound(functions["sense"]),
+        advance=step,
+        substeps=whole("mjx", "substeps", substeps),
+    )
+    return loop.simulator(
         "mjx",
-        _Physics(model, data, bound(sense or _joints), step, whole("mjx", "substeps", substeps)),
+        physics,
         policy=controller,
         horizon=horizon,
         observation=observation,
@@ -167,7 +171,7 @@ def mjx(
 
 
 def _push(data: Any, draw: Any) -> Any:
-    return data.replace(qfrc_applied=data.qfrc_applied + draw.astype(data.qfrc_applied.dtype))
+    return data.replace(qfrc_applied=add("mjx: force", data.qfrc_applied, draw))
 
 
 def _reached(distance: Partial, now: Instant) -> jax.Array:

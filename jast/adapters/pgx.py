@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jast.adapters.loop import Instant, Outcome, bare, simulator
+from jast.adapters import loop
+from jast.adapters.loop import Instant
 from jast.simulator import Simulator
-
-if TYPE_CHECKING:
-    import chex
-
-    from jast.typing import DistributionLike
 
 __all__ = ["pgx"]
 
@@ -35,16 +31,16 @@ class _Environment:
     subject: Any = field(metadata=dict(static=True))
     """The game"""
 
-    def reset(self, key: Any) -> Outcome:
+    def reset(self, key: Any) -> loop.Outcome:
         return _outcome(self.subject.init(key))
 
-    def step(self, key: Any, state: Any, action: Any, push: Callable) -> Outcome:
+    def step(self, key: Any, state: Any, action: Any, push: Callable) -> loop.Outcome:
         return _outcome(self.subject.step(push(state), action, key))
 
 
-def _outcome(state: Any) -> Outcome:
+def _outcome(state: Any) -> loop.Outcome:
     turn = _Turn(*(getattr(state, name) for name in _Turn._fields))
-    return Outcome(state, turn, jnp.ravel(state.rewards)[0], state.terminated)
+    return loop.Outcome(state, turn, jnp.ravel(state.rewards)[0], state.terminated)
 
 
 def pgx(
@@ -52,14 +48,14 @@ def pgx(
     policy: Callable[[Any], Any],
     *,
     horizon: int,
-    observation: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    action: DistributionLike | tuple[Any, Callable[..., Any]] | None = None,
-    force: tuple[Any, Callable[..., Any]] | None = None,
-    parameters: tuple[Any, Callable[..., Any]] | None = None,
+    observation: loop.Noise | None = None,
+    action: loop.Noise | None = None,
+    force: loop.Change | None = None,
+    parameters: loop.Change | None = None,
     seed: int | Literal["episode", "step"] = 0,
-    failure: Callable[[Instant], chex.Array] | None = None,
-    distance: Callable[[Instant], chex.Array] | None = None,
-    observe: Callable[[Instant], chex.Array] | None = None,
+    failure: loop.Judgement | None = None,
+    distance: loop.Judgement | None = None,
+    observe: loop.Judgement | None = None,
 ) -> Simulator:
     """A policy in a game of pgx: ``init(key)`` and ``step(state, action, key)`` return a state.
 
@@ -73,14 +69,11 @@ def pgx(
         policy: what the player who is to move knows, with fields ``observation``,
             ``legal_action_mask`` and ``current_player`` -> action.
         horizon: moves of an episode, of all players together.
-        observation: a pair (distribution, function (seen, draw) -> seen).
-        action: a pair (distribution, function (action, draw) -> action).
-        force: a pair (distribution, function (state, draw) -> state).
+        observation, action, force: pairs (distribution, function (it, draw) -> it) of what is seen,
+            of the move, and of the state.
         parameters: a pair (distribution, function (env, draw) -> env), as in `brax`.
         seed: of the deal, of who begins, and of dice; a number, "episode" or "step".
-        failure: `Instant` -> bool.
-        distance: `Instant` -> float.
-        observe: `Instant` -> float vector, 64 numbers at most.
+        failure, distance, observe: functions of the `Instant`, as in `gymnax`.
 
     Returns:
         `Simulator`, whose states are `Instant`.
@@ -125,10 +118,10 @@ def pgx(
         True
     """
     given = dict(locals())
-    bare("pgx", env, "init(key)", "step(state, action, key)", seed=seed)
+    loop.check_environment("pgx", env, "init(key)", "step(state, action, key)", seed=seed)
     if failure is None and getattr(env, "num_players", 1) > 1:
         given["failure"] = Partial(_lost)
-    return simulator("pgx", _Environment(given.pop("env")), **given)
+    return loop.simulator("pgx", _Environment(given.pop("env")), **given)
 
 
 def _lost(now: Instant) -> jax.Array:

@@ -14,7 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Distribution", "is_distribution"]
+__all__ = ["Distribution", "Elementwise", "float_array", "is_distribution", "tree_map"]
 
 
 class _Kind(type):
@@ -188,3 +188,17 @@ def _build(cls: type, structure: tuple[Any, ...], arrays: Any) -> Any:
 
 def _is_data(x: Any) -> bool:
     return isinstance(x, (jax.Array, np.ndarray, np.generic)) or type(x) is object
+
+
+class Elementwise(Distribution):
+    """Of numbers one by one, by ``_parameters``, names of its attributes, which broadcast."""
+
+    event_shape: Any = ()
+    _parameters: tuple[str, ...]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return jax.lax.broadcast_shapes(*(getattr(self, name).shape for name in self._parameters))
+
+    def _broadcast(self, parameter: jax.Array) -> jax.Array:
+        return jnp.broadcast_to(parameter, self.batch_shape)

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from jast.distributions.base import Distribution, is_distribution, tree_map
-from jast.distributions.foreign import translated
+from jast.distributions.foreign import translate
 from jast.distributions.verbs import mode
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Independent", "Joint"]
+__all__ = ["Independent", "Joint", "accepted", "leaves"]
 
 
 class Independent(Distribution):
@@ -158,7 +158,7 @@ def leaves(distributions: Any) -> list[Any]:
 
 def accepted(d: Any) -> Any:
     """``d``, one of scipy.stats or of NumPyro as jast has it."""
-    return d if isinstance(d, Distribution) else translated(d, Independent)
+    return d if isinstance(d, Distribution) else translate(d, Independent)
 
 
 def _accepted(d: Any) -> Any:

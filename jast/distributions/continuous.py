@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jax.lax import lgamma
 
-from jast.distributions.base import Distribution, float_array
+from jast.distributions.base import Elementwise, float_array
 from jast.distributions.normal import Symmetric
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
+__all__ = ["LOG_2", "Beta", "Gamma", "Laplace", "Logistic", "Uniform"]
 
 LOG_2 = math.log(2.0)
 
@@ -73,7 +73,7 @@ class Logistic(Symmetric):
         return jnp.square(self.stddev())
 
 
-class Uniform(Distribution):
+class Uniform(Elementwise):
     """On [``low``, ``high``], which broadcast.
 
     Example:
@@ -83,22 +83,18 @@ class Uniform(Distribution):
         1.0
     """
 
-    event_shape: Any = ()
+    _parameters = "_low", "_high"
 
     def __init__(self, low: chex.ArrayTree = 0.0, high: chex.ArrayTree = 1.0) -> None:
         self._low, self._high = float_array(low), float_array(high)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self._low.shape, self._high.shape)
-
-    @property
     def low(self) -> jax.Array:
-        return jnp.broadcast_to(self._low, self.batch_shape)
+        return self._broadcast(self._low)
 
     @property
     def high(self) -> jax.Array:
-        return jnp.broadcast_to(self._high, self.batch_shape)
+        return self._broadcast(self._high)
 
     @property
     def range(self) -> jax.Array:
@@ -131,18 +127,14 @@ class Uniform(Distribution):
         return jnp.square(self.range) / 12.0
 
 
-class _Pair(Distribution):
+class _Pair(Elementwise):
     """Of two positive parameters that broadcast."""
 
-    event_shape: Any = ()
+    _parameters = "_a", "_b"
 
     def __init__(self, a: chex.Numeric, b: chex.Numeric) -> None:
         self._a: jax.Array = float_array(a)
         self._b: jax.Array = float_array(b)
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self._a.shape, self._b.shape)
 
     @property
     def dtype(self) -> Any:
@@ -150,7 +142,7 @@ class _Pair(Distribution):
 
     @property
     def _both(self) -> tuple[jax.Array, ...]:
-        return tuple(jnp.broadcast_to(v, self.batch_shape) for v in (self._a, self._b))
+        return self._broadcast(self._a), self._broadcast(self._b)
 
 
 class Gamma(_Pair):

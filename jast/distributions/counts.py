@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jax.lax import lgamma
 from jax.scipy.special import betainc, gammainc, gammaincc
 
-from jast.distributions.base import Distribution, float_array
+from jast.distributions.base import Elementwise, float_array
 from jast.distributions.numerics import inside, log_one_less, log_tails, normal_of_log_tails
 from jast.distributions.table import register
+from jast.distributions.tilted import Tilted
 
 if TYPE_CHECKING:
     import chex
@@ -21,15 +22,11 @@ if TYPE_CHECKING:
 __all__ = ["Binomial", "Geometric", "Poisson", "TiltedCounts"]
 
 
-class _Counts(Distribution):
+class _Counts(Elementwise):
     """0, 1, 2, ... by one parameter; a subclass says ``log_tails(k)`` and ``top``."""
 
-    event_shape: Any = ()
+    _parameters = ("_parameter",)
     _parameter: Any
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self._parameter.shape
 
     @property
     def dtype(self) -> Any:
@@ -148,14 +145,12 @@ class Binomial(_Counts):
         5
     """
 
+    _parameters = "total_count", "probs"
+
     def __init__(self, total_count: chex.Numeric, probs: chex.Numeric) -> None:
         self.probs: jax.Array = float_array(probs)
         self.total_count: jax.Array = jnp.asarray(total_count, self.probs.dtype)
         self._parameter = self.probs
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self.total_count.shape, self.probs.shape)
 
     @property
     def top(self) -> Any:
@@ -192,7 +187,7 @@ class Binomial(_Counts):
         return jnp.minimum(k, self.total_count).astype(self.dtype)
 
 
-class TiltedCounts(Distribution):
+class TiltedCounts(Tilted):
     """A family of counts with z ~ N(mean, deviation^2): only the probabilities of its numbers
     change. Exact.
 
@@ -204,23 +199,9 @@ class TiltedCounts(Distribution):
         True
     """
 
-    def __init__(self, distribution: Any, mean: jax.Array, deviation: jax.Array) -> None:
-        self._distribution, self._mean, self._deviation = distribution, mean, deviation
-
-    event_shape: Any = ()
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self._distribution.batch_shape
-
     @property
     def dtype(self) -> Any:
         return self._distribution.dtype
-
-    def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
-        e = jax.random.normal(key, (n, *self._mean.shape), self._mean.dtype)
-        z = self._mean[None] + self._deviation[None] * e
-        return jax.vmap(lambda z: self._distribution._place(*log_tails(z)))(z)
 
     def _edge(self, k):
         """The z above which numbers are greater than k."""

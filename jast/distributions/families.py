@@ -14,14 +14,16 @@ from jast.distributions.numerics import inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 from jast.distributions.tilted import tilted
 
+__all__ = ["register_both"]
 
-def both(kind: type, **functions: Callable[..., Any]) -> None:
+
+def register_both(kind: type, **functions: Callable[..., Any]) -> None:
     """One row for jast's class ``kind`` and for distrax's of the same name."""
     register(kind, **functions)
     register(f"distrax:{kind.__name__}", **functions)
 
 
-both(
+register_both(
     normal.Normal,
     quantile=lambda d, u: d.loc + d.scale * ndtri(inside(u)),
     cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale)),
@@ -30,7 +32,7 @@ both(
     tilt=lambda d, m, s: normal.Normal(d.loc + d.scale * m, d.scale * s),
 )
 
-both(
+register_both(
     normal.MultivariateNormalDiag,
     quantile=lambda d, u: d.loc + d.scale_diag * ndtri(inside(u)),
     cdf=lambda d, x: ndtr(standard(x - d.loc, d.scale_diag)),
@@ -45,7 +47,7 @@ def _cdf_tri(d, x):
     return ndtr(solve_triangular(d.scale_tri, jnp.clip(x - d.loc, -far, far), lower=d.is_lower))
 
 
-both(
+register_both(
     normal.MultivariateNormalTri,
     quantile=lambda d, u: d.loc + d.scale_tri @ ndtri(inside(u)),
     cdf=_cdf_tri,
@@ -65,7 +67,7 @@ def _summed(d, x):
     return inner.sum(range(inner.ndim - d.reinterpreted_batch_ndims, inner.ndim))
 
 
-both(
+register_both(
     containers.Independent,
     quantile=lambda d, u: verbs.quantile(d.distribution, u),
     cdf=lambda d, x: verbs.cdf(d.distribution, x),
@@ -84,7 +86,7 @@ def _each(verb: Callable[..., Any]) -> Callable[..., Any]:
     return lambda d, *values: tree_map(verb, d.distributions, *values)
 
 
-both(
+register_both(
     containers.Joint,
     quantile=_each(verbs.quantile),
     cdf=_each(verbs.cdf),

@@ -19,10 +19,10 @@ from jast.distributions.verbs import no_quantile
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["translated"]
+__all__ = ["translate"]
 
 
-def translated(d: Any, independent: Callable[[Any, int], Any]) -> Any:
+def translate(d: Any, independent: Callable[[Any, int], Any]) -> Any:
     """``d`` as a distribution of jast where it is one of scipy.stats or of NumPyro, else itself.
 
     Args:

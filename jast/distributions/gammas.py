@@ -9,15 +9,15 @@ from jax.lax import lgamma
 from jax.scipy.special import betainc, betaln, digamma, gammainc, gammaincc, polygamma
 
 from jast.distributions import continuous
-from jast.distributions.families import both
+from jast.distributions.families import register_both
 from jast.distributions.numerics import log_one_less, log_tails, normal_of_log_tails
-from jast.distributions.solved import newton, solved
+from jast.distributions.solved import newton, row_of_inverse
 
 __all__ = ["beta_tails", "gamma_tails"]
 
-STEPS, LIMIT = 24, 4.0
-NEAR = -12.0
-"""The logit below which the first terms of the series at 0 are exact enough."""
+STEPS = 24  # of Newton's method, which so many bring to rounding
+LIMIT = 4.0  # of one of them
+NEAR = -12.0  # the logit below which the first terms of the series at 0 are exact enough
 
 
 def _sure(below: jax.Array, above: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -48,15 +48,22 @@ def _gamma(d, z):
     cube = 1 - 1 / (9 * a) + z / (3 * jnp.sqrt(a))  # Wilson and Hilferty 1931
     small = (log_tails(z)[0] + lgamma(a + 1)) / a
     guess = jnp.where(cube > 0.3, jnp.log(a) + 3 * jnp.log(jnp.maximum(cube, 0.3)), small)
-    score = lambda y: normal_of_log_tails(*gamma_tails(a, y))
-    return jnp.exp(newton(z, guess, score, lambda y: _log_gamma(a, y), STEPS, LIMIT)) / d.rate
+    y = newton(
+        z=z,
+        y=guess,
+        score=lambda y: normal_of_log_tails(*gamma_tails(a, y)),
+        log_density=lambda y: _log_gamma(a, y),
+        steps=STEPS,
+        limit=LIMIT,
+    )
+    return jnp.exp(y) / d.rate
 
 
 def _tails_gamma(d, x):
     return gamma_tails(d.concentration, jnp.log(jnp.maximum(x * d.rate, 0)))
 
 
-both(continuous.Gamma, **solved(_gamma, _tails_gamma))
+register_both(continuous.Gamma, **row_of_inverse(_gamma, _tails_gamma))
 
 
 def beta_tails(a: jax.Array, b: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -96,9 +103,14 @@ def _logit_beta(d, z):
     low = jnp.where(a < 1, jnp.minimum(guess, low), jnp.maximum(guess, low))
     high = jnp.where(b < 1, jnp.maximum(guess, high), jnp.minimum(guess, high))
     guess = jnp.where(z < 0, low, high)
-    score = lambda y: normal_of_log_tails(*beta_tails(a, b, y))
-    log_density = lambda y: _log_beta(a, b, y)
-    return newton(z, guess, score, log_density, STEPS, LIMIT)
+    return newton(
+        z=z,
+        y=guess,
+        score=lambda y: normal_of_log_tails(*beta_tails(a, b, y)),
+        log_density=lambda y: _log_beta(a, b, y),
+        steps=STEPS,
+        limit=LIMIT,
+    )
 
 
 def _tails_beta(d, x):
@@ -107,4 +119,6 @@ def _tails_beta(d, x):
     return beta_tails(d.alpha, d.beta, jnp.log(jnp.minimum(x, 1)) - jnp.log(jnp.minimum(rest, 1)))
 
 
-both(continuous.Beta, **solved(lambda d, z: jax.nn.sigmoid(_logit_beta(d, z)), _tails_beta))
+register_both(
+    continuous.Beta, **row_of_inverse(lambda d, z: jax.nn.sigmoid(_logit_beta(d, z)), _tails_beta)
+)

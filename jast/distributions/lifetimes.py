@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from jast.distributions.base import Distribution, float_array
-from jast.distributions.normal import HALF_LOG_2PI, LocationScale
+from jast.distributions.base import Elementwise, float_array
+from jast.distributions.normal import LocationScale
 from jast.distributions.numerics import (
+    HALF_LOG_2PI,
     inside,
     log_one_less,
     log_tails,
@@ -65,7 +66,7 @@ register(
 )
 
 
-class Exponential(Distribution):
+class Exponential(Elementwise):
     """Density rate exp(-rate x), x >= 0.
 
     Example:
@@ -75,14 +76,10 @@ class Exponential(Distribution):
         0.5
     """
 
-    event_shape: Any = ()
+    _parameters = ("rate",)
 
     def __init__(self, rate: chex.Numeric) -> None:
         self.rate: jax.Array = float_array(rate)
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return self.rate.shape
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         return jax.random.exponential(key, (n, *self.rate.shape), self.rate.dtype) / self.rate[None]
@@ -134,12 +131,14 @@ def _tails_gumbel(d, x):
     return below, log_one_less(below)
 
 
-_gumbel = of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel)
-register(Gumbel, **_gumbel)
-register("distrax:Gumbel", **_gumbel)
+for _kind in (Gumbel, "distrax:Gumbel"):
+    register(
+        _kind,
+        **of_log_tails(lambda d, below, above: d.loc - d.scale * jnp.log(-below), _tails_gumbel),
+    )
 
 
-class Weibull(Distribution):
+class Weibull(Elementwise):
     """Survival function exp(-(x / scale)^concentration), x >= 0.
 
     Example:
@@ -150,22 +149,18 @@ class Weibull(Distribution):
         0.632
     """
 
-    event_shape: Any = ()
+    _parameters = "_shape", "_scale"
 
     def __init__(self, concentration: chex.Numeric, scale: chex.Numeric) -> None:
         self._shape, self._scale = float_array(concentration), float_array(scale)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self._shape.shape, self._scale.shape)
-
-    @property
     def concentration(self) -> jax.Array:
-        return jnp.broadcast_to(self._shape, self.batch_shape)
+        return self._broadcast(self._shape)
 
     @property
     def scale(self) -> jax.Array:
-        return jnp.broadcast_to(self._scale, self.batch_shape)
+        return self._broadcast(self._scale)
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         k, scale = self.concentration, self.scale
@@ -206,6 +201,8 @@ class TruncatedNormal(LocationScale):
         True
     """
 
+    _parameters = "_loc", "_scale", "_low", "_high"
+
     def __init__(
         self, loc: chex.Numeric, scale: chex.Numeric, low: chex.ArrayTree, high: chex.ArrayTree
     ) -> None:
@@ -213,17 +210,12 @@ class TruncatedNormal(LocationScale):
         self._low, self._high = float_array(low), float_array(high)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        each = (self._loc, self._scale, self._low, self._high)
-        return jax.lax.broadcast_shapes(*(a.shape for a in each))
-
-    @property
     def low(self) -> jax.Array:
-        return jnp.broadcast_to(self._low, self.batch_shape)
+        return self._broadcast(self._low)
 
     @property
     def high(self) -> jax.Array:
-        return jnp.broadcast_to(self._high, self.batch_shape)
+        return self._broadcast(self._high)
 
     def ends(self) -> tuple[jax.Array, jax.Array, jax.Array]:
         """(low, high) in standard deviations from loc, and the log of the mass between them."""
@@ -275,10 +267,8 @@ def _cut(d, z, tails=None):
 def _tails_cut(d, x):
     a, b, log_mass = d.ends()
     e = (jnp.clip(x, d.low, d.high) - d.loc) / d.scale
-    left, right = (
-        TruncatedNormal(0.0, 1.0, a, e).ends()[2],
-        TruncatedNormal(0.0, 1.0, e, b).ends()[2],
-    )
+    left = TruncatedNormal(0.0, 1.0, a, e).ends()[2]
+    right = TruncatedNormal(0.0, 1.0, e, b).ends()[2]
     return left - log_mass, right - log_mass
 
 

@@ -12,10 +12,26 @@ from jast.distributions.verbs import event_like, from_normal, mode, sample
 
 __all__ = ["Blended", "Moved", "blend", "x_of"]
 
-COIN = 0x5EED
+COIN = 0x5EED  # what the key of the coin is folded with
 
 
-class Blend(Distribution):
+class _Mixture(Distribution):
+    """Drawn one at a time, by ``_draw(key)``."""
+
+    def sample(self, *, seed, sample_shape=()):
+        """One value; ``sample_shape`` must be ()."""
+        if sample_shape != ():
+            raise ValueError(
+                f"{self.name}: sample_shape must be (), received {sample_shape!r}: use jax.vmap"
+                " over keys"
+            )
+        return self._draw(seed)
+
+    def _sample_n(self, key, n):
+        return jax.vmap(self._draw)(jax.random.split(key, n))
+
+
+class Blend(_Mixture):
     """What `blend` makes."""
 
     def __init__(self, log_weights, parts):
@@ -25,29 +41,21 @@ class Blend(Distribution):
     def event_shape(self):
         return self._parts[0].event_shape
 
-    def sample(self, *, seed, sample_shape=()):
-        """One value; ``sample_shape`` must be ()."""
-        if sample_shape != ():
-            raise ValueError(
-                f"Blend: sample_shape must be (), received {sample_shape!r}: use jax.vmap over keys"
-            )
+    def _draw(self, key):
         # the coin is drawn with a key folded from the value's, one hash less than of a split; only
         # one of the draws is seen, so that one key serves all
         u = jax.random.uniform(
-            jax.random.fold_in(jax.random.clone(seed), COIN), (), self._log_weights.dtype
+            jax.random.fold_in(jax.random.clone(key), COIN), (), self._log_weights.dtype
         )
         edges = jnp.cumsum(jnp.exp(self._log_weights))[:-1]
-        value = sample(self._parts[0], seed)
+        value = sample(self._parts[0], key)
         for part, edge in zip(self._parts[1:], edges, strict=True):
             value = jax.tree.map(
                 lambda a, b: jnp.where(u < edge, a, b.astype(a.dtype)),  # noqa: B023
                 value,
-                sample(part, jax.random.clone(seed)),
+                sample(part, jax.random.clone(key)),
             )
         return value
-
-    def _sample_n(self, key, n):
-        return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
 
     def log_prob(self, value):
         logs = [part.log_prob(value) for part in self._parts]
@@ -101,7 +109,7 @@ class Moved(Distribution):
         return x_of(self.model, self.mean_z)
 
 
-class Blended(Distribution):
+class Blended(_Mixture):
     """sum_k weights[k] (``dist`` with z ~ N(means[k], deviations[k]^2)); ``weights`` [K] of sum 1,
     ``means`` and ``deviations`` [K, n].
     """
@@ -113,19 +121,10 @@ class Blended(Distribution):
     def event_shape(self):
         return jax.tree.map(lambda s: s.shape, event_like(self.model))
 
-    def sample(self, *, seed, sample_shape=()):
-        """One value; ``sample_shape`` must be ()."""
-        if sample_shape != ():
-            raise ValueError(
-                f"Blended: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
-                " keys"
-            )
-        which, where = jax.random.split(seed)
+    def _draw(self, key):
+        which, where = jax.random.split(key)
         k = jax.random.categorical(which, jnp.log(self.weights))
         return Moved(self.model, self.means[k], self.deviations[k]).sample(seed=where)
-
-    def _sample_n(self, key, n):
-        return jax.vmap(lambda k: self.sample(seed=k))(jax.random.split(key, n))
 
     def log_prob(self, value):
         each = jax.vmap(lambda m, s: Moved(self.model, m, s).log_prob(value))(

@@ -9,35 +9,37 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from jast.distributions.base import Distribution, float_array
+from jast.distributions.base import Distribution, Elementwise, float_array
 from jast.distributions.numerics import HALF_LOG_2PI, ndtr
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["MultivariateNormalDiag", "MultivariateNormalTri", "Normal"]
+__all__ = [
+    "LocationScale",
+    "MultivariateNormalDiag",
+    "MultivariateNormalTri",
+    "Normal",
+    "Symmetric",
+]
 
 
-class LocationScale(Distribution):
+class LocationScale(Elementwise):
     """x = loc + scale e, e of a standard distribution; ``loc`` and ``scale`` broadcast."""
 
-    event_shape: Any = ()
+    _parameters = "_loc", "_scale"
 
     def __init__(self, loc: chex.Numeric, scale: chex.Numeric) -> None:
         self._loc: jax.Array = float_array(loc)
         self._scale: jax.Array = float_array(scale)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self._loc.shape, self._scale.shape)
-
-    @property
     def loc(self) -> jax.Array:
-        return jnp.broadcast_to(self._loc, self.batch_shape)
+        return self._broadcast(self._loc)
 
     @property
     def scale(self) -> jax.Array:
-        return jnp.broadcast_to(self._scale, self.batch_shape)
+        return self._broadcast(self._scale)
 
     @property
     def dtype(self) -> Any:

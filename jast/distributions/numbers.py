@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jast.distributions.numerics import float_dtype
 
-__all__ = ["flat", "unflat"]
+__all__ = ["flat", "split", "unflat"]
 
 
 def flat(x: Any) -> jax.Array:
@@ -16,14 +16,19 @@ def flat(x: Any) -> jax.Array:
     return jnp.concatenate([jnp.ravel(a).astype(jnp.float32) for a in jax.tree.leaves(x)])
 
 
-def unflat(u: jax.Array, event: Any) -> Any:
-    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as
-    floats.
-    """
+def split(row: jax.Array, event: Any) -> Any:
+    """The numbers ``row`` [d] in the shapes of ``event``."""
     leaves, treedef = jax.tree.flatten(event)
     out, at = [], 0
     for s in leaves:
         n = math.prod(s.shape)
-        out.append(u[at : at + n].reshape(s.shape).astype(float_dtype(s.dtype)))
+        out.append(row[at : at + n].reshape(s.shape))
         at += n
     return treedef.unflatten(out)
+
+
+def unflat(u: jax.Array, event: Any) -> Any:
+    """Inverse of `flat` for a point of the unit cube: ``u`` [d] in the shapes of ``event``, as
+    floats.
+    """
+    return jax.tree.map(lambda a, s: a.astype(float_dtype(s.dtype)), split(u, event), event)

@@ -14,14 +14,20 @@ if TYPE_CHECKING:
     import chex
 
 __all__ = [
+    "HALF_LOG_2PI",
+    "cell",
+    "cells",
     "float_dtype",
     "fraction",
+    "inside",
+    "log_one_less",
     "log_tails",
     "ndtr",
     "ndtri",
     "normal_of_log_tails",
     "normal_score",
     "phi",
+    "standard",
 ]
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
@@ -159,9 +165,7 @@ def log_one_less(log_p: jax.Array) -> jax.Array:
     near_one = log_p > -math.log(2.0)
     other = jnp.where(near_one, -1.0, log_p)
     return jnp.where(
-        near_one,
-        jnp.log(-jnp.expm1(jnp.where(near_one, log_p, -1.0))),
-        jnp.log1p(-jnp.exp(other)),
+        near_one, jnp.log(-jnp.expm1(jnp.where(near_one, log_p, -1.0))), jnp.log1p(-jnp.exp(other))
     )
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jast.distributions.base import is_distribution
 from jast.distributions.kinds import Where
+from jast.distributions.numbers import split
 from jast.distributions.verbs import event_like, from_normal, to_normal
 from jast.pytrees import count
 
@@ -54,22 +55,12 @@ def _numbers(d: Any) -> Parts:
     like = event_like(d)
     n = count(like)
     return Parts(
-        n,
-        (),
-        lambda z, _: from_normal(d, _shaped(z, like)),
-        lambda x: (_row(jax.tree.leaves(to_normal(d, x))), ()),
-        (-1,) * n,
+        normals=n,
+        choices=(),
+        value=lambda z, _: from_normal(d, split(z, like)),
+        inverse=lambda x: (_row(jax.tree.leaves(to_normal(d, x))), ()),
+        owners=(-1,) * n,
     )
-
-
-def _shaped(z: jax.Array, like: Any) -> Any:
-    leaves, treedef = jax.tree.flatten(like)
-    out, at = [], 0
-    for leaf in leaves:
-        size = count(leaf)
-        out.append(z[at : at + size].reshape(leaf.shape))
-        at += size
-    return treedef.unflatten(out)
 
 
 def _row(arrays: Any) -> jax.Array:
@@ -86,10 +77,10 @@ def _choice(d: Any) -> Parts:
         logits = jax.nn.log_softmax(logits, axis=-1)
     log_p = logits.reshape(-1, logits.shape[-1])
     return Parts(
-        0,
-        (log_p,),
-        lambda _, i: i[0].reshape(like.shape).astype(like.dtype),
-        lambda x: (_row(()), (jnp.ravel(x).astype(jnp.int32),)),
+        normals=0,
+        choices=(log_p,),
+        value=lambda _, i: i[0].reshape(like.shape).astype(like.dtype),
+        inverse=lambda x: (_row(()), (jnp.ravel(x).astype(jnp.int32),)),
     )
 
 
@@ -113,22 +104,27 @@ def _joint(d: Any) -> Parts:
     for p in each:
         owners += [o if o < 0 else o + before for o in p.owners]
         before += sum(len(c) for c in p.choices)
-    return Parts(sum(p.normals for p in each), choices, value, inverse, tuple(owners))
+    return Parts(
+        normals=sum(p.normals for p in each),
+        choices=choices,
+        value=value,
+        inverse=inverse,
+        owners=tuple(owners),
+    )
 
 
 def _either(d: Where) -> Parts:
     a, b = (parts(part) for part in d.parts)
-    shapes = lambda p: (p.normals, p.owners, [c.shape for c in p.choices])
-    alike = shapes(a) == shapes(b)
-    if not alike:  # by the normal numbers that both have behind them
+    shapes = [(p.normals, p.owners, [c.shape for c in p.choices]) for p in (a, b)]
+    if shapes[0] != shapes[1]:  # by the normal numbers that both have behind them
         return _numbers(d)
     choices = tuple(jnp.where(d.pred, p, q) for p, q in zip(a.choices, b.choices, strict=True))
     return Parts(
-        a.normals,
-        choices,
-        lambda z, i: d.select(a.value(z, i), b.value(z, i)),
-        lambda x: d.select(a.inverse(x), b.inverse(x)),
-        a.owners,
+        normals=a.normals,
+        choices=choices,
+        value=lambda z, i: d.select(a.value(z, i), b.value(z, i)),
+        inverse=lambda x: d.select(a.inverse(x), b.inverse(x)),
+        owners=a.owners,
     )
 
 
@@ -152,4 +148,10 @@ def _mixture(d: Any) -> Parts:
         z = jnp.take_along_axis(to_normal(components, own), k[..., None], axis=-1)
         return jnp.ravel(z), (jnp.ravel(k),)
 
-    return Parts(count(like), (log_p,), value, inverse, tuple(range(count(like))))
+    return Parts(
+        normals=count(like),
+        choices=(log_p,),
+        value=value,
+        inverse=inverse,
+        owners=tuple(range(count(like))),
+    )

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.special import expit, log_ndtr, logit
 
 from jast.distributions import continuous, discrete, verbs
-from jast.distributions.families import both
+from jast.distributions.families import register_both
 from jast.distributions.numerics import cell, cells, fraction, inside, ndtr, ndtri, standard
 from jast.distributions.table import register
 
@@ -28,7 +28,7 @@ def _normal_of_laplace(d, x):
     return -jnp.sign(v) * ndtri(jnp.exp(-jnp.abs(v)) / 2)
 
 
-both(
+register_both(
     continuous.Laplace,
     quantile=_quantile_laplace,
     cdf=_cdf_laplace,
@@ -42,7 +42,7 @@ def _normal_of_logistic(d, x):
     return -jnp.sign(v) * ndtri(jax.nn.sigmoid(-jnp.abs(v)))
 
 
-both(
+register_both(
     continuous.Logistic,
     quantile=lambda d, u: d.loc + d.scale * logit(inside(u)),
     cdf=lambda d, x: expit(standard(x - d.loc, d.scale)),
@@ -65,7 +65,7 @@ def _normal_of_uniform(d, x):
     return jnp.where(below < above, z, -z)
 
 
-both(
+register_both(
     continuous.Uniform,
     quantile=lambda d, u: d.low + u * (d.high - d.low),
     cdf=lambda d, x: fraction(x, d.low, d.high),
@@ -83,7 +83,7 @@ def _tilted_bernoulli(d, mean, deviation):
     return discrete.Bernoulli(probs=ndtr((mean - edge) / deviation), dtype=d.dtype)
 
 
-both(
+register_both(
     discrete.Bernoulli,
     quantile=lambda d, u: jnp.asarray(u >= 1 - d.probs, d.dtype),
     cdf=lambda d, x: cell(x, (1 - d.probs)[..., None]),
@@ -92,7 +92,7 @@ both(
 )
 
 
-def _chosen(d, u):
+def _quantile_of_choice(d, u):
     below = jnp.cumsum(d.probs, axis=-1)[..., :-1]
     return jnp.sum(u[..., None] >= below, axis=-1).astype(d.dtype)
 
@@ -103,7 +103,7 @@ def _choice_of_normal(d, z):
     return jnp.take_along_axis(order, i[..., None], axis=-1)[..., 0].astype(d.dtype)
 
 
-def _bounded(edges):
+def _with_infinite_ends(edges):
     """``edges`` of cells between the ends of the line."""
     end = jnp.full((*edges.shape[:-1], 1), jnp.inf, edges.dtype)
     return jnp.concatenate([-end, edges], -1), jnp.concatenate([edges, end], -1)
@@ -112,28 +112,26 @@ def _bounded(edges):
 def _normal_of_choice(d, x):
     order, edges = cells(d.probs)
     i = jnp.argmax(order == x[..., None].astype(order.dtype), axis=-1)[..., None]
-    low, high = (jnp.take_along_axis(e, i, axis=-1)[..., 0] for e in _bounded(edges))
+    low, high = (jnp.take_along_axis(e, i, axis=-1)[..., 0] for e in _with_infinite_ends(edges))
     # the middle in probability, from the side where the numbers are small
     return jnp.where(
-        low + high > 0,
-        -ndtri((ndtr(-low) + ndtr(-high)) / 2),
-        ndtri((ndtr(low) + ndtr(high)) / 2),
+        low + high > 0, -ndtri((ndtr(-low) + ndtr(-high)) / 2), ndtri((ndtr(low) + ndtr(high)) / 2)
     )
 
 
 def _tilted_choice(d, mean, deviation):
     """P(z in the i-th cell), for the cells of N(0, 1) of these probabilities."""
     order, edges = cells(d.probs)
-    a, b = ((e - mean[..., None]) / deviation[..., None] for e in _bounded(edges))
+    a, b = ((e - mean[..., None]) / deviation[..., None] for e in _with_infinite_ends(edges))
     # in the upper tail from the other side, where the numbers are small
     p = jnp.maximum(jnp.where(a > 0, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a)), 0)
     p = jnp.take_along_axis(p, jnp.argsort(order, axis=-1), axis=-1)
     return discrete.Categorical(probs=p, dtype=d.dtype)
 
 
-both(
+register_both(
     discrete.Categorical,
-    quantile=_chosen,
+    quantile=_quantile_of_choice,
     cdf=lambda d, x: cell(x, jnp.cumsum(d.probs, axis=-1)[..., :-1]),
     from_normal=_choice_of_normal,
     to_normal=_normal_of_choice,
@@ -144,12 +142,12 @@ both(
 # distrax's Transformed, of numbers one by one
 
 
-def _of_numbers(d, error):
+def _check_elementwise(d, error):
     if d.bijector.event_ndims_in != 0 or d.bijector.event_ndims_out != 0:
         raise error
 
 
-def _ends(d, like):
+def _quartiles(d, like):
     """The values at the quantiles 1/4 and 3/4 of the base: which of them is larger says whether the
     bijector falls.
     """
@@ -160,8 +158,8 @@ def _ends(d, like):
 
 
 def _transformed(d, u):
-    _of_numbers(d, verbs.no_quantile(d))
-    x0, x1 = _ends(d, u)
+    _check_elementwise(d, verbs.no_quantile(d))
+    x0, x1 = _quartiles(d, u)
     return d.bijector.forward(verbs.quantile(d.distribution, jnp.where(x1 >= x0, u, 1 - u)))
 
 
@@ -173,8 +171,10 @@ def _inverse(d, x, name):
 
 
 def _cdf_transformed(d, x):
-    _of_numbers(d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert"))
-    x0, x1 = _ends(d, x)
+    _check_elementwise(
+        d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
+    )
+    x0, x1 = _quartiles(d, x)
     u = verbs.cdf(d.distribution, _inverse(d, x, "cdf"))
     u = jnp.where(x1 >= x0, u, 1 - u)
     within = (u > 0) & (u < 1)  # off the support the inverse may be NaN, or of either end
@@ -182,18 +182,20 @@ def _cdf_transformed(d, x):
 
 
 def _falls(d, like):
-    x0, x1 = _ends(d, like)
+    x0, x1 = _quartiles(d, like)
     return x1 < x0
 
 
 def _transformed_of_normal(d, z):
     """By the z of the base, which has the tails; a bijector that falls swaps them."""
-    _of_numbers(d, verbs.no_quantile(d))
+    _check_elementwise(d, verbs.no_quantile(d))
     return d.bijector.forward(verbs.from_normal(d.distribution, jnp.where(_falls(d, z), -z, z)))
 
 
 def _normal_of_transformed(d, x):
-    _of_numbers(d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert"))
+    _check_elementwise(
+        d, ValueError(f"cdf: {type(d).__name__} has no quantile function here to invert")
+    )
     z = verbs.to_normal(d.distribution, _inverse(d, x, "cdf"))
     return jnp.where(_falls(d, x), -z, z)
 

@@ -14,16 +14,16 @@ from jax.lax import lgamma, stop_gradient
 from jax.scipy.special import betainc, erfinv
 
 from jast.distributions.base import Distribution, float_array
-from jast.distributions.normal import HALF_LOG_2PI, LocationScale
-from jast.distributions.numerics import inside, log_tails, ndtri, normal_of_log_tails
+from jast.distributions.normal import Symmetric
+from jast.distributions.numerics import HALF_LOG_2PI, inside, log_tails, ndtri, normal_of_log_tails
 from jast.distributions.table import register
-from jast.distributions.tails import tails
+from jast.distributions.tails import log_tails_of
 from jast.distributions.verbs import from_normal
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["MixtureSameFamily", "StudentT"]
+__all__ = ["MixtureSameFamily", "StudentT", "newton", "row_of_inverse"]
 
 
 def newton(
@@ -52,7 +52,7 @@ def newton(
     return step(stop_gradient(y))
 
 
-def solved(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
+def row_of_inverse(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
     """The functions of a row.
 
     Args:
@@ -71,7 +71,7 @@ def solved(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, An
 # Student's t: solved in y = asinh of the standardised value
 
 
-class StudentT(LocationScale):
+class StudentT(Symmetric):
     """Student's t of ``df`` degrees of freedom, moved by ``loc`` and stretched by ``scale``.
 
     Example:
@@ -81,6 +81,8 @@ class StudentT(LocationScale):
         0.0
     """
 
+    _parameters = "_df", "_loc", "_scale"
+
     def __init__(
         self, df: chex.Numeric, loc: chex.Numeric = 0.0, scale: chex.Numeric = 1.0
     ) -> None:
@@ -88,16 +90,12 @@ class StudentT(LocationScale):
         self._df = float_array(df)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        return jax.lax.broadcast_shapes(self._df.shape, self._loc.shape, self._scale.shape)
-
-    @property
     def dtype(self) -> Any:
         return jnp.result_type(self._df, self._loc, self._scale)
 
     @property
     def df(self) -> jax.Array:
-        return jnp.broadcast_to(self._df, self.batch_shape)
+        return self._broadcast(self._df)
 
     def _sample_n(self, key: chex.PRNGKey, n: int) -> Any:
         shape = (n, *self.batch_shape)
@@ -105,15 +103,6 @@ class StudentT(LocationScale):
 
     def log_prob(self, value: Any) -> chex.Array:
         return _log_t(self._df, self._standardize(value)) - jnp.log(self._scale)
-
-    def mean(self) -> Any:
-        return self.loc
-
-    def median(self) -> Any:
-        return self.loc
-
-    def mode(self) -> Any:
-        return self.loc
 
 
 def _log_t(df, t):
@@ -136,12 +125,12 @@ def _student(d, z):
     size = jnp.abs(z)
     # a normal number is below the t of its probability, and z rises ever slower in y
     y = newton(
-        size,
-        jnp.arcsinh(size),
-        lambda y: _score_t(df, jnp.sinh(y)),
-        lambda y: _log_t(df, jnp.sinh(y)) + jnp.log(jnp.cosh(y)),
-        12,
-        8.0,
+        z=size,
+        y=jnp.arcsinh(size),
+        score=lambda y: _score_t(df, jnp.sinh(y)),
+        log_density=lambda y: _log_t(df, jnp.sinh(y)) + jnp.log(jnp.cosh(y)),
+        steps=12,
+        limit=8.0,
     )
     return d.loc + d.scale * jnp.sign(z) * jnp.sinh(y)
 
@@ -151,7 +140,7 @@ def _tails_student(d, x):
     return log_tails(jnp.sign(t) * _score_t(d.df, t))
 
 
-register(StudentT, **solved(_student, _tails_student))
+register(StudentT, **row_of_inverse(_student, _tails_student))
 
 
 # mixtures: the root lies between the values of the parts
@@ -216,13 +205,16 @@ def _log_weights(d):
 
 def _tails_mixture(d, x):
     parts = d.components_distribution
-    each = tails(parts, jnp.broadcast_to(x[..., None], parts.batch_shape))
+    each = log_tails_of(parts, jnp.broadcast_to(x[..., None], parts.batch_shape))
     return tuple(jax.nn.logsumexp(t + _log_weights(d), axis=-1) for t in each)
 
 
 def _mixture(d, z):
     parts = d.components_distribution
-    score = lambda x: normal_of_log_tails(*_tails_mixture(d, x))
+
+    def score(x):
+        return normal_of_log_tails(*_tails_mixture(d, x))
+
     ends = from_normal(parts, jnp.broadcast_to(z[..., None], parts.batch_shape))
     low, high = stop_gradient(jnp.min(ends, axis=-1)), stop_gradient(jnp.max(ends, axis=-1))
 
@@ -237,5 +229,5 @@ def _mixture(d, z):
     return newton(z, low + (high - low) / 2, score, d.log_prob, 2, jnp.inf)
 
 
-register(MixtureSameFamily, **solved(_mixture, _tails_mixture))
-register("distrax:MixtureSameFamily", **solved(_mixture, _tails_mixture))
+register(MixtureSameFamily, **row_of_inverse(_mixture, _tails_mixture))
+register("distrax:MixtureSameFamily", **row_of_inverse(_mixture, _tails_mixture))

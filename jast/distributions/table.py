@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-__all__ = ["register"]
+__all__ = ["register", "row"]
 
 
 class Row(NamedTuple):

@@ -12,6 +12,8 @@ from jast.distributions.numerics import inside, log_tails, normal_of_log_tails
 from jast.distributions.table import row
 from jast.distributions.verbs import to_normal
 
+__all__ = ["log_tails_of", "of_log_tails"]
+
 
 def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[str, Any]:
     """The functions of a row.
@@ -30,7 +32,7 @@ def of_log_tails(place: Callable[..., Any], known: Callable[..., Any]) -> dict[s
     }
 
 
-def tails(d: Any, x: Any) -> tuple[jax.Array, jax.Array]:
+def log_tails_of(d: Any, x: Any) -> tuple[jax.Array, jax.Array]:
     """(log P(X <= x), log P(X > x)) of numbers; by way of z where the row does not say."""
     known = row(d, "log_tails", "to_normal", "quantile").log_tails
     return known(d, x) if known is not None else log_tails(to_normal(d, x))

@@ -110,11 +110,12 @@ def untiltable(dist: DistributionLike) -> str | None:
         >>> D.untiltable(D.Normal(0.0, 1.0)) is None, D.untiltable(D.seeds()) is None
         (True, False)
     """
-    full = lambda v: jax.tree.map(
-        lambda s: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist)
+    zeros, ones = (
+        jax.tree.map(lambda s, v=v: jnp.full(s.shape, v, float_dtype(s.dtype)), event_like(dist))
+        for v in (0, 1)
     )
     try:
-        tilted(dist, full(0), full(1))
+        tilted(dist, zeros, ones)
     except ValueError as error:
         return str(error)
     return None

@@ -31,6 +31,7 @@ __all__ = [
     "log_density",
     "log_mode",
     "mode",
+    "no_quantile",
     "quantile",
     "sample",
     "sum_parts",

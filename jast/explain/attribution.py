@@ -13,7 +13,13 @@ from jast import _checks, results
 from jast.boundary import differentiable
 from jast.counter import generator
 from jast.episode import Episode
-from jast.explain.point import Given, given, like_disturbances, names, steps_of
+from jast.explain.point import (
+    EpisodePoint,
+    failing_point,
+    like_disturbances,
+    number_names,
+    number_steps,
+)
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -22,7 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Attribution", "attribution"]
 
-POINTS, LINES = 128, 10
+POINTS = 128  # on the way from the mode to the episode
+PRINTED = 10  # disturbances
 
 
 @results.shown()
@@ -58,14 +65,14 @@ class Attribution(NamedTuple):
 
     def __str__(self) -> str:
         lines = [f"{self.method}: the disturbances lowered the miss distance by {self.total:.4g}"]
-        for step, name, value, error in self.parts[:LINES]:
+        for step, name, value, error in self.parts[:PRINTED]:
             line = f"  step {step:4d}  {name:<12} {value:+10.4g}"
             line += f" +- {error:.2g}" if error > 0 else ""
             sums = self.total and not np.isnan(self.residual)
             lines.append(line + (f"  {value / self.total:6.1%}" if sums else ""))
-        if len(self.parts) > LINES:
-            rest = sum(value for _, _, value, _ in self.parts[LINES:])
-            lines.append(f"  the other {len(self.parts) - LINES:3d} {'':<12} {rest:+10.4g}")
+        if len(self.parts) > PRINTED:
+            rest = sum(value for _, _, value, _ in self.parts[PRINTED:])
+            lines.append(f"  the other {len(self.parts) - PRINTED:3d} {'':<12} {rest:+10.4g}")
         return "\n".join(lines)
 
 
@@ -116,7 +123,7 @@ def attribution(
     permutations = _checks.whole(name, "permutations", permutations, 2)
     key = jax.random.key(0) if key is None else key
     _checks.random_key(name, key)
-    g = given(name, sim, episode)
+    g = failing_point(name, sim, episode)
     quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
         raise ValueError(
@@ -125,18 +132,24 @@ def attribution(
     total = float(quiet - g.outcome.distance[0])
     values, error, cost = METHODS[method](g, float(quiet), key, permutations)
     x0, shaped = like_disturbances(g.sim, values)
-    steps, called = steps_of(g.sim), names(g.sim)
+    steps, called = number_steps(g.sim), number_names(g.sim)
     live = np.flatnonzero(g.v)
     parts = [(int(steps[i]), called[i], float(values[i]), float(error[i])) for i in live]
     parts.sort(key=lambda part: -abs(part[2]))
     residual = np.nan if method == "gradient" else total - float(values.sum())
-    errors = like_disturbances(g.sim, error)[1]
     return Attribution(
-        shaped, x0, errors, total, method, tuple(parts), residual, g.judge.spent + cost
+        values=shaped,
+        start=x0,
+        error=like_disturbances(g.sim, error)[1],
+        total=total,
+        method=method,
+        parts=tuple(parts),
+        residual=residual,
+        evaluations=g.judge.spent + cost,
     )
 
 
-def _shapley(g: Given, quiet: float, key: jax.Array, permutations: int):
+def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     """Means and standard errors [D], by pairs of orders."""
     live, rng = np.flatnonzero(g.v), generator(key)
     d, pairs = len(live), -(-permutations // 2)
@@ -149,20 +162,20 @@ def _shapley(g: Given, quiet: float, key: jax.Array, permutations: int):
             # row k has the first k + 1 disturbances of the order
             points = np.zeros((d, len(g.v)))
             points[:, one] = np.tril(np.ones((d, d))) * g.v[one]
-            along = np.concatenate([[quiet], _finite(g.judge(points).distance)])
+            along = np.concatenate([[quiet], _checked_finite(g.judge(points).distance)])
             seen[i, one] -= np.diff(along) / 2
     error = seen.std(axis=0, ddof=1) / np.sqrt(pairs) if pairs > 1 else np.full(len(g.v), np.nan)
     return seen.mean(axis=0), error, 0
 
 
-def _integrated(g: Given, quiet: float, key: jax.Array, permutations: int):
+def _integrated(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     """By the midpoint rule on the way from 0 to the episode."""
     shares = (np.arange(POINTS) + 0.5) / POINTS
     slopes = _gradients(g, shares[:, None] * g.v)
     return -slopes.mean(axis=0) * g.v, np.zeros(len(g.v)), 4 * POINTS
 
 
-def _gradient(g: Given, quiet: float, key: jax.Array, permutations: int):
+def _gradient(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     """Just outside of the failures, where the distance is not yet flat."""
     shares = 1 - np.geomspace(1e-5, 1, 2 * POINTS)
     outside = shares[~g.judge(shares[:, None] * g.v).failure]
@@ -182,7 +195,7 @@ METHODS: dict[str, Callable] = {
 }
 
 
-def _gradients(g: Given, points: np.ndarray) -> np.ndarray:
+def _gradients(g: EpisodePoint, points: np.ndarray) -> np.ndarray:
     slopes = np.asarray(_slopes(g.sim, jnp.asarray(points, g.judge.dtype)), np.float64)
     if not np.isfinite(slopes).all() or not slopes.any():
         raise ValueError(
@@ -197,7 +210,7 @@ def _slopes(sim: Simulator, points: jax.Array) -> jax.Array:
     return jax.vmap(jax.grad(lambda z: differentiable(sim, z).distance))(points)
 
 
-def _finite(distance: np.ndarray) -> np.ndarray:
+def _checked_finite(distance: np.ndarray) -> np.ndarray:
     if not np.isfinite(distance).all():
         raise ValueError(
             "attribution: the miss distance is not finite where only some of the disturbances"

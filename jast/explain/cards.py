@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["cards"]
 
-MODES, LEAST = 4, 20
-"""Modes that are explained at most; continuations of a state below which nothing is told."""
+MODES = 4  # that are explained, at most
+CONTINUATIONS = 20  # of a state, below which nothing is told
 
 
 def cards(
@@ -70,7 +70,7 @@ def cards(
             minimal(sim, mode.failure, budget=each // 2)
         ]
         draws = min(each // 2 // (int(mode.failure.length) + 1), 1000)
-        if draws >= LEAST:
+        if draws >= CONTINUATIONS:
             own = jax.random.fold_in(key, i)
             found.append(criticality(own, sim, mode.failure, draws=draws))
         if p is not None and p.draws is not None and not again:

@@ -7,16 +7,15 @@ import jax
 import numpy as np
 
 from jast.episode import Episode
-from jast.explain.gathered import distinct, gathered, kinds_of
+from jast.explain.gathered import distinct_rows, gather_episodes, named_kinds
 from jast.explain.learning import DISTINCT
-from jast.explain.variants import seeds, variants
+from jast.explain.variants import draw_variants, find_seeds
 from jast.simulator import Simulator
 
-__all__ = ["OTHERS", "Cases", "simulated", "told"]
+__all__ = ["OTHERS", "Cases", "given_cases", "simulate_cases"]
 
-OTHERS, DRAWS = "does not fail", 4
-"""What the others are called; draws of an estimate that are looked at for each episode
-wanted."""
+OTHERS = "does not fail"  # what the others are called
+DRAWS = 4  # of an estimate, that are looked at for each episode wanted
 
 
 class Cases(NamedTuple):
@@ -32,7 +31,7 @@ class Cases(NamedTuple):
     evaluations: int
 
 
-def simulated(
+def simulate_cases(
     function: str,
     key: jax.Array,
     sim: Simulator,
@@ -42,8 +41,8 @@ def simulated(
     most: int | None = None,
 ) -> Cases:
     """Variants of ``failures``: ``episodes`` that fail and at most ``most`` near misses."""
-    s = seeds(function, sim, failures, labels, DRAWS * episodes)
-    v = variants(key, sim, s, episodes)
+    seeds = find_seeds(function, sim, failures, labels, DRAWS * episodes)
+    v = draw_variants(key, sim, seeds, episodes)
     if len(v.label) < 2 * DISTINCT:
         raise ValueError(
             f"{function}: failures must be such that small changes of them still fail, received"
@@ -58,16 +57,22 @@ def simulated(
     e = jax.tree.map(lambda a, b: np.concatenate([a, b[:near]]), v.failures, v.near)
     kind = np.concatenate([1 + v.label, np.zeros(near, int)])
     group = np.concatenate([v.group, v.near_group[:near]])
-    return Cases(e, kind, group, (OTHERS, *s.names), s.evaluations + v.evaluations)
+    return Cases(
+        episodes=e,
+        kind=kind,
+        group=group,
+        names=(OTHERS, *seeds.names),
+        evaluations=seeds.evaluations + v.evaluations,
+    )
 
 
-def told(
+def given_cases(
     function: str, sim: Simulator, failures: Any, others: Any, labels: Sequence | None, least: int
 ) -> Cases:
     """The episodes that the user has, each once; ``least`` or more of each kind."""
     parts, kind, names = [], [], ("fails",)
     for argument, given, wanted in (("failures", failures, True), ("others", others, False)):
-        e = gathered(function, argument, sim, given)
+        e = gather_episodes(function, argument, sim, given)
         if wrong := int((e.failure != wanted).sum()):
             raise ValueError(
                 f"{function}: {argument} must {'all' if wanted else 'not'} fail, received"
@@ -75,9 +80,9 @@ def told(
             )
         each = np.full(len(e.length), int(wanted))
         if wanted and labels is not None:
-            names, each = kinds_of(function, labels, len(e.length))
+            names, each = named_kinds(function, labels, len(e.length))
             each = each + 1
-        rows = distinct(e)
+        rows = distinct_rows(e)
         parts.append(jax.tree.map(lambda a, rows=rows: a[rows], e))
         kind.append(each[rows])
         few = min((int(np.sum(kind[-1] == k)) for k in np.unique(each)), default=0)
@@ -88,4 +93,6 @@ def told(
             )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b]), *parts)
     owner = np.concatenate(kind)
-    return Cases(e, owner, np.arange(len(owner)), (OTHERS, *names), 0)
+    return Cases(
+        episodes=e, kind=owner, group=np.arange(len(owner)), names=(OTHERS, *names), evaluations=0
+    )

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Criticality", "criticality"]
 
-LANES, CERTAIN = 512, 0.95
+LANES = 512  # episodes that are played at a time
+CERTAIN = 0.95  # a probability from which on a failure counts as certain
 
 
 @results.result("evaluations")
@@ -125,15 +126,15 @@ def criticality(
     interval = np.stack([clopper_pearson(int(k), draws, level) for k in failing])
     below, sure = np.flatnonzero(p < 0.5), np.flatnonzero(p < CERTAIN)
     return Criticality(
-        p,
-        interval,
-        level,
-        int(below[-1]) if len(below) else None,
-        int(sure[-1]) + 1 if len(sure) else 0,
-        int(np.argmax(np.diff(p))) + 1 if steps else 0,
-        draws,
-        invalid,
-        -(-len(rows) // LANES) * LANES,
+        probability=p,
+        interval=interval,
+        level=level,
+        last_below_half=int(below[-1]) if len(below) else None,
+        point_of_no_return=int(sure[-1]) + 1 if len(sure) else 0,
+        steepest=int(np.argmax(np.diff(p))) + 1 if steps else 0,
+        draws=draws,
+        invalid=invalid,
+        evaluations=-(-len(rows) // LANES) * LANES,
     )
 
 

@@ -25,13 +25,13 @@ class Both(NamedTuple):
 
     a: Any
     b: Any
-    failed_a: Any
-    failed_b: Any
-    over_a: Any
-    over_b: Any
-    nearest: Any
+    failed_a: chex.Array
+    failed_b: chex.Array
+    over_a: chex.Array
+    over_b: chex.Array
+    nearest: chex.Array
     """Miss distance of b so far"""
-    t: Any
+    t: chex.Array
     """int32: steps"""
 
 
@@ -103,13 +103,12 @@ def regression(sim_a: Simulator, sim_b: Simulator) -> Simulator:
                 f"regression: {part} of sim_a and sim_b must have the same shapes, received"
                 f" {_shapes(one)} and {_shapes(other)}"
             )
-    horizon = max(sim_a.horizon, sim_b.horizon)
     return Simulator(
-        Partial(_init, sim_a, sim_b),
-        Partial(_step, sim_a, sim_b),
-        Partial(_disturbance, sim_a, sim_b),
-        Partial(_evaluate, sim_b),
-        horizon,
+        init=Partial(_init, sim_a, sim_b),
+        step=Partial(_step, sim_a, sim_b),
+        disturbance=Partial(_disturbance, sim_a, sim_b),
+        evaluate=Partial(_evaluate, sim_b),
+        horizon=max(sim_a.horizon, sim_b.horizon),
         start=sim_b.start,
         is_terminal=_is_terminal,
         observe=Partial(_observe, sim_a, sim_b),
@@ -135,43 +134,50 @@ def _init(sim_a, sim_b, x0):
     a, b = strong(sim_a.init(x0)), strong(sim_b.init(x0))
     failed_a, over_a, _ = _arrived(sim_a, a, t)
     failed_b, over_b, distance = _arrived(sim_b, b, t)
-    return Both(a, b, failed_a, failed_b, over_a, over_b, strong(distance), t)
-
-
-def _step(sim_a, sim_b, s, x):
-    t = s.t + 1
-    # one that is over stays where it is
-    a = select(s.over_a, s.a, strong(sim_a.step(s.a, x)))
-    b = select(s.over_b, s.b, strong(sim_b.step(s.b, x)))
-    failed_a, over_a, _ = _arrived(sim_a, a, t)
-    failed_b, over_b, distance = _arrived(sim_b, b, t)
-    nearest = jnp.where(s.over_b, s.nearest, jnp.minimum(s.nearest, distance))
-    kept = lambda over, old, new: jnp.where(over, old, new)
     return Both(
-        a,
-        b,
-        kept(s.over_a, s.failed_a, failed_a),
-        kept(s.over_b, s.failed_b, failed_b),
-        s.over_a | over_a,
-        s.over_b | over_b,
-        nearest,
-        t,
+        a=a,
+        b=b,
+        failed_a=failed_a,
+        failed_b=failed_b,
+        over_a=over_a,
+        over_b=over_b,
+        nearest=strong(distance),
+        t=t,
     )
 
 
-def _disturbance(sim_a, sim_b, s):
-    return D.where(s.over_b, sim_a.disturbance(s.a), sim_b.disturbance(s.b))
+def _step(sim_a, sim_b, state, x):
+    t = state.t + 1
+    # one that is over stays where it is
+    a = select(state.over_a, state.a, strong(sim_a.step(state.a, x)))
+    b = select(state.over_b, state.b, strong(sim_b.step(state.b, x)))
+    failed_a, over_a, _ = _arrived(sim_a, a, t)
+    failed_b, over_b, distance = _arrived(sim_b, b, t)
+    return Both(
+        a=a,
+        b=b,
+        failed_a=jnp.where(state.over_a, state.failed_a, failed_a),
+        failed_b=jnp.where(state.over_b, state.failed_b, failed_b),
+        over_a=state.over_a | over_a,
+        over_b=state.over_b | over_b,
+        nearest=jnp.where(state.over_b, state.nearest, jnp.minimum(state.nearest, distance)),
+        t=t,
+    )
 
 
-def _is_terminal(s):
-    return s.failed_a | (s.over_b & ~s.failed_b) | (s.over_a & s.over_b)
+def _disturbance(sim_a, sim_b, state):
+    return D.where(state.over_b, sim_a.disturbance(state.a), sim_b.disturbance(state.b))
 
 
-def _evaluate(sim_b, s):
-    event = s.failed_b & s.over_a & ~s.failed_a
-    both = s.failed_b & ~event
-    quiet = jnp.maximum(_quiet(sim_b).astype(s.nearest.dtype), 1e-3)
-    return event, jnp.where(both, quiet, s.nearest)
+def _is_terminal(state):
+    return state.failed_a | (state.over_b & ~state.failed_b) | (state.over_a & state.over_b)
+
+
+def _evaluate(sim_b, state):
+    event = state.failed_b & state.over_a & ~state.failed_a
+    both = state.failed_b & ~event
+    quiet = jnp.maximum(_quiet(sim_b).astype(state.nearest.dtype), 1e-3)
+    return event, jnp.where(both, quiet, state.nearest)
 
 
 def _quiet(sim):
@@ -179,5 +185,5 @@ def _quiet(sim):
     return jnp.abs(sim.evaluate(strong(sim.init(D.mode(sim.start()))))[1])
 
 
-def _observe(sim_a, sim_b, s):
-    return jnp.concatenate([sim_a.observe(s.a), sim_b.observe(s.b)])
+def _observe(sim_a, sim_b, state):
+    return jnp.concatenate([sim_a.observe(state.a), sim_b.observe(state.b)])

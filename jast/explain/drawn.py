@@ -14,17 +14,23 @@ from jast.episode import replay
 from jast.estimate.answers import asked
 from jast.estimate.estimate import Estimate
 from jast.estimate.redrawn import failing, numbers_of
+from jast.explain.point import used_numbers
 from jast.outline import outline
-from jast.pytrees import count
 from jast.simulator import Simulator
 
-__all__ = ["drawn", "placed"]
+__all__ = ["UNRELIABLE", "failing_draws", "free_undecided", "normalised"]
 
-LANES = 1024
-"""Failures whose choices are looked up at a time."""
+LANES = 1024  # failures whose choices are looked up at a time
+UNRELIABLE = "UNRELIABLE: the estimate is unreliable, or there are too few failures"
 
 
-def drawn(
+def normalised(log_w: np.ndarray) -> np.ndarray:
+    """Weights [m] of sum 1."""
+    w = np.exp(log_w - log_w.max())
+    return w / w.sum()
+
+
+def failing_draws(
     name: str, sim: Simulator, estimate: Estimate, most: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """At most ``most`` of the failures that ``estimate`` drew: points [m, D], log weights [m],
@@ -49,7 +55,7 @@ def drawn(
     return failing(sim, kept, most)
 
 
-def placed(
+def free_undecided(
     sim: Simulator, z: np.ndarray, length: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """The points ``z`` [m, D] as drawn from p(z | failure): a whole number anywhere in the normal
@@ -64,9 +70,8 @@ def placed(
         u = u + chance * (rng.random(z.shape) - 0.5)
         moved = np.asarray(ndtri(jnp.clip(u, 1e-30, 1 - 1e-7))) * np.where(z > 0, -1, 1)
         z = np.where(chance > 0, moved, z)
-    used = count(about.x0) + length * count(about.x)
-    blank = np.arange(z.shape[1]) >= used[:, None]
-    return np.where(blank, rng.standard_normal(z.shape), z).astype(z.dtype)
+    undecided = np.arange(z.shape[1]) >= used_numbers(sim, length)[:, None]
+    return np.where(undecided, rng.standard_normal(z.shape), z).astype(z.dtype)
 
 
 @jax.jit

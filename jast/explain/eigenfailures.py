@@ -14,9 +14,9 @@ from jast.counter import generator
 from jast.episode import Episode
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.explain.drawn import drawn, placed
-from jast.explain.gathered import gathered
-from jast.explain.point import names, steps_of
+from jast.explain.drawn import UNRELIABLE, failing_draws, free_undecided, normalised
+from jast.explain.gathered import gather_episodes
+from jast.explain.point import number_names, number_steps, used_numbers
 from jast.outline import outline
 from jast.pytrees import count
 from jast.search.failure_modes import pointing
@@ -27,15 +27,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Eigenfailures", "eigenfailures"]
 
-KEPT = 4096
-"""Failing draws that are looked at, at most."""
-LEAST, FEW = 20, 100
-"""Effective failures below which there is no answer, and below which it is UNRELIABLE."""
+KEPT = 4096  # failing draws that are looked at, at most
+FAILURES = 20  # effective ones, below which there is no answer
+RELIABLE = 100  # and below which it is UNRELIABLE
 BEYOND = 3.0
 """t of the bounds of Davidson and Szarek (2001): of n draws of the model all deviations lie within
 1 -+ (sqrt(D) + t) / sqrt(n), but with the probability 2 exp(-t^2 / 2); at most, seldom in truth.
 """
-SHOWN = 4
+PRINTED = 4  # numbers of a direction
 
 
 @results.shown()
@@ -51,20 +50,20 @@ class Eigenfailures(NamedTuple):
         True
     """
 
-    directions: Any
+    directions: np.ndarray
     """[K, N] of norm 1; the failures lie on the positive side"""
-    variances: Any
+    variances: np.ndarray
     """[K] of the failures along each; the model's is 1"""
-    shifts: Any
+    shifts: np.ndarray
     """[K] mean of the failures along each, in standard deviations of the model, whose mean is 0"""
-    nats: Any
+    nats: np.ndarray
     """[K] by how much each tells the failures from the model: the Kullback-Leibler divergence of a
     normal distribution of this mean and variance from the standard one"""
-    mean: Any
+    mean: np.ndarray
     """[N] the mean failure"""
     names: tuple[str, ...]
     """[N] what each number is called"""
-    steps: Any
+    steps: np.ndarray
     """[N] int: the step that each belongs to, from 1, in failures that all end at step ``end``; 0
     is the start"""
     end: int
@@ -84,9 +83,7 @@ class Eigenfailures(NamedTuple):
 
     def __str__(self) -> str:
         low, high = self.chance
-        lines = (
-            [] if self.reliable else ["UNRELIABLE: the estimate is, or there are too few failures"]
-        )
+        lines = [] if self.reliable else [UNRELIABLE]
         lines.append(
             f"{self.ess:.0f} effective failures, all to end at step {self.end}; by chance variances"
             f" lie between {low:.2f} and {high:.2f}; the mean failure: {_outcome(self.middle)}"
@@ -100,7 +97,7 @@ class Eigenfailures(NamedTuple):
                 f"{k + 1:2d} {self.nats[k]:7.3f} {self.variances[k]:8.3f} {self.shifts[k]:6.2f}"
                 f" {at[0]:>24} {at[1]:>24}"
             )
-            first = np.argsort(-np.abs(direction), kind="stable")[:SHOWN]
+            first = np.argsort(-np.abs(direction), kind="stable")[:PRINTED]
             parts = (f"{self.names[i]} {direction[i]:+.2f} at {self.steps[i]}" for i in first)
             lines.append(f"   {', '.join(parts)}")
         return "\n".join([*lines, *["nothing differs beyond chance"] * (not len(self.directions))])
@@ -159,17 +156,16 @@ def eigenfailures(
     if mode >= max(len(ways), 1):
         raise ValueError(f"{name}: mode must be below {max(len(ways), 1)}, received {mode}")
     if len(ways) > 1:
-        rows = _of_modes(sim, z, length, ways) == mode
+        rows = _modes_of(sim, z, length, ways) == mode
         z, log_w, length, spent = z[rows], log_w[rows], length[rows], spent + len(ways)
     ess = float(effective(log_w)) if len(z) else 0.0
-    if ess < LEAST:
+    if ess < FAILURES:
         raise ValueError(
-            f"{name}: failures must be at least {LEAST} effective ones of the mode, received"
+            f"{name}: failures must be at least {FAILURES} effective ones of the mode, received"
             f" {ess:.3g}"
         )
-    z = _aligned(sim, placed(sim, z, length, generator(key)).astype(np.float64), length)
-    w = np.exp(log_w - log_w.max())
-    mean, variances, vectors, chance = components(z, w / w.sum(), ess)
+    z = _align_ends(sim, free_undecided(sim, z, length, generator(key)).astype(np.float64), length)
+    mean, variances, vectors, chance = components(z, normalised(log_w), ess)
     shifts = vectors @ mean
     nats = (variances - 1 - np.log(np.maximum(variances, 1e-300)) + shifts**2) / 2
     order = np.argsort(-nats, kind="stable")[:directions]
@@ -177,22 +173,25 @@ def eigenfailures(
     moves = np.sqrt(variances[order])[:, None] * vectors
     played = latent.played(sim, np.concatenate([mean[None], mean - moves, mean + moves]))
     k = len(order)
-    part = lambda rows: jax.tree.map(lambda a: np.asarray(a)[rows], played)
+    middle, minus, plus = (
+        jax.tree.map(lambda a, rows=rows: np.asarray(a)[rows], played)
+        for rows in (0, slice(1, k + 1), slice(k + 1, None))
+    )
     return Eigenfailures(
         directions=vectors,
         variances=variances[order],
         shifts=np.abs(shifts[order]),
         nats=nats[order],
         mean=mean,
-        names=tuple(names(sim)),
-        steps=steps_of(sim),
+        names=tuple(number_names(sim)),
+        steps=number_steps(sim),
         end=int(length.max()),
-        middle=part(0),
-        minus=part(slice(1, k + 1)),
-        plus=part(slice(k + 1, None)),
+        middle=middle,
+        minus=minus,
+        plus=plus,
         chance=chance,
         ess=ess,
-        reliable=good and ess >= FEW,
+        reliable=good and ess >= RELIABLE,
         evaluations=spent + 2 * k + 1,
     )
 
@@ -226,9 +225,9 @@ def _points(
     p = given if isinstance(given, Estimate) else getattr(given, "probability", None)
     held = isinstance(p, Estimate) and p.draws is not None and p.draws.failure.any()
     if p is given or held:
-        z, log_w, length, spent = drawn(name, sim, p, KEPT)
+        z, log_w, length, spent = failing_draws(name, sim, p, KEPT)
         return z, log_w, length, bool(p.reliable), spent
-    e = gathered(name, "failures", sim, given)
+    e = gather_episodes(name, "failures", sim, given)
     if not e.failure.all():
         raise ValueError(
             f"{name}: failures must all fail, received {np.count_nonzero(~e.failure)} episodes of"
@@ -237,16 +236,14 @@ def _points(
     return latent.normal_of(sim, e), np.zeros(len(e.length)), e.length, True, len(e.length)
 
 
-def _of_modes(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> np.ndarray:
+def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> np.ndarray:
     """The mode of each of the points ``z`` [m, D], by direction: [m]."""
-    about = outline(sim)
-    used = count(about.x0) + length * count(about.x)
-    known = np.arange(z.shape[1]) < used[:, None]
-    heads = gathered("eigenfailures", "failures", sim, ways)
+    known = np.arange(z.shape[1]) < used_numbers(sim, length)[:, None]
+    heads = gather_episodes("eigenfailures", "failures", sim, ways)
     return pointing(sim, np.where(known, z, 0), length, latent.normal_of(sim, heads), heads.length)
 
 
-def _aligned(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:
+def _align_ends(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:
     """The points ``z`` [m, D] as late as the last of them: what was behind the end comes first."""
     first, (m, d), last = count(outline(sim).x0), z.shape, int(length.max())
     steps = z[:, first:].reshape(m, sim.horizon, -1)

@@ -1,25 +1,23 @@
 """Numbers that say in a few words what an episode was like, with the names of the user's fields."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jast.explain.gathered import Whole
-from jast.explain.point import numbers_of
+from jast.explain.gathered import FullEpisodes
+from jast.explain.point import names_of_leaves
 from jast.fields import fields
 from jast.outline import outline
 from jast.simulator import Simulator
 
-__all__ = ["Describer", "Feature", "describer", "table"]
+__all__ = ["Describer", "Feature", "feature_table", "make_describer"]
 
-RUNS = 2, 3, 4, 8, 16
-"""Steps in a row that are looked at together, wherever they are."""
-VALUES, MOST, TOGETHER = 8, 4000, 6
-"""Different whole numbers that are told apart as kinds; features, nearly; components of which it is
-said what each was while another was greatest.
-"""
+RUNS = 2, 3, 4, 8, 16  # steps in a row that are looked at together, wherever they are
+VALUES = 8  # different whole numbers that are told apart as kinds, at most
+FEATURES = 4000  # of a table, nearly, at most
+COMPONENTS = 6  # of which it is said what each was while another was greatest, at most
 
 
 class Feature(NamedTuple):
@@ -41,21 +39,22 @@ class Describer(NamedTuple):
     lead: int
 
 
-def describer(sim: Simulator, episodes: Whole, of: str, lead: int) -> Describer:
+def make_describer(sim: Simulator, episodes: FullEpisodes, of: str, lead: int) -> Describer:
     """The `Describer` for episodes like these."""
     kinds = {}
-    for name, v in _components(sim, episodes):
+    components = _components(sim, episodes)
+    for name, v in components:
         if v.dtype.kind in "iub" and len(values := np.unique(v)) <= VALUES:
             kinds[name] = tuple(values.tolist())
-    width = sum(max(len(kinds.get(name, ())), 1) for name, _ in _components(sim, episodes))
+    width = sum(max(len(kinds.get(name, ())), 1) for name, _ in components)
     finest = 1
-    while 3 * width * sim.horizon // finest > MOST:
+    while 3 * width * sim.horizon // finest > FEATURES:
         finest *= 2
     return Describer(kinds, finest, of, lead)
 
 
-def table(
-    sim: Simulator, d: Describer, episodes: Whole, end: np.ndarray
+def feature_table(
+    sim: Simulator, d: Describer, episodes: FullEpisodes, end: np.ndarray
 ) -> tuple[list[Feature], np.ndarray]:
     """The features [F] of ``episodes`` [n], and their values [n, F].
 
@@ -65,11 +64,12 @@ def table(
     if d.of != "states":
         for name, v in _columns(episodes.x0, "x0", 1):
             found.append((Feature(f"{name} at the start", "number"), v))
-        parts = list(_components(sim, episodes))
+        parts = _components(sim, episodes)
         for name, v in parts:
             if name in d.kinds:
-                for value in d.kinds[name][-1:] if _truth(v) else d.kinds[name]:
-                    found += _of_kind(name if _truth(v) else f"{name} = {value}", v == value, d)
+                truth = v.dtype.kind == "b"
+                for value in d.kinds[name][-1:] if truth else d.kinds[name]:
+                    found += _of_kind(name if truth else f"{name} = {value}", v == value, d)
             else:
                 found += _of_numbers(name, v.astype(float), d)
         numbers = [(name, v.astype(float)) for name, v in parts if name not in d.kinds]
@@ -79,10 +79,12 @@ def table(
     return [f for f, _ in found], np.stack([np.asarray(v, np.float32) for _, v in found], axis=1)
 
 
-def _components(sim: Simulator, episodes: Whole) -> Iterator[tuple[str, np.ndarray]]:
+def _components(sim: Simulator, episodes: FullEpisodes) -> list[tuple[str, np.ndarray]]:
     """(name, values [n, horizon]) of each number of a disturbance."""
-    named = numbers_of(outline(sim).x, "x")
-    yield from zip(named, _flat(episodes.disturbances, 2), strict=True)
+    named = iter(names_of_leaves(outline(sim).x, "x"))
+    leaves = map(np.asarray, jax.tree.leaves(episodes.disturbances))
+    rows = [a.reshape(*a.shape[:2], -1) for a in leaves]
+    return [(next(named), a[..., i]) for a in rows for i in range(a.shape[-1])]
 
 
 def _columns(tree: Any, root: str, lead: int) -> Iterator[tuple[str, np.ndarray]]:
@@ -90,20 +92,6 @@ def _columns(tree: Any, root: str, lead: int) -> Iterator[tuple[str, np.ndarray]
     for part in fields(tree, root, lead):
         for i, entry in enumerate(part.entries):
             yield part.name + entry, part.values[..., i]
-
-
-def _flat(tree: Any, lead: int) -> list[np.ndarray]:
-    """Arrays of the ``lead`` axes, one for each number behind them."""
-    out = []
-    for a in jax.tree.leaves(tree):
-        a = np.asarray(a)
-        rows = a.reshape(*a.shape[:lead], -1)
-        out += [rows[..., i] for i in range(rows.shape[-1])]
-    return out
-
-
-def _truth(v: np.ndarray) -> bool:
-    return v.dtype.kind == "b"
 
 
 def _windows(v: np.ndarray, finest: int) -> Iterator[tuple[str, int, np.ndarray]]:
@@ -173,7 +161,7 @@ def _together(
     numbers: list[tuple[str, np.ndarray]], parts: list[tuple[str, np.ndarray]]
 ) -> Iterator[tuple[Feature, np.ndarray]]:
     """What each component was while another was greatest or least."""
-    if not 2 <= len(parts) <= TOGETHER or parts[0][1].shape[1] == 1:
+    if not 2 <= len(parts) <= COMPONENTS or parts[0][1].shape[1] == 1:
         return
     rows = np.arange(len(parts[0][1]))
     for name, v in numbers:
@@ -181,7 +169,7 @@ def _together(
             at = where(v, axis=1)
             for other, w in parts:
                 if other != name:
-                    kind = "truth" if _truth(w) else "number"
+                    kind = "truth" if w.dtype.kind == "b" else "number"
                     yield Feature(f"{other} while {name} is {word}", kind), w[rows, at]
 
 
@@ -191,14 +179,14 @@ def _of_states(
     """Of the states that are seen until step ``at`` [n]."""
     rows, when = np.arange(len(at)), f"{lead} step{'s' * (lead != 1)} before the end"
     seen = np.arange(sim.horizon + 1) <= at[:, None]
-    far: Callable = lambda v, value: np.where(seen, v, value)
     for name, v in _columns(states, "state", 2):
         yield Feature(f"{name} {when}", "number"), v[rows, at]
-        yield Feature(f"greatest {name} until {when}", "number"), far(v, -np.inf).max(axis=1)
-        yield Feature(f"least {name} until {when}", "number"), far(v, np.inf).min(axis=1)
-        mean = far(v, 0.0).sum(axis=1) / (at + 1)
-        yield Feature(f"mean {name} until {when}", "number"), mean
         yield (
-            Feature(f"rise of {name} in the 4 steps until {when}", "number"),
-            (v[rows, at] - v[rows, np.maximum(at - 4, 0)]),
+            Feature(f"greatest {name} until {when}", "number"),
+            np.where(seen, v, -np.inf).max(axis=1),
         )
+        yield Feature(f"least {name} until {when}", "number"), np.where(seen, v, np.inf).min(axis=1)
+        mean = np.where(seen, v, 0.0).sum(axis=1) / (at + 1)
+        yield Feature(f"mean {name} until {when}", "number"), mean
+        rise = v[rows, at] - v[rows, np.maximum(at - 4, 0)]
+        yield Feature(f"rise of {name} in the 4 steps until {when}", "number"), rise

@@ -1,28 +1,41 @@
-"""Episodes in whatever form a user has them, as one batch; and what their ends left undrawn."""
+"""Episodes in whatever form a user has them, as one batch; what their ends left undrawn, what is
+observed at each of their steps; and ordinary ones.
+"""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast import rewards
 from jast._jax import jit
-from jast.episode import Episode, play_back
+from jast.episode import Episode, play_back, rollout
 from jast.failures import Failures, identity
 from jast.limit_state import side_by_side
 from jast.outline import outline
+from jast.pytrees import bound
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
-__all__ = ["Whole", "distinct", "gathered", "kinds_of", "whole"]
+__all__ = [
+    "FullEpisodes",
+    "distinct_rows",
+    "draw_ordinary",
+    "gather_episodes",
+    "named_kinds",
+    "observations",
+    "play_to_horizon",
+]
 
-LANES = 256
+LANES = 256  # episodes that are played at a time
 
 
-class Whole(NamedTuple):
+class FullEpisodes(NamedTuple):
     """Episodes [n] whose disturbances go on to the horizon, on the host."""
 
     x0: Any
@@ -34,7 +47,7 @@ class Whole(NamedTuple):
     evaluations: int
 
 
-def gathered(function: str, argument: str, sim: Simulator, given: Any) -> Episode:
+def gather_episodes(function: str, argument: str, sim: Simulator, given: Any) -> Episode:
     """One batch [n], on the host and without states, of a `jast.Episode` (one or a batch), a
     `jast.failures.Failures`, anything that has these as ``failures``, or a sequence of episodes or
     of modes.
@@ -43,23 +56,24 @@ def gathered(function: str, argument: str, sim: Simulator, given: Any) -> Episod
         ValueError: which names the ``argument``, for anything else and for episodes that are not of
             ``sim``.
     """
-    e = given
-    if not isinstance(e, Episode | Failures) and isinstance(
-        getattr(e, "failures", None), Failures | Episode
-    ):
-        e = e.failures
+    refusal = ValueError(
+        f"{function}: {argument} must be episodes (a jast.Episode with a leading axis, a list of"
+        f" them, result.failures, a report), received {type(given).__name__}"
+    )
+    held = getattr(given, "failures", None)
+    e = held if isinstance(held, Failures | Episode) else given
     if isinstance(e, Failures):
         e = e.episodes
     elif isinstance(e, list | tuple) and not isinstance(e, Episode):
         each = [part.failure if isinstance(part, Mode) else part for part in e]
         if not all(isinstance(part, Episode) and np.ndim(part.length) == 0 for part in each):
-            raise ValueError(_refusal(function, argument, given))
+            raise refusal
         if not each:
             raise ValueError(f"{function}: {argument} must hold episodes, received none")
         bare = [jax.device_get(part._replace(states=None)) for part in each]
         e = jax.tree.map(lambda *a: np.stack([np.asarray(one) for one in a]), *bare)
     if not isinstance(e, Episode):
-        raise ValueError(_refusal(function, argument, given))
+        raise refusal
     e = jax.tree.map(np.asarray, jax.device_get(e._replace(states=None)))
     if e.length.ndim == 0:
         e = jax.tree.map(lambda a: a[None], e)
@@ -79,7 +93,7 @@ def gathered(function: str, argument: str, sim: Simulator, given: Any) -> Episod
     return e
 
 
-def distinct(e: Episode) -> np.ndarray:
+def distinct_rows(e: Episode) -> np.ndarray:
     """Rows of the first of each of the equal episodes [n]."""
     seen: dict[bytes, int] = {}
     for i in range(len(e.length)):
@@ -87,7 +101,7 @@ def distinct(e: Episode) -> np.ndarray:
     return np.fromiter(seen.values(), int, len(seen))
 
 
-def kinds_of(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np.ndarray]:
+def named_kinds(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np.ndarray]:
     """The different names in ``labels``, and the number of that of each of ``n`` failures."""
     names, at = np.unique(np.asarray(labels).astype(str), return_inverse=True)
     if at.shape != (n,):
@@ -98,8 +112,10 @@ def kinds_of(function: str, labels: Any, n: int) -> tuple[tuple[str, ...], np.nd
     return tuple(names.tolist()), at
 
 
-def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Whole:
-    """The episodes [n] of `gathered`, whose disturbances go on.
+def play_to_horizon(
+    sim: Simulator, e: Episode, key: jax.Array, states: bool = True
+) -> FullEpisodes:
+    """The episodes [n] of `gather_episodes`, whose disturbances go on.
 
     A failing episode is over sooner than others; what would have come is drawn from the model at
     its last state. So no number tells that an episode was over.
@@ -110,10 +126,12 @@ def whole(sim: Simulator, e: Episode, key: jax.Array, states: bool = True) -> Wh
     """
     n = len(e.length)
     if not states and (e.length == sim.horizon).all():
-        return Whole(e.x0, e.disturbances, e.length, None, 0)
+        return FullEpisodes(
+            x0=e.x0, disturbances=e.disturbances, length=e.length, states=None, evaluations=0
+        )
     rows = np.arange(n, dtype=np.int32), e.x0, e.disturbances, e.length
     x, s = side_by_side(sim, partial(_played_on, sim, key), *rows, lanes=LANES)
-    return Whole(e.x0, x, e.length, s, n)
+    return FullEpisodes(x0=e.x0, disturbances=x, length=e.length, states=s, evaluations=n)
 
 
 @jit
@@ -137,8 +155,34 @@ def _plain(a: jax.Array) -> jax.Array:
     return jnp.zeros((len(a), 0)) if key else a
 
 
-def _refusal(function, argument, given):
-    return (
-        f"{function}: {argument} must be episodes (a jast.Episode with a leading axis, a list of"
-        f" them, result.failures, a report), received {type(given).__name__}"
-    )
+def draw_ordinary(key: jax.Array, sim: Simulator, n: int) -> Episode:
+    """At most ``n`` episodes of the model that do not fail."""
+    at = np.arange(n, dtype=np.int32)
+    e = side_by_side(sim, partial(_drawn, key, sim), at, lanes=LANES)
+    return jax.tree.map(lambda a: a[~e.failure], e)
+
+
+@jit
+def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
+    return jax.vmap(lambda k: rollout(jax.random.fold_in(key, k), sim)._replace(states=None))(at)
+
+
+def observations(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
+    """[n, horizon + 1, d] of the states."""
+    watched, about = partial(_watched, sim, bound(observe)), (e.x0, e.disturbances, e.length)
+    seen = side_by_side(sim, watched, *about, lanes=LANES)
+    if not isinstance(seen, np.ndarray) or seen.ndim != 3:
+        shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)
+        raise ValueError(
+            f"{name}: observe must return a vector [d], received arrays of the shapes {shapes}"
+        )
+    return seen.astype(float)
+
+
+@jit
+def _watched(sim: Simulator, observe: Partial, x0: Any, x: Any, length: Any) -> Any:
+    def one(x0, x, length):
+        states = play_back(sim, rewards.STANDARD, x0, x, length).states
+        return jax.tree.map(jnp.asarray, jax.vmap(observe)(states))
+
+    return jax.vmap(one)(x0, x, length)

@@ -15,8 +15,8 @@ from jast.estimate.answers import asked
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.explain.drawn import drawn, placed
-from jast.explain.point import names, steps_of
+from jast.explain.drawn import UNRELIABLE, failing_draws, free_undecided, normalised
+from jast.explain.point import number_names, number_steps
 from jast.intervals import clopper_pearson, log_normal
 from jast.judge import Judge
 from jast.simulator import Simulator
@@ -26,13 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Index", "Indices", "indices"]
 
-KEPT = 16_384
-"""Failing draws that are looked at, at most."""
-FEW = 100
-"""Effective failures below which nothing is told."""
-WIDTH = 0.02
-"""Of the cells in which failures are counted, in standard deviations."""
-SHOWN = 20
+KEPT = 16_384  # failing draws that are looked at, at most
+RELIABLE = 100  # effective failures, below which the answer is UNRELIABLE
+WIDTH = 0.02  # of the cells in which failures are counted, in standard deviations
+PRINTED = 20  # numbers
 
 
 class Index(NamedTuple):
@@ -89,23 +86,19 @@ class Indices(NamedTuple):
     evaluations: int
 
     def __str__(self) -> str:
-        lines = (
-            []
-            if self.reliable
-            else ["UNRELIABLE: the estimate is unreliable, or there are too few failures"]
-        )
+        lines = [] if self.reliable else [UNRELIABLE]
         lines.append(
             f"{'number':<20} {'step':>4} {'mean':>7} {'first order':>12} {'total':>7}"
             f"   {self.level:.0%} intervals"
         )
-        key = lambda r: (-r.total if r.total == r.total else 0.0, -r.first)
-        for r in sorted(self.rows, key=key)[:SHOWN]:
+        greatest_first = sorted(self.rows, key=lambda r: (-np.nan_to_num(r.total), -r.first))
+        for r in greatest_first[:PRINTED]:
             (a, b), (c, d) = r.first_interval, r.total_interval
-            ends = f"[{a:.3g}, {b:.3g}]" + (f"  [{c:.3f}, {d:.3f}]" if d == d else "")
-            total = f"{r.total:7.3f}" if r.total == r.total else "      -"
+            ends = f"[{a:.3g}, {b:.3g}]" + ("" if np.isnan(d) else f"  [{c:.3f}, {d:.3f}]")
+            total = "      -" if np.isnan(r.total) else f"{r.total:7.3f}"
             lines.append(f"{r.name:<20} {r.step:4d} {r.mean:7.3f} {r.first:12.4g} {total}   {ends}")
-        if len(self.rows) > SHOWN:
-            lines.append(f"{len(self.rows) - SHOWN} more numbers")
+        if len(self.rows) > PRINTED:
+            lines.append(f"{len(self.rows) - PRINTED} more numbers")
         return "\n".join(lines)
 
 
@@ -160,15 +153,14 @@ def indices(
     draws = _checks.whole(name, "draws", draws, 0)
     latent.check(name, sim)
     rng = generator(key)
-    z, log_w, length, spent = drawn(name, sim, estimate, KEPT)
-    z = placed(sim, z, length, rng)
-    w = np.exp(log_w - log_w.max())
-    w /= w.sum()
+    z, log_w, length, spent = failing_draws(name, sim, estimate, KEPT)
+    z = free_undecided(sim, z, length, rng)
+    w = normalised(log_w)
     p, n_eff = float(estimate.mean), float(effective(log_w))
     samples = kept.samples * len(z) / np.count_nonzero(kept.failure)
     judge, picks = Judge(sim), resampled(log_w, draws, rng.random()) if draws else None
     rows = []
-    for i, (called, step) in enumerate(zip(names(sim), steps_of(sim), strict=True)):
+    for i, (called, step) in enumerate(zip(number_names(sim), number_steps(sim), strict=True)):
         gain, each = _gain(z[:, i], w)
         first = p * (gain - 1) / (1 - p)
         # P and the gain are of the same draws: the influence of each draw on their product
@@ -177,22 +169,34 @@ def indices(
         error = p / (1 - p) * math.sqrt(max(square, 0.0))
         total, ends = math.nan, (math.nan, math.nan)
         if picks is not None:
-            fails = int(_redrawn(judge, z[picks], i, rng))
+            fails = int(_still_failing(judge, z[picks], i, rng))
             # as many independent failures as both samples are worth
             n = max(int(1 / (1 / draws + 1 / n_eff)), 1)
             q = fails / draws
             low = clopper_pearson(math.floor(q * n), n, level)[0]
             high = clopper_pearson(math.ceil(q * n), n, level)[1]
             total, ends = (1 - q) / (1 - p), ((1 - high) / (1 - p), min((1 - low) / (1 - p), 1.0))
-        mean = float(w @ z[:, i])
-        rows.append(
-            Index(called, int(step), mean, first, _around(first, error, c, level), total, ends)
+        index = Index(
+            name=called,
+            step=int(step),
+            mean=float(w @ z[:, i]),
+            first=first,
+            first_interval=_interval(first, error, c, level),
+            total=total,
+            total_interval=ends,
         )
-    good = bool(estimate.reliable and n_eff >= FEW)
-    return Indices(tuple(rows), p, level, n_eff, good, spent + judge.spent)
+        rows.append(index)
+    return Indices(
+        rows=tuple(rows),
+        probability=p,
+        level=level,
+        ess=n_eff,
+        reliable=bool(estimate.reliable and n_eff >= RELIABLE),
+        evaluations=spent + judge.spent,
+    )
 
 
-def _around(first: float, error: float, c: np.ndarray, level: float) -> tuple[float, float]:
+def _interval(first: float, error: float, c: np.ndarray, level: float) -> tuple[float, float]:
     """The interval of a first-order index by its standard error and the influences ``c`` [m] of the
     draws: log-normal where it is clearly above 0, as few failures far out may decide it.
     """
@@ -203,7 +207,7 @@ def _around(first: float, error: float, c: np.ndarray, level: float) -> tuple[fl
     return first - half, first + half
 
 
-def _redrawn(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> int:
+def _still_failing(judge: Judge, z: np.ndarray, i: int, rng: np.random.Generator) -> int:
     """How many of the failures ``z`` still fail with number ``i`` drawn anew."""
     moved = z.copy()
     moved[:, i] = rng.standard_normal(len(z))
@@ -214,11 +218,12 @@ def _gain(z: np.ndarray, w: np.ndarray) -> tuple[float, np.ndarray]:
     """E[f(z | F) / phi(z) | F] of one number, from failures ``z`` [m] with weights ``w`` of sum 1,
     and f(z | F) / phi(z) of each, by the others: [m].
     """
+    from scipy.special import ndtr
+
     cells, at = np.unique(np.floor(z.astype(np.float64) / WIDTH), return_inverse=True)
     # as a tail's own number: no difference of numbers near 1
-    tail = lambda v: 0.5 * math.erfc(v / math.sqrt(2))
     near = np.minimum(np.abs(cells), np.abs(cells + 1)) * WIDTH
-    phi = np.array([tail(a) - tail(a + WIDTH) for a in near])
+    phi = ndtr(-near) - ndtr(-near - WIDTH)
     others = (np.bincount(at, w, len(cells))[at] - w) / np.maximum(phi, 1e-300)[at]
     pairs = 1 - w @ w
     gain = float(w @ others / pairs) if pairs > 0 else math.nan

@@ -6,18 +6,17 @@ import numpy as np
 
 from jast._checks import library
 
-__all__ = ["learner", "parted"]
+__all__ = ["DISTINCT", "hold_out", "sklearn_module"]
 
-DISTINCT = 4
-"""Episodes of a class, the least."""
+DISTINCT = 4  # episodes of a class, the least
 
 
-def learner(function: str, module: str) -> Any:
+def sklearn_module(function: str, module: str) -> Any:
     """A module of scikit-learn; ImportError where it is not installed."""
     return library(function, f"sklearn.{module}", "explain")
 
 
-def parted(
+def hold_out(
     rng: np.random.Generator, owner: np.ndarray, group: np.ndarray, share: float
 ) -> np.ndarray:
     """Which episodes [n] are held out: of each class ``owner`` [n] about a ``share``, by groups

@@ -11,15 +11,20 @@ from jast import limit_state as latent
 from jast import results
 from jast._checks import number, whole
 from jast.episode import Episode, replay
-from jast.explain.point import Given, given, like_disturbances, names, steps_of
+from jast.explain.point import (
+    EpisodePoint,
+    failing_point,
+    like_disturbances,
+    number_names,
+    number_steps,
+)
 from jast.simulator import Simulator
 
 __all__ = ["Minimal", "minimal"]
 
-SECTIONS = 31
-"""Places between two ends that are looked at together."""
-SWEEPS, LINES = 3, 12
-"""Rounds of shrinking one number after the other; needed disturbances that are printed."""
+SECTIONS = 31  # places between two ends that are looked at together
+SWEEPS = 3  # rounds of shrinking one number after the other
+PRINTED = 12  # needed disturbances, and runs of steps
 
 
 @results.shown()
@@ -52,25 +57,19 @@ class Minimal(NamedTuple):
     def __str__(self) -> str:
         steps = sorted({step for step, *_ in self.parts})
         are = "is" if len(self.parts) == 1 else "are"
-        lines = [
-            f"{len(self.parts)} of {self.numbers} disturbances {are} needed: {_in_words(steps)}"
-        ]
+        count = f"{len(self.parts)} of {self.numbers} disturbances {are} needed"
+        lines = [f"{count}: {_steps_in_words(steps)}"]
         lines += [
             f"  step {step:4d}  {name:<12} {value:12.5g}   {z:+.2f} from the mode"
-            for step, name, value, z in self.parts[:LINES]
+            for step, name, value, z in self.parts[:PRINTED]
         ]
-        if len(self.parts) > LINES:
-            lines.append(f"  ... {len(self.parts) - LINES} more")
+        if len(self.parts) > PRINTED:
+            lines.append(f"  ... {len(self.parts) - PRINTED} more")
         return "\n".join(lines)
 
 
 def minimal(
-    sim: Simulator,
-    episode: Episode,
-    *,
-    orders: int = 8,
-    slack: float = 0.1,
-    budget: int = 5000,
+    sim: Simulator, episode: Episode, *, orders: int = 8, slack: float = 0.1, budget: int = 5000
 ) -> Minimal:
     """Which disturbances of a failure are needed, and how large must they be?
 
@@ -107,19 +106,26 @@ def minimal(
     name = "minimal"
     orders, budget = whole(name, "orders", orders, 1), whole(name, "budget", budget, 1)
     slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
-    g = given(name, sim, episode)
+    g = failing_point(name, sim, episode)
     if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:
         g = farther
-    kept = _needed(g, orders, budget)
-    v = _shrunk(g, np.where(kept, g.v, 0.0), budget)
+    kept = _find_needed(g, orders, budget)
+    v = _shrink(g, np.where(kept, g.v, 0.0), budget)
     e = latent.played(g.sim, v[None])
     e = jax.device_get(replay(sim, jax.tree.map(lambda a: a[0], e._replace(states=None))))
-    kept &= steps_of(sim) <= int(e.length)
+    kept &= number_steps(sim) <= int(e.length)
     x0, needed = like_disturbances(sim, kept)
-    return Minimal(needed, x0, e, _parts(sim, e, v, kept), int(g.outcome.used[0]), g.judge.spent)
+    return Minimal(
+        needed=needed,
+        needed_start=x0,
+        episode=e,
+        parts=_parts(sim, e, v, kept),
+        numbers=int(g.outcome.used[0]),
+        evaluations=g.judge.spent,
+    )
 
 
-def _needed(g: Given, orders: int, budget: int) -> np.ndarray:
+def _find_needed(g: EpisodePoint, orders: int, budget: int) -> np.ndarray:
     """[D] bool: the fewest numbers that are not 0 at the end of any order."""
     rng = np.random.default_rng(0)
     size = np.abs(g.v)
@@ -131,24 +137,24 @@ def _needed(g: Given, orders: int, budget: int) -> np.ndarray:
     # of each order what lies before ``at`` is decided
     at = np.zeros(orders, int)
     while (at < len(live)).any() and g.judge.spent < budget:
-        points, at = _advanced(g, points, order, at)
+        points, at = _advance(g, points, order, at)
     counts = (points != 0).sum(axis=1)
     best = points[np.lexsort(((points**2).sum(axis=1), counts))[0]]
-    return _spared(g, best, budget) != 0
+    return _spare_one_by_one(g, best, budget) != 0
 
 
-def _advanced(g: Given, points: np.ndarray, order: np.ndarray, at: np.ndarray):
+def _advance(g: EpisodePoint, points: np.ndarray, order: np.ndarray, at: np.ndarray):
     """Put back as much of what comes next in each order as can be in one piece; the number behind
     the piece stays.
     """
     n = order.shape[1]
     low, high = at.copy(), np.full(len(at), n)  # all before low can be spared, not all before high
     rows = np.flatnonzero(at < n)
-    ends = lambda i: np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round().astype(int))
     first = True
     while len(rows):
-        tried = [ends(i)[1:] if first else ends(i)[1:-1] for i in rows]
-        batch = [_back(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
+        ends = [np.unique(np.linspace(low[i], high[i], SECTIONS + 1).round()) for i in rows]
+        tried = [e.astype(int)[1 : None if first else -1] for e in ends]
+        batch = [_at_mode(points[i], order[i, at[i] : e]) for i, t in zip(rows, tried) for e in t]
         fails = iter(g.judge(np.stack(batch)).failure)
         for i, t in zip(rows, tried):
             good = [e for e in t if next(fails)]
@@ -156,17 +162,17 @@ def _advanced(g: Given, points: np.ndarray, order: np.ndarray, at: np.ndarray):
             high[i] = min((e for e in t if e > low[i]), default=high[i] if low[i] < high[i] else n)
         rows, first = rows[high[rows] - low[rows] > 1], False
     for i in np.flatnonzero(at < n):
-        points[i] = _back(points[i], order[i, at[i] : low[i]])
+        points[i] = _at_mode(points[i], order[i, at[i] : low[i]])
     return points, np.where(at < n, np.minimum(low + 1, n), at)
 
 
-def _back(point: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _at_mode(point: np.ndarray, which: np.ndarray) -> np.ndarray:
     out = point.copy()
     out[which] = 0.0
     return out
 
 
-def _spared(g: Given, point: np.ndarray, budget: int) -> np.ndarray:
+def _spare_one_by_one(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
     """``point`` without what can be spared one by one."""
     while g.judge.spent < budget and (left := np.flatnonzero(point)).size:
         each = np.tile(point, (len(left), 1))
@@ -178,22 +184,22 @@ def _spared(g: Given, point: np.ndarray, budget: int) -> np.ndarray:
     return point
 
 
-def _shrunk(g: Given, point: np.ndarray, budget: int) -> np.ndarray:
+def _shrink(g: EpisodePoint, point: np.ndarray, budget: int) -> np.ndarray:
     """``point`` nearer to the mode, all numbers at first and then each alone."""
     left = np.flatnonzero(point)
-    point = _scaled(g, point, left)
+    point = _scale(g, point, left)
     for _ in range(SWEEPS):
         before = point
         for i in left:
             if g.judge.spent >= budget:
                 return point
-            point = _scaled(g, point, np.array([i]))
+            point = _scale(g, point, np.array([i]))
         if np.allclose(before, point, rtol=1e-3, atol=0):
             break
     return point
 
 
-def _scaled(g: Given, point: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _scale(g: EpisodePoint, point: np.ndarray, which: np.ndarray) -> np.ndarray:
     """``point`` with the numbers ``which`` shrunk by the least factor, to 1 / 1024, that leads over
     failures alone.
     """
@@ -212,17 +218,16 @@ def _scaled(g: Given, point: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 
 def _parts(sim: Simulator, e: Episode, v: np.ndarray, kept: np.ndarray) -> tuple:
-    rows = zip(jax.tree.leaves(e.disturbances), strict=True)
-    each = [np.asarray(a).reshape(len(a), -1) for (a,) in rows]
+    each = [np.asarray(a).reshape(len(a), -1) for a in jax.tree.leaves(e.disturbances)]
     first = [np.asarray(a).reshape(-1) for a in jax.tree.leaves(e.x0)]
     values = np.concatenate([*first, np.concatenate(each, axis=1).reshape(-1)])
-    steps, called = steps_of(sim), names(sim)
+    steps, called = number_steps(sim), number_names(sim)
     return tuple(
         (int(steps[i]), called[i], float(values[i]), float(v[i])) for i in np.flatnonzero(kept)
     )
 
 
-def _in_words(steps: list) -> str:
+def _steps_in_words(steps: list) -> str:
     """ "steps 4 to 6, 9" """
     runs: list[list[int]] = []
     for step in steps:
@@ -230,6 +235,6 @@ def _in_words(steps: list) -> str:
             runs[-1][1] = step
         else:
             runs.append([step, step])
-    text = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs[:LINES])
-    more = ", ..." if len(runs) > LINES else ""
+    text = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs[:PRINTED])
+    more = ", ..." if len(runs) > PRINTED else ""
     return f"step{'s' if len(steps) != 1 else ''} {text}{more}" if steps else "none"

@@ -10,9 +10,9 @@ import numpy as np
 
 from jast import _checks, results
 from jast.counter import generator
-from jast.explain.cases import simulated, told
-from jast.explain.learning import learner, parted
-from jast.explain.observed import observed, ordinary
+from jast.explain.cases import given_cases, simulate_cases
+from jast.explain.gathered import draw_ordinary, observations
+from jast.explain.learning import hold_out, sklearn_module
 from jast.intervals import clopper_pearson
 from jast.simulator import Simulator
 from jast.weakness.measures import Roc, roc
@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Monitor", "monitor"]
 
-HELD_OUT, ASIDE, LEAST = 0.3, 0.3, 12
-"""The share of the episodes that is held out; of the rest, that which sets the threshold; failures,
-and others, the least."""
-ROWS, BINS, REPEATS = 200_000, 256, 400
-"""Observations to learn from, the most; of the bootstrap: different scores, and samples."""
+HELD_OUT = 0.3  # the share of the episodes that tells how good the monitor is
+ASIDE = 0.3  # of the other ordinary ones, the share that sets the threshold
+EPISODES = 12  # failures, and others, the least
+ROWS = 200_000  # observations to learn from, the most
+BINS = 256  # different scores of the bootstrap
+REPEATS = 400  # samples of the bootstrap
+FAILING, NEAR, ORDINARY = 1, 2, 0  # kinds of episodes
 
 
 @results.result("evaluations")
@@ -172,21 +174,20 @@ def monitor(
         True
     """
     name = "monitor"
-    learner(name, "ensemble")
+    sklearn_module(name, "ensemble")
     key = jax.random.key(0) if key is None else key
     _checks.random_key(name, key)
     within = _checks.whole(name, "within", within, 1)
     episodes = _checks.whole(name, "episodes", episodes, 40)
-    share = lambda v: 0 <= v <= 1
-    rate = _checks.number(name, "false_alarms", false_alarms, share, "from 0 to 1")
+    rate = _checks.number(name, "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1")
     level = _checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     if model not in MODELS:
         raise ValueError(f"{name}: model must be one of {sorted(MODELS)}, received {model!r}")
     first, second = jax.random.split(key)
     e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes)
-    seen = observed(name, sim, sim.observe if observe is None else observe, e)
+    seen = observations(name, sim, sim.observe if observe is None else observe, e)
     rng = generator(second)
-    out = parted(rng, owner, group, HELD_OUT)
+    out = hold_out(rng, owner, group, HELD_OUT)
     aside = np.zeros(len(out), bool)
     calm = np.flatnonzero(~out & (owner == ORDINARY))
     aside[rng.permutation(calm)[: max(int(ASIDE * len(calm)), 1)]] = True
@@ -212,41 +213,37 @@ def monitor(
     hit, wrong = alarm[failing].any(axis=1), alarm[ordinary].any(axis=1)
     steps = (e.length[failing] - np.argmax(alarm[failing], axis=1))[hit]
     ahead = np.quantile(steps, (0.1, 0.5, 0.9), method="lower") if len(steps) else [np.nan] * 3
-    counted = lambda a: (float(a.mean()), clopper_pearson(int(a.sum()), len(a), level))
     rows = live & out[:, None]
+    curve = roc(score[rows], soon[rows])
+    settings = dict(within=within, model=model, false_alarms=rate, episodes=episodes, level=level)
     return Monitor(
-        fitted,
-        within,
-        threshold,
-        counted(wrong),
-        counted(hit),
-        tuple(map(float, ahead)),
-        *_areas(rng, score, soon, rows, group, level),
-        roc(score[rows], soon[rows]),
-        tuple(int(np.sum(out & (owner == k))) for k in (FAILING, NEAR, ORDINARY)),
-        level,
-        maxima,
-        spent + len(e.length),
-        results.asked(
-            name, key, within=within, model=model, false_alarms=rate, episodes=episodes, level=level
-        ),
+        model=fitted,
+        within=within,
+        threshold=threshold,
+        false_alarms=_share(wrong, level),
+        warned=_share(hit, level),
+        ahead=tuple(map(float, ahead)),
+        auc=curve.area,
+        auc_interval=_area_interval(rng, score, soon, rows, group, level),
+        roc=curve,
+        held_out=tuple(int(np.sum(out & (owner == k))) for k in (FAILING, NEAR, ORDINARY)),
+        level=level,
+        maxima=maxima,
+        evaluations=spent + len(e.length),
+        settings=results.asked(name, key, **settings),
     )
 
 
-FAILING, NEAR, ORDINARY = 1, 2, 0
-
-
 def _boosted(name: str) -> Any:
-    return learner(name, "ensemble").HistGradientBoostingClassifier(
+    return sklearn_module(name, "ensemble").HistGradientBoostingClassifier(
         max_leaf_nodes=8, early_stopping=False, random_state=0
     )
 
 
 def _logistic(name: str) -> Any:
-    pipeline, scaler = learner(name, "pipeline"), learner(name, "preprocessing").StandardScaler()
-    return pipeline.make_pipeline(
-        scaler, learner(name, "linear_model").LogisticRegression(max_iter=1000)
-    )
+    scaler = sklearn_module(name, "preprocessing").StandardScaler()
+    regression = sklearn_module(name, "linear_model").LogisticRegression(max_iter=1000)
+    return sklearn_module(name, "pipeline").make_pipeline(scaler, regression)
 
 
 MODELS: dict[str, Callable] = {"boosted": _boosted, "logistic": _logistic}
@@ -255,15 +252,15 @@ MODELS: dict[str, Callable] = {"boosted": _boosted, "logistic": _logistic}
 def _episodes(name, key, sim, failures, others, episodes):
     """The episodes [n], what they are [n], their group [n], evaluations."""
     if others is not None:
-        cases = told(name, sim, failures, others, None, LEAST)
+        cases = given_cases(name, sim, failures, others, None, EPISODES)
         return cases.episodes, cases.kind, cases.group, 0
     own, calm = jax.random.split(key)
-    cases = simulated(name, own, sim, failures, None, episodes)
-    plain = ordinary(calm, sim, episodes)
+    cases = simulate_cases(name, own, sim, failures, None, episodes)
+    plain = draw_ordinary(calm, sim, episodes)
     n = len(plain.length)
-    if n < LEAST:
+    if n < EPISODES:
         raise ValueError(
-            f"{name}: others: expected at least {LEAST} of {episodes} ordinary episodes that do"
+            f"{name}: others: expected at least {EPISODES} of {episodes} ordinary episodes that do"
             f" not fail, received {n}"
         )
     e = jax.tree.map(lambda a, b: np.concatenate([a, b]), cases.episodes, plain)
@@ -278,8 +275,13 @@ def _threshold(maxima: np.ndarray, rate: float) -> float:
     return float(maxima[n - 1 - min(int(rate * n), n - 1)])
 
 
-def _areas(rng, score, soon, rows, group, level) -> tuple:
-    """(area under the ROC curve, its interval by the bootstrap over groups of episodes)."""
+def _share(which: np.ndarray, level: float) -> tuple[float, tuple[float, float]]:
+    """Of ``which`` [n] bool those that are True, with the interval."""
+    return float(which.mean()), clopper_pearson(int(which.sum()), len(which), level)
+
+
+def _area_interval(rng, score, soon, rows, group, level) -> tuple[float, float]:
+    """Of the area under the ROC curve, by the bootstrap over groups of episodes."""
     values = np.sort(score[rows])
     edges = np.unique(values[np.linspace(0, len(values) - 1, BINS).astype(int)])
     bins = np.searchsorted(edges, score[rows])
@@ -297,4 +299,4 @@ def _areas(rng, score, soon, rows, group, level) -> tuple:
 
     tail = (1 - level) / 2
     low, high = np.nanquantile(area(no, yes), (tail, 1 - tail))
-    return roc(score[rows], soon[rows]).area, (float(low), float(high))
+    return float(low), float(high)

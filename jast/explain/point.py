@@ -15,15 +15,21 @@ from jast.pytrees import count
 from jast.search.centred import centred
 from jast.simulator import Simulator
 
-__all__ = ["Given", "given", "like_disturbances", "names", "numbers_of", "steps_of"]
+__all__ = [
+    "EpisodePoint",
+    "failing_point",
+    "like_disturbances",
+    "names_of_leaves",
+    "number_names",
+    "number_steps",
+    "used_numbers",
+]
 
+# by how much farther from the mode an episode is taken where it does not fail as recorded
 LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3
-"""By how much farther from the mode an episode is taken, at most, where it does not fail as
-recorded.
-"""
 
 
-class Given(NamedTuple):
+class EpisodePoint(NamedTuple):
     """An episode that is to be explained."""
 
     sim: Simulator
@@ -31,12 +37,12 @@ class Given(NamedTuple):
     judge: Judge
     v: np.ndarray
     """[D] float64; 0 where a number decided nothing"""
-    outcome: Any
-    """`Outcomes` of the point, one row"""
+    outcome: latent.Outcomes
+    """Of the point, one row"""
 
 
-def given(name: str, sim: Simulator, episode: Episode) -> Given:
-    """The `Given` of an ``episode`` that must fail where it is replayed."""
+def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
+    """The `EpisodePoint` of an ``episode`` that must fail where it is replayed."""
     if not isinstance(episode, Episode):
         raise ValueError(
             f"{name}: episode must be a jast.Episode (as of result.failures or jast.replay),"
@@ -63,38 +69,44 @@ def given(name: str, sim: Simulator, episode: Episode) -> Given:
             f"{name}: episode must fail when it is replayed, received one that ends after"
             f" {int(outcome.length[0])} steps without a failure"
         )
-    return Given(of_modes, judge, np.where(np.arange(len(v)) < outcome.used[0], v, 0.0), outcome)
+    v = np.where(np.arange(len(v)) < outcome.used[0], v, 0.0)
+    return EpisodePoint(of_modes, judge, v, outcome)
 
 
 def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
     """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
     about = outline(sim)
     start = count(about.x0)
-    shaped = lambda part, like: jax.tree.map(
-        np.asarray, jax.tree.map(lambda a, s: _like(a, s, row.dtype), unflat(part, like), like)
-    )
+
+    def shaped(part: np.ndarray, like: Any) -> Any:
+        return jax.tree.map(
+            lambda a, s: np.asarray(a).astype(row.dtype).reshape(s.shape), unflat(part, like), like
+        )
+
     rows = [shaped(part, about.x) for part in row[start:].reshape(sim.horizon, -1)]
     return shaped(row[:start], about.x0), jax.tree.map(lambda *a: np.stack(a), *rows)
 
 
-def _like(a, s, dtype):
-    return np.asarray(a).astype(dtype).reshape(s.shape)
-
-
-def steps_of(sim: Simulator) -> np.ndarray:
+def number_steps(sim: Simulator) -> np.ndarray:
     """[D]: the step that each number belongs to, from 1; 0 for those of the start."""
     about = outline(sim)
     start, each = count(about.x0), count(about.x)
     return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
 
 
-def names(sim: Simulator) -> list[str]:
+def used_numbers(sim: Simulator, length: np.ndarray) -> np.ndarray:
+    """[n]: how many of the numbers decided something in episodes of ``length`` [n] steps."""
+    about = outline(sim)
+    return count(about.x0) + length * count(about.x)
+
+
+def number_names(sim: Simulator) -> list[str]:
     """[D]: what each number is called: "x" or its field, with its place in an array."""
     about = outline(sim)
-    return [*numbers_of(about.x0, "x0"), *numbers_of(about.x, "x") * sim.horizon]
+    return [*names_of_leaves(about.x0, "x0"), *names_of_leaves(about.x, "x") * sim.horizon]
 
 
-def numbers_of(like: Any, root: str) -> list[str]:
+def names_of_leaves(like: Any, root: str) -> list[str]:
     """What each number of ``like``, arrays or their shapes, is called: its field with its place in
     an array, or ``root``.
     """

@@ -11,11 +11,11 @@ import numpy as np
 from jast import _checks, results
 from jast.counter import generator
 from jast.episode import Episode
-from jast.explain.cases import simulated, told
-from jast.explain.features import Describer, describer, table
-from jast.explain.gathered import gathered, whole
-from jast.explain.learning import DISTINCT, learner, parted
-from jast.explain.trees import grown, read
+from jast.explain.cases import given_cases, simulate_cases
+from jast.explain.features import Describer, feature_table, make_describer
+from jast.explain.gathered import gather_episodes, play_to_horizon
+from jast.explain.learning import DISTINCT, hold_out, sklearn_module
+from jast.explain.trees import grow_tree, read_rules
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Rules", "rules"]
 
-HELD_OUT = 0.3
-"""The share of the episodes that is held out."""
+HELD_OUT = 0.3  # the share of the episodes that tells how often the rules are right
 OF = "disturbances", "states", "both"
 
 
@@ -91,10 +90,10 @@ class Rules(NamedTuple):
 
         The disturbances decide; what an early end left undrawn is drawn from the model.
         """
-        e = gathered("predict", "episodes", self.sim, episodes)
+        e = gather_episodes("predict", "episodes", self.sim, episodes)
         key = jax.random.key(1)
-        seen = whole(self.sim, e, key, self.describer.of != "disturbances")
-        x = table(self.sim, self.describer, seen, _ends(generator(key), e, self.ends))[1]
+        seen = play_to_horizon(self.sim, e, key, self.describer.of != "disturbances")
+        x = feature_table(self.sim, self.describer, seen, _ends(generator(key), e, self.ends))[1]
         return np.asarray(self.classes)[self.tree.predict(x)]
 
 
@@ -164,7 +163,7 @@ def rules(
         True
     """
     name = "rules"
-    trees = learner(name, "tree")
+    trees = sklearn_module(name, "tree")
     key = jax.random.key(0) if key is None else key
     _checks.random_key(name, key)
     episodes = _checks.whole(name, "episodes", episodes, 20)
@@ -176,40 +175,45 @@ def rules(
     number = isinstance(others, int | np.integer) and not isinstance(others, bool)
     if others is None or number:
         many = _checks.whole(name, "others", others, 1) if number else None
-        cases = simulated(name, first, sim, failures, labels, episodes, many)
+        cases = simulate_cases(name, first, sim, failures, labels, episodes, many)
     else:
-        cases = told(name, sim, failures, others, labels, DISTINCT)
+        cases = given_cases(name, sim, failures, others, labels, DISTINCT)
     e, owner, group, names, spent = cases
-    seen = whole(sim, e, second, of != "disturbances")
+    seen = play_to_horizon(sim, e, second, of != "disturbances")
     rng = generator(third)
     ends = e.length[owner > 0]
-    d = describer(sim, seen, of, lead)
-    features, x = table(sim, d, seen, _ends(rng, e, ends))
+    d = make_describer(sim, seen, of, lead)
+    features, x = feature_table(sim, d, seen, _ends(rng, e, ends))
     if not np.isfinite(x).all():
         raise ValueError(
             f"{name}: disturbances and states must be finite, received some that are not"
         )
-    out = parted(rng, owner, group, HELD_OUT)
-    tree = grown(trees, rng, x[~out], owner[~out], group[~out], most)
+    out = hold_out(rng, owner, group, HELD_OUT)
+    tree = grow_tree(trees, rng, x[~out], owner[~out], group[~out], most)
     said, leaf = tree.predict(x[out]), tree.apply(x[out])
     truth = owner[out]
-    ratio = lambda part, all_: float(part / all_) if all_ else float("nan")
-    right = [int(np.sum((said == k) & (truth == k))) for k in range(len(names))]
+    kinds = {n: (said == k, truth == k) for k, n in enumerate(names)}
+    settings = dict(episodes=episodes, of=of, lead=lead, most=most, level=level)
     return Rules(
-        read(tree, features, names, leaf, truth, level),
-        names,
-        {n: ratio(right[k], np.sum(said == k)) for k, n in enumerate(names)},
-        {n: ratio(right[k], np.sum(truth == k)) for k, n in enumerate(names)},
-        {n: int(np.sum(truth == k)) for k, n in enumerate(names)},
-        level,
-        tree,
-        tuple(f.name for f in features),
-        d,
-        ends,
-        sim,
-        spent + seen.evaluations,
-        results.asked(name, key, episodes=episodes, of=of, lead=lead, most=most, level=level),
+        rules=read_rules(tree, features, names, leaf, truth, level),
+        classes=names,
+        precision={n: _mean(true[said]) for n, (said, true) in kinds.items()},
+        recall={n: _mean(said[true]) for n, (said, true) in kinds.items()},
+        held_out={n: int(true.sum()) for n, (_, true) in kinds.items()},
+        level=level,
+        tree=tree,
+        features=tuple(f.name for f in features),
+        describer=d,
+        ends=ends,
+        sim=sim,
+        evaluations=spent + seen.evaluations,
+        settings=results.asked(name, key, **settings),
     )
+
+
+def _mean(which: np.ndarray) -> float:
+    """The share that is True; NaN of none."""
+    return float(which.mean()) if len(which) else float("nan")
 
 
 def _ends(rng: np.random.Generator, e: Episode, ends: np.ndarray) -> np.ndarray:

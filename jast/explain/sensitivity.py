@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +17,7 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.redrawn import fits, redrawn
 from jast.estimate.sample import Sample
+from jast.explain.drawn import UNRELIABLE, normalised
 from jast.intervals import checked_level
 from jast.simulator import Simulator
 
@@ -24,9 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Sensitivity", "sensitivity"]
 
-LANES = 1024
-FEW = 100
-"""Effective failures below which nothing is told."""
+LANES = 1024  # draws at a time
+RELIABLE = 100  # effective failures, below which the answer is UNRELIABLE
 
 
 @results.shown()
@@ -53,11 +54,7 @@ class Sensitivity(NamedTuple):
     evaluations: int
 
     def __str__(self) -> str:
-        lines = (
-            []
-            if self.reliable
-            else ["UNRELIABLE: the estimate is unreliable, or there are too few failures"]
-        )
+        lines = [] if self.reliable else [UNRELIABLE]
         lines.append(
             f"{'parameter':<28} {'value':>10} {'d log P':>11} {'elasticity':>11}"
             f"   {self.level:.0%} interval of d log P"
@@ -146,19 +143,20 @@ def sensitivity(
             " draws failures"
         )
     log_w, s = np.concatenate(logs), np.concatenate(scores)
-    w = np.exp(log_w - log_w.max())
-    w /= w.sum()
+    w = normalised(log_w)
     slope = w @ s
     error = np.sqrt((w**2) @ (s - slope) ** 2)
     half = NormalDist().inv_cdf(0.5 + level / 2) * error
     ess = float(effective(log_w))
     rows = zip(called, values, slope, error, slope - half, slope + half, strict=True)
     return Sensitivity(
-        tuple((n, float(v), float(d), float(e), (float(a), float(b))) for n, v, d, e, a, b in rows),
-        level,
-        ess,
-        bool(estimate.reliable and ess >= FEW),
-        -(-samples // LANES) * LANES + len(s),
+        rows=tuple(
+            (n, float(v), float(d), float(e), (float(a), float(b))) for n, v, d, e, a, b in rows
+        ),
+        level=level,
+        ess=ess,
+        reliable=bool(estimate.reliable and ess >= RELIABLE),
+        evaluations=-(-samples // LANES) * LANES + len(s),
     )
 
 
@@ -193,19 +191,7 @@ def _scores(sim: Simulator, z: jax.Array) -> jax.Array:
     def log_p(parameters, e):
         given = iter(parameters)
         own = [next(given) if m else leaf for m, leaf in zip(moving, leaves, strict=True)]
-        bound = treedef.unflatten(own)
-        changed = Simulator(
-            sim.init,
-            sim.step,
-            bound["disturbance"],
-            sim.evaluate,
-            sim.horizon,
-            start=bound["start"],
-            is_terminal=sim.is_terminal,
-            observe=sim.observe,
-            episodic=sim.episodic,
-        )
-        return replay(changed, e).log_prob
+        return replay(replace(sim, **treedef.unflatten(own)), e).log_prob
 
     def one(z):
         e = jax.lax.stop_gradient(latent.episodes(sim, z[None]))

@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jast import results
-from jast.explain.learning import parted
+from jast.explain.learning import hold_out
 from jast.intervals import clopper_pearson
 
-__all__ = ["Rule", "grown", "read"]
+__all__ = ["Rule", "grow_tree", "read_rules"]
 
-FOLDS = 3
-"""Parts of the episodes by which the size of a tree is chosen."""
+FOLDS = 3  # parts of the episodes by which the size of a tree is chosen
 
 
 @results.shown()
@@ -43,18 +42,21 @@ class Rule(NamedTuple):
         return f"{text} -> {self.label}"
 
 
-def grown(trees, rng, x, owner, group, most):
+def grow_tree(trees, rng, x, owner, group, most):
     """The tree of fewest ways that does as well as the best, up to one standard error (Breiman et
     al. 1984, section 3.4.3) of its balanced accuracy on the parts left out.
     """
     least = max(2, len(owner) // 200)
-    grow = lambda ways, rows: trees.DecisionTreeClassifier(
-        max_leaf_nodes=ways, min_samples_leaf=least, class_weight="balanced", random_state=0
-    ).fit(x[rows], owner[rows])
+    settings = dict(min_samples_leaf=least, class_weight="balanced", random_state=0)
+
+    def grow(ways, rows):
+        tree = trees.DecisionTreeClassifier(max_leaf_nodes=ways, **settings)
+        return tree.fit(x[rows], owner[rows])
+
     sizes = range(2, most + 1)
     score = np.zeros((FOLDS, len(sizes)))
     for i in range(FOLDS):
-        out = parted(rng, owner, group, 1 / FOLDS)
+        out = hold_out(rng, owner, group, 1 / FOLDS)
         for j, ways in enumerate(sizes):
             said = grow(ways, ~out).predict(x[out])
             kinds = np.unique(owner[out])
@@ -67,7 +69,7 @@ def grown(trees, rng, x, owner, group, most):
     return grow(sizes[chosen], np.ones(len(owner), bool))
 
 
-def read(tree, features, names, leaf, truth, level) -> tuple:
+def read_rules(tree, features, names, leaf, truth, level) -> tuple:
     """`Rule` of each leaf that says of an episode that it fails."""
     t, found = tree.tree_, []
 
@@ -75,21 +77,23 @@ def read(tree, features, names, leaf, truth, level) -> tuple:
         if t.children_left[node] < 0:
             k = int(tree.classes_[np.argmax(t.value[node][0])])
             if k:
-                here = leaf == node
-                hits, fits, all_ = (
-                    int(np.sum(here & (truth == k))),
-                    int(here.sum()),
-                    int(np.sum(truth == k)),
-                )
+                here, own = leaf == node, truth == k
+                hits = int(np.sum(here & own))
+                precision, precise = _share(hits, int(here.sum()), level)
+                recall, recalled = _share(hits, int(own.sum()), level)
                 conditions = tuple(
                     (features[i].name, features[i].kind, low, high)
                     for i, (low, high) in bounds.items()
                 )
-                found.append(
-                    Rule(
-                        names[k], conditions, *_share(hits, fits, level), *_share(hits, all_, level)
-                    )
+                rule = Rule(
+                    label=names[k],
+                    conditions=conditions,
+                    precision=precision,
+                    precision_interval=precise,
+                    recall=recall,
+                    recall_interval=recalled,
                 )
+                found.append(rule)
             return
         i, cut = int(t.feature[node]), float(t.threshold[node])
         low, high = bounds.get(i, (-np.inf, np.inf))
@@ -115,14 +119,11 @@ def _condition(condition: tuple) -> str:
         low, high = np.floor(low) + 1, np.floor(high)
         if low == high:
             return f"{what} = {low:.0f}"
-        least, most = (f"{what} >= {low:.0f}", f"{what} <= {high:.0f}")
-        between = f"{low:.0f} <= {what} <= {high:.0f}"
+        above, below, digits = ">=", "<=", ".0f"
     else:
-        least, most, between = (
-            f"{what} > {low:.3g}",
-            f"{what} <= {high:.3g}",
-            f"{low:.3g} < {what} <= {high:.3g}",
-        )
-    return (
-        between if np.isfinite(low) and np.isfinite(high) else (least if np.isfinite(low) else most)
-    )
+        above, below, digits = ">", "<", ".3g"
+    if not np.isfinite(low):
+        return f"{what} <= {high:{digits}}"
+    if not np.isfinite(high):
+        return f"{what} {above} {low:{digits}}"
+    return f"{low:{digits}} {below} {what} <= {high:{digits}}"

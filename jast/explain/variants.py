@@ -12,7 +12,8 @@ from jast.estimate.batches import resampled
 from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
 from jast.estimate.redrawn import failing, fits
-from jast.explain.gathered import distinct, gathered, kinds_of
+from jast.explain.gathered import distinct_rows, gather_episodes, named_kinds
+from jast.explain.point import used_numbers
 from jast.judge import Judge
 from jast.markov import proposed
 from jast.outline import outline
@@ -20,16 +21,13 @@ from jast.pytrees import count
 from jast.search.failure_modes import Modes, owners
 from jast.simulator import Simulator
 
-__all__ = ["Seeds", "Variants", "seeds", "variants"]
+__all__ = ["Seeds", "Variants", "draw_variants", "find_seeds"]
 
+# how far the disturbances of a move go: 1 is a new draw; None: they all come some steps later
 SCALES = (1.0, 0.3, None, 1.0, 0.7, 1.0, None, 0.15, 1.0, 0.5)
-"""How far the disturbances of a move go: 1 is a new draw. None: they all come some steps later,
-those at the end first.
-"""
-MOST = 6
-"""Modes that are told apart."""
-MANY = 0.25
-"""Share of the chains that may start from one seed for seeds to be held out as a whole."""
+MODES = 6  # that are told apart
+CROWDED = 0.25  # share of the chains from one seed above which seeds are not held out as a whole
+UNKNOWN_WEIGHT = -700.0  # log weight that counts only where nothing else is known
 
 
 class Seeds(NamedTuple):
@@ -43,7 +41,7 @@ class Seeds(NamedTuple):
     """[m] by how much each stands for the model; all 0 where that is not known."""
     label: np.ndarray
     """[m] index into"""
-    names: tuple
+    names: tuple[str, ...]
     evaluations: int
 
 
@@ -60,7 +58,7 @@ class Variants(NamedTuple):
     evaluations: int
 
 
-def seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> Seeds:
+def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> Seeds:
     """The `Seeds` in ``given``: of an estimate, or the estimate of a report, the failing draws that
     it kept, at most ``most``, with their weights; else the episodes themselves.
 
@@ -73,26 +71,31 @@ def seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> 
     kept = estimate.draws if isinstance(estimate, Estimate) else None
     modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
     modes = modes if isinstance(modes, Modes) else None
-    if labels is None and _serves(sim, kept):
+    if labels is None and _holds_points(sim, kept):
         z, log_w, length, spent = failing(sim, kept, most)
-        about = outline(sim)
-        used = count(about.x0) + length * count(about.x)
-        s = Seeds(z, used, log_w, np.zeros(len(z), int), ("fails",), spent)
-        return _of_modes(function, sim, s, modes)
+        found = Seeds(
+            z=z,
+            used=used_numbers(sim, length),
+            log_weight=log_w,
+            label=np.zeros(len(z), int),
+            names=("fails",),
+            evaluations=spent,
+        )
+        return _label_by_mode(function, sim, found, modes)
     if isinstance(given, Estimate):
         raise ValueError(
             f"{function}: failures must be episodes, or an estimate for sim that drew normal"
             f" numbers and saw failures, received one by {given.method} that did not"
         )
     of_mode = isinstance(given, Modes) and len(given) > 1
-    e = gathered(function, "failures", sim, given[:MOST] if of_mode else given)
+    e = gather_episodes(function, "failures", sim, given[:MODES] if of_mode else given)
     n = len(e.length)
     names, label = ("fails",), np.zeros(n, int)
     if labels is not None:
-        names, label = kinds_of(function, labels, n)
+        names, label = named_kinds(function, labels, n)
     elif of_mode:
-        names, label = _numbered(n), np.arange(n)
-    rows = distinct(e)
+        names, label = _mode_names(n), np.arange(n)
+    rows = distinct_rows(e)
     e, label = jax.tree.map(lambda a: a[rows], e), label[rows]
     if not len(e.length):
         raise ValueError(f"{function}: failures must hold at least one failure, received none")
@@ -103,12 +106,18 @@ def seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int) -> 
             f"{function}: failures must all fail, received"
             f" {int((~(e.failure & o.failure)).sum())} of {len(z)} that do not"
         )
-    z, label, used = z[o.failure], label[o.failure], o.used[o.failure]
-    found = Seeds(z, used, np.zeros(len(z)), label, names, len(rows))
-    return found if labels is not None or of_mode else _of_modes(function, sim, found, modes)
+    found = Seeds(
+        z=z[o.failure],
+        used=o.used[o.failure],
+        log_weight=np.zeros(int(o.failure.sum())),
+        label=label[o.failure],
+        names=names,
+        evaluations=len(rows),
+    )
+    return found if labels is not None or of_mode else _label_by_mode(function, sim, found, modes)
 
 
-def _serves(sim: Simulator, kept: Draws | None) -> bool:
+def _holds_points(sim: Simulator, kept: Draws | None) -> bool:
     """Whether points of failures can be told from these draws."""
     if kept is None or not kept.failure.any():
         return False
@@ -116,32 +125,38 @@ def _serves(sim: Simulator, kept: Draws | None) -> bool:
     return of_model or fits(sim, kept.source)
 
 
-def _of_modes(function: str, sim: Simulator, s: Seeds, modes: Any) -> Seeds:
-    """``s`` with the mode that each is most alike, where there are several; each mode has its
+def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> Seeds:
+    """``seeds`` with the mode that each is most alike, where there are several; each mode has its
     likeliest failure as a seed, too.
     """
     if modes is None or len(modes) < 2:
-        return s
-    best = gathered(function, "modes", sim, modes[:MOST])
+        return seeds
+    best = gather_episodes(function, "modes", sim, modes[:MODES])
     heads = latent.normal_of(sim, best)
     judge = Judge(sim)
     o = judge(heads)
-    z = np.concatenate([s.z, heads[o.failure]]).astype(heads.dtype)
-    used = np.concatenate([s.used, o.used[o.failure]])
-    label = owners(sim, _played(sim, z)[0], best)
-    label[len(s.z) :] = np.flatnonzero(o.failure)
+    z = np.concatenate([seeds.z, heads[o.failure]]).astype(heads.dtype)
+    used = np.concatenate([seeds.used, o.used[o.failure]])
+    label = owners(sim, latent.played(sim, z), best)
+    label[len(seeds.z) :] = np.flatnonzero(o.failure)
     # a mode's likeliest failure counts only where nothing else is known of the mode
-    log_w = np.concatenate([s.log_weight, np.full(int(o.failure.sum()), -700.0)])
-    k = len(best.length)
-    return Seeds(z, used, log_w, label, _numbered(k), s.evaluations + judge.spent)
+    log_w = np.concatenate([seeds.log_weight, np.full(int(o.failure.sum()), UNKNOWN_WEIGHT)])
+    return Seeds(
+        z=z,
+        used=used,
+        log_weight=log_w,
+        label=label,
+        names=_mode_names(len(best.length)),
+        evaluations=seeds.evaluations + judge.spent,
+    )
 
 
-def _numbered(k: int) -> tuple:
+def _mode_names(k: int) -> tuple:
     return tuple(f"mode {i + 1}" for i in range(k))
 
 
-def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
-    """``n`` failures and at most as many near misses, from Markov chains that begin at ``s``.
+def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Variants:
+    """``n`` failures and at most as many near misses, from Markov chains that begin at ``seeds``.
 
     In each move of a chain some of the disturbances are drawn anew, or moved a little
     (`jast.markov.proposed`), or all come some steps later, so that the model stays as it is: where
@@ -151,15 +166,15 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
     failures get the same number of chains.
     """
     rng, judge = generator(key), Judge(sim)
-    kinds = np.unique(s.label)
-    each = [_chosen(rng, s, k, -(-n // len(kinds))) for k in kinds]
+    kinds = np.unique(seeds.label)
+    each = [_draw_seeds(rng, seeds, k, -(-n // len(kinds))) for k in kinds]
     seed = np.concatenate(each)
-    z = s.z[seed].astype(np.float64)
-    behind = np.arange(z.shape[1]) >= s.used[seed][:, None]
+    z = seeds.z[seed].astype(np.float64)
+    behind = np.arange(z.shape[1]) >= seeds.used[seed][:, None]
     z = np.where(behind, rng.standard_normal(z.shape), z)
     near, misses = np.zeros_like(z), np.zeros(len(z), int)
     for scale in SCALES:
-        to = _later(rng, sim, z) if scale is None else _redrawn(rng, z, scale)
+        to = _shift_in_time(rng, sim, z) if scale is None else _redraw(rng, z, scale)
         o = judge(to)
         rejected = ~o.failure & ~o.invalid
         misses += rejected
@@ -167,15 +182,14 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
         near[kept] = to[kept]
         z = np.where(o.failure[:, None], to, z)
     missed = np.flatnonzero(misses)
-    bad, played = _played(sim, z)
-    calm, more = _played(sim, near[missed]) if len(missed) else (bad, 0)
+    bad = latent.played(sim, z)
+    calm = latent.played(sim, near[missed]) if len(missed) else bad
     fails = np.flatnonzero(bad.failure)
     calm_rows = np.flatnonzero(~calm.failure) if len(missed) else np.zeros(0, int)
-    take = lambda e, rows: jax.tree.map(lambda a: a[rows], e)
-    label, group = s.label[seed[fails]], seed[fails]
+    label, group = seeds.label[seed[fails]], seed[fails]
     near_group = seed[missed[calm_rows]]
     crowded = any(
-        np.unique(group[label == k], return_counts=True)[1].max() > MANY * np.sum(label == k)
+        np.unique(group[label == k], return_counts=True)[1].max() > CROWDED * np.sum(label == k)
         for k in np.unique(label)
     )
     if crowded:
@@ -183,22 +197,22 @@ def variants(key: jax.Array, sim: Simulator, s: Seeds, n: int) -> Variants:
         group = np.arange(len(fails))
         near_group = len(fails) + np.arange(len(calm_rows))
     return Variants(
-        take(bad, fails),
-        label,
-        group,
-        take(calm, calm_rows),
-        near_group,
-        judge.spent + played + more,
+        failures=jax.tree.map(lambda a: a[fails], bad),
+        label=label,
+        group=group,
+        near=jax.tree.map(lambda a: a[calm_rows], calm),
+        near_group=near_group,
+        evaluations=judge.spent + len(z) + len(missed),
     )
 
 
-def _redrawn(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray:
+def _redraw(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray:
     """``z`` [n, D] of which some numbers moved, of each row another share."""
     meant = rng.random(z.shape) < rng.random((len(z), 1))
     return np.where(meant, proposed(z, rng.standard_normal(z.shape), scale, 1.0), z)
 
 
-def _later(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
+def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
     """``z`` [n, D] with the disturbances some steps later, in a ring."""
     n, steps = len(z), sim.horizon
     start = count(outline(sim).x0)
@@ -208,12 +222,7 @@ def _later(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarra
     return np.concatenate([z[:, :start], moved.reshape(n, -1)], axis=1)
 
 
-def _chosen(rng: np.random.Generator, s: Seeds, kind: int, n: int) -> np.ndarray:
+def _draw_seeds(rng: np.random.Generator, seeds: Seeds, kind: int, n: int) -> np.ndarray:
     """Rows [n] of the seeds of one kind, by weight; all alike, so many times each."""
-    rows = np.flatnonzero(s.label == kind)
-    return rows[resampled(s.log_weight[rows], n, rng.random())]
-
-
-def _played(sim: Simulator, z: np.ndarray) -> tuple[Episode, int]:
-    """The episodes [n] of the points ``z`` [n, D], and how many were simulated."""
-    return latent.played(sim, z), len(z)
+    rows = np.flatnonzero(seeds.label == kind)
+    return rows[resampled(seeds.log_weight[rows], n, rng.random())]

@@ -10,8 +10,8 @@ from jast.page.traces import short
 
 __all__ = ["directions"]
 
-PANELS, STEPS = 3, 200
-"""Numbers of a disturbance that are drawn for a direction, and steps of each, at most."""
+PANELS = 3  # numbers of a disturbance that are drawn for a direction, at most
+STEPS = 200  # of each, at most
 
 
 def directions(found: Eigenfailures) -> list[dict]:

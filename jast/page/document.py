@@ -44,13 +44,11 @@ def document(title: str, body: str, data: Any, *scripts: str) -> str:
             are texts there, as JSON has no such numbers.
         *scripts: names of files beside this one, in the order in which they run.
     """
-    read = lambda name: (HERE / name).read_text(encoding="utf-8")
+    style, *code = (
+        (HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js", *scripts)
+    )
     return PAGE.format(
-        title=text(title),
-        style=read("page.css"),
-        body=body,
-        data=embedded(data),
-        script="\n".join(map(read, ("page.js", *scripts))),
+        title=text(title), style=style, body=body, data=embedded(data), script="\n".join(code)
     )
 
 

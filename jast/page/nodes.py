@@ -67,34 +67,36 @@ def nodes_of(caller: str, result: Any, tree: int | None = None) -> Nodes:
 
 
 def _one(found: Any, tree: int, value: np.ndarray, target: int) -> Nodes:
-    of = lambda a: a[:, tree]
-    row = np.flatnonzero(of(found.visits) > 0)
+    own = jax.tree.map(lambda a: a[:, tree], found)
+    row = np.flatnonzero(own.visits > 0)
+
+    def below(root: Any, a: np.ndarray) -> np.ndarray:
+        """``a`` of the nodes, that of the root first."""
+        return np.concatenate([[root], a[row]])
+
     number = np.zeros(len(value) + 1, int)  # of a node by the search's own number
     number[row + 1] = np.arange(1, len(row) + 1)
-    parent = np.concatenate([[-1], number[of(found.parent)[row]]])
-    visits = np.concatenate([[0], of(found.visits)[row]])
-    q = np.concatenate([[0.0], of(found.q)[row].astype(float)])
+    parent = np.concatenate([[-1], number[own.parent[row]]])
+    visits, q = below(0, own.visits), below(0.0, own.q.astype(float))
     first = parent == 0
     visits[0] = visits[first].sum() + 1
     q[0] = np.average(q[first], weights=visits[first]) if first.any() else np.nan
-    best = np.concatenate([[-np.inf], value[row].astype(float)])
-    failing = np.concatenate([[0], of(found.failure)[row].astype(int)])
+    best, failing = below(-np.inf, value.astype(float)), below(0, own.failure.astype(int))
     for node in range(len(row), 0, -1):  # a child is made after its parent
         best[parent[node]] = max(best[parent[node]], best[node])
         failing[parent[node]] += failing[node]
     path = [int(number[target + 1])]
     while path[-1] > 0:
         path.append(int(parent[path[-1]]))
-    lead = lambda before, a: np.concatenate([[before], of(a)[row]])
     return Nodes(
-        tree,
-        np.concatenate([[-1], row]),
-        parent,
-        visits,
-        q,
-        lead(False, found.end),
-        lead(np.nan, found.distance),
-        best,
-        failing,
-        np.array(path[::-1]),
+        tree=tree,
+        row=np.concatenate([[-1], row]),
+        parent=parent,
+        visits=visits,
+        q=q,
+        end=below(False, own.end),
+        distance=below(np.nan, own.distance),
+        best=best,
+        failing=failing,
+        path=np.array(path[::-1]),
     )

@@ -16,12 +16,11 @@ from jast.stress_testing.words import advice, belief, headline, mode_facts, verd
 
 __all__ = ["write_report"]
 
-NUMBERS, EXACT, PICTURES = 80_000, 900_000, 1_000_000
-"""Shared by the modes: numbers of traces, bytes of exact disturbances, bytes of pictures. Together
-they keep a page below 3 MB.
-"""
-MODES = 16
-"""Cards; further modes are counted."""
+# shared by the modes; together they keep a page below 3 MB
+NUMBERS = 80_000  # of traces
+EXACT = 900_000  # bytes of exact disturbances
+PICTURES = 1_000_000  # bytes of pictures
+MODES = 16  # cards; further modes are counted
 
 SNIPPET = """\
 import jast
@@ -70,7 +69,7 @@ def write_report(
             f"Report.html: explanations must be at most {len(failures)}, one for each mode shown,"
             f" received {len(explanations)}"
         )
-    told = [_several(one) for one in explanations]
+    told = [_as_list(one) for one in explanations]
     told += [[]] * (len(failures) - len(told))
     data = {"modes": _data(report, failures, told, sim, draw)}
     body = [
@@ -87,13 +86,13 @@ def _shown(report: Any) -> list[Episode]:
     return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
-def _several(explanation: Any) -> list:
+def _as_list(explanation: Any) -> list:
     """One or many; a result of `jast.explain` is a tuple of its own kind, and one."""
     several = explanation if type(explanation) in (list, tuple) else [explanation]
     return [one for one in several if one is not None]
 
 
-def _explained(explanations: list, steps: list[int]) -> dict:
+def _data_of_explanations(explanations: list, steps: list[int]) -> dict:
     """What the traces show of explanations: the probability of failing from each step (`risk`), the
     steps at which each disturbance is needed, and the directions of failures (`directions`).
     """
@@ -123,7 +122,7 @@ def _data(
     for number, episode in enumerate(failures, 1):
         card = trace(sim, episode, quiet, NUMBERS // n)
         card["name"] = f"failure-{number}"
-        card |= _explained(explanations[number - 1], card["steps"])
+        card |= _data_of_explanations(explanations[number - 1], card["steps"])
         values = json.dumps(plain(exact(episode)))
         size = len(values) + values.count('"')
         card["exact"] = values if size <= left else None

@@ -17,8 +17,7 @@ from jast.simulator import Simulator
 
 __all__ = ["exact", "far", "groups", "pictures", "short", "states_of", "trace"]
 
-ENTRIES = 24
-"""Numbers of one array that a page shows; the others are counted."""
+ENTRIES = 24  # numbers of one array that a page shows; the others are counted
 
 
 def trace(sim: Simulator | None, episode: Episode, quiet: Episode | None, most: int) -> dict:
@@ -93,15 +92,14 @@ def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
     """
     found = []
     for called, places, flat in fields(tree, name):
-        column = lambda j, flat=flat: short(
-            [np.nan if t < late else float(flat[t - late, j]) for t in steps]
-        )
+        shown = min(flat.shape[1], ENTRIES)
+        rows = [flat[t - late, :shown] if t >= late else np.full(shown, np.nan) for t in steps]
         found.append(
             {
                 "name": called,
                 "entries": places[:ENTRIES],
                 "more": max(0, flat.shape[1] - ENTRIES),
-                "columns": [column(j) for j in range(min(flat.shape[1], ENTRIES))],
+                "columns": [short([float(row[j]) for row in rows]) for j in range(shown)],
             }
         )
     return found

@@ -11,10 +11,10 @@ from jast.page.traces import groups, short
 
 __all__ = ["write_tree"]
 
-BYTES, NODE, NUMBER = 2_400_000, 60, 12
-"""Of a page, of a node beside its action, of a number of an action; about."""
-ENTRIES = 8
-"""Numbers of one array of an action that are shown."""
+BYTES = 2_400_000  # of a page, about
+NODE = 60  # bytes of a node beside its action, about
+NUMBER = 12  # bytes of a number of an action, about
+ENTRIES = 8  # numbers of one array of an action that are shown
 
 
 def write_tree(caller: str, path: Any, result: Any, tree: int | None = None) -> None:

@@ -7,9 +7,9 @@ its simulator where a picture needs it. The colours are Okabe and Ito's, told ap
 readers; what matters is told by shape or words as well.
 
 Of any system: `traces`, `phase`, `failure_fan`, `disturbances`, `distances`; of a search `history`,
-`trials`, `trial_distances`, and by how slow a simulator is `failing_trees`, `simulation_times`; of
-its tree `tree`, and `tree_page`, an HTML file. Of one simulator: `ferry`; `fms`; `colav`,
-`colav_published`, `colav_story`, `colav_animation`. Of cross-entropy methods: `convergence`,
+`trials`, `trial_distances`; of its tree `tree`, and `tree_page`, an HTML file. Of one simulator:
+`ferry`; `fms`; `colav`, `colav_published`, `colav_story`, `colav_animation`. Of cross-entropy
+methods: `convergence`,
 `proposal_contours`, `surrogate_samples`, `sierra`. Of failure probabilities: `probability`,
 `exceedance`, `weights`, `levels`; against a setting: `sweep`. Of failure policies: `training`. Of
 weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`; of the thesis's
@@ -17,15 +17,9 @@ adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelih
 """
 
 from jast._doors import listed
-from jast.plot.adversary import (
-    confusion,
-    likely_failures,
-    pixel_likelihood,
-    threshold_sweep,
-)
+from jast.plot.adversary import confusion, likely_failures, pixel_likelihood, threshold_sweep
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.colav_published import colav_published
-from jast.plot.cost import failing_trees, simulation_times
 from jast.plot.cross_entropy import convergence, proposal_contours, surrogate_samples
 from jast.plot.exceedance import exceedance
 from jast.plot.failing_inputs import contributions, first_failures
@@ -61,7 +55,6 @@ __all__ = [
     "disturbances",
     "distances",
     "exceedance",
-    "failing_trees",
     "failure_fan",
     "failures_found",
     "first_failures",
@@ -77,7 +70,6 @@ __all__ = [
     "proposal_contours",
     "roc",
     "sierra",
-    "simulation_times",
     "sweep",
     "surrogate_samples",
     "threshold_sweep",

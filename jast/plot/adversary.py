@@ -13,7 +13,7 @@ import numpy as np
 
 from jast._checks import number, whole
 from jast.plot import style
-from jast.plot.weakness import checked_result, truth_of
+from jast.plot.weakness import checked_result, checked_truth
 from jast.weakness.encoded import Encoded
 from jast.weakness.measures import precision_recall
 
@@ -34,7 +34,7 @@ def confusion(
     result: Result, failed: chex.Array, threshold: float = 0.5, ax: Axes | None = None
 ) -> Axes:
     """How many inputs a score of at least ``threshold`` calls failures, against the truth: the
-    confusion matrix of the adversary (figure 4.3b of the thesis). Returns the Axes.
+    confusion matrix of the adversary (figure 4.3b of the thesis).
 
     Args:
         result: a `jast.weakness.Result`, whose last scores are judged.
@@ -57,9 +57,8 @@ def confusion(
     """
     caller = "confusion"
     scores = np.asarray(checked_result(caller, result).scores)
-    failed = truth_of(caller, failed, len(scores))
-    share = lambda v: 0 <= v <= 1
-    threshold = number(f"plot.{caller}", "threshold", threshold, share, "in 0 .. 1")
+    failed = checked_truth(caller, failed, len(scores))
+    threshold = number(f"plot.{caller}", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 .. 1")
     chosen = scores >= threshold
     counts = np.array([[np.sum((failed == t) & (chosen == c)) for c in (0, 1)] for t in (0, 1)])
     precision, recall = precision_recall(chosen, failed)
@@ -72,9 +71,8 @@ def confusion(
         ax.set_xticklabels(names)
         ax.set_yticklabels(names, rotation=90, va="center")
         ax.grid(False)
-        ax.set_title(
-            f"Score at least {threshold:g}:\nprecision {precision:.3f}, recall {recall:.3f}"
-        )
+        measured = f"precision {precision:.3f}, recall {recall:.3f}"
+        ax.set_title(f"Score at least {threshold:g}:\n{measured}")
     return ax
 
 
@@ -85,7 +83,7 @@ def threshold_sweep(
     ax: Axes | None = None,
 ) -> Axes:
     """Precision and recall of the scores against the threshold from which an input is called a
-    failure (figure 4.4b of the thesis). Returns the Axes.
+    failure (figure 4.4b of the thesis).
 
     Args:
         result, failed, ax: as for `confusion`.
@@ -105,15 +103,12 @@ def threshold_sweep(
     """
     caller = "threshold_sweep"
     scores = np.asarray(checked_result(caller, result).scores)
-    failed = truth_of(caller, failed, len(scores))
+    failed = checked_truth(caller, failed, len(scores))
     at = np.linspace(0, 1, whole(f"plot.{caller}", "thresholds", thresholds, 2))
     precision, recall = np.array([precision_recall(scores >= t, failed) for t in at]).T
     with style.axes(ax, (5.4, 3.6)) as ax:
-        for name, values, colour, marker in (
-            ("precision", precision, style.BLUE, "o"),
-            ("recall", recall, style.VERMILION, "s"),
-        ):
-            ax.plot(at, values, color=colour, marker=marker, markersize=4, label=name)
+        ax.plot(at, precision, color=style.BLUE, marker="o", markersize=4, label="precision")
+        ax.plot(at, recall, color=style.VERMILION, marker="s", markersize=4, label="recall")
         ax.axvline(0.5, color=style.GREY, linewidth=1, linestyle=":")
         ax.set(xlabel="threshold of the score", ylim=(-0.01, 1.05), xlim=(0, 1))
         ax.legend(loc="best")
@@ -165,7 +160,7 @@ def likely_failures(
             f"plot.{caller}: inputs must be the images of the validation, {[n, *networks.shape]},"
             f" received shape {inputs.shape}"
         )
-    failed = truth_of(caller, failed, n)
+    failed = checked_truth(caller, failed, n)
     if kind not in KINDS:
         raise ValueError(f"plot.{caller}: kind must be one of {list(KINDS)}, received {kind!r}")
     suspect = networks.scores >= 0.5
@@ -183,26 +178,25 @@ def likely_failures(
         "strongest\nfeature": networks.decode(strongest),
         "recon-\nstruction": networks.decode(codes),
     }
-    size = (1.05 * len(chosen) + 0.8, 3.9)
-    with style.axes(axes, size, len(rows), len(chosen)) as drawn:
-        panels = style.panels(caller, drawn, 3 * len(chosen), "image of three rows")
+    columns, size = len(chosen), (1.05 * len(chosen) + 0.8, 3.9)
+    count = len(rows) * columns
+    with style.panels(caller, axes, size, count, "image of three rows", columns) as axes:
         for i, (name, images) in enumerate(rows.items()):
             for j, image in enumerate(images):
-                ax = panels[i * len(chosen) + j]
+                ax = axes[i * columns + j]
                 ax.imshow(image, cmap="gray", vmin=0 if i else None)
-                ax.set(xticks=[], yticks=[])
-                ax.grid(False)
+                style.unframed(ax)
                 if not j:
                     ax.set_ylabel(name)
                 if not i:
                     word = "fails" if failed[chosen[j]] else "does not"
                     ax.set_title(f"{networks.scores[chosen[j]]:.3f}\n{word}", fontsize=9)
-    return panels[: 3 * len(chosen)]
+    return axes
 
 
 def pixel_likelihood(networks: Encoded, ax: Axes | None = None) -> Axes:
     """A(E(x)) of images that are dark but for one pixel, which is 1: how suspect each pixel alone
-    makes an image (figure 4.6 of the thesis). Returns the Axes.
+    makes an image (figure 4.6 of the thesis).
 
     Args:
         networks: `jast.weakness.encoded` of a result on images [n, height, width].

@@ -59,9 +59,6 @@ def colav(
             that comes too soon for so many), the others are spread evenly before it.
         axes: one for each moment, whose figure gets the title; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for many episodes, states that are missing or another system's, moments outside
             the episode, and too few axes.
@@ -89,9 +86,6 @@ def colav_story(
         sim: its simulator. With it the delay is in seconds, else it is a share of the longest.
         axes: one for each panel; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: as `colav`.
 
@@ -102,61 +96,35 @@ def colav_story(
         3
     """
     states = _states("colav_story", episode, sim)
-    kinds, log, edges = (
-        _kinds(episode, states, sim),
-        _log(states),
-        PERIOD * np.arange(len(states.step)),
-    )
-    count = len(kinds) + 2
-    with style.axes(axes, (7.4, 1.15 + 1.45 * count), count) as axes:
-        axes = style.panels(
-            "colav_story", axes, count, "kind of disturbance, the distances and the speed"
-        )[:count]
+    kinds, log = _kinds(episode, states, sim), _log(states)
+    edges = PERIOD * np.arange(len(states.step))
+    count, size = len(kinds) + 2, (7.4, 1.15 + 1.45 * (len(kinds) + 2))
+    each = "kind of disturbance, the distances and the speed"
+    with style.panels("colav_story", axes, size, count, each) as axes:
         *first, apart, speed = axes
+        looks = (
+            dict(color=style.INK, linestyle="-"),
+            dict(color=style.PURPLE, linestyle=(0, (3, 1))),
+        )
+        over = dict(baseline=None, linewidth=1.8)
         for ax, (label, rows) in zip(first, kinds.items(), strict=True):
-            for (name, values), colour, line in zip(
-                rows.items(), (style.INK, style.PURPLE), ("-", (0, (3, 1))), strict=False
-            ):
-                ax.stairs(
-                    values,
-                    edges,
-                    baseline=None,
-                    color=colour,
-                    linestyle=line,
-                    linewidth=1.8,
-                    label=name,
-                    zorder=3,
-                    clip_on=False,
-                )
+            for (name, values), look in zip(rows.items(), looks, strict=False):
+                ax.stairs(values, edges, label=name, zorder=3, clip_on=False, **look, **over)
             ax.axhline(0, color=style.GREY, linewidth=1, zorder=1)
-            ax.set(
-                ylabel=label,
-                ylim=(None if any((values < 0).any() for values in rows.values()) else 0, None),
-            )
-        gaps = [np.hypot(*(log.ferry - rows)[:, :2].T) for rows in (log.adversary, log.believed)]
-        apart.plot(
-            edges,
-            gaps[0],
-            color=style.VERMILION,
-            marker="o",
-            markersize=3,
-            label="to the adversary",
+            signed = any((values < 0).any() for values in rows.values())
+            ax.set(ylabel=label, ylim=(None if signed else 0, None))
+        true, told = (
+            np.hypot(*(log.ferry - rows)[:, :2].T) for rows in (log.adversary, log.believed)
         )
-        apart.plot(edges, gaps[1], color=BELIEF, linestyle=DASHED, label="to where it is believed")
-        apart.axhline(
-            COLLISION,
-            color=style.INK,
-            linewidth=1,
-            linestyle=":",
-            label=f"collision: {COLLISION:g} m",
-        )
+        red = dict(color=style.VERMILION, marker="o", markersize=3)
+        apart.plot(edges, true, label="to the adversary", **red)
+        apart.plot(edges, told, color=BELIEF, linestyle=DASHED, label="to where it is believed")
+        look = dict(color=style.INK, linewidth=1, linestyle=":")
+        apart.axhline(COLLISION, label=f"collision: {COLLISION:g} m", **look)
         apart.set(ylabel="distance (m)", ylim=(0, None))
-        speed.stairs(
-            log.order[:-1], edges, baseline=None, color=style.INK, linewidth=1.8, label="ordered"
-        )
-        speed.plot(
-            edges, states.velocity.u, color=style.BLUE, linestyle=DASHED, label="actual (surge)"
-        )
+        speed.stairs(log.order[:-1], edges, color=style.INK, label="ordered", **over)
+        blue = dict(color=style.BLUE, linestyle=DASHED)
+        speed.plot(edges, states.velocity.u, label="actual (surge)", **blue)
         speed.set(ylabel="speed (m/s)", xlabel="time (s)")
         for ax in axes:
             ax.set_xlim(0, max(edges[-1], PERIOD))
@@ -202,7 +170,8 @@ def colav_animation(
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    states, path = _states("colav_animation", episode, sim), style.writable("colav_animation", path)
+    states = _states("colav_animation", episode, sim)
+    path = style.checked_writable("colav_animation", path)
     if not isinstance(fps, Real) or not 0 < fps < math.inf:
         raise ValueError(f"plot.colav_animation: fps must be a positive number, received {fps!r}")
     if isinstance(smooth, bool) or not isinstance(smooth, int) or smooth < 1:
@@ -216,7 +185,7 @@ def colav_animation(
         # an even number of pixels, as films must have
         height = round(40 * (np.clip(4.1 * (high - low)[1] / (high - low)[0], 2.6, 5.0) + 0.9)) / 40
         # not pyplot's: a notebook would show it a second time
-        figure = style.frugal()(figsize=(6.6, height), dpi=80, layout="compressed")
+        figure = style.frugal_figure()(figsize=(6.6, height), dpi=80, layout="compressed")
         FigureCanvasAgg(figure)
         ax = figure.subplots()
         panel = _Panel(ax, log, low, high)
@@ -225,13 +194,8 @@ def colav_animation(
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # the axes stand still from here on
-        animation = FuncAnimation(
-            figure,
-            panel.show,
-            np.arange(steps * smooth + 1) / smooth,
-            interval=1000 / fps,
-            blit=False,
-        )
+        times = np.arange(steps * smooth + 1) / smooth
+        animation = FuncAnimation(figure, panel.show, times, interval=1000 / fps, blit=False)
         if path is not None and path.suffix.lower() == ".html":
             path.write_text(animation.to_jshtml(fps=fps, default_mode="once"))
         elif path is not None:
@@ -247,15 +211,10 @@ def draw_moments(caller, episode, sim, moments, axes, draw_panel):
     log, moments = _log(states), _moments(caller, moments, states)
     low, high = _limits(log, moments)
     height = np.clip(3.7 * (high - low)[1] / (high - low)[0], 2.6, 7.0)
-    with style.axes(
-        axes,
-        (0.7 + 3.7 * len(moments) + 2.2, height + 1.45),
-        1,
-        len(moments),
-        sharey=True,
-        layout="compressed",
-    ) as axes:
-        axes = style.panels(caller, axes, len(moments), "moment")[: len(moments)]
+    count = len(moments)
+    size = (0.7 + 3.7 * count + 2.2, height + 1.45)
+    settings = dict(sharey=True, layout="compressed")
+    with style.panels(caller, axes, size, count, "moment", count, **settings) as axes:
         for ax, t in zip(axes, moments, strict=True):
             draw_panel(ax, log, low, high, t)
             ax.set_xlabel("east (m)")
@@ -285,48 +244,31 @@ class _Panel:
 
     def __init__(self, ax, log, low, high):
         self.log, self.title = log, ax.set_title(" ", loc="left")
-        ax.plot(
-            [0, 0], [0, 100], color=style.GREY, linewidth=1, label="the ferry's route", zorder=1
-        )
-        self.ferry = ax.plot([], [], color=style.BLUE, linewidth=2.4, label="ferry", zorder=4)[0]
-        self.adversary = ax.plot(
-            [],
-            [],
-            color=style.VERMILION,
-            marker="o",
-            markersize=3,
-            linewidth=1.2,
-            label="adversary (a dot a step)",
-            zorder=4,
-        )[0]
-        self.believed = ax.plot(
-            [], [], color=BELIEF, linestyle=DASHED, label="adversary as believed", zorder=5
-        )[0]
-        self.error = ax.plot(
-            [],
-            [],
-            color=style.INK,
-            linewidth=0.8,
-            marker="o",
-            markersize=2.5,
-            label="from belief to truth",
-            zorder=7,
-        )[0]
-        shape = lambda **how: ax.fill([], [], **how)[0]
-        looks = [
-            dict(facecolor=(ZONE, opacity), linestyle=line, label=zone.name)
+        look = dict(color=style.GREY, linewidth=1, zorder=1)
+        ax.plot([0, 0], [0, 100], label="the ferry's route", **look)
+
+        def line(label, **look):
+            return ax.plot([], [], label=label, **look)[0]
+
+        dots = dict(marker="o", markersize=3)
+        self.ferry = line("ferry", color=style.BLUE, linewidth=2.4, zorder=4)
+        red = dict(color=style.VERMILION, linewidth=1.2, zorder=4)
+        self.adversary = line("adversary (a dot a step)", **red, **dots)
+        self.believed = line("adversary as believed", color=BELIEF, linestyle=DASHED, zorder=5)
+        look = dict(color=style.INK, linewidth=0.8, zorder=7)
+        self.error = line("from belief to truth", **look, **dots | dict(markersize=2.5))
+        edge = dict(edgecolor=style.INK, linewidth=0.9, zorder=2)
+        self.zones = [
+            ax.fill([], [], facecolor=(ZONE, opacity), linestyle=line, label=zone.name, **edge)[0]
             for zone, (opacity, line) in zip(ZONES, SHADES, strict=True)
         ]
-        self.zones = [shape(**look, edgecolor=style.INK, linewidth=0.9, zorder=2) for look in looks]
+        ink = dict(linestyle="-", edgecolor=style.INK, linewidth=1)
         looks = (
-            (style.BLUE, "-", style.INK, 1),
-            (style.VERMILION, "-", style.INK, 1),
-            ("none", DASHED, BELIEF, 1.8),
+            dict(facecolor=style.BLUE, **ink),
+            dict(facecolor=style.VERMILION, **ink),
+            dict(facecolor="none", linestyle=DASHED, edgecolor=BELIEF, linewidth=1.8),
         )
-        self.hulls = [
-            shape(facecolor=face, linestyle=line, edgecolor=edge, linewidth=width, zorder=6)
-            for face, line, edge, width in looks
-        ]
+        self.hulls = [ax.fill([], [], zorder=6, **look)[0] for look in looks]
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
 
     def show(self, t):
@@ -341,7 +283,7 @@ class _Panel:
             east, north, course = now[2]
             patch.set_xy(zone_outline(zone, north, east, course))
         for patch, here in zip(self.hulls, now, strict=True):
-            patch.set_xy(_placed(*HULL.T, *here))
+            patch.set_xy(_place(*HULL.T, *here))
         self.title.set_text(
             f"t = {t * PERIOD:.0f} s, ordered {self.log.order[math.floor(t)]:.2f} m/s"
         )
@@ -349,7 +291,7 @@ class _Panel:
 
 def _states(caller, episode, sim):
     """s_0 .. s_length as NumPy arrays."""
-    states = style.one(caller, episode).states
+    states = style.one_episode(caller, episode).states
     if states is None and sim is None:
         raise ValueError(
             f"plot.{caller}: episode must have states, or sim be the simulator to replay it on,"
@@ -391,10 +333,10 @@ def zone_outline(zone, n, e, course, points=200):
     angle = np.linspace(0, 2 * np.pi, points)
     ahead = np.cos(angle) * np.where(np.cos(angle) > 0, zone.forward, zone.aft)
     right = np.sin(angle) * np.where(np.sin(angle) > 0, zone.starboard, zone.port)
-    return _placed(ahead, right, e, n, course)
+    return _place(ahead, right, e, n, course)
 
 
-def _placed(ahead, right, east, north, heading):
+def _place(ahead, right, east, north, heading):
     """[points, 2] in (east, north): points ahead and to the right of a place on a heading."""
     return np.stack(
         [
@@ -422,17 +364,13 @@ def _moments(caller, moments, states):
         f" {moments!r}"
     )
     try:
-        if np.ndim(moments) == 0:
-            count = index(moments)
-            nearest = int(np.argmin(states.near))
-            end = nearest if nearest >= count else last
-            chosen = (
-                np.unique(np.linspace(0, end, count + 1).round().astype(int)[-count:])
-                if count > 0
-                else ()
-            )
-        else:
+        if np.ndim(moments):
             chosen = [index(t) for t in moments]
+        else:
+            count, nearest = max(index(moments), 0), int(np.argmin(states.near))
+            end = nearest if nearest >= count else last
+            evenly = np.linspace(0, end, count + 1).round().astype(int)
+            chosen = np.unique(evenly[1:])
     except TypeError:
         raise wrong from None
     if not len(chosen) or not all(0 <= t <= last for t in chosen):
@@ -455,35 +393,21 @@ def _kinds(episode, states, sim):
     n, x = int(episode.length), episode.disturbances
     model = next(iter(getattr(getattr(sim, "init", None), "args", ())), None)
     if not isinstance(x, dict):  # one kind: which, the simulator says, or what the states remember
-        steered = (
-            np.ndim(x) == 1
-            and np.allclose(np.clip(x[:n], 0, 1), states.steering[1:])
-            and not states.delay.any()
-        )
-        x = {
-            (
-                model.kinds[0]
-                if hasattr(model, "kinds")
-                else "noise"
-                if np.ndim(x) == 2
-                else "steering"
-                if steered
-                else "delay"
-            ): x
-        }
+        kind = "noise" if np.ndim(x) == 2 else "delay"
+        if kind == "delay" and not states.delay.any():
+            same = np.allclose(np.clip(x[:n], 0, 1), states.steering[1:])
+            kind = "steering" if same else "delay"
+        x = {model.kinds[0] if hasattr(model, "kinds") else kind: x}
     x = {kind: np.asarray(a, float)[:n] for kind, a in x.items()}
     longest = getattr(model, "longest", None)
-    size = lambda rows: np.hypot(*rows.T)
-    of = {
-        "delay": lambda a: (
-            ("delay (share)", {"": a})
-            if longest is None
-            else ("delay (s)", {"": a * float(longest)})
-        ),
-        "steering": lambda a: ("steering (rad/s)", {"": a - 0.5}),
-        "noise": lambda a: (
-            "size of noise",
-            {"position (m)": size(a[:, :2]), "velocity (m/s)": size(a[:, 2:])},
-        ),
-    }
-    return dict(of[kind](x[kind]) for kind in of if kind in x)
+    rows = {}
+    if "delay" in x and longest is None:
+        rows["delay (share)"] = {"": x["delay"]}
+    elif "delay" in x:
+        rows["delay (s)"] = {"": x["delay"] * float(longest)}
+    if "steering" in x:
+        rows["steering (rad/s)"] = {"": x["steering"] - 0.5}
+    if "noise" in x:
+        position, velocity = (np.hypot(*x["noise"][:, i : i + 2].T) for i in (0, 2))
+        rows["size of noise"] = {"position (m)": position, "velocity (m/s)": velocity}
+    return rows

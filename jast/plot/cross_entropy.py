@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 __all__ = ["convergence", "proposal_contours", "surrogate_samples"]
 
-GRID, LEVELS = 121, 12  # points of a side, shades of the objective
-EDGE, DEVIATIONS = dict(markeredgecolor=style.INK, markeredgewidth=0.7), {1: "-", 2: (0, (4, 2))}
+GRID = 121  # points of a side
+LEVELS = 12  # shades of the objective
+EDGE = dict(markeredgecolor=style.INK, markeredgewidth=0.7)
+DEVIATIONS = {1: "-", 2: style.DASHED}  # lines of the ellipses
 SHADES = ("#2F70A6", "#7FAFD3", "#BFD7E9", "#EDF2F6")
 
 
@@ -53,9 +55,6 @@ def proposal_contours(
             widest one's side.
         elites: how many of the best points so far are marked.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for many runs, dimensions other than 2, iterations that were not run, bounds
             that are none, elites below 1, and too few axes.
@@ -67,64 +66,33 @@ def proposal_contours(
         >>> len(jast.plot.proposal_contours(found, ce.paraboloid, iterations=[1, 5]))
         2
     """
-    import matplotlib.pyplot as plt
-
     caller = "proposal_contours"
     log = _log(caller, result)
     if isinstance(elites, bool) or not isinstance(elites, int) or elites < 1:
         raise ValueError(f"plot.{caller}: elites must be an int of at least 1, received {elites!r}")
-    run = len(_sizes(log))
-    chosen = (
-        np.unique(np.geomspace(1, run, min(4, run)).round().astype(int))
-        if iterations is None
-        else np.atleast_1d(np.asarray(iterations, object))
-    )
-    chosen = [style.iteration(caller, "iterations", k, run) for k in chosen]
-    if not chosen:
-        raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
-    boxes = _boxes(
-        caller,
-        bounds,
-        [np.concatenate([log.x[log.iteration == k - 1], _best(log, k, elites)]) for k in chosen],
-    )
-    columns = len(chosen) if len(chosen) <= 4 else -(-len(chosen) // 2)
-    rows = -(-len(chosen) // columns)
-    with style.styled():
-        drawn = (
-            plt.subplots(
-                rows,
-                columns,
-                figsize=(2.75 * columns + 2.0, 2.75 * rows + 0.3),
-                layout="compressed",
-            )[1]
-            if axes is None
-            else axes
-        )
-        every = style.panels(caller, drawn, len(chosen), "iteration")
-        for spare in every[len(chosen) :] if axes is None else ():
-            spare.set_axis_off()
-        panels = every[: len(chosen)]
+    run = _iterations(log)
+    evenly = np.geomspace(1, run, min(4, run))
+    chosen = style.checked_iterations(caller, iterations, evenly, run)
+    drawn = [(log.x[log.iteration == k - 1], _best(log, k, elites)) for k in chosen]
+    boxes = _boxes(caller, bounds, [np.concatenate(points) for points in drawn])
+    count = len(chosen)
+    columns = count if count <= 4 else -(-count // 2)
+    size = (2.75 * columns + 2.0, 2.75 * -(-count // columns) + 0.3)
+    settings = dict(sharex=False, layout="compressed")
+    with style.panels(caller, axes, size, count, "iteration", columns, **settings) as panels:
         for i, (ax, k, box) in enumerate(zip(panels, chosen, boxes, strict=True)):
-            now, best = log.x[log.iteration == k - 1], _best(log, k, elites)
+            now, best = drawn[i]
             _ground(ax, objective, box, log.x.dtype)
             _proposal(ax, result, k - 1)
             _points(ax, now, "evaluated in\nthe iteration")
-            ax.plot(
-                *best.T,
-                linestyle="",
-                marker="D",
-                markersize=5.5,
-                color=style.ORANGE,
-                **EDGE,
-                label=f"the {elites} best so far",
-                zorder=6,
-            )
+            look = dict(linestyle="", marker="D", markersize=5.5, color=style.ORANGE, **EDGE)
+            ax.plot(*best.T, label=f"the {elites} best so far", zorder=6, **look)
             _star(ax, log.best_x[k - 1])
             _outside(ax, now, box)
             ax.set_title(f"iteration {k}")
             if i % columns == 0:
                 ax.set_ylabel("$x_2$")
-            if i + columns >= len(chosen):
+            if i + columns >= count:
                 ax.set_xlabel("$x_1$")
         _legend(panels[columns - 1], objective)
     return panels
@@ -149,9 +117,6 @@ def surrogate_samples(
         axes: two; None: a new figure.
         bounds: as for `proposal_contours`, but the default leaves out the farthest points.
 
-    Returns:
-        The list of two Axes.
-
     Raises:
         ValueError: as `proposal_contours`, and for a run without a surrogate.
 
@@ -165,7 +130,7 @@ def surrogate_samples(
     """
     caller = "surrogate_samples"
     log = _log(caller, result)
-    k = style.iteration(caller, "iteration", iteration, len(_sizes(log)))
+    k = style.checked_iteration(caller, "iteration", iteration, _iterations(log))
     judged = np.asarray(result.history.model_x, float)[k - 1]
     judged = judged[np.isfinite(judged).all(1)]
     if not len(judged):
@@ -175,33 +140,21 @@ def surrogate_samples(
         )
     now = log.x[log.iteration == k - 1]
     low, high = np.quantile(judged, [0.01, 0.99], axis=0)
-    [box] = _boxes(
-        caller,
-        bounds,
-        [
-            np.concatenate(
-                [np.clip(np.concatenate([judged, now]), low, high), log.best_x[k - 1 : k]]
-            )
-        ],
-    )
-    with style.axes(axes, (8.6, 3.5), 1, 2, sharey=True, layout="compressed") as drawn:
-        panels = style.panels(caller, drawn, 2, "kind of sample")[:2]
+    near = np.clip(np.concatenate([judged, now]), low, high)
+    [box] = _boxes(caller, bounds, [np.concatenate([near, log.best_x[k - 1 : k]])])
+    settings = dict(sharey=True, layout="compressed")
+    with style.panels(caller, axes, (8.6, 3.5), 2, "kind of sample", 2, **settings) as panels:
         for ax, which in zip(panels, (k - 1, k), strict=True):
             _ground(ax, objective, box, log.x.dtype)
             _proposal(ax, result, which)
             ax.set_xlabel("$x_1$")
         left, right = panels
         _points(left, now, "truly evaluated")
-        look = (
-            dict(linestyle="", marker=".", markersize=6, color=style.ORANGE)
-            | EDGE
-            | dict(markeredgewidth=0.5)
-        )
+        look = dict(linestyle="", marker=".", markersize=6, color=style.ORANGE, **EDGE)
+        look |= dict(markeredgewidth=0.5)
         right.plot(*judged.T, **look, label="judged by\nthe surrogate", zorder=4)
-        for ax, points, title in (
-            (left, now, "truly evaluated"),
-            (right, judged, "judged; next proposal"),
-        ):
+        titles = (now, "truly evaluated"), (judged, "judged; next proposal")
+        for ax, (points, title) in zip(panels, titles, strict=True):
             _star(ax, log.best_x[k - 1])
             _outside(ax, points, box)
             ax.set_title(f"{len(points)} {title}")
@@ -228,9 +181,6 @@ def convergence(
             the best point to it, on a logarithmic axis.
         axes: one or two; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for what is no batch of runs, an optimum of another dimension, and too few axes.
 
@@ -243,7 +193,7 @@ def convergence(
         2
     """
     caller = "convergence"
-    results = results if isinstance(results, dict) else {"": results}
+    results = style.by_name(results)
     if not results:
         raise ValueError(
             "plot.convergence: results must hold at least one batch of runs, received none"
@@ -260,52 +210,29 @@ def convergence(
                 f" {received}{f' for {name!r}' if name else ''}"
             )
     count = 1 if optimum is None else 2
-    with style.axes(axes, (5.2 * count, 3.8), 1, count) as drawn:
-        panels = style.panels(caller, drawn, count, "quantity")[:count]
+    with style.panels(caller, axes, (5.2 * count, 3.8), count, "quantity", count) as panels:
         for i, (name, result) in enumerate(results.items()):
             runs, d = np.shape(result.best_x)
-            value = np.asarray(result.history.best_value, float)
-            known = result._replace(
-                history=result.history._replace(
-                    best_value=np.where(np.isfinite(value), value, np.nan)
-                )
-            )
+            history = result.history
+            value = np.asarray(history.best_value, float)
+            value = np.where(np.isfinite(value), value, np.nan)
+            known = result._replace(history=history._replace(best_value=value))
             score = scores(known, np.zeros(d) if optimum is None else optimum)
-            evaluations = np.cumsum(np.bincount(np.asarray(result.history.iteration)[0]))
-            colour, marker = (
-                style.COLOURS[i % len(style.COLOURS)],
-                style.MARKERS[i % len(style.MARKERS)],
-            )
-            look = dict(
-                color=colour, marker=marker, markersize=4.5, label=name or f"mean of {runs} runs"
-            )
+            evaluations = np.cumsum(np.bincount(np.asarray(history.iteration)[0]))
             quantities = [(score.best_value, score.standard_error)]
             if optimum is not None:
-                distance = np.linalg.norm(
-                    np.asarray(result.history.best_x, float) - np.asarray(optimum, float), axis=2
-                )
-                error = (
-                    distance.std(0, ddof=1) / np.sqrt(runs)
-                    if runs > 1
-                    else np.full(distance.shape[1], np.nan)
-                )
-                quantities.append((score.mean_distance, error))
+                away = np.asarray(history.best_x, float) - np.asarray(optimum, float)
+                quantities.append((score.mean_distance, _standard_error(away)))
+            look = dict(color=style.colour(i), marker=style.marker(i), markersize=4.5)
+            look |= dict(label=name or f"mean of {runs} runs")
             for ax, (mean, error) in zip(panels, quantities, strict=True):
                 there = np.isfinite(mean)
-                ax.plot(evaluations[there], mean[there], zorder=3, **look)
+                at, mean, half = evaluations[there], mean[there], 1.96 * error[there]
+                ax.plot(at, mean, zorder=3, **look)
                 if there.any() and runs > 1:
-                    low, high = (mean + sign * 1.96 * error for sign in (-1, 1))
-                    ax.fill_between(
-                        evaluations[there],
-                        low[there],
-                        high[there],
-                        color=look["color"],
-                        alpha=0.2,
-                        linewidth=0,
-                    )
-        for ax, title in zip(
-            panels, ("mean best value", "mean distance to the optimum"), strict=False
-        ):
+                    style.band(ax, at, mean - half, mean + half, color=look["color"])
+        titles = "mean best value", "mean distance to the optimum"
+        for ax, title in zip(panels, titles, strict=False):
             ax.set(xlabel="true evaluations", xlim=(0, None))
             ax.set_title(title)
         if optimum is not None:
@@ -313,6 +240,14 @@ def convergence(
             _plain(panels[1])
         panels[0].legend(loc="best")
     return panels
+
+
+def _standard_error(away):
+    """[n] of the mean distance over runs, of ``away`` [runs, n, d]; NaN for one run."""
+    distance = np.linalg.norm(away, axis=2)
+    if len(distance) == 1:
+        return np.full(distance.shape[1], np.nan)
+    return distance.std(0, ddof=1) / np.sqrt(len(distance))
 
 
 class _Log:
@@ -348,8 +283,9 @@ def _log(caller, result):
     return log
 
 
-def _sizes(log):
-    return np.bincount(log.iteration)
+def _iterations(log):
+    """How many were run."""
+    return int(log.iteration.max()) + 1
 
 
 def _best(log, k, count):
@@ -371,9 +307,8 @@ def _boxes(caller, bounds, panels):
         return [box] * len(panels)
     panels = [x[np.isfinite(x).all(1)] for x in panels]
     sides = np.array([np.max(np.ptp(x, axis=0)) for x in panels])
-    sides = 1.25 * np.maximum(
-        sides, max(sides.max() / 20, 1e-6 * max(1.0, *(np.abs(x).max() for x in panels)))
-    )
+    least = max(sides.max() / 20, 1e-6 * max(1.0, *(np.abs(x).max() for x in panels)))
+    sides = 1.25 * np.maximum(sides, least)
     return [
         ((x.min(0) + x.max(0)) / 2)[:, None] + np.array([-0.5, 0.5]) * side
         for x, side in zip(panels, sides, strict=True)
@@ -387,24 +322,15 @@ def _ground(ax, objective, box, dtype):
 
     if objective is not None:
         x, y = (np.linspace(*side, GRID) for side in box)
-        values = np.ma.masked_invalid(
-            _values(
-                objective, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(dtype)
-            ).reshape(GRID, GRID)
-        )
-        low, high = (
-            (values.min(), np.quantile(values.compressed(), 0.98)) if values.count() else (0, 0)
-        )
-        if high > low:  # a few great values must not flatten the rest
-            ax.contourf(
-                x,
-                y,
-                values,
-                np.linspace(low, high, LEVELS + 1),
-                cmap=LinearSegmentedColormap.from_list("", SHADES),
-                extend="max",
-                zorder=0,
-            )
+        plane = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(dtype)
+        values = np.ma.masked_invalid(_values(objective, plane).reshape(GRID, GRID))
+        low, high = 0, 0
+        if values.count():  # a few great values must not flatten the rest
+            low, high = values.min(), np.quantile(values.compressed(), 0.98)
+        if high > low:
+            levels = np.linspace(low, high, LEVELS + 1)
+            blues = LinearSegmentedColormap.from_list("", SHADES)
+            ax.contourf(x, y, values, levels, cmap=blues, extend="max", zorder=0)
     ax.grid(False)
     ax.set(xlim=box[0], ylim=box[1], aspect="equal")
     for axis in (ax.xaxis, ax.yaxis):
@@ -428,65 +354,32 @@ def _proposal(ax, result, k):
         weights, means, covariances = proposal
         strengths, width = 0.25 + 0.75 * weights / max(weights.max(), np.finfo(float).tiny), 1.1
     else:
-        means, covariances, strengths, width = (
-            proposal.mean[None],
-            proposal.covariance[None],
-            np.ones(1),
-            1.6,
-        )
+        means, covariances = proposal.mean[None], proposal.covariance[None]
+        strengths, width = np.ones(1), 1.6
     for strength, mean, covariance in zip(strengths, means, covariances, strict=True):
         values, vectors = np.linalg.eigh(covariance)
         sides, angle = 2 * np.sqrt(np.maximum(values, 0)), np.degrees(np.arctan2(*vectors[::-1, 0]))
         for deviations, line in DEVIATIONS.items():
-            how = dict(
-                fill=False,
-                edgecolor=style.VERMILION,
-                linewidth=width,
-                linestyle=line,
-                alpha=float(strength),
-                zorder=3,
-            )
-            ax.add_patch(Ellipse(mean, *deviations * sides, angle=angle, **how))
+            look = dict(fill=False, edgecolor=style.VERMILION, linewidth=width, linestyle=line)
+            look |= dict(alpha=float(strength), zorder=3)
+            ax.add_patch(Ellipse(mean, *deviations * sides, angle=angle, **look))
 
 
 def _points(ax, x, label):
-    ax.plot(
-        *x.T,
-        linestyle="",
-        marker="o",
-        markersize=5,
-        color="white",
-        **EDGE | dict(markeredgewidth=1.0),
-        label=label,
-        zorder=5,
-    )
+    look = EDGE | dict(linestyle="", marker="o", markersize=5, color="white", markeredgewidth=1.0)
+    ax.plot(*x.T, label=label, zorder=5, **look)
 
 
 def _star(ax, x):
-    ax.plot(
-        *x,
-        linestyle="",
-        marker="*",
-        markersize=13,
-        color=style.VERMILION,
-        **EDGE,
-        label="best so far",
-        zorder=7,
-    )
+    look = dict(linestyle="", marker="*", markersize=13, color=style.VERMILION, **EDGE)
+    ax.plot(*x, label="best so far", zorder=7, **look)
 
 
 def _outside(ax, x, box):
     """Says how many points the panel does not show."""
     if count := int(((x < box[:, 0]) | (x > box[:, 1])).any(1).sum()):
-        ax.text(
-            0.03,
-            0.03,
-            f"{count} of {len(x)} outside",
-            transform=ax.transAxes,
-            fontsize=8.5,
-            zorder=8,
-            path_effects=style.halo(),
-        )
+        look = dict(transform=ax.transAxes, fontsize=8.5, zorder=8, path_effects=style.halo())
+        ax.text(0.03, 0.03, f"{count} of {len(x)} outside", **look)
 
 
 def _legend(ax, objective, *others):
@@ -500,19 +393,12 @@ def _legend(ax, objective, *others):
         for handle, label in zip(*other.get_legend_handles_labels(), strict=True)
     }
     for deviations, line in DEVIATIONS.items():
-        handles[f"proposal, {deviations} sd"] = Line2D(
-            [], [], color=style.VERMILION, linewidth=1.6, linestyle=line
-        )
+        look = dict(color=style.VERMILION, linewidth=1.6, linestyle=line)
+        handles[f"proposal, {deviations} sd"] = Line2D([], [], **look)
     if objective is not None:
         handles["objective:\ndarker is lower"] = Patch(facecolor=SHADES[1])
-    ax.legend(
-        handles.values(),
-        handles,
-        loc="upper left",
-        bbox_to_anchor=(1.02, 1.02),
-        fontsize=9,
-        labelspacing=0.7,
-    )
+    look = dict(loc="upper left", bbox_to_anchor=(1.02, 1.02), fontsize=9, labelspacing=0.7)
+    ax.legend(handles.values(), handles, **look)
 
 
 def _plain(ax):

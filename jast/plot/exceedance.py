@@ -31,9 +31,6 @@ def exceedance(
         truth: threshold -> probability, of an array, where it is known: dots.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything else, an estimate without draws, and where nothing is known.
 
@@ -54,20 +51,13 @@ def exceedance(
     if not all(np.isfinite(c.probability).any() for c in named.values()):
         raise ValueError(f"{caller}: curves must hold at least one probability, received only NaN")
     with style.axes(ax, (6.8, 3.8)) as ax:
-        ax.axvline(0.0, color=style.INK, linewidth=1.0, linestyle=(0, (1, 1.5)), label="failure")
+        ax.axvline(0.0, color=style.INK, linewidth=1.0, linestyle=style.DOTTED, label="failure")
         for i, (name, c) in enumerate(named.items()):
-            colour = style.COLOURS[i % len(style.COLOURS)]
+            colour, low = style.colour(i), np.maximum(c.low, np.finfo(float).tiny)
+            style.band(ax, c.thresholds, low, c.high, color=colour)
+            label = f"{name or c.method}, {c.level:.4g} interval"
             good = np.where(c.reliable, c.probability, np.nan)
-            label = f"{c.level:.4g} interval"
-            ax.fill_between(
-                c.thresholds,
-                np.maximum(c.low, np.finfo(float).tiny),
-                c.high,
-                color=colour,
-                alpha=0.2,
-                linewidth=0,
-            )
-            ax.plot(c.thresholds, good, color=colour, label=f"{name or c.method}, {label}")
+            ax.plot(c.thresholds, good, color=colour, label=label)
             if (~c.reliable & np.isfinite(c.probability)).any():
                 doubted = np.where(c.reliable, np.nan, c.probability)
                 look = dict(color=style.VERMILION, linestyle=(0, (2, 1.5)), zorder=3)
@@ -77,10 +67,7 @@ def exceedance(
             u = u[:: max(len(u) // 16, 1)]
             look = dict(color=style.INK, linestyle="", marker="o", markersize=3, zorder=4)
             ax.plot(u, np.asarray(truth(u), float), label="truth", **look)
-        ax.set(
-            yscale="log",
-            xlabel="threshold of the miss distance",
-            ylabel="probability of coming so near",
-        )
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
+        words = "threshold of the miss distance", "probability of coming so near"
+        ax.set(yscale="log", xlabel=words[0], ylabel=words[1])
+        style.legend_above(ax, ncols=3, fontsize=9)
     return ax

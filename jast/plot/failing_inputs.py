@@ -22,6 +22,7 @@ __all__ = ["contributions", "first_failures"]
 
 HEAT = ("#E69F0000", "#E69F00B0", "#D55E00", "#5A1A00")  # from nothing, which shows what is beneath
 BARS = 15  # features of a table
+PIXELS = dict(interpolation="nearest")
 EFFECTS = {1: ("raises", style.VERMILION), -1: ("lowers", style.BLUE), 0: ("neither", style.GREY)}
 
 
@@ -62,8 +63,6 @@ def first_failures(
         >>> len(jast.plot.first_failures(found, inputs, labels, count=6))
         6
     """
-    import matplotlib.pyplot as plt
-
     caller = "first_failures"
     failures, n = np.asarray(checked_result(caller, result).failures), len(result.scores)
     count = whole(f"plot.{caller}", "count", count)
@@ -90,22 +89,16 @@ def first_failures(
         )
     words = _words(caller, names, max([*said, *true], default=-1))
     tiles = failures[:count]
-    columns = min(5, max(len(tiles), 1))
-    lines = -(-max(len(tiles), 1) // columns)
+    count = max(len(tiles), 1)
+    columns = min(5, count)
+    lines = -(-count // columns)
     tall = 1.45 * np.clip(inputs.shape[1] / inputs.shape[2], 0.4, 2.5)
-    titles = [
-        (f"said {words(a)}", f"is {words(b)}")
-        for a, b in zip(said[:count], true[:count], strict=True)
-    ]
+    answers = zip(said[:count], true[:count], strict=True)
+    titles = [(f"said {words(a)}", f"is {words(b)}") for a, b in answers]
     joint = ", " if max((len("".join(pair)) for pair in titles), default=0) <= 12 else "\n"
-    with style.styled():
-        own = axes is None
-        size = max(1.55 * columns + 0.3, 3.2), (tall + 0.5 + 0.18 * ("\n" in joint)) * lines + 0.4
-        axes = plt.subplots(lines, columns, figsize=size, layout="constrained")[1] if own else axes
-        axes = style.panels(caller, axes, max(len(tiles), 1), "failure")
-        for spare in axes[len(tiles) :] if own else ():
-            spare.set_axis_off()
-        axes = axes[: max(len(tiles), 1)]
+    size = max(1.55 * columns + 0.3, 3.2), (tall + 0.5 + 0.18 * ("\n" in joint)) * lines + 0.4
+    own = axes is None
+    with style.panels(caller, axes, size, count, "failure", columns, sharex=False) as axes:
         if not len(tiles):
             _say(axes[0], "no failure found")
         for ax, i, title in zip(axes, tiles, titles, strict=False):
@@ -113,14 +106,11 @@ def first_failures(
             ax.set_title(joint.join(title), loc="left", fontsize=10, pad=4)
             ax.set_xlabel(f"input {i}", loc="left", fontsize=8, color=style.GREY, labelpad=3)
         if own and len(tiles):
-            first = (
-                f"the first {f'{len(tiles)} ' * (len(tiles) > 1)}of "
-                if len(tiles) < len(failures)
-                else ""
-            )
-            found = f"{first}{len(failures):,} failure{'s' * (len(failures) > 1)} found"
+            found = f"{style.count_of(len(failures), 'failure')} found"
+            if len(tiles) < len(failures):
+                found = f"The first {f'{len(tiles)} ' * (len(tiles) > 1)}of {found}"
             axes[0].figure.get_layout_engine().set(h_pad=0.07)
-            axes[0].figure.suptitle(found[0].upper() + found[1:], x=0.01, ha="left", fontsize=11)
+            axes[0].figure.suptitle(found, x=0.01, ha="left", fontsize=11)
     return axes
 
 
@@ -145,9 +135,6 @@ def contributions(
         names: of the columns of a table.
         background: of images, in grey, [height, width(, channels)]: for example the mean image.
         ax: Axes to draw in; None: a new figure.
-
-    Returns:
-        The Axes.
 
     Raises:
         ValueError: for values of another shape or that are not finite, and names or a background
@@ -196,17 +183,10 @@ def _bars(caller, values, names, background, ax):
             word, colour = EFFECTS[int(np.sign(mean[i]))]
             ax.barh(y, size[i], height=0.66, color=colour, alpha=0.9, zorder=2)
             text = f"{word}, mean {mean[i]:+.2g}" if mean[i] else word
-            ax.annotate(
-                text,
-                (size[i], y),
-                (5, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=9,
-                color=colour,
-            )
+            style.note(ax, text, (size[i], y), (5, 0), va="center", fontsize=9, color=colour)
+        words = "mean magnitude of the contribution to the log odds of failure"
         ax.set(
-            xlabel=f"mean magnitude of the contribution to the log odds of failure, {_inputs(k)}",
+            xlabel=f"{words}, {style.count_of(k, 'input')}",
             ylim=(len(chosen) - 0.4, -0.6),
             yticks=range(len(chosen)),
         )
@@ -214,10 +194,8 @@ def _bars(caller, values, names, background, ax):
         ax.set_xlim(0, 1.3 * size.max() or 1.0)  # room for the words
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
-        ax.set_title(
-            "Which columns mark the"
-            f" failures{f': the {BARS} greatest of {d:,}' if d > BARS else ''}"
-        )
+        most = f": the {BARS} greatest of {d:,}" if d > BARS else ""
+        ax.set_title(f"Which columns mark the failures{most}")
     return ax
 
 
@@ -233,16 +211,11 @@ def _map(caller, values, names, background, ax):
     size = size.sum(2) if size.ndim == 3 else size
     if background is not None:
         given = _numbers(background)
-        if (
-            given is None
-            or given.ndim not in (2, 3)
-            or given.shape[:2] != size.shape
-            or not np.isfinite(given).all()
-        ):
+        finite = given is not None and np.isfinite(given).all()
+        if not finite or given.ndim not in (2, 3) or given.shape[:2] != size.shape:
             received = "no such array"
             if given is not None:
-                broken = "" if np.isfinite(given).all() else " with numbers that are not"
-                received = f"shape {given.shape}{broken}"
+                received = f"shape {given.shape}{'' if finite else ' with numbers that are not'}"
             raise ValueError(
                 f"plot.{caller}: background must be finite {list(size.shape)} or with channels,"
                 f" received {received}"
@@ -252,27 +225,17 @@ def _map(caller, values, names, background, ax):
     with style.axes(ax, (5.0, max(3.75 * tall + 0.5, 3.2)), layout="compressed") as ax:
         if background is not None:
             low, high = background.min(), background.max()
-            ax.imshow(
-                background,
-                cmap="gray_r",
-                vmin=low,
-                vmax=low + 3 * (high - low) if high > low else low + 1,
-                interpolation="nearest",
-                zorder=1,
-            )
+            most = low + 3 * (high - low) if high > low else low + 1
+            ax.imshow(background, cmap="gray_r", vmin=low, vmax=most, zorder=1, **PIXELS)
         heat = LinearSegmentedColormap.from_list("", HEAT)
-        drawn = ax.imshow(
-            size, cmap=heat, vmin=0, vmax=size.max() or 1, interpolation="nearest", zorder=2
-        )
-        _bare(ax)
+        most = size.max() or 1
+        drawn = ax.imshow(size, cmap=heat, vmin=0, vmax=most, zorder=2, **PIXELS)
+        style.unframed(ax)
         ax.spines[:].set_visible(True)
         ax.set_title("Which pixels mark the failures")
         bar = ax.figure.colorbar(drawn, ax=ax, fraction=0.05, pad=0.03)
-        bar.set_label(
-            "mean magnitude of the contribution\nto the log odds of failure,"
-            f" {_inputs(len(values))}",
-            fontsize=9,
-        )
+        words = "mean magnitude of the contribution\nto the log odds of failure"
+        bar.set_label(f"{words}, {style.count_of(len(values), 'input')}", fontsize=9)
         bar.ax.grid(False)
         bar.outline.set_edgecolor(style.GREY)
     return ax
@@ -282,13 +245,11 @@ def _words(caller, names, largest):
     """Class -> its name, or a ValueError where ``names`` do not reach ``largest``."""
     if names is None:
         return str
-    if not isinstance(names, list | tuple | np.ndarray) or len(names) <= largest:
-        received = (
-            len(names) if isinstance(names, list | tuple | np.ndarray) else type(names).__name__
-        )
+    listed = isinstance(names, list | tuple | np.ndarray)
+    if not listed or len(names) <= largest:
         raise ValueError(
             f"plot.{caller}: names must be a list of one for each class, at least {largest + 1},"
-            f" received {received}"
+            f" received {len(names) if listed else type(names).__name__}"
         )
     return lambda label: str(names[label])
 
@@ -298,33 +259,19 @@ def _image(ax, image, every):
     if image.ndim == 3 and image.shape[2] > 1:
         full = 255 if every.dtype.kind in "iu" else 1
         low, high = min(every.min(), 0), max(every.max(), full)
-        ax.imshow((image.astype(float) - low) / (float(high) - low), interpolation="nearest")
+        ax.imshow((image.astype(float) - low) / (float(high) - low), **PIXELS)
     else:
         grey = image.reshape(image.shape[:2]).astype(float)
-        ax.imshow(
-            grey,
-            cmap="gray",
-            vmin=float(every.min()),
-            vmax=float(every.max()),
-            interpolation="nearest",
-        )
-    _bare(ax)
+        ends = dict(vmin=float(every.min()), vmax=float(every.max()))
+        ax.imshow(grey, cmap="gray", **ends, **PIXELS)
+    style.unframed(ax)
+    ax.spines[:].set_visible(False)
 
 
 def _say(ax, words):
     """Nothing but ``words``."""
     ax.set_axis_off()
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=style.GREY)
-
-
-def _bare(ax):
-    ax.set(xticks=[], yticks=[])
-    ax.grid(False)
-    ax.spines[:].set_visible(False)
-
-
-def _inputs(k):
-    return f"{k:,} input{'s' * (k != 1)}"
 
 
 def _numbers(values):

@@ -10,7 +10,15 @@ import numpy as np
 
 from jast.episode import Episode, replay
 from jast.plot import style
-from jast.plot.played import DISTANCE, Given, chosen, given, kind_words, kinds, lines
+from jast.plot.played import (
+    DISTANCE,
+    Samples,
+    by_mode,
+    choose_fields,
+    mode_label,
+    samples_of,
+    series_of,
+)
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -51,9 +59,6 @@ def failure_fan(
         units: name -> unit, for the label of a field.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for samples of another kind, a value that is not one number or no field, and
             ``most`` below 1.
@@ -65,47 +70,34 @@ def failure_fan(
         >>> ax = jast.plot.failure_fan(found, sim)
     """
     caller = "failure_fan"
-    g = given(caller, samples, sim, modes, most)
+    g = samples_of(caller, samples, sim, modes, most)
     rows = _rows(caller, g.sim, g.episodes, value)
     behind = []
     if nominal is not None:
-        some = given(caller, nominal, g.sim, None, most).episodes
+        some = samples_of(caller, nominal, g.sim, None, most).episodes
         behind = _rows(caller, g.sim, some, value)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, line in enumerate(behind):
-            ax.plot(
-                line,
-                color=style.GREY,
-                linewidth=0.6,
-                alpha=0.5,
-                zorder=2,
-                label="_" if i else f"{len(behind)} nominal episodes",
-            )
+            words = "_" if i else f"{len(behind)} nominal episodes"
+            ax.plot(line, color=style.GREY, linewidth=0.6, alpha=0.5, zorder=2, label=words)
         for own, colour, marker, name in _groups(g, np.array([line[-1] for line in rows])):
             alpha = float(np.clip(12 / len(own), 0.12, 0.8))
             for i in own:
                 ax.plot(rows[i], color=colour, linewidth=0.8, alpha=alpha, zorder=3)
             ends = [len(rows[i]) - 1 for i in own], [rows[i][-1] for i in own]
-            ax.plot(
-                *ends,
-                linestyle="",
-                marker=marker,
-                markersize=3.5,
-                color=colour,
-                alpha=min(2 * alpha, 1),
-                zorder=4,
-            )
-            ax.plot([], [], color=colour, marker=marker, markersize=4, linewidth=1.2, label=name)
+            look = dict(color=colour, marker=marker)
+            ax.plot(*ends, linestyle="", markersize=3.5, alpha=min(2 * alpha, 1), zorder=4, **look)
+            ax.plot([], [], markersize=4, linewidth=1.2, label=name, **look)
         ax.set(xlabel="step", ylabel=label or _name(value, units), xlim=(0, None))
-        ax.xaxis.get_major_locator().set_params(integer=True)
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+        style.whole_steps(ax.xaxis)
+        style.legend_above(ax, fontsize=9)
     return ax
 
 
-def _groups(g: Given, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
+def _groups(g: Samples, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]]:
     """(which episodes, colour, mark, words) of each kind of failure."""
     if g.mode is not None:
-        return [(own, *style.look(k), kind_words(g, k, len(own))) for k, own in kinds(g)]
+        return [(own, *style.look(k), mode_label(g, k, len(own))) for k, own in by_mode(g)]
     n = len(ends)
     if not ((ends > 0).any() and (ends < 0).any()):
         return [(np.arange(n), style.BLUE, "o", f"{n} failures")]
@@ -119,8 +111,8 @@ def _groups(g: Given, ends: np.ndarray) -> list[tuple[np.ndarray, str, str, str]
 def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np.ndarray]:
     """[steps + 1] of the value for each episode."""
     if isinstance(value, str):
-        played = lines(sim, episodes)
-        names = chosen(caller, value, played, 1)
+        played = series_of(sim, episodes)
+        names = choose_fields(caller, value, played, 1)
         if len(names) > 1:
             raise ValueError(
                 f"plot.{caller}: value must name one number of {names}, received {value!r}, which"
@@ -128,9 +120,12 @@ def _rows(caller: str, sim: Simulator, episodes: Episode, value: Any) -> list[np
             )
         out = played.columns[names[0]]
     else:
-        number = value if value is not None else lambda s: sim.evaluate(s)[1]
-        each = lambda e: jax.vmap(number)((replay(sim, e) if e.states is None else e).states)
-        out = np.asarray(jax.jit(jax.vmap(each))(episodes), float)
+
+        def numbers(e: Episode) -> jax.Array:
+            states = (replay(sim, e) if e.states is None else e).states
+            return jax.vmap(lambda s: sim.evaluate(s)[1] if value is None else value(s))(states)
+
+        out = np.asarray(jax.jit(jax.vmap(numbers))(episodes), float)
     if out.ndim != 2:
         raise ValueError(
             f"plot.{caller}: value must return one number, received shape {out.shape[2:]}"

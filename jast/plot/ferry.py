@@ -29,9 +29,6 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
         sim: its simulator. Default: `jast.simulators.ferry` S0.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for an episode of another system, or for many episodes.
 
@@ -39,7 +36,9 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
         >>> import jax, jast
         >>> ax = jast.plot.ferry(jast.rollout(jax.random.key(0), jast.simulators.ferry()))
     """
-    states = style.one("ferry", episode).states
+    from matplotlib.patches import Circle
+
+    states = style.one_episode("ferry", episode).states
     if states is None:
         states = replay(ferry_simulator() if sim is None else sim, episode).states
     if not isinstance(states, FerryState):
@@ -58,6 +57,7 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
     low, high = np.min([p.min(0) for p in paths], 0) - 9, np.max([p.max(0) for p in paths], 0) + 9
     height = np.clip(6.2 * (high - low)[1] / (high - low)[0], 3.0, 8.0) + 0.8
 
+    halo = dict(path_effects=style.halo(), ha="center", va="center")
     with style.axes(ax, (6.2, height)) as ax:
         for path, name, colour, offset in (
             (paths[0], "ferry", style.BLUE, (-4, 9)),
@@ -65,71 +65,27 @@ def ferry(episode: Episode, sim: Simulator | None = None, ax: Axes | None = None
         ):
             ax.plot(*path.T, color=colour, marker="o", markersize=3, zorder=3)
             ax.plot(*path[0], color=colour, marker="s", markersize=8, zorder=4)
-            ax.annotate(
-                name,
-                path[0],
-                offset,
-                textcoords="offset points",
-                color=colour,
-                weight="bold",
-                path_effects=style.halo(),
-                zorder=6,
-            )
+            look = dict(color=colour, path_effects=style.halo(), zorder=6)
+            style.note(ax, name, path[0], offset, weight="bold", **look)
+            look |= dict(ha="center", va="center")
             for t in range(5, n + 1, 5):
                 if abs(t - nearest) < 3:  # room for the closest approach
                     continue
                 along = path[t] - path[t - 1]
                 # to the right of the way
                 side = np.array([along[1], -along[0]]) / max(np.linalg.norm(along), 1e-9)
-                place = dict(textcoords="offset points", ha="center", va="center")
-                ax.annotate(
-                    str(t),
-                    path[t],
-                    side * 11,
-                    **place,
-                    color=colour,
-                    fontsize=8,
-                    path_effects=style.halo(),
-                    zorder=6,
-                )
+                style.note(ax, str(t), path[t], side * 11, fontsize=8, **look)
         meet = np.stack([paths[0][nearest], paths[1][nearest]])
-        ax.add_patch(_circle(meet[0], COLLISION))
+        circle = dict(facecolor=style.BLUE, edgecolor=style.BLUE, alpha=0.15, linewidth=1.0)
+        ax.add_patch(Circle(tuple(meet[0]), COLLISION, zorder=2, **circle))
         ax.plot(*meet.T, color=style.INK, linewidth=1.4, marker="o", markersize=4, zorder=5)
         # then the number stands on the line, else above the circle
         wide = gaps[nearest] > 3 * COLLISION
         at = meet.mean(0) if wide else meet[0] + [0, COLLISION + 2.5]
-        ax.annotate(
-            f"{gaps[nearest]:.2f}",
-            at,
-            ha="center",
-            va="center",
-            weight="bold",
-            path_effects=style.halo(),
-            zorder=7,
-        )
-        ax.set_title(
-            style.headline(
-                "Ferry",
-                episode,
-                f"\nclosest approach {gaps[nearest]:.2f} at step {nearest} (circle: radius"
-                f" {COLLISION:g})",
-            )
-        )
-        ax.set(
-            xlabel="x", ylabel="y", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal"
-        )
+        ax.annotate(f"{gaps[nearest]:.2f}", at, weight="bold", zorder=7, **halo)
+        gap = f"\nclosest approach {gaps[nearest]:.2f} at step {nearest}"
+        words = f"{gap} (circle: radius {COLLISION:g})"
+        ax.set_title(style.headline("Ferry", episode, words))
+        limits = dict(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set(xlabel="x", ylabel="y", aspect="equal", **limits)
     return ax
-
-
-def _circle(centre, radius):
-    from matplotlib.patches import Circle
-
-    return Circle(
-        tuple(centre),
-        radius,
-        facecolor=style.BLUE,
-        alpha=0.15,
-        edgecolor=style.BLUE,
-        linewidth=1.0,
-        zorder=2,
-    )

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["fms"]
 
 POINTS = 181  # on an arc
+LEGS = dict(color=style.GREY, linewidth=0.9, linestyle=style.DASHED, zorder=2)
+QUESTIONED = dict(color=style.VERMILION, linewidth=2.6)  # the arc in question
 UNITS = {"arc length": "", "kink": " rad", "disconnection": " ft", "course": " rad"}
 
 
@@ -47,9 +49,6 @@ def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) ->
         sim: its simulator.
         axes: two; None: a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for another system's simulator, for many episodes, and for fewer than two axes.
 
@@ -60,9 +59,7 @@ def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) ->
         ...     len(jast.plot.fms(jast.rollout(jax.random.key(0), sim), sim))
         2
     """
-    import matplotlib.pyplot as plt
-
-    style.one("fms", episode)
+    style.one_episode("fms", episode)
     path = fms_path(sim, episode)
     model = sim.init.args[0]
     arcs, built, error, event, path = jax.device_get(
@@ -70,17 +67,8 @@ def fms(episode: Episode, sim: Simulator, axes: Sequence[Axes] | None = None) ->
     )
     path = jax.tree.map(lambda a: a[: _count(path, a)], path)
     n = len(path.waypoints) - 2
-    with style.styled():
-        axes = style.panels(
-            "fms",
-            (
-                plt.subplots(1, 2, figsize=(11.5, 6.3), layout="constrained")[1]
-                if axes is None
-                else axes
-            ),
-            2,
-            "the map and the turn",
-        )[:2]
+    size = (11.5, 6.3)
+    with style.panels("fms", axes, size, 2, "the map and the turn", 2, sharex=False) as axes:
         worst = None
         if n:
             acted = path.skipped[:n] | ((np.arange(n) == n - 1) & path.skipped[n])
@@ -111,28 +99,22 @@ def _arcs(earth, path, event):
     _, at_end, _ = inverse(earth, path.centre, path.end)
     share = jnp.linspace(0.0, 1.0, POINTS)[None]
     sense, centres = jnp.sign(path.radius)[:, None], jnp.repeat(path.centre[:, None], POINTS, 1)
-    around = lambda azimuth: direct(
-        earth, centres, azimuth, jnp.broadcast_to(radius[:, None], azimuth.shape)
-    )[0]
+
+    def around(azimuth):
+        return direct(earth, centres, azimuth, jnp.broadcast_to(radius[:, None], azimuth.shape))[0]
+
     flown = around(at_start[:, None] + sense * angle[:, None] * share)
     built = around(at_end[:, None] - sense * jnp.abs(path.turn)[:, None] * (1 - share))
-    return (
-        flown,
-        built,
-        jnp.where(path.arc, jnp.abs(path.beta - angle * radius), 0),
-        EVENTS[event](earth, path),
-    )
+    error = jnp.where(path.arc, jnp.abs(path.beta - angle * radius), 0)
+    return flown, built, error, EVENTS[event](earth, path)
 
 
 def _line(path, arcs):
     """The whole path as points (latitude, longitude), from KSFO to KLAX."""
     parts = [path.waypoints[:1]]
     for i, arc in enumerate(arcs[: len(path.turn)]):
-        parts += [
-            path.start[i : i + 1],
-            arc if path.arc[i] else path.end[i : i + 1],
-            path.end[i : i + 1],
-        ]
+        end = path.end[i : i + 1]
+        parts += [path.start[i : i + 1], arc if path.arc[i] else end, end]
     return np.concatenate([*parts, path.waypoints[-1:]])
 
 
@@ -141,49 +123,22 @@ def _map(ax, path, arcs, worst):
     low, high = places.min(0) - 0.5, places.max(0) + 0.5
     for name, (latitude, longitude) in FIXES.items():
         ax.plot(longitude, latitude, "^", color="#C8C8C8", markersize=4, zorder=1)
-        ax.annotate(
-            name,
-            (longitude, latitude),
-            (3, 3),
-            textcoords="offset points",
-            color="#B4B4B4",
-            fontsize=6.5,
-            zorder=1,
-            annotation_clip=True,
-        )
-    ax.plot(
-        *places.T[::-1],
-        color=style.GREY,
-        linewidth=0.9,
-        linestyle=(0, (4, 2)),
-        label="legs",
-        zorder=2,
-    )
+        look = dict(color="#B4B4B4", fontsize=6.5, zorder=1, annotation_clip=True)
+        style.note(ax, name, (longitude, latitude), (3, 3), **look)
+    ax.plot(*places.T[::-1], label="legs", **LEGS)
     ax.plot(*_line(path, arcs).T[::-1], color=style.BLUE, label="predicted path", zorder=3)
     ax.plot(*places[1:-1].T[::-1], "o", color=style.INK, markersize=3.5, zorder=4)
     if worst is not None:
-        ax.plot(
-            *arcs[worst].T[::-1],
-            color=style.VERMILION,
-            linewidth=2.6,
-            label="arc with the largest error",
-            zorder=5,
-        )
+        label = "arc with the largest error"
+        ax.plot(*arcs[worst].T[::-1], label=label, zorder=5, **QUESTIONED)
+    above = dict(path_effects=style.halo(), zorder=7)
     for group in _groups(places[1:-1]):
-        words = dict(textcoords="offset points", fontsize=8, path_effects=style.halo(), zorder=7)
-        ax.annotate(
-            ", ".join(str(i + 1) for i in group), places[group[0] + 1][::-1], (6, 5), **words
-        )
+        numbers = ", ".join(str(i + 1) for i in group)
+        style.note(ax, numbers, places[group[0] + 1][::-1], (6, 5), fontsize=8, **above)
     for name, (latitude, longitude) in (("KSFO", KSFO), ("KLAX", KLAX)):
         ax.plot(longitude, latitude, "s", color=style.GREEN, markersize=8, zorder=6)
-        words = dict(
-            textcoords="offset points",
-            color=style.GREEN,
-            weight="bold",
-            path_effects=style.halo(),
-            zorder=7,
-        )
-        ax.annotate(name, (longitude, latitude), (9, 5), **words)
+        look = dict(color=style.GREEN, weight="bold", **above)
+        style.note(ax, name, (longitude, latitude), (9, 5), **look)
     ax.set(xlabel="longitude (degrees)", ylabel="latitude (degrees)")
     _frame(ax, low[::-1], high[::-1], np.cos(np.radians((low[0] + high[0]) / 2)))
     ax.legend(loc="best", fontsize=9)
@@ -195,10 +150,8 @@ def _groups(points):
     """
     groups = []
     for i, point in enumerate(points):
-        near = next(
-            (group for group in groups if np.hypot(*(points[group[0]] - point)) < 0.12), None
-        )
-        groups.append([i]) if near is None else near.append(i)
+        near = [group for group in groups if np.hypot(*(points[group[0]] - point)) < 0.12]
+        near[0].append(i) if near else groups.append([i])
     return groups
 
 
@@ -208,41 +161,29 @@ def _frame(ax, low, high, narrow=1.0):
     """
     scale = np.array([narrow, 1.0])
     middle, half = (low + high) / 2, max((high - low) * scale) / 2 / scale
-    ax.set(
-        xlim=(middle[0] - half[0], middle[0] + half[0]),
-        ylim=(middle[1] - half[1], middle[1] + half[1]),
-        aspect=1 / narrow,
-    )
+    ends = np.stack([middle - half, middle + half])
+    ax.set(xlim=ends[:, 0], ylim=ends[:, 1], aspect=1 / narrow)
 
 
 def _turn(ax, path, arcs, built, i, error):
     origin = path.waypoints[i + 1]
-    plane = lambda points: (
-        ((np.asarray(points) - origin) * 60)[..., ::-1] * [np.cos(np.radians(origin[0])), 1]
-    )  # (east, north) in nmi
-    ax.plot(
-        *plane(path.waypoints).T, color=style.GREY, linewidth=0.9, linestyle=(0, (4, 2)), zorder=2
-    )
+    narrow = [np.cos(np.radians(origin[0])), 1]
+
+    def plane(points):
+        """(east, north) in nmi"""
+        return ((np.asarray(points) - origin) * 60)[..., ::-1] * narrow
+
+    ax.plot(*plane(path.waypoints).T, **LEGS)
     ax.plot(*plane(_line(path, arcs)).T, color=style.BLUE, zorder=3)
-    ax.plot(
-        *plane(built[i]).T,
-        color=style.GREEN,
-        linestyle=(0, (3, 1.5)),
-        linewidth=1.6,
-        label="as it was built",
-        zorder=5,
-    )
-    ax.plot(
-        *plane(arcs[i]).T,
-        color=style.VERMILION,
-        linewidth=2.6,
-        label="as its packet says",
-        zorder=4,
-    )
-    away = plane(path.start[i]) - plane(path.centre[i])
+    look = dict(color=style.GREEN, linestyle=(0, (3, 1.5)), linewidth=1.6)
+    ax.plot(*plane(built[i]).T, label="as it was built", zorder=5, **look)
+    ax.plot(*plane(arcs[i]).T, label="as its packet says", zorder=4, **QUESTIONED)
+    centre = plane(path.centre[i])
+    away = plane(path.start[i]) - centre
     # s is named outside of the circle, e inside, so that the names stay apart where s and e are
     # near
     away = 13 * away / max(np.hypot(*away), 1e-9)
+    red = dict(color=style.VERMILION)
     for name, point, offset in (
         ("s", path.start[i], away),
         ("e", path.end[i], -away),
@@ -250,42 +191,25 @@ def _turn(ax, path, arcs, built, i, error):
     ):
         here = plane(point)
         if name != "c":
-            ax.plot(
-                *np.stack([plane(path.centre[i]), here]).T,
-                color=style.VERMILION,
-                linewidth=0.8,
-                linestyle=":",
-                zorder=3,
-            )
-        ax.plot(*here, "o" if name != "c" else "+", color=style.VERMILION, markersize=7, zorder=6)
-        place = dict(textcoords="offset points", ha="center", va="center", color=style.VERMILION)
-        ax.annotate(name, here, offset, **place, weight="bold", path_effects=style.halo(), zorder=8)
+            ax.plot(*np.stack([centre, here]).T, linewidth=0.8, linestyle=":", zorder=3, **red)
+        ax.plot(*here, "o" if name != "c" else "+", markersize=7, zorder=6, **red)
+        look = dict(ha="center", va="center", weight="bold", path_effects=style.halo())
+        style.note(ax, name, here, offset, zorder=8, **look, **red)
     ax.plot(*plane(path.waypoints[1:-1]).T, "o", color=style.INK, markersize=4.5, zorder=7)
     turns = range(max(i - 1, 0) if path.skipped[i] else i, i + 1)
-    shown = np.concatenate(
-        [
-            *(plane(arcs[j]) for j in turns),
-            plane(built[i]),
-            plane([path.start[i], path.end[i], path.centre[i], origin]),
-        ]
-    )
+    corners = plane([path.start[i], path.end[i], path.centre[i], origin])
+    shown = np.concatenate([*(plane(arcs[j]) for j in turns), plane(built[i]), corners])
     low, high = shown.min(0), shown.max(0)
     margin = 0.15 * max(*(high - low), 0.1)
     apart = path.legs[i] / FOOT
-    gap = (
-        f"{apart:,.{0 if apart > 10 else 1}f} ft"
-        if apart < 3000
-        else f"{path.legs[i] / NMI:,.1f} nmi"
-    )
-    stated = (
-        f"stated length {path.beta[i] / NMI:.3f} nmi, error {error:,.2f} ft"
-        if error < 1e3
-        else f"stated {path.beta[i] / NMI:.2f} nmi, error {error:,.0f} ft"
-    )
-    ax.set_title(
-        f"Turn at waypoint {i + 1}, {gap} behind {i if i else 'KSFO'}\n{stated}"
-        + ("\nthe leg between was not fitted" if path.skipped[i] else "")
-    )
+    gap = f"{path.legs[i] / NMI:,.1f} nmi"
+    if apart < 3000:
+        gap = f"{apart:,.{0 if apart > 10 else 1}f} ft"
+    stated = f"stated {path.beta[i] / NMI:.2f} nmi, error {error:,.0f} ft"
+    if error < 1e3:
+        stated = f"stated length {path.beta[i] / NMI:.3f} nmi, error {error:,.2f} ft"
+    title = f"Turn at waypoint {i + 1}, {gap} behind {i if i else 'KSFO'}\n{stated}"
+    ax.set_title(title + "\nthe leg between was not fitted" * bool(path.skipped[i]))
     ax.set(xlabel="east (nmi)", ylabel="north (nmi)")
     _frame(ax, low - margin, high + margin)
     ax.legend(loc="best", fontsize=9, title="the arc")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jast.search.result import SearchResult
 
 
-__all__ = ["disturbances", "distances", "history", "spreads"]
+__all__ = ["disturbances", "distances", "history", "shade_deviations", "spreads"]
 
 
 def history(
@@ -39,9 +39,6 @@ def history(
         total: draw the best over trees with the episodes of all trees, by which searches of
             different numbers of trees compare.
 
-    Returns:
-        The Axes.
-
     Example:
         >>> import jax, jast
         >>> sim = jast.simulators.walk1d()
@@ -50,53 +47,33 @@ def history(
     """
     from matplotlib.ticker import EngFormatter
 
-    results = results if isinstance(results, dict) else {"": results}
     with style.axes(ax, (6.8, 4.2)) as ax:
         means, bests = [], []
-        for i, (name, result) in enumerate(results.items()):
-            episodes, best = (
-                np.asarray(result.history.simulations),
-                np.asarray(result.history.best_reward, float),
-            )
+        for i, (name, result) in enumerate(style.by_name(results).items()):
+            episodes = np.asarray(result.history.simulations)
+            best = np.asarray(result.history.best_reward, float)
             best = np.where(np.isfinite(best), best, np.nan)  # no valid episode yet: not drawn
             if best.ndim != 2 or episodes.shape != best.shape[:1]:
                 raise ValueError(
                     "plot.history: history must have simulations [C] and best_reward [C, trees],"
                     f" received {episodes.shape} and {best.shape}"
                 )
-            colour, trees = style.COLOURS[i % len(style.COLOURS)], best.shape[1]
+            colour, trees = style.colour(i), best.shape[1]
             if total:
                 episodes, best, trees = episodes * trees, np.fmax.reduce(best, 1, keepdims=True), 1
             mean = best.mean(1)
-            label = (
-                name
-                if total
-                else f"{name + ': ' if name else ''}mean of {trees} tree{'s' * (trees > 1)}"
-            )
+            label = name if total else style.named(name, f"mean of {style.count_of(trees, 'tree')}")
             means += ax.plot(episodes, mean, color=colour, label=label, zorder=3)
             if trees > 1:
                 half = 1.96 * best.std(1, ddof=1) / np.sqrt(trees)
-                ax.fill_between(
-                    episodes, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0
-                )
-                bests += ax.plot(
-                    episodes,
-                    best.max(1),
-                    color=colour,
-                    linestyle=(0, (4, 2)),
-                    linewidth=1.3,
-                    label="best of them",
-                )
+                style.band(ax, episodes, mean - half, mean + half, color=colour)
+                look = dict(color=colour, linestyle=style.DASHED, linewidth=1.3)
+                bests += ax.plot(episodes, best.max(1), label="best of them", **look)
         ax.set(xlabel="episodes" if total else "episodes a tree", ylabel="best reward so far")
         if total:
             ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-        ax.legend(
-            [*means, *bests],
-            [line.get_label() for line in (*means, *bests)],
-            loc="lower left",
-            bbox_to_anchor=(-0.02, 1.0),
-            ncols=2,
-        )
+        lines = [*means, *bests]
+        style.legend_above(ax, lines, [line.get_label() for line in lines])
     return ax
 
 
@@ -120,9 +97,6 @@ def disturbances(
             same distance. Panels of x0, at step 0, come first. Grey: up to 1 and up to 2.
         units: name -> unit, for the labels; not where ``sim`` is given.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for no or many episodes, too few axes, and a simulator with a distribution that
             has no quantile function.
@@ -133,49 +107,49 @@ def disturbances(
         >>> len(jast.plot.disturbances(jast.rollout(jax.random.key(0), sim)))
         1
     """
-    style.one("disturbances", episode)
+    style.one_episode("disturbances", episode)
     n = int(episode.length)
     if sim is None:
         first, steps = (), episode.disturbances
     else:
         latent.check("plot.disturbances", sim)
         first, steps = spreads(sim, episode)
-    panels = [
-        (f._replace(name=f.name if f.name.startswith("x0") else f"x0 {f.name}"), 0)
+    first = [
+        (f if f.name.startswith("x0") else f._replace(name=f"x0 {f.name}"), 0)
         for f in fields(first, "x0", lead=0)
     ]
-    panels += [(f, 1) for f in fields(steps, "x")]
-    count = max(len(panels), 1)
-    with style.axes(axes, (6.8, 1.4 + 2.0 * count), count) as axes:
-        axes = style.panels("disturbances", axes, len(panels), "array of x")
-        for ax, ((name, places, values), begin) in zip(axes, panels, strict=False):
+    arrays = [*first, *((f, 1) for f in fields(steps, "x"))]
+    count = max(len(arrays), 1)
+    size = (6.8, 1.4 + 2.0 * count)
+    with style.panels("disturbances", axes, size, count, "array of x") as axes:
+        for ax, ((name, places, values), begin) in zip(axes, arrays, strict=False):
             rows = values[:n] if begin else values[None]
             few = rows.shape[1] <= len(style.COLOURS)
             if sim is not None:
-                for reach, alpha in ((2, 0.1), (1, 0.12)):
-                    ax.axhspan(-reach, reach, color=style.GREY, alpha=alpha, linewidth=0, zorder=0)
+                shade_deviations(ax)
             for i, row in enumerate(rows.T):
                 colour = style.COLOURS[i] if few else style.shade(i / (rows.shape[1] - 1))
-                ax.plot(
-                    np.arange(begin, begin + len(row)),
-                    row,
-                    color=colour,
-                    marker=style.MARKERS[i] if few else "o",
-                    markersize=3.5 if few or not begin else 0,
-                    label=places[i],
-                    linewidth=1.6 if few else 0.9,
-                )
+                look = dict(color=colour, linewidth=1.6 if few else 0.9, label=places[i])
+                look |= dict(marker=style.MARKERS[i] if few else "o")
+                look |= dict(markersize=3.5 if few or not begin else 0)
+                ax.plot(np.arange(begin, begin + len(row)), row, **look)
             if few and 1 < rows.shape[1] and rows.size:
                 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="entry")
             ax.set(
                 ylabel=style.labelled(name, units if sim is None else None),
-                xlim=(-0.5 if panels and not panels[0][1] else 0.5, max(n, 1) + 0.5),
+                xlim=(-0.5 if first else 0.5, max(n, 1) + 0.5),
             )
-            ax.xaxis.get_major_locator().set_params(integer=True)
-        axes[len(panels) - 1].set_xlabel("step")
+            style.whole_steps(ax.xaxis)
+        axes[-1].set_xlabel("step")
         what = "Disturbances" if sim is None else "Disturbances in standard deviations"
         axes[0].set_title(style.headline(what, episode))
     return axes
+
+
+def shade_deviations(ax: Axes) -> None:
+    """Grey: up to 1 and up to 2 standard deviations."""
+    for reach, alpha in ((2, 0.1), (1, 0.12)):
+        ax.axhspan(-reach, reach, color=style.GREY, alpha=alpha, linewidth=0, zorder=0)
 
 
 def spreads(sim: Simulator, episode: Episode) -> tuple[Any, Any]:
@@ -209,9 +183,6 @@ def distances(
         bins: of the histogram.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: where no episode or no label fits.
 
@@ -238,32 +209,17 @@ def distances(
     edges = np.histogram_bin_edges(finite, bins) if finite.size else np.linspace(0, 1, 2)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (label, (d, failure)) in enumerate(zip(labels, batches, strict=True)):
-            colour = style.COLOURS[i % len(style.COLOURS)]
+            colour = style.colour(i)
             share = np.histogram(d[np.isfinite(d)], edges)[0] / max(len(d), 1)
-            name = f"{label}: {len(d)} episode{'s' * (len(d) != 1)}, {int(failure.sum())} fail"
+            words = f"{style.count_of(len(d), 'episode')}, {int(failure.sum())} fail"
+            unnamed = len(episodes) == 1 and label == "batch 1"
             ax.stairs(share, edges, color=colour, fill=True, alpha=0.2)
-            ax.stairs(
-                share,
-                edges,
-                color=colour,
-                linewidth=1.6,
-                label=(
-                    name
-                    if len(episodes) > 1 or labels[0] != "batch 1"
-                    else name.removeprefix("batch 1: ")
-                ),
-            )
+            words = style.named("" if unnamed else label, words)
+            ax.stairs(share, edges, color=colour, linewidth=1.6, label=words)
             hits = d[failure & np.isfinite(d)]
-            ax.plot(
-                hits,
-                np.full(len(hits), -0.02 - 0.03 * i),
-                "|",
-                color=colour,
-                markersize=8,
-                transform=ax.get_xaxis_transform(),
-                clip_on=False,
-            )
+            at = np.full(len(hits), -0.02 - 0.03 * i), ax.get_xaxis_transform()
+            ax.plot(hits, at[0], "|", color=colour, markersize=8, transform=at[1], clip_on=False)
         ax.set(xlabel="miss distance", ylabel="share of episodes", ylim=(0, None))
         ax.tick_params(axis="x", pad=6 + 6 * len(episodes), length=0)
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0))
+        style.legend_above(ax, ncols=1)
     return ax

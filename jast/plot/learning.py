@@ -28,9 +28,6 @@ def training(
         policies: of `jast.policies.sac` or `ppo`, or a dict of name -> policy.
         axes: two, to draw into.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for what is no failure policy, and for too few axes.
 
@@ -41,12 +38,12 @@ def training(
         >>> len(jast.plot.training(jast.policies.sac(jax.random.key(0), sim, **small)))
         2
     """
-    policies = policies if isinstance(policies, dict) else {"": policies}
+    policies = style.by_name(policies)
     _check("training", "policies", policies, FailurePolicy)
-    with style.axes(axes, (6.8, 5.4), 2) as axes:
-        share, log_p = axes = style.panels("training", axes, 2, "quantity")[:2]
+    with style.panels("training", axes, (6.8, 5.4), 2, "quantity") as axes:
+        share, log_p = axes
         for i, (name, policy) in enumerate(policies.items()):
-            h, look = policy.history, dict(color=style.COLOURS[i % len(style.COLOURS)], label=name)
+            h, look = policy.history, dict(color=style.colour(i), label=name)
             share.plot(h.episodes, h.failing_share, **look)
             log_p.plot(h.episodes, h.log_p, **look)  # NaN where none failed: not drawn
         share.set(ylabel="share that fails", ylim=(0, None))
@@ -64,9 +61,6 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
         proposals: one run, or a dict of name -> run.
         ax: to draw into.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for what is no such result, and a batch of runs.
 
@@ -76,7 +70,7 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
         >>> found = jast.estimate.failure_proposal(jax.random.key(0), sim, samples=200)
         >>> ax = jast.plot.levels(found)
     """
-    proposals = proposals if isinstance(proposals, dict) else {"": proposals}
+    proposals = style.by_name(proposals)
     _check("levels", "proposals", proposals, FailureProposal)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (name, found) in enumerate(proposals.items()):
@@ -86,10 +80,10 @@ def levels(proposals: FailureProposal | dict[str, FailureProposal], ax: Axes | N
                     f"plot.levels: proposals must be one run each, received {reached.shape[:-1]}"
                 )
             at = np.arange(1, len(reached) + 1)
-            look = dict(color=style.COLOURS[i % len(style.COLOURS)], marker=style.MARKERS[i % 6])
+            look = dict(color=style.colour(i), marker=style.marker(i))
             ax.plot(at, np.where(np.isfinite(reached), reached, np.nan), label=name, **look)
         ax.set(xlabel="iteration", ylabel="miss distance of the elites", ylim=(0, None))
-        ax.xaxis.get_major_locator().set_params(integer=True)
+        style.whole_steps(ax.xaxis)
         _legend(ax, proposals)
     return ax
 
@@ -105,4 +99,4 @@ def _check(caller: str, name: str, given: dict, kind: type) -> None:
 
 def _legend(ax: Any, named: dict) -> None:
     if set(named) != {""}:
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
+        style.legend_above(ax)

@@ -24,24 +24,23 @@ from jast.stress_testing import Report
 
 __all__ = [
     "DISTANCE",
-    "Given",
-    "Lines",
-    "chosen",
-    "free",
-    "given",
-    "kind_words",
-    "kinds",
-    "lines",
-    "nominal_lines",
-    "quiet_line",
+    "Samples",
+    "Series",
+    "choose_fields",
+    "replays_without_calls",
+    "samples_of",
+    "mode_label",
+    "by_mode",
+    "series_of",
+    "nominal_series",
+    "undisturbed_series",
 ]
 
 DISTANCE = "miss distance"
-DRAWS = 200
-"""Nominal episodes of a band."""
+DRAWS = 200  # nominal episodes of a band
 
 
-class Given(NamedTuple):
+class Samples(NamedTuple):
     """Episodes that are to be drawn."""
 
     episodes: Episode
@@ -53,7 +52,7 @@ class Given(NamedTuple):
     """How many modes there are"""
 
 
-class Lines(NamedTuple):
+class Series(NamedTuple):
     """Numbers of episodes over their steps."""
 
     columns: dict[str, np.ndarray]
@@ -64,7 +63,7 @@ class Lines(NamedTuple):
     """Which of the names are drawn where nobody chooses: those of the state, if it has any"""
 
 
-def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
+def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Samples:
     """At most ``most`` episodes of ``samples``, evenly taken.
 
     Args:
@@ -90,7 +89,7 @@ def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
         samples = Modes([samples])
     if isinstance(samples, Modes) and len(samples):
         modes = np.arange(len(samples)) if modes is None else modes
-        samples = _heads(samples)
+        samples = _likeliest(samples)
     if isinstance(samples, SearchResult | FailureSamples):
         samples = samples.failures
     samples = samples.episodes if isinstance(samples, Failures) else samples
@@ -110,39 +109,41 @@ def given(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Given:
     rows = np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int))
     few = jax.tree.map(lambda a: a[rows], samples)
     if modes is None or (isinstance(modes, Modes) and not len(modes)):
-        return Given(few, sim, None, 0)
+        return Samples(few, sim, None, 0)
     if isinstance(modes, Modes):
-        return Given(few, sim, owners(sim, few._replace(states=None), _heads(modes)), len(modes))
+        return Samples(
+            few, sim, owners(sim, few._replace(states=None), _likeliest(modes)), len(modes)
+        )
     numbers = np.asarray(modes)
     if numbers.shape != (n,) or numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(
             f"plot.{caller}: modes must be jast.search.Modes, or the number of its mode from 0 for"
             f" each of {n} episodes, received {modes!r}"
         )
-    return Given(few, sim, numbers[rows], int(numbers.max()) + 1)
+    return Samples(few, sim, numbers[rows], int(numbers.max()) + 1)
 
 
-def _heads(modes: Modes) -> Episode:
+def _likeliest(modes: Modes) -> Episode:
     """The likeliest failure of each mode, as a batch without states."""
     each = [m.failure._replace(states=None) for m in modes]
     return jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
 
 
-def kinds(g: Given) -> list[tuple[int, np.ndarray]]:
+def by_mode(g: Samples) -> list[tuple[int, np.ndarray]]:
     """(number of the look, which episodes): the modes, or all in one."""
     if g.mode is None:
         return [(1, np.arange(len(g.episodes.length)))]
     return [(k, np.flatnonzero(g.mode == k)) for k in range(g.modes) if (g.mode == k).any()]
 
 
-def kind_words(g: Given, kind: int, count: int) -> str:
+def mode_label(g: Samples, kind: int, count: int) -> str:
     """What a legend calls ``count`` episodes of one kind."""
     fail = bool(np.asarray(g.episodes.failure).all())
     what = f"failure{'s' * (count != 1)}" if fail else f"episode{'s' * (count != 1)}"
     return f"{count} {what}" if g.mode is None else f"mode {kind + 1}: {count} {what}"
 
 
-def lines(sim: Simulator, episodes: Episode) -> Lines:
+def series_of(sim: Simulator, episodes: Episode) -> Series:
     """The numbers of the states of ``episodes`` [n], their miss distance, and their disturbances as
     "disturbance ...". Without states they are replayed; a black box with states is run once an
     episode then.
@@ -162,14 +163,16 @@ def lines(sim: Simulator, episodes: Episode) -> Lines:
         distance = np.asarray(far(sim, flat), float).reshape(there.shape)
         columns[DISTANCE] = np.where(there, distance, np.nan)
     own = tuple(columns)
-    late = jax.tree.map(lambda a: _late(np.asarray(a, float), sim.horizon), episodes.disturbances)
+    late = jax.tree.map(
+        lambda a: _from_step_1(np.asarray(a, float), sim.horizon), episodes.disturbances
+    )
     for name, values in _columns(late, "disturbance", there).items():
         columns[name if name.startswith("disturbance") else f"disturbance {name}"] = values
-    return Lines(columns, length, own or tuple(columns))
+    return Series(columns, length, own or tuple(columns))
 
 
-def free(sim: Simulator) -> bool:
-    """Whether `lines` calls no black box."""
+def replays_without_calls(sim: Simulator) -> bool:
+    """Whether `series_of` calls no black box."""
     return not hosted(sim) or isinstance(outline(sim).state, Record)
 
 
@@ -192,14 +195,15 @@ def _columns(tree: Any, root: str, there: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _late(a: np.ndarray, horizon: int) -> np.ndarray:
+def _from_step_1(a: np.ndarray, horizon: int) -> np.ndarray:
     """[n, horizon + 1, ...]: the disturbance of step t led to state t."""
+    a = np.asarray(a, float)
     out = np.full((len(a), horizon + 1, *a.shape[2:]), np.nan)
     out[:, 1 : a.shape[1] + 1] = a
     return out
 
 
-def _moves(values: np.ndarray) -> bool:
+def _changes(values: np.ndarray) -> bool:
     seen = values[np.isfinite(values)]
     return bool(len(seen)) and float(np.ptp(seen)) > 0
 
@@ -210,13 +214,13 @@ def _departs(values: np.ndarray, usual: np.ndarray) -> bool:
     return bool((gap[np.isfinite(gap)] > 1e-6 * size).any())
 
 
-def nominal_lines(caller: str, sim: Simulator, nominal: Any) -> Lines | None:
-    """The `Lines` of nominal episodes: those of an `Episode` batch, or so many drawn with key 0.
+def nominal_series(caller: str, sim: Simulator, nominal: Any) -> Series | None:
+    """The `Series` of nominal episodes: those of an `Episode` batch, or so many drawn with key 0.
 
     ``nominal`` None: 200 are drawn, of a black box none, as each is a call.
     """
     if isinstance(nominal, Episode):
-        return lines(sim, given(caller, nominal, sim, None, DRAWS).episodes)
+        return series_of(sim, samples_of(caller, nominal, sim, None, DRAWS).episodes)
     count = (0 if hosted(sim) else DRAWS) if nominal is None else nominal
     if isinstance(count, bool) or not isinstance(count, int) or count < 0:
         raise ValueError(
@@ -226,28 +230,30 @@ def nominal_lines(caller: str, sim: Simulator, nominal: Any) -> Lines | None:
     if not count:
         return None
     keys = jax.random.split(jax.random.key(0), count)
-    return lines(sim, (_drawn if hosted(sim) else _compiled_draws)(sim, keys))
+    return series_of(sim, (_drawn if hosted(sim) else _compiled_draws)(sim, keys))
 
 
-def quiet_line(sim: Simulator) -> Lines | None:
-    """The `Lines` of the one undisturbed episode; None where a disturbance has neither a mode nor a
+def undisturbed_series(sim: Simulator) -> Series | None:
+    """The `Series` of the undisturbed episode; None where a disturbance has neither a mode nor a
     median.
     """
     about = outline(sim)
     if not (about.start.mode and about.disturbance.mode):
         return None
     quiet = rollout(jax.random.key(0), sim, undisturbed(sim))
-    return lines(sim, jax.tree.map(lambda a: a[None], quiet))
+    return series_of(sim, jax.tree.map(lambda a: a[None], quiet))
 
 
-def chosen(caller: str, names: Any, of: Lines, most: int, quiet: Lines | None = None) -> list[str]:
+def choose_fields(
+    caller: str, names: Any, of: Series, most: int, quiet: Series | None = None
+) -> list[str]:
     """The names to draw: those asked for, where "car" stands for all numbers of that array; or the
     first ``most`` of what moves, and otherwise than in the episode ``quiet``, the miss distance
     among them.
     """
     if names is None:
         rest = [k for k in of.state if k != DISTANCE]
-        rest = [k for k in rest if _moves(of.columns[k])] or rest
+        rest = [k for k in rest if _changes(of.columns[k])] or rest
         if quiet is not None:
             rest = [k for k in rest if _departs(of.columns[k], quiet.columns[k])] or rest
         own = [DISTANCE] * (DISTANCE in of.state)

@@ -32,9 +32,6 @@ def probability(
         truth: the known probability, a vertical line.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything else, a truth outside (0, 1], and estimates below the least double.
 
@@ -64,44 +61,23 @@ def probability(
         levels = sorted({e.level for e in found})
         interval = f"{levels[0]:.4g} interval" if len(levels) == 1 else "interval"
         if truth is not None:
-            ax.axvline(
-                float(truth),
-                color=style.INK,
-                linewidth=1.2,
-                linestyle=(0, (1, 1.5)),
-                label=f"truth {float(truth):.4g}",
-            )
+            look = dict(color=style.INK, linewidth=1.2, linestyle=style.DOTTED)
+            ax.axvline(float(truth), label=f"truth {float(truth):.4g}", **look)
+        beside = dict(transform=ax.get_yaxis_transform(), va="center", fontsize=9)
         for y, row in enumerate(rows.values()):
-            for at, e in zip(
-                y + (np.linspace(-0.3, 0.3, len(row)) if len(row) > 1 else np.zeros(1)),
-                row,
-                strict=True,
-            ):
-                _row(ax, e, at, interval)
-            ax.text(
-                1.02, y, _words(row), transform=ax.get_yaxis_transform(), va="center", fontsize=9
-            )
-        ax.set(
-            xscale="log",
-            xlabel="failure probability",
-            yticks=range(len(rows)),
-            ylim=(len(rows) - 0.5, -0.5),
-        )
+            offsets = np.linspace(-0.3, 0.3, len(row)) if len(row) > 1 else np.zeros(1)
+            for offset, e in zip(offsets, row, strict=True):
+                _row(ax, e, y + offset, interval)
+            ax.text(1.02, y, _words(row), **beside)
+        ax.set(xscale="log", xlabel="failure probability")
+        ax.set(yticks=range(len(rows)), ylim=(len(rows) - 0.5, -0.5))
         ax.set_yticklabels([e.method if name is None else name for name, (e, *_) in rows.items()])
         ax.tick_params(axis="y", length=0)
         ax.grid(False, axis="y")
-        handles = {
-            label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-        }
+        handles, labels = ax.get_legend_handles_labels()
         if handles:
-            ax.legend(
-                handles.values(),
-                handles,
-                loc="lower left",
-                bbox_to_anchor=(-0.02, 1.0),
-                ncols=3,
-                fontsize=9,
-            )
+            once = dict(zip(labels, handles, strict=True))
+            style.legend_above(ax, once.values(), once, ncols=3, fontsize=9)
     return ax
 
 
@@ -117,9 +93,6 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
         traces: the `Traces` of `jast.estimate.log_weights`, or a dict of name -> `Traces`.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything else, and with fewer than 2 failures.
 
@@ -131,7 +104,7 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.ticker import LogLocator
 
-    traces = traces if isinstance(traces, dict) else {"": traces}
+    traces = style.by_name(traces)
     with style.axes(ax, (6.8, 3.8)) as ax:
         for i, (name, t) in enumerate(traces.items()):
             if not isinstance(t, Traces) or np.ndim(t.log_weight) != 1:
@@ -149,44 +122,25 @@ def weights(traces: Traces, ax: Axes | None = None) -> Axes:
             k = pareto_k(log_w, n)
             w = np.exp(log_w - log_w[0])
             w, share = w * n / w.sum(), np.arange(1, len(w) + 1) / n
-            colour, words = (
-                style.COLOURS[i % len(style.COLOURS)],
-                f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else ""),
-            )
+            words = f"k-hat {k:.2f}" + (" UNRELIABLE" if not k <= 0.7 else "")
             # the tail that pareto_k looks at
             m = min(int(np.ceil(min(n / 5, 3 * np.sqrt(n)))), len(w) - 1)
             # evenly along the axis
             few = np.unique(np.geomspace(1, min(4 * m, len(w)), 200).astype(int)) - 1
-            look = dict(linestyle="", marker=style.MARKERS[i % len(style.MARKERS)], markersize=4)
-            ax.plot(
-                w[few],
-                share[few],
-                color=colour,
-                label=f"{name}: {words}" if name else words,
-                zorder=3,
-                **look,
-            )
+            look = dict(color=style.colour(i), marker=style.marker(i), linestyle="", markersize=4)
+            ax.plot(w[few], share[few], label=style.named(name, words), zorder=3, **look)
             if np.isfinite(k) and w[0] > w[m]:
                 x = np.geomspace(w[m], w[0], 100)
                 k = k if abs(k) > 1e-6 else 1e-6
                 scale = k * (np.median(w[:m]) - w[m]) / (2**k - 1)
                 above = np.maximum(1 + k * (x - w[m]) / scale, 0)
                 tail = m / n * np.where(above > 0, above, np.nan) ** (-1 / k)
-                ax.plot(
-                    x,
-                    np.where(tail >= 0.3 / n, tail, np.nan),
-                    color=style.INK,
-                    linewidth=1.2,
-                    zorder=4,
-                )
-        ax.set(
-            xscale="log",
-            yscale="log",
-            xlabel="weight over the mean weight",
-            ylabel="share of episodes above it",
-        )
+                tail = np.where(tail >= 0.3 / n, tail, np.nan)
+                ax.plot(x, tail, color=style.INK, linewidth=1.2, zorder=4)
+        words = "weight over the mean weight", "share of episodes above it"
+        ax.set(xscale="log", yscale="log", xlabel=words[0], ylabel=words[1])
         ax.yaxis.set_major_locator(LogLocator(numticks=8))
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+        style.legend_above(ax, fontsize=9)
     return ax
 
 
@@ -195,37 +149,19 @@ def _row(ax, e, y, interval):
     low, high = e.interval
     if np.isnan(e.mean):  # an upper bound is all that is known
         if high < 1:
-            ax.plot(
-                high,
-                y,
-                linestyle="",
-                marker=8,
-                markersize=9,
-                color=style.PURPLE,
-                label="no failure seen: upper bound",
-                zorder=3,
-            )
+            look = dict(color=style.PURPLE, linestyle="", marker=8, markersize=9, zorder=3)
+            ax.plot(high, y, label="no failure seen: upper bound", **look)
         return
-    look = (
-        dict(color=style.BLUE, linestyle="-")
-        if e.reliable
-        else dict(color=style.VERMILION, linestyle=(0, (2, 1.5)))
-    )
+    look = dict(color=style.VERMILION, linestyle=(0, (2, 1.5)))
+    marker, label = "X", "UNRELIABLE"
+    if e.reliable:
+        look = dict(color=style.BLUE, linestyle="-")
+        marker, label = "o", f"estimate, {interval}"
     ends = [max(low, np.finfo(float).tiny), high]
     # with caps that stand out of the dot, which is wider than a good interval
     ax.plot(ends, [y, y], **look, linewidth=1.6, marker="|", markersize=11, zorder=3)
-    marker, label = ("o", f"estimate, {interval}") if e.reliable else ("X", "UNRELIABLE")
-    ax.plot(
-        e.mean,
-        y,
-        **look,
-        marker=marker,
-        markersize=6,
-        markeredgecolor="white",
-        markeredgewidth=0.7,
-        label=label,
-        zorder=4,
-    )
+    look |= dict(marker=marker, markersize=6, markeredgecolor="white", markeredgewidth=0.7)
+    ax.plot(e.mean, y, **look, label=label, zorder=4)
 
 
 def _words(row):

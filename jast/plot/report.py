@@ -13,17 +13,17 @@ from jast.fields import fields
 from jast.incidents import hosted
 from jast.outline import outline
 from jast.plot import style
-from jast.plot.general import spreads
+from jast.plot.general import shade_deviations, spreads
 from jast.plot.played import (
     DISTANCE,
-    Given,
-    Lines,
-    chosen,
-    free,
-    given,
-    lines,
-    nominal_lines,
-    quiet_line,
+    Samples,
+    Series,
+    choose_fields,
+    nominal_series,
+    replays_without_calls,
+    samples_of,
+    series_of,
+    undisturbed_series,
 )
 from jast.plot.states import draw_traces
 from jast.simulator import Simulator
@@ -36,16 +36,17 @@ if TYPE_CHECKING:
     from jast.episode import Episode
 
 
-__all__ = ["report"]
+__all__ = ["pictures", "report"]
 
-WIDTH, MARGIN = 8.27, 0.55
-"""Inches: as wide as A4."""
-LINE, MODE, PANEL = 0.185, 1.62, 1.02
-"""Inches: of a line of words, of a failure mode, and of its panels."""
-MODES, EACH = 4, 12
-"""Modes that are drawn, and failures of each."""
-DOTS, COLOURS = 80, 32
-"""To the inch, and different ones, in a notebook: a quarter of the bytes of all colours."""
+WIDTH = 8.27  # inches: of A4
+MARGIN = 0.55  # inches
+LINE = 0.185  # inches: of a line of words
+MODE = 1.62  # inches: of a failure mode
+PANEL = 1.02  # inches: of its panels
+MODES = 4  # that are drawn
+FAILURES = 12  # of each mode, behind its likeliest
+DOTS = 80  # to the inch, in a notebook
+COLOURS = 32  # different ones there: a quarter of the bytes of all colours
 MOODS = {"good": style.GREEN, "bad": style.VERMILION, "unknown": style.GREY}
 
 
@@ -89,9 +90,9 @@ def report(
             f"plot.report: report must be of jast.stress, received a {type(report).__name__}"
         )
     sim = report.sim if sim is None else sim
-    shown = _shown(report)
+    shown = _shown_failures(report)
     told = belief(report.probability)
-    left = _left(told)
+    left = _probability_rows(told)
     ours = "", "probability", "doubtful"
     known = [(name, words) for name, words in verdict(report) if name not in ours]
     right = _wrapped([*known, ("evaluations", f"{report.episodes:,}")], 43)
@@ -105,15 +106,15 @@ def report(
     with style.styled():
         figure = plt.figure(figsize=(WIDTH, height))
         page = _Page(figure, height)
-        _title(page, title, headline(report)[1])
+        _draw_title(page, title, headline(report)[1])
         page.y = MARGIN + top
-        _belief(page, told, left)
-        _rows(page, right, MARGIN + 3.75, 1.0)
+        _draw_probability(page, told, left)
+        _draw_facts(page, right, MARGIN + 3.75, 1.0)
         page.y = MARGIN + top + facts
         if shown:
-            _modes(page, report, sim, shown, nominal, units)
+            _draw_modes(page, report, sim, shown, nominal, units)
         page.y = MARGIN + top + facts + modes
-        _tried(page, report, tried)
+        _draw_work(page, report, tried)
         page.y += 0.1
         for line in textwrap.wrap(advice(report), 100):
             page.words(MARGIN, line, color=style.GREY, fontsize=8.5)
@@ -129,13 +130,13 @@ def pictures(report: Report) -> list[bytes]:
     from PIL import Image  # comes with matplotlib
 
     sim = None if report.sim is None or hosted(report.sim) else report.sim
-    shown, files = _shown(report), []
+    shown, files = _shown_failures(report), []
     with style.styled():
-        owned = _played(report, sim, shown, None) if shown else None
+        owned = _series_of_modes(report, sim, shown, None) if shown else None
         for k, failure in enumerate(shown):
             page = _Page(Figure(figsize=(WIDTH, MODE + 0.35)), MODE + 0.35)
             page.y = 0.45
-            _mode(page, sim, owned, failure, k, None, legend=True)
+            _draw_mode(page, sim, owned, failure, k, None, legend=True)
             page.figure.savefig(whole := io.BytesIO(), format="png", dpi=DOTS)
             few = Image.open(whole).convert("RGB").quantize(COLOURS)
             few.save(file := io.BytesIO(), format="png", optimize=True)
@@ -143,7 +144,7 @@ def pictures(report: Report) -> list[bytes]:
     return files
 
 
-def _shown(report: Report) -> list[Episode]:
+def _shown_failures(report: Report) -> list[Episode]:
     return [mode.failure for mode in report.modes[:MODES]] or list(report.failures[:1])
 
 
@@ -163,13 +164,13 @@ class _Page:
         return self.figure.add_axes((x / WIDTH, below, width / WIDTH, height / self.height))
 
 
-def _title(page: _Page, title: list[str], mood: str) -> None:
+def _draw_title(page: _Page, title: list[str], mood: str) -> None:
     page.words(MARGIN, "jast: adaptive stress test", color=style.GREY, fontsize=9)
     for i, line in enumerate(title):
         page.words(MARGIN, line, 0.22 + 0.27 * i, color=MOODS[mood], fontsize=13.5, weight="bold")
 
 
-def _left(told: Any) -> list[tuple[str, str]]:
+def _probability_rows(told: Any) -> list[tuple[str, str]]:
     rows = [("", told.more)] if told.more else []
     rows += [("!", told.badge)] if told.badge else []
     return _wrapped([*rows, *((">", reason) for reason in told.reasons), *told.facts], 44)
@@ -185,7 +186,7 @@ def _wrapped(rows: list, width: int) -> list[tuple[str, str]]:
     return out
 
 
-def _belief(page: _Page, told: Any, rows: list) -> None:
+def _draw_probability(page: _Page, told: Any, rows: list) -> None:
     page.words(MARGIN, "Probability of failure", weight="bold", fontsize=10.5)
     look = dict(fontsize=19 if len(told.value) < 16 else 13, weight="bold")
     if told.doubt:
@@ -202,81 +203,81 @@ def _belief(page: _Page, told: Any, rows: list) -> None:
             page.words(MARGIN + 1.5, words, down, fontsize=8.5)
 
 
-def _rows(page: _Page, rows: list, x: float, indent: float) -> None:
+def _draw_facts(page: _Page, rows: list, x: float, indent: float) -> None:
     for i, (name, words) in enumerate(rows):
         page.words(x, name or "", LINE * i, fontsize=8.5, color=style.GREY)
         page.words(x + indent, words, LINE * i, fontsize=8.5)
 
 
-def _modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units: Any) -> None:
+def _draw_modes(page: _Page, report: Any, sim: Any, shown: list, nominal: Any, units: Any) -> None:
     more = len(report.modes) - len(shown)
     words = f"Failure modes{f' ({len(shown)} of {len(report.modes)})' if more > 0 else ''}"
     page.words(MARGIN, words, weight="bold", fontsize=10.5)
     page.y += 0.45
-    owned = _played(report, sim, shown, nominal)
+    owned = _series_of_modes(report, sim, shown, nominal)
     for k, failure in enumerate(shown):
         facts = "   ".join(f"{name} {value}" for name, value in mode_facts(report, k, failure))
         colour = style.look(k)[0]
         page.words(MARGIN, f"Mode {k + 1}", -0.12, weight="bold", fontsize=9, color=colour)
         page.words(MARGIN + 0.65, facts, -0.12, fontsize=8.5)
-        _mode(page, sim, owned, failure, k, units, legend=k == 0)
+        _draw_mode(page, sim, owned, failure, k, units, legend=k == 0)
         page.y += MODE
 
 
-def _played(report: Any, sim: Any, shown: list, nominal: Any) -> tuple | None:
+def _series_of_modes(report: Any, sim: Any, shown: list, nominal: Any) -> tuple | None:
     """What the traces of all modes need; None without a simulator."""
     if sim is None:
         return None
     g = _failures(report, sim, shown)
-    own, behind = lines(sim, g.episodes), nominal_lines("report", sim, nominal)
-    return g, own, behind, quiet_line(sim)
+    own, behind = series_of(sim, g.episodes), nominal_series("report", sim, nominal)
+    return g, own, behind, undisturbed_series(sim)
 
 
-def _mode(
+def _draw_mode(
     page: _Page, sim: Any, owned: tuple | None, failure: Any, k: int, units: Any, legend: bool
 ) -> None:
     """The panels of mode ``k``."""
     if owned:
-        _traces(page, *owned, k, units, legend=legend)
+        _draw_traces(page, *owned, k, units, legend=legend)
     x, wide = MARGIN + 0.45 + (5.1 if owned else 0.0), 1.88 if owned else 5.0
-    _pushes(page.axes(x, wide, PANEL, 0.2), sim, failure)
+    _draw_disturbances(page.axes(x, wide, PANEL, 0.2), sim, failure)
 
 
-def _failures(report: Any, sim: Any, shown: list) -> Given:
+def _failures(report: Any, sim: Any, shown: list) -> Samples:
     """The likeliest failure of each mode ``shown``, then those that the report has, unless each is
     a call of a black box.
     """
-    more = report.failures[: 64 if free(sim) else 0]
+    more = report.failures[: 64 if replays_without_calls(sim) else 0]
     each = [e._replace(states=None) for e in (*shown, *more)]
     mode = np.arange(len(shown))
     if report.modes and len(more):
-        others = given("report", more, sim, report.modes, 64).mode
+        others = samples_of("report", more, sim, report.modes, 64).mode
     else:
         others = np.zeros(len(each) - len(shown), int)
     episodes = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-    return Given(episodes, sim, np.concatenate([mode, others]), len(shown))
+    return Samples(episodes, sim, np.concatenate([mode, others]), len(shown))
 
 
-def _traces(
+def _draw_traces(
     page: _Page,
-    g: Given,
-    own: Lines,
-    behind: Lines | None,
-    quiet: Lines | None,
+    g: Samples,
+    own: Series,
+    behind: Series | None,
+    quiet: Series | None,
     k: int,
     units: Any,
     legend: bool,
 ) -> None:
     """Two panels of mode ``k``."""
-    rows = np.flatnonzero(g.mode == k)[: EACH + 1]
+    rows = np.flatnonzero(g.mode == k)[: FAILURES + 1]
     episodes = jax.tree.map(lambda a: a[rows], g.episodes)
-    few = Given(episodes, g.sim, np.full(len(rows), k), k + 1)
-    part = Lines({n: a[rows] for n, a in own.columns.items()}, own.length[rows], own.state)
-    names = _telling(part, behind)
+    few = Samples(episodes, g.sim, np.full(len(rows), k), k + 1)
+    part = Series({n: a[rows] for n, a in own.columns.items()}, own.length[rows], own.state)
+    names = _most_unusual(part, behind)
     axes = [page.axes(MARGIN + 0.45 + 2.55 * i, 1.88, PANEL, 0.2) for i in range(len(names))]
     draw_traces(axes, names, few, part, behind, quiet, units)
     for ax in axes:
-        _small(ax, "step")
+        _shrink_labels(ax, "step")
     if legend:
         look = dict(fontsize=7, ncols=4, loc="lower right", handlelength=1.6, columnspacing=1.2)
         handles, words = axes[0].get_legend_handles_labels()
@@ -287,9 +288,9 @@ def _traces(
         )
 
 
-def _telling(own: Lines, behind: Lines | None) -> list[str]:
+def _most_unusual(own: Series, behind: Series | None) -> list[str]:
     """Two numbers, those of the first failure that leave the nominal bands the most."""
-    names = chosen("report", None, own, 1000)
+    names = choose_fields("report", None, own, 1000)
     far = {}
     for name in names:
         values = own.columns[name][0]
@@ -303,7 +304,7 @@ def _telling(own: Lines, behind: Lines | None) -> list[str]:
     return [n for n in names if n in best]
 
 
-def _pushes(ax: Any, sim: Any, failure: Any) -> None:
+def _draw_disturbances(ax: Any, sim: Any, failure: Any) -> None:
     """The disturbances of a failure over its steps."""
     n = int(failure.length)
     about = None if sim is None else outline(sim)
@@ -318,8 +319,7 @@ def _pushes(ax: Any, sim: Any, failure: Any) -> None:
         (f"x0 {name}" if not at and "x0" not in name else name, at, v) for name, at, v in named
     ]
     if normal:
-        ax.axhspan(-2, 2, color=style.GREY, alpha=0.1, linewidth=0, zorder=0)
-        ax.axhspan(-1, 1, color=style.GREY, alpha=0.12, linewidth=0, zorder=0)
+        shade_deviations(ax)
     few = len(named) <= len(style.COLOURS)
     for i, (name, at, values) in enumerate(named):
         colour, marker = style.look(i) if few else (style.shade(i / (len(named) - 1)), "o")
@@ -329,10 +329,10 @@ def _pushes(ax: Any, sim: Any, failure: Any) -> None:
     if few and len(named) > 1:
         ax.legend(fontsize=6.5, loc="best", handlelength=1.2, borderpad=0.1, labelspacing=0.2)
     ax.set_ylabel("disturbance" + " (sd)" * bool(normal))
-    _small(ax, "step")
+    _shrink_labels(ax, "step")
 
 
-def _small(ax: Any, label: str) -> None:
+def _shrink_labels(ax: Any, label: str) -> None:
     ax.set_xlabel(label, fontsize=8, labelpad=1)
     ax.yaxis.label.set_size(8)
     ax.yaxis.labelpad = 2
@@ -341,7 +341,7 @@ def _small(ax: Any, label: str) -> None:
     ax.yaxis.get_major_locator().set_params(nbins=5)
 
 
-def _tried(page: _Page, report: Any, rows: list) -> None:
+def _draw_work(page: _Page, report: Any, rows: list) -> None:
     page.words(MARGIN, "What was tried", weight="bold", fontsize=10.5)
     page.y += 0.27
     head = ("", "calls", "evaluations", "failing", "best log p relative to the mode")

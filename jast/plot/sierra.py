@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["sierra"]
 
-SIDE, POINTS, LEVELS = 15.0, 161, 24
+SIDE = 15.0  # the picture reaches from -15 to 15, as the figure
+POINTS = 161  # of a side
+LEVELS = 24  # of colour
 PUBLISHED = tuple((sharpness, decay) for decay in (1.0, 0.0) for sharpness in (0.5, 2.0, 6.0))
 
 
@@ -33,9 +35,6 @@ def sierra(
             and 6 with decay 1, then with decay 0.
         axes: Axes to draw in, at least one for each pair; None: a new figure, three panels a row.
         others: further settings of `jast.cross_entropy.sierra`, of all panels, as ``spacing=3.0``.
-
-    Returns:
-        The list of Axes.
 
     Raises:
         ValueError: for settings that are no pairs, those that sierra refuses, and too few axes.
@@ -56,11 +55,10 @@ def sierra(
     line = np.linspace(-SIDE, SIDE, POINTS)
     plane = jnp.asarray(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
     columns = min(3, len(pairs))
-    rows = -(-len(pairs) // columns)
-    size = (3.1 * columns, 3.2 * rows)
-    with style.axes(axes, size, rows, columns, sharey=True, layout="compressed") as drawn:
-        every = style.panels("sierra", drawn, len(pairs), "pair of settings")
-        for ax, (eta, decay) in zip(every, pairs, strict=False):
+    size = (3.1 * columns, 3.2 * -(-len(pairs) // columns))
+    shared, count = dict(sharey=True, layout="compressed"), len(pairs)
+    with style.panels("sierra", axes, size, count, "pair of settings", columns, **shared) as axes:
+        for ax, (eta, decay) in zip(axes, pairs, strict=True):
             f = objective(sharpness=eta, decay=decay, **others)
             value = np.asarray(jax.vmap(f)(plane), float).reshape(POINTS, POINTS)
             levels = np.linspace(value.min(), 0, LEVELS + 1)
@@ -68,6 +66,4 @@ def sierra(
             ax.set_title(rf"$\eta$ = {eta:g}, decay {decay:g}" + f"\nleast {value.min():.4f}")
             ax.set_aspect("equal")
             ax.grid(False)
-        for spare in every[len(pairs) :] if axes is None else ():
-            spare.set_axis_off()
-    return every[: len(pairs)]
+    return axes

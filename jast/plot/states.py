@@ -12,15 +12,15 @@ import numpy as np
 from jast.plot import style
 from jast.plot.played import (
     DISTANCE,
-    Given,
-    Lines,
-    chosen,
-    given,
-    kind_words,
-    kinds,
-    lines,
-    nominal_lines,
-    quiet_line,
+    Samples,
+    Series,
+    by_mode,
+    choose_fields,
+    mode_label,
+    nominal_series,
+    samples_of,
+    series_of,
+    undisturbed_series,
 )
 
 if TYPE_CHECKING:
@@ -32,10 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_traces", "phase", "traces"]
 
-PANELS = 8
-BANDS = ((0.05, 0.95, 0.15), (0.25, 0.75, 0.35))
-"""Quantiles and opacity."""
-DASHED = (0, (4, 2))
+PANELS = 8  # that are drawn where nobody chooses
+BANDS = ((0.05, 0.95, 0.15), (0.25, 0.75, 0.35))  # quantiles and opacity
 
 
 @style.result_first
@@ -70,9 +68,6 @@ def traces(
         most: failures drawn, evenly taken.
         axes: one for each field, or None for a new figure.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for samples of another kind, and a field that there is not.
 
@@ -84,38 +79,34 @@ def traces(
         True
     """
     caller = "traces"
-    g = given(caller, samples, sim, modes, most)
-    own = lines(g.sim, g.episodes)
-    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
-    names = chosen(caller, fields, own, PANELS, quiet)
+    g = samples_of(caller, samples, sim, modes, most)
+    own = series_of(g.sim, g.episodes)
+    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
+    names = choose_fields(caller, fields, own, PANELS, quiet)
     columns = 1 if len(names) < 4 else 2
     rows = -(-len(names) // columns)
     size = (6.8, 1.1 + 1.9 * rows) if columns == 1 else (9.6, 1.0 + 1.75 * rows)
     new = axes is None
-    with style.axes(axes, size, rows, columns) as axes:
-        axes = style.panels(caller, axes, len(names), "field")
-        for ax in axes[len(names) :]:
-            ax.remove()
-        axes = axes[: len(names)]
+    with style.panels(caller, axes, size, len(names), "field", columns) as axes:
         draw_traces(axes, names, g, own, behind, quiet, units)
         for ax in axes[-columns:]:
             ax.set_xlabel("step")
             ax.tick_params(labelbottom=True)
-        handles, words = axes[0].get_legend_handles_labels()
         if new:
-            axes[0].figure.legend(handles, words, loc="outside upper left", ncols=3, fontsize=9)
+            what = axes[0].get_legend_handles_labels()
+            axes[0].figure.legend(*what, loc="outside upper left", ncols=3, fontsize=9)
         else:
-            axes[0].legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, fontsize=9)
+            style.legend_above(axes[0], ncols=3, fontsize=9)
     return axes
 
 
 def draw_traces(
     axes: list,
     names: list[str],
-    g: Given,
-    own: Lines,
-    behind: Lines | None,
-    quiet: Lines | None,
+    g: Samples,
+    own: Series,
+    behind: Series | None,
+    quiet: Series | None,
     units: dict | None = None,
 ) -> None:
     """The panels of `traces`: the ``names`` on ``axes``, without labels of steps and a legend."""
@@ -125,24 +116,24 @@ def draw_traces(
             _bands(ax, behind.columns[name][:, : last + 1], len(behind.length))
         if quiet is not None and name in quiet.columns:
             row = quiet.columns[name][0, : last + 1]
-            ax.plot(row, color=style.INK, linewidth=1.3, linestyle=DASHED, label="undisturbed")
-        for kind, rows in kinds(g):
+            ax.plot(
+                row, color=style.INK, linewidth=1.3, linestyle=style.DASHED, label="undisturbed"
+            )
+        for kind, rows in by_mode(g):
             colour, marker = style.look(kind)
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
-            label = kind_words(g, kind, len(rows))
+            label = mode_label(g, kind, len(rows))
+            mark = dict(color=colour, marker=marker, markersize=4.5)
             for i in rows:
                 line, n = own.columns[name][i], own.length[i]
                 ax.plot(line, color=colour, linewidth=1.4, alpha=alpha, zorder=3)
-                ax.plot(
-                    n, line[n], color=colour, marker=marker, markersize=4.5, alpha=alpha, zorder=4
-                )
-            look = dict(color=colour, marker=marker, markersize=4.5, linewidth=1.4)
-            ax.plot([], [], label=label, **look)
+                ax.plot(n, line[n], alpha=alpha, zorder=4, **mark)
+            ax.plot([], [], label=label, linewidth=1.4, **mark)
         if name == DISTANCE:
             ax.axhline(0, color=style.GREY, linewidth=0.8, zorder=1)
         ax.set(ylabel=style.labelled(name, units), xlim=(0, max(last, 1)))
         ax.margins(x=0.02)
-        ax.xaxis.get_major_locator().set_params(integer=True)
+        style.whole_steps(ax.xaxis)
 
 
 def _bands(ax: Any, rows: np.ndarray, n: int) -> None:
@@ -152,7 +143,7 @@ def _bands(ax: Any, rows: np.ndarray, n: int) -> None:
     for low, high, alpha in BANDS:
         edges = np.nanquantile(rows[:, at], (low, high), axis=0)
         label = f"{high - low:.0%} of {n} nominal episodes"
-        ax.fill_between(at, *edges, color=style.GREY, alpha=alpha, linewidth=0, label=label)
+        style.band(ax, at, *edges, color=style.GREY, alpha=alpha, label=label)
 
 
 @style.result_first
@@ -177,9 +168,6 @@ def phase(
             undisturbed.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: as `traces`, and where there are not two fields.
 
@@ -190,10 +178,10 @@ def phase(
         >>> ax = jast.plot.phase(found, sim, nominal=20)
     """
     caller = "phase"
-    g = given(caller, samples, sim, modes, most)
-    own = lines(g.sim, g.episodes)
-    behind, quiet = nominal_lines(caller, g.sim, nominal), quiet_line(g.sim)
-    names = chosen(caller, fields, own, PANELS, quiet)
+    g = samples_of(caller, samples, sim, modes, most)
+    own = series_of(g.sim, g.episodes)
+    behind, quiet = nominal_series(caller, g.sim, nominal), undisturbed_series(g.sim)
+    names = choose_fields(caller, fields, own, PANELS, quiet)
     if fields is None:
         names = [k for k in names if k != DISTANCE] + [DISTANCE] * (DISTANCE in names)
         names = names[:2]
@@ -209,11 +197,12 @@ def phase(
             ax.plot([], [], color=style.GREY, linewidth=1.2, label=label)
         if quiet is not None:
             row = [quiet.columns[k][0] for k in names]
-            look = dict(color=style.INK, linewidth=1.3, linestyle=DASHED)
+            look = dict(color=style.INK, linewidth=1.3, linestyle=style.DASHED)
             ax.plot(*row, **look, label="undisturbed", zorder=3)
-        for kind, rows in kinds(g):
+        for kind, rows in by_mode(g):
             colour, marker = style.look(kind)
             alpha = float(np.clip(14 / len(rows), 0.15, 1.0))
+            mark = dict(color=colour, marker=marker, markersize=6)
             for i in rows:
                 across, up = (own.columns[k][i] for k in names)
                 n = own.length[i]
@@ -221,10 +210,8 @@ def phase(
                 ax.plot(across, up, color=colour, linewidth=1.4, alpha=alpha, zorder=4)
                 start = dict(color=style.INK, marker="s", markersize=4, zorder=5)
                 ax.plot(across[first], up[first], **start)
-                end = dict(color=colour, marker=marker, markersize=6, alpha=alpha, zorder=6)
-                ax.plot(across[n], up[n], **end)
-            look = dict(color=colour, marker=marker, markersize=6, linewidth=1.4)
-            ax.plot([], [], label=kind_words(g, kind, len(rows)), **look)
+                ax.plot(across[n], up[n], alpha=alpha, zorder=6, **mark)
+            ax.plot([], [], label=mode_label(g, kind, len(rows)), linewidth=1.4, **mark)
         ax.set(xlabel=style.labelled(names[0], units), ylabel=style.labelled(names[1], units))
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+        style.legend_above(ax, fontsize=9)
     return ax

@@ -1,4 +1,4 @@
-"""What the pictures share: colours, settings of matplotlib, and small helpers."""
+"""What the pictures share: colours, settings of matplotlib, panels, and what is drawn in many."""
 
 import functools
 import warnings
@@ -14,7 +14,46 @@ import numpy as np
 from jast.episode import Episode
 from jast.simulator import Simulator
 
-__all__ = ["BLUE", "COLOURS", "GREY", "INK", "STYLE", "VERMILION", "axes", "result_first", "styled"]
+__all__ = [
+    "BLUE",
+    "COLOURS",
+    "DASHED",
+    "DOTTED",
+    "GREEN",
+    "GREY",
+    "INK",
+    "MARKERS",
+    "ORANGE",
+    "PURPLE",
+    "STYLE",
+    "VERMILION",
+    "WRITERS",
+    "axes",
+    "band",
+    "by_name",
+    "checked_iteration",
+    "checked_iterations",
+    "checked_writable",
+    "colour",
+    "count_of",
+    "frugal_figure",
+    "halo",
+    "headline",
+    "labelled",
+    "legend_above",
+    "look",
+    "marker",
+    "named",
+    "note",
+    "one_episode",
+    "panels",
+    "plain",
+    "result_first",
+    "shade",
+    "styled",
+    "unframed",
+    "whole_steps",
+]
 
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
     "#0072B2",
@@ -25,6 +64,7 @@ BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = COLOURS = (
     "#56B4E9",
 )
 INK, GREY = "#222222", "#8A8A8A"
+DASHED, DOTTED = (0, (4, 2)), (0, (1, 1.5))
 MARKERS = ("o", "s", "^", "D", "v", "P")
 STYLE: dict[str, Any] = {
     "font.size": 10,
@@ -53,18 +93,32 @@ WRITERS = {".mp4": "ffmpeg", ".gif": "pillow", ".html": "html"}
 
 
 @contextmanager
-def axes(given, size, rows=1, columns=1, sharey=False, layout="constrained"):
+def axes(given, size, rows=1, columns=1, *, sharex=True, sharey=False, layout="constrained"):
     """The given axes, or those of a new figure; the style of these pictures while drawing."""
     import matplotlib.pyplot as plt
 
     with styled():
-        yield (
-            given
-            if given is not None
-            else plt.subplots(
-                rows, columns, figsize=size, sharex=True, sharey=sharey, layout=layout
-            )[1]
-        )
+        if given is None:
+            shared = dict(sharex=sharex, sharey=sharey)
+            given = plt.subplots(rows, columns, figsize=size, layout=layout, **shared)[1]
+        yield given
+
+
+@contextmanager
+def panels(caller, given, size, count, each, columns=1, **settings):
+    """The first ``count`` of the given axes, one for ``each``, or of a new figure's with so many
+    ``columns``, as a list; ValueError where fewer are given. ``settings``: of `axes`.
+    """
+    with axes(given, size, -(-count // columns), columns, **settings) as drawn:
+        drawn = np.atleast_1d(np.asarray(drawn, object)).ravel().tolist()
+        if len(drawn) < count:
+            raise ValueError(
+                f"plot.{caller}: axes must be at least {count}, one for each {each}, received"
+                f" {len(drawn)}"
+            )
+        for spare in drawn[count:] if given is None else ():
+            spare.set_axis_off()
+        yield drawn[:count]
 
 
 @contextmanager
@@ -100,7 +154,7 @@ def headline(what, episode, more=""):
     )
 
 
-def one(caller, episode):
+def one_episode(caller, episode):
     """``episode``, or a ValueError where it is not one `Episode`."""
     if not isinstance(episode, Episode) or np.ndim(episode.length):
         received = type(episode).__name__ + (
@@ -110,7 +164,7 @@ def one(caller, episode):
     return episode
 
 
-def iteration(caller, name, k, run):
+def checked_iteration(caller, name, k, run):
     """``k``, the argument ``name``, as an int, or a ValueError where that iteration of ``run`` was
     not run.
     """
@@ -121,6 +175,16 @@ def iteration(caller, name, k, run):
     if isinstance(k, bool) or not 1 <= number <= run:
         raise ValueError(f"plot.{caller}: {name} must be in 1 .. {run}, received {k!r}")
     return number
+
+
+def checked_iterations(caller, given, default, run):
+    """The iterations ``given``, or ``default`` where None, as a list of ints of 1 .. ``run``."""
+    wanted = np.unique(default.round().astype(int)) if given is None else given
+    wanted = np.atleast_1d(np.asarray(wanted, object))
+    chosen = [checked_iteration(caller, "iterations", k, run) for k in wanted]
+    if not chosen:
+        raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
+    return chosen
 
 
 def result_first(picture: Callable[..., Any]) -> Callable[..., Any]:
@@ -159,20 +223,59 @@ def look(i):
     return (COLOURS[i], MARKERS[i]) if i < len(COLOURS) else (GREY, "x")
 
 
-def panels(caller, axes, least, each):
-    """The axes as a flat list, or a ValueError where they are fewer than ``least``, one for
-    ``each``.
-    """
-    axes = np.atleast_1d(np.asarray(axes, object)).ravel().tolist()
-    if len(axes) < least:
-        raise ValueError(
-            f"plot.{caller}: axes must be at least {least}, one for each {each}, received"
-            f" {len(axes)}"
-        )
-    return axes
+def colour(i):
+    """The colour of the result number ``i``, of which there may be more than colours."""
+    return COLOURS[i % len(COLOURS)]
 
 
-def frugal():
+def marker(i):
+    """Its marker."""
+    return MARKERS[i % len(MARKERS)]
+
+
+def by_name(results):
+    """A dict of name -> result; one result has the name ""."""
+    return results if isinstance(results, dict) else {"": results}
+
+
+def named(name, words):
+    """``words`` behind the name of their result, if it has one."""
+    return f"{name}: {words}" if name else words
+
+
+def count_of(number, noun):
+    """ "1 episode", "2,000 episodes"."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
+def band(ax, x, low, high, **look):
+    """What lies between two lines, in the light colour of the line that it belongs to."""
+    ax.fill_between(x, low, high, **dict(alpha=0.2, linewidth=0) | look)
+
+
+def legend_above(ax, *what, ncols=2, **look):
+    """A legend above the axes, from their left."""
+    ax.legend(*what, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=ncols, **look)
+
+
+def whole_steps(*axes):
+    """Ticks at whole numbers of these axes, such as ``ax.xaxis``."""
+    for axis in axes:
+        axis.get_major_locator().set_params(integer=True)
+
+
+def note(ax, text, place, offset, **look):
+    """``text`` so many points from a place of the data."""
+    ax.annotate(text, place, offset, textcoords="offset points", **look)
+
+
+def unframed(ax):
+    """The axes of an image: no ticks and no grid."""
+    ax.set(xticks=[], yticks=[])
+    ax.grid(False)
+
+
+def frugal_figure():
     """A `Figure` whose PNGs have 256 colours, which are all that one needs: a third of the bytes in
     an animation's HTML.
     """
@@ -196,7 +299,7 @@ def shade(u):
     return matplotlib.colormaps["cividis"](u)
 
 
-def writable(caller, path):
+def checked_writable(caller, path):
     """``path`` as a `Path`, or a ValueError where nothing here can write it."""
     from matplotlib.animation import writers
 

@@ -36,9 +36,6 @@ def sweep(
         truth: value of the setting -> probability, of an array, where it is known: dots.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for anything but a `Sweep`, one without a probability, and as
             `Sweep.crossing`.
@@ -64,7 +61,7 @@ def sweep(
     with style.axes(ax, (6.8, 3.8)) as ax:
         good = seen & reliable
         floor = np.maximum(low, np.nanmin(np.where(seen, p, np.inf), initial=1.0) / 10)
-        ax.fill_between(x[good], floor[good], high[good], color=blue, alpha=0.2, linewidth=0)
+        style.band(ax, x[good], floor[good], high[good], color=blue)
         ax.plot(x[good], p[good], color=blue, marker="o", markersize=3, label="probability")
         doubted, unseen = seen & ~reliable, ~seen & np.isfinite(high)
         if doubted.any():
@@ -79,9 +76,9 @@ def sweep(
             ax.plot(x, np.asarray(truth(x), float), label="truth", **look)
         if level is not None:
             found = table.crossing(level, against)
-            ax.axhline(found.level, color=style.INK, linewidth=1.0, linestyle=(0, (1, 1.5)))
+            ax.axhline(found.level, color=style.INK, linewidth=1.0, linestyle=style.DOTTED)
             ax.axvspan(*np.clip(found.interval, x[0], x[-1]), color=style.INK, alpha=0.12)
             ax.axvline(found.value, color=style.INK, linewidth=1.0, label=style.plain(found))
         ax.set(yscale="log", xlabel=style.plain(name), ylabel="probability of failure")
-        ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=9)
+        style.legend_above(ax, fontsize=9)
     return ax

@@ -33,9 +33,6 @@ def tree(
         tree: which of its trees; default: that of the best episode.
         levels: how far down the picture goes.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for a result that holds no trees, and a number that it does not have.
 
@@ -48,11 +45,9 @@ def tree(
     """
     nodes = nodes_of("plot.tree", result, tree)
     path = nodes.path[: levels + 1]
-    with style.axes(axes, (7.2, 5.6), 2) as axes:
-        axes = style.panels("tree", axes, 2, "number of a node")[:2]
-        for ax, values, label in zip(
-            axes, (nodes.q, nodes.visits), ("Q(s, a)", "visits N(s, a)"), strict=True
-        ):
+    with style.panels("tree", axes, (7.2, 5.6), 2, "number of a node") as axes:
+        labels = ("Q(s, a)", "visits N(s, a)")
+        for ax, values, label in zip(axes, (nodes.q, nodes.visits), labels, strict=True):
             for level, node in enumerate(path):
                 below = nodes.children(node)
                 if level == levels or not len(below):
@@ -62,20 +57,12 @@ def tree(
                 size = 4 + 60 * nodes.visits[below] / nodes.visits[below].max()
                 at = np.full(len(below), level + 1)
                 ax.scatter(at, values[below], s=size, color=style.BLUE, alpha=0.6, linewidth=0)
-            ax.plot(
-                np.arange(len(path)),
-                values[path],
-                color=style.VERMILION,
-                marker="o",
-                markersize=4,
-                label="path to the best episode",
-                zorder=4,
-            )
-            ax.set_ylabel(label)
-            ax.set_xlim(-0.5, len(path) + 0.5)
+            look = dict(color=style.VERMILION, marker="o", markersize=4, zorder=4)
+            ax.plot(np.arange(len(path)), values[path], label="path to the best episode", **look)
+            ax.set(ylabel=label, xlim=(-0.5, len(path) + 0.5))
         axes[1].set(yscale="log", xlabel="level of the tree")
-        axes[1].xaxis.get_major_locator().set_params(integer=True)
-        axes[0].legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0))
+        style.whole_steps(axes[1].xaxis)
+        style.legend_above(axes[0], ncols=1)
         title = f"tree {nodes.tree}: {len(nodes.visits):,} nodes, best {nodes.best[0]:.4g}"
         axes[0].set_title(title, loc="right")
     return axes

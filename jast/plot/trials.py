@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["trial_distances", "trials"]
 
-MOST = 2000  # points of a line
+POINTS = 2000  # of a line: more than a picture has pixels
+HORIZON = dict(color=style.INK, linewidth=1, linestyle="--", label="event horizon")
 
 
 def trials(
@@ -43,9 +44,6 @@ def trials(
             about the mean is one standard deviation of the episodes so far (of several trees: its
             mean).
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: for a result without trials, and another mode.
 
@@ -59,8 +57,7 @@ def trials(
         3
     """
     results, printed = _named("trials", results), _printed("trials", mode)
-    with style.axes(axes, (7.2, 7.4), 3) as axes:
-        axes = style.panels("trials", axes, 3, "running figure")[:3]
+    with style.panels("trials", axes, (7.2, 7.4), 3, "running figure") as axes:
         for i, (name, result) in enumerate(results.items()):
             distance, _, failure, counts = _columns("trials", result)
             n, trees = distance.shape
@@ -68,39 +65,33 @@ def trials(
             if printed:
                 figures = -figures[0], -figures[1], figures[2]
                 deviation = _deviation(distance, counts).mean(1)
-            at = np.unique(np.linspace(0, n - 1, min(n, MOST)).astype(int))
-            colour, label = (
-                style.COLOURS[i % len(style.COLOURS)],
-                name + (f"{': ' if name else ''}mean of {trees} trees" if trees > 1 else ""),
-            )
+            at = np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))
+            colour = style.colour(i)
+            label = style.named(name, f"mean of {trees} trees") if trees > 1 else name
             for ax, rows in zip(axes, figures, strict=True):
                 rows = rows[at]
                 mean = rows.mean(1)
                 ax.plot(at + 1, mean, color=colour, label=label, zorder=3)
-                look = dict(color=colour, alpha=0.2, linewidth=0, zorder=2)
                 if printed and ax is axes[0]:
-                    spread = deviation[at]
-                    ax.fill_between(at + 1, mean - spread, mean + spread, **look)
+                    ends = mean - deviation[at], mean + deviation[at]
+                    style.band(ax, at + 1, *ends, color=colour, zorder=2)
                 elif trees > 1 and not printed:
-                    ax.fill_between(
-                        at + 1,
-                        *np.quantile(rows, (0.25, 0.75), 1),
-                        **look,
-                    )
+                    ends = np.quantile(rows, (0.25, 0.75), 1)
+                    style.band(ax, at + 1, *ends, color=colour, zorder=2)
         names = ("mean miss distance", "least miss distance", "failures")
         if printed:
             names = ("mean -d", "greatest -d", "failures")
             for ax in axes[:2]:
-                ax.axhline(0, color=style.INK, linewidth=1, linestyle="--", label="event horizon")
+                ax.axhline(0, **HORIZON)
             for ax in axes:
                 ax.set_xscale("log")
         for ax, label in zip(axes, names, strict=True):
             ax.set_ylabel(f"{label} so far")
         axes[2].set(xlabel="simulations of a tree", ylim=(0, None))
-        axes[2].yaxis.get_major_locator().set_params(integer=True)
+        style.whole_steps(axes[2].yaxis)
         axes[0].figure.align_ylabels(axes)
         if any(not line.get_label().startswith("_") for line in axes[0].lines):
-            axes[0].legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
+            style.legend_above(axes[0])
     return axes
 
 
@@ -122,9 +113,6 @@ def trial_distances(
         mode: "thesis" is figure 3.8 of Moss's thesis as printed: distances negated, and the event
             horizon at 0.
 
-    Returns:
-        The list of Axes.
-
     Raises:
         ValueError: as `trials`.
 
@@ -137,8 +125,6 @@ def trial_distances(
         >>> len(jast.plot.trial_distances(found))
         2
     """
-    import matplotlib.pyplot as plt
-
     of, printed = {}, _printed("trial_distances", mode)
     for name, result in _named("trial_distances", results).items():
         distance, log_p, failure, counts = _columns("trial_distances", result)
@@ -148,51 +134,33 @@ def trial_distances(
             log_p[failure & np.isfinite(log_p)],
             f"{counts.sum():,} episodes, {failure.sum():,} fail",
         )
-    with style.styled():
-        axes = (
-            plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained")[1]
-            if axes is None
-            else axes
-        )
-        axes = style.panels("trial_distances", axes, 2, "histogram")[:2]
-        for column, (ax, what) in enumerate(
-            zip(axes, (("miss distance", "-d")[printed], "log p of failures"), strict=True)
-        ):
+    with style.panels("trial_distances", axes, (7.2, 6.4), 2, "histogram", sharex=False) as axes:
+        whats = ("-d" if printed else "miss distance", "log p of failures")
+        for column, (ax, what) in enumerate(zip(axes, whats, strict=True)):
             if printed and not column:
-                ax.axvline(0, color=style.INK, linewidth=1, linestyle="--", label="event horizon")
+                ax.axvline(0, **HORIZON)
             every = np.concatenate([rows[column] for rows in of.values()])
-            edges = (
-                np.histogram_bin_edges(
-                    every, bins if column == 0 else min(bins, 5 + every.size // 4)
-                )
-                if every.size
-                else np.linspace(0, 1, 2)
-            )
+            most = min(bins, 5 + every.size // 4) if column else bins
+            edges = np.histogram_bin_edges(every, most) if every.size else np.linspace(0, 1, 2)
             for i, (name, rows) in enumerate(of.items()):
-                these, colour = rows[column], style.COLOURS[i % len(style.COLOURS)]
+                these, colour = rows[column], style.colour(i)
                 if not these.size:
                     continue
                 share = np.histogram(these, edges)[0] / these.size
-                words = rows[2] if column == 0 else f"mean {these.mean():,.1f}"
+                words = f"mean {these.mean():,.1f}" if column else rows[2]
                 ax.stairs(share, edges, color=colour, fill=True, alpha=0.15)
-                ax.stairs(
-                    share,
-                    edges,
-                    color=colour,
-                    linewidth=1.6,
-                    label=f"{name}: {words}" if name else words,
-                )
+                label = style.named(name, words)
+                ax.stairs(share, edges, color=colour, linewidth=1.6, label=label)
             ax.set(
                 xlabel=what,
                 ylabel="share of failures" if column else "share of episodes",
                 yscale="linear" if column else "log",
             )  # failures may be rare
             if every.size:
-                ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2)
+                style.legend_above(ax)
             else:
-                ax.annotate(
-                    "none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=style.GREY
-                )
+                look = dict(ha="center", color=style.GREY)
+                ax.annotate("none", (0.5, 0.5), xycoords="axes fraction", **look)
     return axes
 
 
@@ -204,7 +172,7 @@ def _printed(caller, mode):
 
 
 def _named(caller, results):
-    results = results if isinstance(results, dict) else {"": results}
+    results = style.by_name(results)
     if not results:
         raise ValueError(
             f"plot.{caller}: results must be a search result, or a dict of name -> result, received"
@@ -221,11 +189,8 @@ def _columns(caller, result):
             f"plot.{caller}: results must be of searches with record=True, received a"
             f" {type(result).__name__} without trials"
         )
-    distance, log_p, failure = (
-        np.asarray(found.distance, float),
-        np.asarray(found.log_prob, float),
-        np.asarray(found.failure, bool),
-    )
+    distance, log_p = np.asarray(found.distance, float), np.asarray(found.log_prob, float)
+    failure = np.asarray(found.failure, bool)
     if distance.ndim != 2 or not distance.size:
         raise ValueError(
             f"plot.{caller}: trials must be arrays [n, trees], received distances of shape"
@@ -239,13 +204,10 @@ def _running(distance, failure, counts):
     failures, [n, trees] each.
     """
     number = np.cumsum(counts, 0)
-    mean = np.where(
-        number > 0, np.cumsum(np.where(counts, distance, 0), 0) / np.maximum(number, 1), np.nan
-    )
-    least = np.where(
-        number > 0, np.minimum.accumulate(np.where(counts, distance, np.inf), 0), np.nan
-    )
-    return mean, least, np.cumsum(failure & counts, 0)
+    total = np.cumsum(np.where(counts, distance, 0), 0)
+    least = np.minimum.accumulate(np.where(counts, distance, np.inf), 0)
+    mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    return mean, np.where(number > 0, least, np.nan), np.cumsum(failure & counts, 0)
 
 
 def _deviation(distance, counts):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import chex
     from matplotlib.axes import Axes
 
-__all__ = ["failures_found", "roc"]
+__all__ = ["checked_result", "checked_truth", "failures_found", "roc"]
 
 LIGHT, DARK = "#A9CCE6", "#06263D"  # of the first and the last iteration
 
@@ -36,9 +36,6 @@ def failures_found(
             deviations (hypergeometric) to both sides.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for what is no result, for results of different n, and for a ``failed`` of
             another shape or type, or that contradicts what the calls found.
@@ -55,7 +52,7 @@ def failures_found(
     caller = "failures_found"
     rows = _rows(caller, results)
     n = _same_n(caller, rows)
-    truth = None if failed is None else truth_of(caller, failed, n)
+    truth = None if failed is None else checked_truth(caller, failed, n)
     for result in [] if truth is None else [result for row in rows.values() for result in row]:
         wrong = int(np.sum(truth[result.order] != _hits(result)))
         if wrong:
@@ -78,36 +75,18 @@ def failures_found(
         for i, (name, row) in enumerate(counts.items()):
             labels.append(_found(ax, name, row, i, len(counts) > 1, total))
         _bounds(ax, total, width, height)
-        ax.set(
-            xlabel="calls of the system", ylabel="failures found", xlim=(0, width), ylim=(0, height)
-        )
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.get_major_locator().set_params(integer=True)
+        ax.set(xlabel="calls of the system", xlim=(0, width))
+        ax.set(ylabel="failures found", ylim=(0, height))
+        style.whole_steps(ax.xaxis, ax.yaxis)
         labels.sort(key=lambda label: label[0])
         gap = (0.115 if any("\n" in text for _, text, _ in labels) else 0.065) * height
-        for (_, text, look), y in zip(
-            labels, _apart([at for (at, _), _, _ in labels], gap, 0, height), strict=True
-        ):
+        places = _apart([at for (at, _), _, _ in labels], gap, 0, height)
+        beside = dict(transform=ax.get_yaxis_transform())
+        for (_, text, look), y in zip(labels, places, strict=True):
             if "marker" in look:
-                ax.plot(
-                    [1.025],
-                    [y],
-                    transform=ax.get_yaxis_transform(),
-                    clip_on=False,
-                    linestyle="",
-                    markersize=5,
-                    label="_key",
-                    **look,
-                )
-            ax.text(
-                1.045,
-                y,
-                text,
-                transform=ax.get_yaxis_transform(),
-                color=look["color"],
-                va="center",
-                fontsize=9,
-            )
+                key = dict(clip_on=False, linestyle="", markersize=5, label="_key")
+                ax.plot([1.025], [y], **beside, **key, **look)
+            ax.text(1.045, y, text, color=look["color"], va="center", fontsize=9, **beside)
     return ax
 
 
@@ -130,9 +109,6 @@ def roc(
             evenly, the last one included.
         ax: Axes to draw in; None: a new figure.
 
-    Returns:
-        The Axes.
-
     Raises:
         ValueError: for what is no `jast.weakness.Result`, one without iterations, iterations that
             were not made, and a ``failed`` of another shape or type.
@@ -148,70 +124,33 @@ def roc(
     """
     caller = "roc"
     made = len(checked_result(caller, result).history.scores)
-    truth = truth_of(caller, failed, len(result.scores))
+    truth = checked_truth(caller, failed, len(result.scores))
     if not made:
         raise ValueError(f"plot.{caller}: result must have iterations, received none")
-    chosen = (
-        np.unique(np.linspace(1, made, min(4, made)).round().astype(int))
-        if iterations is None
-        else np.atleast_1d(np.asarray(iterations, object))
-    )
-    chosen = [style.iteration(caller, "iterations", k, made) for k in chosen]
-    if not chosen:
-        raise ValueError(f"plot.{caller}: iterations must name at least one, received none")
+    evenly = np.linspace(1, made, min(4, made))
+    chosen = style.checked_iterations(caller, iterations, evenly, made)
     with style.axes(ax, (4.9, 4.7)) as ax:
         from matplotlib.colors import LinearSegmentedColormap
 
         shades = LinearSegmentedColormap.from_list("", (LIGHT, style.BLUE, DARK))
-        ax.plot(
-            [0, 1],
-            [0, 1],
-            color=style.GREY,
-            linewidth=1.2,
-            linestyle=(0, (1, 1.5)),
-            label="_chance",
-            zorder=2,
-        )
-        look = dict(
-            rotation=45,
-            rotation_mode="anchor",
-            transform_rotates_text=True,
-            ha="center",
-            va="top",
-            fontsize=9,
-        )
-        ax.text(0.22, 0.205, "chance", color=style.GREY, path_effects=style.halo(), **look)
-        areas = []
+        grey = dict(color=style.GREY, ha="center", path_effects=style.halo())
+        look = dict(color=style.GREY, linewidth=1.2, linestyle=style.DOTTED, zorder=2)
+        ax.plot([0, 1], [0, 1], label="_chance", **look)
+        along = dict(rotation=45, rotation_mode="anchor", transform_rotates_text=True)
+        ax.text(0.22, 0.205, "chance", va="top", fontsize=9, **along, **grey)
+        areas, (first, last) = [], (min(chosen), max(chosen))
         for k in chosen:
-            late = (
-                (k - min(chosen)) / (max(chosen) - min(chosen))
-                if max(chosen) > min(chosen)
-                else 0.5
-            )
+            late = (k - first) / (last - first) if last > first else 0.5
             curve = measures.roc(result.history.scores[k - 1], truth)
             areas.append(curve.area)
             label = f"iteration {k}:  AUC {'-' if np.isnan(areas[-1]) else f'{areas[-1]:.3f}'}"
-            ax.plot(
-                curve.false_positive,
-                curve.true_positive,
-                color=shades(late),
-                linewidth=1.2 + 1.2 * late,
-                label=label,
-                zorder=3 + late,
-            )
+            look = dict(color=shades(late), linewidth=1.2 + 1.2 * late, zorder=3 + late)
+            ax.plot(curve.false_positive, curve.true_positive, label=label, **look)
         if truth.all() or not truth.any():
-            ax.text(
-                0.5,
-                0.55,
-                "all inputs fail" if truth.all() else "no input fails",
-                color=style.GREY,
-                ha="center",
-                path_effects=style.halo(),
-            )
-        ax.set(
-            xlabel="share of passing inputs flagged (false positives)",
-            ylabel="share of failures flagged (true positives)",
-        )
+            words = "all inputs fail" if truth.all() else "no input fails"
+            ax.text(0.5, 0.55, words, **grey)
+        ax.set(xlabel="share of passing inputs flagged (false positives)")
+        ax.set(ylabel="share of failures flagged (true positives)")
         ax.set(xlim=(-0.01, 1.01), ylim=(-0.01, 1.01), aspect="equal")
         place = "upper left" if max(areas) < 0.5 else "lower right"  # beyond the diagonal
         ax.legend(loc=place, fontsize=9, frameon=True, framealpha=0.85, edgecolor="none")
@@ -232,17 +171,11 @@ def _rows(caller, results):
     """Name -> list of `Result`s, or a ValueError. A `Result` is a tuple, so a tuple is no list
     here.
     """
-    rows = results if isinstance(results, dict) else {"": results}
+    rows = style.by_name(results)
     rows = {name: row if isinstance(row, list) else [row] for name, row in rows.items()}
-    if (
-        not rows
-        or not all(rows.values())
-        or not all(isinstance(result, Result) for row in rows.values() for result in row)
-    ):
-        received = (
-            sorted({type(result).__name__ for row in rows.values() for result in row} - {"Result"})
-            or "none"
-        )
+    every = [result for row in rows.values() for result in row]
+    if not rows or not all(rows.values()) or not all(isinstance(r, Result) for r in every):
+        received = sorted({type(r).__name__ for r in every} - {"Result"}) or "none"
         raise ValueError(
             f"plot.{caller}: results must be a jast.weakness.Result, a list of them or a dict of"
             f" name -> either, received {received}"
@@ -261,7 +194,7 @@ def _same_n(caller, rows):
     return sizes[0]
 
 
-def truth_of(caller, failed, n):
+def checked_truth(caller, failed, n):
     """``failed`` as an array, or a ValueError."""
     truth = np.asarray(failed)
     if truth.shape != (n,) or truth.dtype != bool:
@@ -281,32 +214,15 @@ def _found(ax, name, row, i, marked, total):
     """The curve of one result or the mean of several, and its label: ((height at its end, mean
     height), text, look).
     """
-    look = dict(color=style.COLOURS[i % len(style.COLOURS)]) | (
-        dict(marker=style.MARKERS[i % len(style.MARKERS)]) if marked else {}
-    )
-    common = min(map(len, row))
-    counts = np.stack([count[:common] for count in row])
-    mean, last = counts.mean(0), counts[:, -1].mean()
-    ax.plot(
-        np.arange(common),
-        mean,
-        label=name or "found",
-        linewidth=2,
-        markersize=5,
-        markevery=(0.03 + 0.03 * i, 0.17) if marked else None,
-        zorder=4,
-        **look,
-    )
+    look = dict(color=style.colour(i))
+    look |= dict(marker=style.marker(i)) if marked else {}
+    counts = np.stack([count[: min(map(len, row))] for count in row])
+    calls, last = np.arange(counts.shape[1]), counts[:, -1].mean()
+    mean, every = counts.mean(0), (0.03 + 0.03 * i, 0.17) if marked else None
+    curve = dict(label=name or "found", linewidth=2, markersize=5, markevery=every, zorder=4)
+    ax.plot(calls, mean, **curve, **look)
     if len(row) > 1:
-        ax.fill_between(
-            np.arange(common),
-            counts.min(0),
-            counts.max(0),
-            color=look["color"],
-            alpha=0.2,
-            linewidth=0,
-            zorder=3,
-        )
+        style.band(ax, calls, counts.min(0), counts.max(0), color=look["color"], zorder=3)
     share = f" ({100 * last / total:.1f} %)" if total else ""
     number = f"{last:,.{1 if len(row) > 1 else 0}f}"
     text = f"{name}: {number}{share}" if name else f"{number} found{share}"
@@ -318,86 +234,35 @@ def _chance(ax, total, n, width):
     calls = np.unique(np.append(np.linspace(0, n, 400).round(), min(width, n))).astype(int)
     mean = calls * total / n
     half = 2 * np.sqrt(mean * (1 - total / n) * (n - calls) / max(n - 1, 1))
-    ax.fill_between(
-        calls,
-        np.maximum(mean - half, 0),
-        np.minimum(mean + half, total),
-        color=style.GREY,
-        alpha=0.22,
-        linewidth=0,
-        zorder=1.5,
-    )
-    ax.plot(
-        calls,
-        mean,
-        color=style.GREY,
-        linewidth=1.4,
-        linestyle=(0, (4, 2)),
-        label="random choice",
-        zorder=2,
-    )
+    ends = np.maximum(mean - half, 0), np.minimum(mean + half, total)
+    style.band(ax, calls, *ends, color=style.GREY, alpha=0.22, zorder=1.5)
+    look = dict(color=style.GREY, linewidth=1.4, linestyle=style.DASHED, zorder=2)
+    ax.plot(calls, mean, label="random choice", **look)
     return (width * total / n, -1.0), "random choice, ± 2 sd", dict(color="#6B6B6B")
 
 
 def _bounds(ax, total, width, height):
     """All failures, where they are known, and a perfect choice."""
     top = height if total is None else total
-    ax.plot(
-        [0, top],
-        [0, top],
-        color=style.INK,
-        linewidth=1.2,
-        linestyle=(0, (1, 1.5)),
-        label="perfect choice",
-        zorder=2.5,
-    )
+    look = dict(color=style.INK, linewidth=1.2, linestyle=style.DOTTED, zorder=2.5)
+    ax.plot([0, top], [0, top], label="perfect choice", **look)
     small = dict(fontsize=9, color=style.INK, path_effects=style.halo(), zorder=5)
+    above = dict(ha="right", va="bottom")
     if total is not None:
         ax.axhline(total, color=style.INK, linewidth=1.0, label="all failures", zorder=2)
         words = {0: "no input fails", 1: "the only failure"}.get(total, f"all {total:,} failures")
-        ax.annotate(
-            words,
-            (1, total),
-            (0, 3),
-            xycoords=ax.get_yaxis_transform(),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            **small,
-        )
+        right = ax.get_yaxis_transform()
+        style.note(ax, words, (1, total), (0, 3), xycoords=right, **above, **small)
     if total == 0:
         return
     reach = min(top, width)
     if reach > 0.4 * width:  # beside the line, where nothing can be
-        ax.annotate(
-            "perfect choice",
-            (0.62 * reach, 0.62 * reach),
-            (-6, 2),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            **small,
-        )
+        place, offset, side = (0.62 * reach, 0.62 * reach), (-6, 2), above
     elif total is None:
-        ax.annotate(
-            "perfect choice",
-            (reach, height),
-            (6, -2),
-            textcoords="offset points",
-            ha="left",
-            va="top",
-            **small,
-        )
+        place, offset, side = (reach, height), (6, -2), dict(ha="left", va="top")
     else:
-        ax.annotate(
-            "perfect choice",
-            (reach, total),
-            (0, 3),
-            textcoords="offset points",
-            ha="left",
-            va="bottom",
-            **small,
-        )
+        place, offset, side = (reach, total), (0, 3), dict(ha="left", va="bottom")
+    style.note(ax, "perfect choice", place, offset, **side, **small)
 
 
 def _apart(heights, gap, low, high):

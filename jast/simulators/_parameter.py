@@ -5,6 +5,8 @@ import numpy as np
 
 from jast._jax import is_traced
 
+__all__ = ["positive"]
+
 
 def positive(function, **values):
     """Scalar float arrays of one dtype; ValueError naming ``function`` and the argument unless

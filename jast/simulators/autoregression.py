@@ -46,11 +46,11 @@ def autoregression(
     """
     rate, threshold = positive("autoregression", rate=rate, threshold=threshold)
     return Simulator(
-        Partial(_init, rate),
-        Partial(_step, rate),
-        _disturbance,
-        Partial(_evaluate, threshold),
-        horizon,
+        init=Partial(_init, rate),
+        step=Partial(_step, rate),
+        disturbance=_disturbance,
+        evaluate=Partial(_evaluate, threshold),
+        horizon=horizon,
     )
 
 

@@ -53,10 +53,16 @@ SIGMAS = (30.0, 2.0, 39.5, 8.0)
 (kt).
 """
 
-KNOT, FOOT, NMI = 1852 / 3600, 0.3048, 1852.0
-# m, m/s, and the true air speed that these make (kt)
-ALTITUDE, CAS, TAS = 6000 * FOOT, 210 * KNOT, 229.0
-BANK, SHARPEST, LEAST, FLOOR = 25.0, 120.0, 0.1, 1e-3  # degrees, degrees, nmi, of the tolerance
+KNOT = 1852 / 3600  # m/s
+FOOT = 0.3048  # m
+NMI = 1852.0  # m
+ALTITUDE = 6000 * FOOT  # m
+CAS = 210 * KNOT  # m/s
+TAS = 229.0  # kt: the true air speed that these make
+BANK = 25.0  # degrees
+SHARPEST = 120.0  # degrees
+LEAST = 0.1  # nmi
+FLOOR = 1e-3  # of the tolerance
 ONE = threading.Lock()  # one BlueSky a process
 
 
@@ -250,7 +256,14 @@ def judged(route, track, speed, finished):
     # of each leg, to have room for the turns at its ends
     lack = np.maximum(np.append(0.0, lead[:-1]) + lead - length, 0.0)
     allowed = radius * (1 / np.cos(half) - 1) + lack + np.append(lack[1:], 0.0)
-    return Flight(route, track, turns, nearest(route[1:], track), allowed, finished)
+    return Flight(
+        route=route,
+        track=track,
+        turns=turns,
+        nearest=nearest(route[1:], track),
+        allowed=allowed,
+        finished=finished,
+    )
 
 
 def nearest(points, track):

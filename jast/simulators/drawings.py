@@ -25,10 +25,7 @@ __all__ = ["DRAWN", "draw"]
 
 HULL = ((4.0, 0.0), (1.8, 1.5), (-4.0, 1.5), (-4.0, -1.5), (1.8, -1.5))
 """Ahead and to the right of the centre, drawn larger than a collision so as to be seen."""
-
-
-TRAIL = 60
-"""Places of a trail, at most."""
+TRAIL = 60  # places of a trail, at most
 
 
 def draw(state: chex.ArrayTree, past: chex.ArrayTree | None = None) -> str:
@@ -69,8 +66,8 @@ def _ferry(s: FerryState, past: FerryState | None) -> str:
         *_trail(plane, past, lambda p: (p.x, p.y), other, VERMILION),
         plane.circle(ferry, COLLISION, BLUE, 0.2),
         plane.line([ferry, other], INK if gap < 4 * COLLISION else "#ccc", width=1),
-        plane.shape(_placed(ferry, math.pi / 2), BLUE),
-        plane.shape(_placed(other, float(s.heading)), VERMILION),
+        plane.shape(_hull_at(ferry, math.pi / 2), BLUE),
+        plane.shape(_hull_at(other, float(s.heading)), VERMILION),
         plane.words((-19.0, 105.0), "ferry", BLUE),
         plane.words((2.0, 105.0), "adversary", VERMILION),
         plane.words((112.0, 105.0), f"distance {gap:.2f}", INK, "end"),
@@ -92,9 +89,9 @@ def _colav(s: ColavState, past: ColavState | None) -> str:
         ),
         plane.line(places[1:], INK, width=1),
         plane.circle(places[0], TOUCH, BLUE, 0.4),
-        plane.shape(_placed(places[0], float(own.psi)), BLUE),
-        plane.shape(_placed(places[1], float(other.psi)), VERMILION),
-        plane.shape(_placed(places[2], course), "none", GREEN),
+        plane.shape(_hull_at(places[0], float(own.psi)), BLUE),
+        plane.shape(_hull_at(places[1], float(other.psi)), VERMILION),
+        plane.shape(_hull_at(places[2], course), "none", GREEN),
         plane.words((-36.0, 107.0), "ferry", BLUE),
         plane.words((-22.0, 107.0), "adversary", VERMILION),
         plane.words((3.0, 107.0), "as believed", GREEN),
@@ -106,7 +103,10 @@ def _colav(s: ColavState, past: ColavState | None) -> str:
 def _pendulum(s: PendulumState, past: PendulumState | None) -> str:
     plane = svg.Plane((-1.3, -0.35), (1.3, 1.35), 330)
     theta, omega = float(s.theta), float(s.omega)
-    at = lambda angle, r: (r * math.sin(angle), r * math.cos(angle))
+
+    def at(angle: float, r: float) -> svg.Place:
+        return r * math.sin(angle), r * math.cos(angle)
+
     # where it will be in a tenth of a second at this speed
     ahead = [at(theta + 0.1 * omega * i / 10, 1.12) for i in range(11)]
     return plane.picture(
@@ -132,7 +132,7 @@ def _trail(
     return [plane.line([*before[rows], now], colour, opacity=0.5)]
 
 
-def _placed(place: tuple[float, float], heading: float) -> list[tuple[float, float]]:
+def _hull_at(place: tuple[float, float], heading: float) -> list[tuple[float, float]]:
     """The hull at ``place``, its bow to ``heading`` (radians from up to the right)."""
     sin, cos = math.sin(heading), math.cos(heading)
     return [

@@ -20,7 +20,7 @@ from jax.tree_util import Partial
 from jast.distributions import Uniform, tent, where
 from jast.simulator import Simulator
 
-__all__ = ["FerryState", "ferry"]
+__all__ = ["COLLISION", "FerryState", "ferry"]
 
 SPEED = 5.0
 COLLISION = 5.0
@@ -93,20 +93,26 @@ def ferry(
 def _init(adversary, x0):
     zero = jnp.zeros((), adversary.dtype)
     return FerryState(
-        zero, zero + 50, adversary[0], adversary[1], zero, zero + 0.5, jnp.zeros((), bool)
+        ferry_x=zero,
+        ferry_y=zero + 50,
+        x=adversary[0],
+        y=adversary[1],
+        heading=zero,
+        seed=zero + 0.5,
+        moving=jnp.zeros((), bool),
     )
 
 
 def _step(s, a):
     heading = s.heading + (10 * a - 5) * jnp.asarray(jnp.pi / 100, a.dtype)
     return FerryState(
-        s.ferry_x + SPEED,
-        s.ferry_y,
-        s.x + SPEED * jnp.sin(heading),
-        s.y + SPEED * jnp.cos(heading),
-        heading,
-        a,
-        jnp.ones((), bool),
+        ferry_x=s.ferry_x + SPEED,
+        ferry_y=s.ferry_y,
+        x=s.x + SPEED * jnp.sin(heading),
+        y=s.y + SPEED * jnp.cos(heading),
+        heading=heading,
+        seed=a,
+        moving=jnp.ones((), bool),
     )
 
 

@@ -66,7 +66,12 @@ def pendulum(
     )
     start = Partial(_start, jnp.stack([sigma_theta, sigma_omega]))
     return Simulator(
-        _init, _step, Partial(_disturbance, noise), Partial(_evaluate, limit), STEPS, start=start
+        init=_init,
+        step=_step,
+        disturbance=Partial(_disturbance, noise),
+        evaluate=Partial(_evaluate, limit),
+        horizon=STEPS,
+        start=start,
     )
 
 

@@ -54,11 +54,11 @@ def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 
         raise ValueError(f"ruin: goal must be above start = {start}, received {goal}")
     start, goal = jnp.asarray(start, jnp.int32), jnp.asarray(goal, jnp.int32)
     return Simulator(
-        Partial(_init, start),
-        _step,
-        Partial(_disturbance, up),
-        Partial(_evaluate, goal, up),
-        horizon,
+        init=Partial(_init, start),
+        step=_step,
+        disturbance=Partial(_disturbance, up),
+        evaluate=Partial(_evaluate, goal, up),
+        horizon=horizon,
         is_terminal=_is_terminal,
     )
 

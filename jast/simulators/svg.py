@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from html import escape
 from typing import NamedTuple
 
-__all__ = ["BLUE", "GREEN", "GREY", "INK", "VERMILION", "Plane"]
+__all__ = ["BLUE", "GREEN", "GREY", "INK", "VERMILION", "Place", "Plane"]
 
 BLUE, VERMILION, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8A8A8A", "#222222"
 Place = tuple[float, float]

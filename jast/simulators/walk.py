@@ -54,11 +54,11 @@ def walk1d(
     sigma, threshold = positive("walk1d", sigma=sigma, threshold=threshold)
     evaluate = Partial(_two_sided if form == "two-sided" else _one_sided, threshold)
     return Simulator(
-        Partial(_init, sigma),
-        _step,
-        Partial(_disturbance, sigma),
-        evaluate,
-        HORIZON[form] if horizon is None else horizon,
+        init=Partial(_init, sigma),
+        step=_step,
+        disturbance=Partial(_disturbance, sigma),
+        evaluate=evaluate,
+        horizon=HORIZON[form] if horizon is None else horizon,
     )
 
 

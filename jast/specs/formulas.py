@@ -48,10 +48,10 @@ class Formula:
     """
 
     def __and__(self, other: "Formula") -> "Formula":
-        return _joined("&", self, other)
+        return _junction("&", self, other)
 
     def __or__(self, other: "Formula") -> "Formula":
-        return _joined("|", self, other)
+        return _junction("|", self, other)
 
     def __invert__(self) -> "Formula":
         return Not(self)
@@ -86,7 +86,7 @@ class Not(Formula):
     of: Formula
 
     def __str__(self) -> str:
-        return f"~{_inner(self.of)}"
+        return f"~{_in_brackets(self.of)}"
 
 
 @jax.tree_util.register_dataclass
@@ -98,7 +98,7 @@ class Junction(Formula):
     kind: str = field(**_static)
 
     def __str__(self) -> str:
-        return f" {self.kind} ".join(map(_inner, self.parts))
+        return f" {self.kind} ".join(map(_in_brackets, self.parts))
 
 
 @jax.tree_util.register_dataclass
@@ -110,7 +110,7 @@ class Implies(Formula):
     right: Formula
 
     def __str__(self) -> str:
-        return f"{_inner(self.left)} implies {_inner(self.right)}"
+        return f"{_in_brackets(self.left)} implies {_in_brackets(self.right)}"
 
 
 @jax.tree_util.register_dataclass
@@ -124,7 +124,7 @@ class Temporal(Formula):
     b: float | None = field(**_static)
 
     def __str__(self) -> str:
-        return f"{self.kind}{window(self)} {_inner(self.of)}"
+        return f"{self.kind}{window(self)} {_in_brackets(self.of)}"
 
 
 @jax.tree_util.register_dataclass
@@ -138,7 +138,7 @@ class Until(Formula):
     b: float | None = field(**_static)
 
     def __str__(self) -> str:
-        return f"{_inner(self.left)} until{window(self)} {_inner(self.right)}"
+        return f"{_in_brackets(self.left)} until{window(self)} {_in_brackets(self.right)}"
 
 
 def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
@@ -244,8 +244,8 @@ def until(f: Formula, g: Formula, a: float = 0.0, b: float | None = None) -> For
         >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
         1.0
     """
-    f, g = _formula("until", "f", f), _formula("until", "g", g)
-    return Until(f, g, *_window("until", g, a, b))
+    f, g = _checked_formula("until", "f", f), _checked_formula("until", "g", g)
+    return Until(f, g, *_checked_window("until", g, a, b))
 
 
 def implies(f: Formula, g: Formula) -> Formula:
@@ -269,7 +269,7 @@ def implies(f: Formula, g: Formula) -> Formula:
         >>> print(float(specs.robustness(rule, jnp.array([1.0, 4.0, 2.0]), 1.0)))
         1.0
     """
-    return Implies(_formula("implies", "f", f), _formula("implies", "g", g))
+    return Implies(_checked_formula("implies", "f", f), _checked_formula("implies", "g", g))
 
 
 def children(f: Formula) -> tuple[Formula, ...]:
@@ -297,23 +297,23 @@ def window(f: Temporal | Until) -> str:
 
 
 def _temporal(kind: str, f: Formula, a: Any, b: Any) -> Formula:
-    return Temporal(_formula(kind, "f", f), kind, *_window(kind, f, a, b))
+    return Temporal(_checked_formula(kind, "f", f), kind, *_checked_window(kind, f, a, b))
 
 
-def _joined(kind: str, *parts: Formula) -> Formula:
+def _junction(kind: str, *parts: Formula) -> Formula:
     for part in parts:
-        _formula(kind, "each side", part)
-    flat = lambda p: p.parts if isinstance(p, Junction) and p.kind == kind else (p,)
-    return Junction(sum(map(flat, parts), ()), kind)
+        _checked_formula(kind, "each side", part)
+    flat = [p.parts if isinstance(p, Junction) and p.kind == kind else (p,) for p in parts]
+    return Junction(sum(flat, ()), kind)
 
 
-def _inner(f: Formula) -> str:
+def _in_brackets(f: Formula) -> str:
     text = str(f)
     alone = isinstance(f, Not) or (isinstance(f, Predicate) and text.isidentifier())
     return text if alone else f"({text})"
 
 
-def _formula(function: str, name: str, f: Any) -> Formula:
+def _checked_formula(function: str, name: str, f: Any) -> Formula:
     if not isinstance(f, Formula):
         raise ValueError(
             f"{function}: {name} must be a formula, as jast.specs.predicate(function) makes it,"
@@ -322,11 +322,12 @@ def _formula(function: str, name: str, f: Any) -> Formula:
     return f
 
 
-def _window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, float | None]:
-    number = lambda v: isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)
-    if not (number(a) and (b is None or number(b)) and 0 <= a and (b is None or a <= b)):
+def _checked_window(function: str, f: Formula, a: Any, b: Any) -> tuple[float, float | None]:
+    ends = [a] if b is None else [a, b]
+    numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in ends)
+    if not (numbers and all(map(math.isfinite, ends)) and 0 <= a <= ends[-1]):
         raise ValueError(
-            f"{function} {_inner(f)}: the window must be two numbers of seconds, 0 <= a <= b (b may"
-            f" be left out: to the trace's end), received a={a!r}, b={b!r}"
+            f"{function} {_in_brackets(f)}: the window must be two numbers of seconds, 0 <= a <= b"
+            f" (b may be left out: to the trace's end), received a={a!r}, b={b!r}"
         )
     return float(a), None if b is None else float(b)

@@ -6,6 +6,7 @@ many as what is inside looks ahead: after Deshmukh et al. 2017, Robust online mo
 temporal logic. So the memory has a fixed size, and `always` of a predicate keeps a single number.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -31,19 +32,22 @@ __all__ = ["Memory", "begin", "push"]
 class Memory(NamedTuple):
     """What is kept of one window, or of a predicate outside of all windows."""
 
-    best: Any
+    best: jax.Array
     """Of the moments whose value is known."""
-    held: Any
+    held: jax.Array
     """The least of what must hold up to the last of these moments; inf but for ``until``."""
-    recent: Any
+    recent: tuple[jax.Array, ...]
     """The last samples of each predicate inside: a tuple of [r]."""
 
 
 def begin(formula: Formula, dt: float, total: int, dtype: Any) -> tuple[Memory, ...]:
     """The memories before the first sample of a trace of ``total``, from left to right."""
     inf = jnp.asarray(jnp.inf, dtype)
-    blank = lambda f: tuple(jnp.zeros(_ahead(f, dt, total), dtype) for _ in predicates(f))
-    return tuple(Memory(-inf, inf, blank(f)) for f in _windows(formula))
+    memories = []
+    for f in _windows(formula):
+        recent = tuple(jnp.zeros(_ahead(f, dt, total), dtype) for _ in predicates(f))
+        memories.append(Memory(-inf, inf, recent))
+    return tuple(memories)
 
 
 def push(
@@ -79,10 +83,9 @@ def push(
             return jnp.maximum(-bound(f.left, -sign), bound(f.right, sign))
         if isinstance(f, Junction):
             op = jnp.minimum if f.kind == "&" else jnp.maximum
-            found = [bound(part, sign) for part in f.parts]
-            return jax.tree.reduce(op, found)
+            return functools.reduce(op, [bound(part, sign) for part in f.parts])
         news = tuple(next(left) for _ in predicates(f))
-        memory, found = _watched(f, sign, next(before), news, start, unknown, dt, total)
+        memory, found = _push_window(f, sign, next(before), news, start, unknown, dt, total)
         after.append(memory)
         return found
 
@@ -90,7 +93,7 @@ def push(
     return tuple(after), found
 
 
-def _watched(
+def _push_window(
     f: Formula,
     sign: int,
     memory: Memory,

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from jast import results
-from jast.specs import robustness as R
 from jast.specs.formulas import Formula, Implies, Not, Predicate, Until, children
+from jast.specs.robustness import Values, margins, robustness, samples_in, spacing, values
 
 __all__ = ["Part", "Parts", "parts"]
 
@@ -102,17 +102,27 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
         >>> "s < 5" in str(found)
         True
     """
-    dt = R.spacing("parts", dt)
-    R.robustness(formula, trace, dt, goes_on=goes_on)  # its checks
-    given = R.margins("parts", formula, trace)
-    found = jax.device_get(R.values(formula, given, dt, goes_on))
+    dt = spacing("parts", dt)
+    robustness(formula, trace, dt, goes_on=goes_on)  # its checks
+    given = margins("parts", formula, trace)
+    found = jax.device_get(values(formula, given, dt, goes_on))
     total, rows = found.own[0], []
 
-    def look(f: Formula, v: R.Values, at: int | None, depth: int) -> None:
+    def look(f: Formula, v: Values, at: int | None, depth: int) -> None:
         value = float(v.own[at]) if at is not None else float("nan")
         time = float("nan") if at is None else at * dt
         decides = abs(value) == abs(float(total)) and np.isfinite(value)
-        rows.append(Part(f, depth, time, value, value >= 0, decides, v.own))
+        rows.append(
+            Part(
+                formula=f,
+                depth=depth,
+                time=time,
+                value=value,
+                held=value >= 0,
+                decides=decides,
+                values=v.own,
+            )
+        )
         moments = _moments(f, v, at, dt)
         for child, part, when in zip(children(f), v.parts, moments, strict=True):
             look(child, part, when, depth + 1)
@@ -121,13 +131,13 @@ def parts(formula: Formula, trace: Any, dt: float, *, goes_on: bool = False) -> 
     return Parts(tuple(rows), dt)
 
 
-def _moments(f: Formula, v: R.Values, at: int | None, dt: float) -> list[int | None]:
+def _moments(f: Formula, v: Values, at: int | None, dt: float) -> list[int | None]:
     """When the parts of ``f`` are asked, which is itself asked ``at``."""
     if at is None or isinstance(f, Predicate | Not | Implies) or not hasattr(f, "b"):
         return [at] * len(v.parts)
     if not np.isfinite(v.own[at]):  # open yet
         return [None] * len(v.parts)
-    first, last = R.samples_in("parts", f, dt)
+    first, last = samples_in("parts", f, dt)
     end = None if last is None else at + last + 1
     inside = slice(at + first, end)
     if isinstance(f, Until):

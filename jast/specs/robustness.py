@@ -44,18 +44,13 @@ may come from float32.
 class Values(NamedTuple):
     """The robustness of a formula at every moment, and that of its parts."""
 
-    own: Any
+    own: jax.Array
     """[T]"""
     parts: tuple["Values", ...]
 
 
 def robustness(
-    formula: Formula,
-    trace: Any,
-    dt: float,
-    *,
-    temperature: Any = None,
-    goes_on: bool = False,
+    formula: Formula, trace: Any, dt: float, *, temperature: Any = None, goes_on: bool = False
 ) -> jax.Array:
     """By how much a trace satisfies a formula; below 0, it violates it.
 

@@ -36,17 +36,17 @@ class Monitored(NamedTuple):
 
     state: Any
     """The system's own."""
-    samples: Any
+    samples: jax.Array
     """int32: samples of the trace so far."""
-    memory: Any
+    memory: tuple[monitor.Memory, ...]
     """`jast.specs.monitor.Memory` of each window."""
-    robustness: Any
+    robustness: jax.Array
     """The greatest robustness that the trace can still reach; at its end, its robustness. Infinite
     while nothing is decided.
     """
-    goes_on: Any
+    goes_on: jax.Array
     """bool: the trace goes on. False at the horizon, and where ``is_terminal`` ended it."""
-    told: Any = ()
+    told: tuple[jax.Array, ...] = ()
     """``(log p,)`` of the trace so far, where the system's ``evaluate`` tells log p; else ``()``.
     """
 
@@ -119,8 +119,8 @@ def under(
     contract("under", sim)
     samples = samples if samples is None else bound(samples)
     about, dt = outline(sim), spacing("under", dt)
-    watch = _Watch(sim, formula, samples, dt, 0)
-    rows = jax.eval_shape(lambda: _rows(watch, _zeros(about.state)))
+    watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=0)
+    rows = jax.eval_shape(lambda: _samples_of(watch, _zeros(about.state)))
     sizes = {a.shape[0] if a.ndim else 0 for a in jax.tree.leaves(rows)}
     if len(sizes) != 1 or 0 in sizes:
         raise ValueError(
@@ -129,8 +129,10 @@ def under(
         )
     total = sim.horizon * sizes.pop() + 1
     fits("under", formula, total, dt)
-    watch = _Watch(sim, formula, samples, dt, total)
-    shapes = jax.eval_shape(lambda: margins("under", formula, _rows(watch, _zeros(about.state))))
+    watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=total)
+    shapes = jax.eval_shape(
+        lambda: margins("under", formula, _samples_of(watch, _zeros(about.state)))
+    )
     watched = dict(
         init=Partial(_init, watch),
         step=Partial(_step, watch),
@@ -174,8 +176,10 @@ def trace_of(episode: Episode, samples: Callable[[Any], Any] | None = None) -> A
     if samples is None:
         return states
     rows = jax.vmap(samples)(states)
-    flat = lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])])
-    return jax.tree.map(lambda a: flat(np.asarray(a)), rows)
+    rows = jax.tree.map(np.asarray, rows)
+    return jax.tree.map(
+        lambda a: np.concatenate([a[0, -1:], a[1:].reshape(-1, *a.shape[2:])]), rows
+    )
 
 
 def goes_on(episode: Episode) -> bool:
@@ -212,27 +216,27 @@ def _monitored(function: str, episode: Any) -> Monitored:
 
 def _init(watch: _Watch, x0: Any) -> Monitored:
     state = watch.sim.init(x0)
-    rows = jax.tree.map(lambda a: a[-1:], _rows(watch, state))
+    rows = jax.tree.map(lambda a: a[-1:], _samples_of(watch, state))
     given = margins("under", watch.formula, rows)
     memory = monitor.begin(watch.formula, watch.dt, watch.total, given[0].dtype)
     start = jnp.zeros((), jnp.int32)
-    return _pushed(watch, state, start, memory, given, _told(watch, state))
+    return _observed_to(watch, state, start, memory, given, _log_p_of_evaluate(watch, state))
 
 
 def _step(watch: _Watch, s: Monitored, x: Any) -> Monitored:
     state = watch.sim.step(s.state, x)
-    given = margins("under", watch.formula, _rows(watch, state))
-    told = tuple(a + b for a, b in zip(s.told, _told(watch, state), strict=True))
-    return _pushed(watch, state, s.samples, s.memory, given, told)
+    given = margins("under", watch.formula, _samples_of(watch, state))
+    told = tuple(a + b for a, b in zip(s.told, _log_p_of_evaluate(watch, state), strict=True))
+    return _observed_to(watch, state, s.samples, s.memory, given, told)
 
 
-def _told(watch: _Watch, state: Any) -> tuple[jax.Array, ...]:
+def _log_p_of_evaluate(watch: _Watch, state: Any) -> tuple[jax.Array, ...]:
     """What the system's ``evaluate`` tells of log p; an episodic one is not asked."""
     told = () if watch.sim.episodic else watch.sim.evaluate(state)[2:]
     return tuple(jnp.asarray(p) for p in told)
 
 
-def _pushed(
+def _observed_to(
     watch: _Watch, state: Any, samples: Any, memory: Any, given: Any, told: Any
 ) -> Monitored:
     after = samples + len(given[0])
@@ -240,10 +244,12 @@ def _pushed(
     memory, bound = monitor.push(
         watch.formula, memory, given, samples, unknown, watch.dt, watch.total
     )
-    return Monitored(state, after, memory, bound, unknown, told)
+    return Monitored(
+        state=state, samples=after, memory=memory, robustness=bound, goes_on=unknown, told=told
+    )
 
 
-def _rows(watch: _Watch, state: Any) -> Any:
+def _samples_of(watch: _Watch, state: Any) -> Any:
     if watch.samples is None:
         return jax.tree.map(lambda a: jnp.asarray(a)[None], state)
     return watch.samples(state)
@@ -258,7 +264,7 @@ def _observe(watch: _Watch, s: Monitored) -> Any:
 
 
 def _evaluate_step(watch: _Watch, s: Monitored) -> tuple[jax.Array, ...]:
-    return (*_evaluate(s)[:2], *_told(watch, s.state))
+    return (*_evaluate(s)[:2], *_log_p_of_evaluate(watch, s.state))
 
 
 def _evaluate(s: Monitored) -> tuple[jax.Array, ...]:

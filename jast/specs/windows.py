@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Pair", "exact", "soft", "until"]
+__all__ = ["Pair", "exact", "over", "soft", "until"]
 
 
 class Pair(NamedTuple):
@@ -28,7 +28,10 @@ exact = Pair(jnp.minimum, jnp.maximum, True)
 
 def soft(temperature: Any) -> Pair:
     """Least and greatest smoothed: -t log(sum exp(-x / t)), t log(sum exp(x / t))."""
-    most = lambda a, b: temperature * jnp.logaddexp(a / temperature, b / temperature)
+
+    def most(a, b):
+        return temperature * jnp.logaddexp(a / temperature, b / temperature)
+
     return Pair(lambda a, b: -most(-a, -b), most, False)
 
 
@@ -42,7 +45,10 @@ def over(op: Callable, x: Any, first: int, last: int, beyond: Any, overlap: bool
     width = min(last - first, size) + 1
     rows = size + width - 1
     y, n = jax.tree.map(partial(_continued, rows, first), x, beyond), 1
-    cut = lambda y, start, length: jax.tree.map(lambda a: a[start : start + length], y)
+
+    def cut(y, start, length):
+        return jax.tree.map(lambda a: a[start : start + length], y)
+
     found, done = None, 0
     while True:  # y[t] is that of the n numbers from t on
         if overlap and 2 * n > width:

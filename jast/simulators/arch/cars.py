@@ -35,7 +35,7 @@ DURATION = 100.0
 INPUTS = (("throttle", 0.0, 1.0), ("brake", 0.0, 1.0))
 """Names and ranges of the inputs."""
 KEEP, CHASE, BRAKE = 0, 1, 2
-SECANTS = 3
+SECANTS = 3  # by which a switch is located
 
 
 class Cars(NamedTuple):
@@ -49,13 +49,13 @@ class Cars(NamedTuple):
         [0.0, 10.0, 20.0, 30.0, 40.0]
     """
 
-    gaps: Any
+    gaps: jax.Array
     """[4] m: y2 - y1, .., y5 - y4"""
-    speeds: Any
+    speeds: jax.Array
     """[5] m/s: v of each car; cars 2 to 5 that chase or brake move by -v"""
-    modes: Any
+    modes: jax.Array
     """[4] int32 of cars 2 to 5: 0 Keep, 1 Chase, 2 Brake"""
-    first: Any
+    first: jax.Array
     """m: y1"""
 
     @property
@@ -70,11 +70,11 @@ class _Path(NamedTuple):
     is the factors of the first five powers of time in its way; the sixth is below 1e-9 m.
     """
 
-    law: Any
-    switch: Any
+    law: tuple[Any, ...]
+    switch: jax.Array
     """Seconds; inf where there is none"""
-    later: Any
-    gone: Any
+    later: tuple[Any, ...]
+    gone: jax.Array
     """m, up to the switch"""
 
 
@@ -95,16 +95,16 @@ def drive(cars: Cars, inputs: jax.Array) -> tuple[Cars, Cars]:
         (the cars k `DT` later, `Cars` [k, ...] after each input).
     """
     # car by car, as each depends on those before it alone
-    path, (speed, first) = _led(cars, inputs)
+    path, (speed, first) = _drive_first(cars, inputs)
     gaps, speeds, modes = [], [speed], []
     for i in range(4):
         begin = cars.gaps[i], cars.speeds[i + 1], cars.modes[i]
-        _, (path, (gap, speed, mode)) = lax.scan(_followed, begin, path)
+        _, (path, (gap, speed, mode)) = lax.scan(_drive_follower, begin, path)
         gaps.append(gap)
         speeds.append(speed)
         modes.append(mode)
-    stack = lambda columns: jnp.stack(columns, axis=-1)
-    samples = Cars(stack(gaps), stack(speeds), stack(modes), first)
+    gaps, speeds, modes = (jnp.stack(columns, axis=-1) for columns in (gaps, speeds, modes))
+    samples = Cars(gaps, speeds, modes, first)
     return jax.tree.map(lambda a: a[-1], samples), samples
 
 
@@ -113,16 +113,16 @@ def observe(cars: Cars) -> tuple[Any, ...]:
     return cars.gaps, cars.speeds, cars.modes
 
 
-def _led(cars: Cars, inputs: jax.Array) -> tuple[_Path, tuple[Any, Any]]:
+def _drive_first(cars: Cars, inputs: jax.Array) -> tuple[_Path, tuple[Any, Any]]:
     """The paths of car 1, and its speeds and positions, [k, ...]."""
 
     def body(at: tuple[Any, Any], u: jax.Array) -> tuple[Any, Any]:
         speed, y = at
         throttle, brake = u
-        fading = _fading(brake)
+        fading = _braking(brake)
         late = (0, *(c / k for k, c in enumerate(fading[:4], 2)))
         law = tuple(speed * a - throttle * b for a, b in zip(fading, late, strict=True))
-        after = _speed(law, DT), y + _way(law, DT)
+        after = _speed(law, DT), y + _distance(law, DT)
         return after, (law, after)
 
     begin = cars.speeds[0], cars.first
@@ -132,13 +132,17 @@ def _led(cars: Cars, inputs: jax.Array) -> tuple[_Path, tuple[Any, Any]]:
     return _Path(laws, never, laws, zero), after
 
 
-def _followed(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
+def _drive_follower(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     """A car (its gap, speed and mode) behind one that goes ``ahead``: as it is `DT` later, and with
     its path. It switches once at most.
     """
     gap, speed, mode = at
     law = _law(mode, speed)
-    free = lambda t: gap + _way(law, t) - _gone(ahead, t)
+
+    def free(t: Any) -> Any:
+        """The gap, as long as the car does not switch."""
+        return gap + _distance(law, t) - _distance_gone(ahead, t)
+
     up = jnp.where(mode == KEEP, 15.0, jnp.where(mode == BRAKE, 20.0, jnp.inf))
     down = jnp.where(mode == KEEP, 5.0, jnp.where(mode == CHASE, 10.0, -jnp.inf))
     up, down = up.astype(gap.dtype), down.astype(gap.dtype)
@@ -153,7 +157,11 @@ def _followed(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     sign = jnp.where(high, 1, -1).astype(gap.dtype)
     left = jnp.where(early, jnp.zeros_like(kink), kink)
     right = jnp.where(early, kink, jnp.asarray(DT, gap.dtype))
-    over = lambda t: sign * (free(t) - level)  # at least 0 from the switch on
+
+    def over(t: Any) -> Any:
+        """At least 0 from the switch on."""
+        return sign * (free(t) - level)
+
     for _ in range(SECANTS):
         a, b = jnp.minimum(over(left), 0), jnp.maximum(over(right), 0)
         share = jnp.where(b > a, -a / jnp.where(b > a, b - a, 1), 0)
@@ -164,11 +172,11 @@ def _followed(at: tuple[Any, Any, Any], ahead: _Path) -> tuple[Any, Any]:
     new = jnp.where(high, CHASE, jnp.where(mode == KEEP, BRAKE, KEEP)).astype(mode.dtype)
     then = jnp.where(mode == KEEP, speed, jnp.abs(_speed(law, when)))
     later = _law(new, then)
-    path = _Path(law, jnp.where(switches, when, jnp.inf), later, _way(law, when))
+    path = _Path(law, jnp.where(switches, when, jnp.inf), later, _distance(law, when))
     mode = jnp.where(switches, new, mode)
     last = jnp.where(switches, _speed(later, DT - when), _speed(law, DT))
     end = jnp.asarray(DT, gap.dtype)
-    after = gap + _gone(path, end) - _gone(ahead, end), jnp.abs(last), mode
+    after = gap + _distance_gone(path, end) - _distance_gone(ahead, end), jnp.abs(last), mode
     return after, (path, after)
 
 
@@ -177,14 +185,14 @@ def _law(mode: Any, speed: Any) -> Any:
     zero = jnp.zeros_like(speed)
     keep = (speed, *[zero] * 4)
     chase = (-speed, zero - 0.5, *[zero] * 3)
-    brake = tuple(-speed * c for c in _fading(zero + 1))
+    brake = tuple(-speed * c for c in _braking(zero + 1))
     return tuple(
         jnp.where(mode == KEEP, k, jnp.where(mode == CHASE, c, b))
         for k, c, b in zip(keep, chase, brake, strict=True)
     )
 
 
-def _fading(rate: Any) -> tuple[Any, ...]:
+def _braking(rate: Any) -> tuple[Any, ...]:
     """(1 - exp(-rate t)) / rate in powers of t."""
     powers = [jnp.ones_like(rate)]
     for k in (2, 3, 4, 5):
@@ -192,7 +200,7 @@ def _fading(rate: Any) -> tuple[Any, ...]:
     return tuple(powers)
 
 
-def _way(law: Any, t: Any) -> Any:
+def _distance(law: Any, t: Any) -> Any:
     """m, by t."""
     total = law[4]
     for k in (3, 2, 1, 0):
@@ -208,7 +216,8 @@ def _speed(law: Any, t: Any) -> Any:
     return total
 
 
-def _gone(path: _Path, t: Any) -> Any:
+def _distance_gone(path: _Path, t: Any) -> Any:
     """m, by t."""
     rest = jnp.where(t > path.switch, t - path.switch, 0)
-    return jnp.where(t > path.switch, path.gone + _way(path.later, rest), _way(path.law, t))
+    later = path.gone + _distance(path.later, rest)
+    return jnp.where(t > path.switch, later, _distance(path.law, t))

@@ -7,26 +7,21 @@ surfaces in degrees.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast.simulators.arch._table import along
-from jast.simulators.arch.f16_tables import (
-    DAMPING,
-    LIFT,
-    PITCHING,
-    SLIPPING,
-    STEERING,
-    THRUST,
-)
+from jast.simulators.arch.f16_tables import DAMPING, LIFT, PITCHING, SLIPPING, STEERING, THRUST
 
 __all__ = ["F16", "Controls", "Loads", "motion"]
 
 GRAVITY = 32.17
 MASS = 1 / 1.57e-3
 """slug; rounded as in the book, whose check values need it so"""
-AREA, SPAN, CHORD = 300.0, 30.0, 11.32
-"""ft2, ft, ft"""
+AREA = 300.0  # ft2
+SPAN = 30.0  # ft
+CHORD = 11.32  # ft
 CENTRE = 0.35
 """Of gravity, in chords: where the tables have it."""
 INERTIA = np.array([[9496.0, 0, -982], [0, 55814, 0], [-982, 0, 63100]])
@@ -38,15 +33,15 @@ ENGINE = 160.0
 class F16(NamedTuple):
     """The aircraft at a moment, over a flat earth."""
 
-    velocity: Any
+    velocity: jax.Array
     """[3] ft/s along the body's axes: forward, right, down"""
-    attitude: Any
+    attitude: jax.Array
     """[3] rad: roll, pitch, yaw"""
-    rates: Any
+    rates: jax.Array
     """[3] rad/s: p, q, r"""
-    position: Any
+    position: jax.Array
     """[3] ft: north, east, altitude"""
-    power: Any
+    power: jax.Array
     """Of the engine, 0 to 100"""
 
     @property
@@ -93,9 +88,9 @@ class Controls(NamedTuple):
 class Loads(NamedTuple):
     """Aerodynamic accelerations at the centre of gravity, in g."""
 
-    side: Any
+    side: jax.Array
     """To the right"""
-    normal: Any
+    normal: jax.Array
     """Up, 1 in level flight"""
 
 
@@ -115,7 +110,9 @@ def motion(now: F16, controls: Controls, centre: float = CENTRE) -> tuple[F16, L
     position = (now.velocity @ frame.T) * jnp.array([1, 1, -1], dtype)
     power = _spooling(now.power, controls.throttle)
     loads = Loads(force[1] / (MASS * GRAVITY), -force[2] / (MASS * GRAVITY))
-    return F16(velocity, _turning(now), rates, position, power), loads
+    return F16(
+        velocity=velocity, attitude=_turning(now), rates=rates, position=position, power=power
+    ), loads
 
 
 def _coefficients(now: F16, controls: Controls, centre: float) -> tuple[Any, Any]:

@@ -37,7 +37,7 @@ LOOPS = (
 the states and of the integrals of the errors."""
 EFFORT = 0.03
 """Weight of the square of a surface's angle in degrees."""
-NEWTON = 20
+NEWTON = 20  # steps of Newton's method, more than it takes
 
 
 class Design(NamedTuple):
@@ -56,7 +56,13 @@ def level(speed: chex.Numeric, alpha: chex.Numeric, power: chex.Numeric) -> F16:
     """The aircraft in level flight at sea level."""
     zero = jnp.zeros(3)
     along = jnp.stack([jnp.cos(alpha), jnp.zeros(()), jnp.sin(alpha)])
-    return F16(speed * along, zero.at[1].set(alpha), zero, zero, jnp.asarray(power))
+    return F16(
+        velocity=speed * along,
+        attitude=zero.at[1].set(alpha),
+        rates=zero,
+        position=zero,
+        power=jnp.asarray(power),
+    )
 
 
 def trim(speed: chex.Numeric) -> tuple[jax.Array, Controls]:
@@ -71,7 +77,9 @@ def trim(speed: chex.Numeric) -> tuple[jax.Array, Controls]:
         rate, _ = motion(now, Controls(throttle, elevator, zero, zero))
         return jnp.stack([rate.velocity[0], rate.velocity[2], rate.rates[1]])
 
-    better = lambda _, v: v - jnp.linalg.solve(jax.jacfwd(residual)(v), residual(v))
+    def better(_: int, v: jax.Array) -> jax.Array:
+        return v - jnp.linalg.solve(jax.jacfwd(residual)(v), residual(v))
+
     alpha, elevator, throttle = lax.fori_loop(0, NEWTON, better, jnp.array([0.1, -1.0, 0.2]))
     return alpha, Controls(throttle, elevator, zero, zero)
 
@@ -106,7 +114,6 @@ def _rates(level_alpha: jax.Array, throttle: jax.Array, x: jax.Array, u: jax.Arr
     now = level(SPEED, level_alpha, POWER * throttle)
     now = now._replace(velocity=SPEED * way, rates=jnp.stack([p, q, r]))
     rate, loads = motion(now, Controls(throttle, *u))
-    angles = lambda now: (now.alpha, now.beta)
-    alphas, betas = jax.jvp(angles, (now,), (rate,))[1]
+    alphas, betas = jax.jvp(lambda now: (now.alpha, now.beta), (now,), (rate,))[1]
     dp, dq, dr = rate.rates
     return jnp.concatenate([jnp.stack([alphas, dq, betas, dp, dr]), measured(now, loads)])

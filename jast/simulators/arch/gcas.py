@@ -43,23 +43,23 @@ DT = 1 / 30
 DURATION = 15.0
 """Seconds of a run."""
 WAIT, ROLL, PULL = 0, 1, 2
-LEVEL, STILL = np.deg2rad(5), np.deg2rad(10)
-"""Of the wings: roll in rad, rad/s."""
-ROLLING = 4.0, 2.0
-LOAD = 5.0
-"""g"""
-DECK = 1000.0
-"""ft"""
-PULLS = 2.0
-"""Seconds, at least."""
-SPEED, ALPHA, POWER = 540.0, np.deg2rad(2.1215), 9.0
-LIMITS = 25.0, 21.5, 30.0
-"""Degrees."""
+LEVEL = np.deg2rad(5)  # roll of level wings, at most
+STILL = np.deg2rad(10)  # rad/s: and their rate
+ROLLING = 4.0, 2.0  # gains of roll and its rate
+LOAD = 5.0  # g
+DECK = 1000.0  # ft
+PULLS = 2.0  # seconds, at least
+SPEED = 540.0  # ft/s
+ALPHA = np.deg2rad(2.1215)
+POWER = 9.0
+LIMITS = 25.0, 21.5, 30.0  # degrees
 STAGES = np.array([[0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1, 1 / 6]])
 """Of Runge-Kutta's method: how far along the last slope each is, and its weight."""
 
 # jast.simulators.arch.f16_design: level flight at 502 ft/s, and the gains about it
-LEVEL_ALPHA, THROTTLE, ELEVATOR = 0.0369109, 0.138535, -0.758780
+LEVEL_ALPHA = 0.0369109
+THROTTLE = 0.138535
+ELEVATOR = -0.758780
 PITCH = np.array([-280.2576, -69.8972, -57.735])
 LATERAL = np.array([[27.9123, -3.2968, -16.1738, -17.9932, -9.7869],
                     [8.6686, 1.1445, -49.1969, 3.0949, -56.8995]])  # fmt: skip
@@ -76,11 +76,11 @@ class Flight(NamedTuple):
     """
 
     aircraft: F16
-    errors: Any
+    errors: jax.Array
     """[3] integrals of the errors of the normal load, the roll rate, and the side load + r"""
-    mode: Any
+    mode: jax.Array
     """int32: 0 Wait, 1 Roll, 2 Pull"""
-    since: Any
+    since: jax.Array
     """int32: samples in this mode"""
 
     @property
@@ -99,7 +99,13 @@ def start(attitude: jax.Array, altitude: Any) -> Flight:
     dtype = attitude.dtype
     velocity = SPEED * jnp.array([np.cos(ALPHA), 0, np.sin(ALPHA)], dtype)
     position = jnp.zeros(3, dtype).at[2].set(altitude)
-    aircraft = F16(velocity, attitude, jnp.zeros(3, dtype), position, jnp.asarray(POWER, dtype))
+    aircraft = F16(
+        velocity=velocity,
+        attitude=attitude,
+        rates=jnp.zeros(3, dtype),
+        position=position,
+        power=jnp.asarray(POWER, dtype),
+    )
     zero = jnp.zeros((), jnp.int32)
     return Flight(aircraft, jnp.zeros(3, dtype), zero, zero)
 

@@ -23,7 +23,16 @@ from jast.specs.robustness import reach
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["automatic_transmission", "chasing_cars", "simulate"]
+__all__ = [
+    "Driving",
+    "automatic_transmission",
+    "begun",
+    "chasing_cars",
+    "ends",
+    "nothing",
+    "samples_of",
+    "simulate",
+]
 
 MODELS = {"chasing cars": cars, "automatic transmission": transmission}
 

@@ -47,18 +47,20 @@ INPUTS = (("throttle", 0.0, 100.0), ("brake", 0.0, 325.0))
 
 STEPS = 2
 """Steps of the integrator a sample."""
-TICK, WAIT = 2, 2
-"""Samples between looks of the shift logic, and looks before it shifts."""
-IDLE, MOST = 600.0, 6000.0
-ENGINE, VEHICLE = 0.0219914882836, 12.0941478573
-"""Inertias."""
-FINAL, FRICTION, DRAG = 3.23, 40.0, 0.02
-MPH = 2 * math.pi * 60 / 5280
-"""Of a wheel's rpm."""
+TICK = 2  # samples between looks of the shift logic
+WAIT = 2  # looks before it shifts
+IDLE = 600.0  # rpm, the least
+FASTEST = 6000.0  # rpm, the most
+ENGINE = 0.0219914882836  # its inertia
+VEHICLE = 12.0941478573  # its inertia
+FINAL = 3.23  # ratio of the final drive
+FRICTION = 40.0  # ft lb
+DRAG = 0.02  # ft lb, for the square of each mph
+MPH = 2 * math.pi * 60 / 5280  # of a wheel's rpm
 GEARS = np.array([2.393, 1.45, 1.0, 0.677])
 
 
-def _even(step: float, at: Any, values: Any) -> np.ndarray:
+def _evenly_spaced(step: float, at: Any, values: Any) -> np.ndarray:
     """A table of numbers [n, ...] at the places ``at`` [n], as one of even spacing: all places are
     multiples of ``step``, from the first on.
     """
@@ -71,7 +73,7 @@ def _even(step: float, at: Any, values: Any) -> np.ndarray:
 
 
 # ft lb, by throttle (rows) and engine speed, 800, 1200, .. 4800 rpm
-TORQUE = _even(
+TORQUE = _evenly_spaced(
     10,
     [0, 20, 30, 40, 50, 60, 70, 80, 90, 100],
     [
@@ -88,7 +90,7 @@ TORQUE = _even(
     ],
 )
 # capacity K and torque ratio, by speed ratio
-CONVERTER = _even(
+CONVERTER = _evenly_spaced(
     0.01,
     [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, *np.arange(80, 91) / 100, 0.92, 0.94],
     np.transpose([
@@ -101,13 +103,13 @@ CONVERTER = _even(
 )  # fmt: skip
 # mph, by throttle (rows) and gear: above the first a shift up, below the second a shift down
 NEVER = 1e6
-UP = _even(
+UP = _evenly_spaced(
     5,
     [0, 25, 35, 50, 90, 100],
     np.transpose([[10, 10, 15, 23, 40, 40], [30, 30, 30, 41, 70, 70], [50, 50, 50, 60, 100, 100],
                   [NEVER] * 6]),
 )  # fmt: skip
-DOWN = _even(
+DOWN = _evenly_spaced(
     5,
     [0, 5, 40, 50, 90, 100],
     np.transpose([[0] * 6, [5, 5, 5, 5, 30, 30], [20, 20, 25, 30, 50, 50],
@@ -127,17 +129,17 @@ class Transmission(NamedTuple):
         36
     """
 
-    rpm: Any
+    rpm: jax.Array
     """Engine speed"""
-    wheel: Any
+    wheel: jax.Array
     """rpm of the wheels"""
-    gear: Any
+    gear: jax.Array
     """int32: 1 to 4"""
-    wish: Any
+    wish: jax.Array
     """int32: 1 where the logic is about to shift up, -1 down, else 0"""
-    waited: Any
+    waited: jax.Array
     """int32: looks of the logic since it wished so"""
-    samples: Any
+    samples: jax.Array
     """int32: since the last look"""
 
     @property
@@ -149,7 +151,14 @@ class Transmission(NamedTuple):
 def start() -> Transmission:
     """The car at 0 s: at rest, the engine at 1000 rpm."""
     zero = jnp.zeros((), jnp.int32)
-    return Transmission(jnp.full((), 1000.0), jnp.zeros(()), zero + 1, zero, zero, zero)
+    return Transmission(
+        rpm=jnp.full((), 1000.0),
+        wheel=jnp.zeros(()),
+        gear=zero + 1,
+        wish=zero,
+        waited=zero,
+        samples=zero,
+    )
 
 
 def drive(car: Transmission, inputs: jax.Array) -> tuple[Transmission, Transmission]:
@@ -164,7 +173,7 @@ def drive(car: Transmission, inputs: jax.Array) -> tuple[Transmission, Transmiss
     """
 
     def body(car: Transmission, u: jax.Array) -> tuple[Transmission, Transmission]:
-        car = _moved(_shifted(car, u[0]), u)
+        car = _integrate(_shift_gear(car, u[0]), u)
         return car, car
 
     return lax.scan(body, car, inputs)
@@ -175,7 +184,7 @@ def observe(car: Transmission) -> tuple[Any, ...]:
     return car.rpm[None], car.speed[None], car.gear[None]
 
 
-def _shifted(car: Transmission, throttle: Any) -> Transmission:
+def _shift_gear(car: Transmission, throttle: Any) -> Transmission:
     """The car after the logic looked, where it is time to."""
     level = throttle / 5
     up, down = along(UP, level)[car.gear - 1], along(DOWN, level)[car.gear - 1]
@@ -184,8 +193,10 @@ def _shifted(car: Transmission, throttle: Any) -> Transmission:
     dropped = jnp.where(car.wish > 0, v < up, v > down)
     wishes = jnp.where(v > up, 1, jnp.where(v < down, -1, 0))
     wish = jnp.where(car.wish == 0, wishes, jnp.where(fires | dropped, 0, car.wish))
-    looks = car.samples == 0
-    kept = lambda new, old: jnp.where(looks, new, old).astype(old.dtype)
+
+    def kept(new: Any, old: Any) -> Any:
+        return jnp.where(car.samples == 0, new, old).astype(old.dtype)
+
     return car._replace(
         gear=kept(jnp.clip(car.gear + jnp.where(fires, car.wish, 0), 1, 4), car.gear),
         wish=kept(wish, car.wish),
@@ -194,32 +205,34 @@ def _shifted(car: Transmission, throttle: Any) -> Transmission:
     )
 
 
-def _moved(car: Transmission, u: jax.Array) -> Transmission:
+def _integrate(car: Transmission, u: jax.Array) -> Transmission:
     """The car `DT` later, in its gear, at throttle and brake ``u``."""
     dtype = car.rpm.dtype
     torques = along(TORQUE, u[0] / 10)
     ratio = jnp.asarray(GEARS, dtype)[car.gear - 1]
 
     def slopes(rpm: Any, wheel: Any) -> tuple[Any, Any]:
-        rpm, v = jnp.clip(rpm, IDLE, MOST), MPH * wheel
+        rpm, v = jnp.clip(rpm, IDLE, FASTEST), MPH * wheel
         capacity, gain = along(CONVERTER, 100 * FINAL * ratio * wheel / rpm)
         impeller = (rpm / capacity) ** 2
         rise = (along(torques, rpm / 400 - 2) - impeller) / ENGINE
-        stuck = ((rpm <= IDLE) & (rise < 0)) | ((rpm >= MOST) & (rise > 0))
+        stuck = ((rpm <= IDLE) & (rise < 0)) | ((rpm >= FASTEST) & (rise > 0))
         load = (FRICTION + DRAG * v**2 + u[1]) * jnp.sign(v)
         return jnp.where(stuck, 0, rise), (FINAL * ratio * impeller * gain - load) / VEHICLE
 
     h = DT / STEPS
 
     def step(_: Any, now: tuple[Any, Any]) -> tuple[Any, Any]:
-        ahead = lambda k, share: (now[0] + share * h * k[0], now[1] + share * h * k[1])
+        def ahead(k: tuple[Any, Any], share: float) -> tuple[Any, Any]:
+            return now[0] + share * h * k[0], now[1] + share * h * k[1]
+
         a = slopes(*now)
         b = slopes(*ahead(a, 0.5))
         c = slopes(*ahead(b, 0.5))
         d = slopes(*ahead(c, 1))
         rise = [(p + 2 * q + 2 * r + s) / 6 for p, q, r, s in zip(a, b, c, d, strict=True)]
         rpm, wheel = ahead(rise, 1)
-        return jnp.clip(rpm, IDLE, MOST), wheel
+        return jnp.clip(rpm, IDLE, FASTEST), wheel
 
     rpm, wheel = lax.fori_loop(0, STEPS, step, (car.rpm, car.wheel))
     return car._replace(rpm=rpm, wheel=wheel)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["DESIRED", "FIRST", "SPEEDS", "ZONES", "costs", "inside", "plan"]
+__all__ = ["DESIRED", "FIRST", "SPEEDS", "STILL", "ZONES", "costs", "inside", "plan", "speed_of"]
 
 
 class Zone(NamedTuple):
@@ -29,16 +29,21 @@ class Zone(NamedTuple):
 
 
 ZONES = (
-    Zone("region of collision", 20.0, 10.0, 10.0, 10.0, 1000.0),
-    Zone("high penalty region", 25.0, 20.0, 15.0, 15.0, 100.0),
-    Zone("low penalty region", 40.0, 30.0, 25.0, 25.0, 10.0),
+    Zone(
+        name="region of collision", forward=20.0, starboard=10.0, aft=10.0, port=10.0, weight=1000.0
+    ),
+    Zone(
+        name="high penalty region", forward=25.0, starboard=20.0, aft=15.0, port=15.0, weight=100.0
+    ),
+    Zone(name="low penalty region", forward=40.0, starboard=30.0, aft=25.0, port=25.0, weight=10.0),
 )
 DESIRED = 0.75  # m/s
 STILL = 0.05  # m/s: published threshold of low velocity
 # candidates, m/s: published range
 SPEEDS = np.concatenate([[-0.2, 0.0], np.linspace(0.15, 1.5, 10)])
 FIRST = int(np.flatnonzero(np.isclose(SPEEDS, DESIRED))[0])
-STEP, AHEAD = 2.0, 30.0  # s: the prediction's step and its end: ours (published horizon: up to 600)
+STEP = 2.0  # s: of the prediction: ours
+AHEAD = 30.0  # s: its end: ours (published: up to 600)
 SLOWNESS = 10.0  # cost of a second at 1 m/s off the desired speed
 KEEP = 0.8  # the speed in force stays unless another costs less than this share of it ...
 KEEP_LEAST = 20.0  # ... and this much less

@@ -33,7 +33,7 @@ from jast.simulators.colav.vessels import (
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["ColavState", "colav"]
+__all__ = ["COLLISION", "ColavState", "colav"]
 
 KINDS = ("delay", "steering", "noise")
 COLLISION = 1.0  # m between the centres: published
@@ -239,7 +239,7 @@ def _init(model, x0):
     return ColavState(
         pose=pose,
         velocity=Velocity(zero, zero, zero),
-        control=Control(pose.n, zero, zero, zero, zero),
+        control=Control(along=pose.n, speed=zero, sum_n=zero, sum_e=zero, sum_psi=zero),
         choice=jnp.int32(planner.FIRST),
         track=now,
         adversary=adversary,
@@ -303,17 +303,17 @@ def _step(model, s, x):
     since = jnp.arange(1, n + 1, dtype=dtype) / n
     (pose, velocity, control, track, near), _ = lax.scan(drive, start, (since, poses))
     return ColavState(
-        pose,
-        velocity,
-        control,
-        choice,
-        track,
-        adversary,
-        past,
-        s.step + 1,
-        delay,
-        steering,
-        jnp.sqrt(near),
+        pose=pose,
+        velocity=velocity,
+        control=control,
+        choice=choice,
+        track=track,
+        adversary=adversary,
+        past=past,
+        step=s.step + 1,
+        delay=delay,
+        steering=steering,
+        near=jnp.sqrt(near),
     )
 
 

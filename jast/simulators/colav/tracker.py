@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-__all__ = ["PERIOD", "Track", "begin", "push", "reader", "track"]
+__all__ = ["BUFFER", "PERIOD", "Track", "begin", "push", "reader", "track"]
 
 PERIOD = 3.0  # s: a search step
 BUFFER = 40.0  # s: the published buffer's 400 samples of 0.1 s

@@ -34,7 +34,9 @@ LINEAR, QUADRATIC, CUBIC = (
     (110.064, 116.487, 874.428),
     (13.965, 24.313, 0.0),
 )  # damping X, Y, N
-KP, KI, KD = (200.0, 200.0, 800.0), (10.0, 10.0, 15.0), (700.0, 700.0, 1600.0)
+KP = (200.0, 200.0, 800.0)
+KI = (10.0, 10.0, 15.0)
+KD = (700.0, 700.0, 1600.0)
 THRUST = (1000.0, 1000.0, 2000.0)  # greatest force (N) and moment (N m), each way: ours
 # greatest position error that the controller sees, m: ours (the published planner allows 5 along
 # the path, 3 across)
@@ -101,7 +103,10 @@ def forces(control, pose, velocity):
     """
     c, s = jnp.cos(pose.psi), jnp.sin(pose.psi)
     error_n, error_e, error_psi = _errors(control.along, pose)
-    body = lambda n, e: (c * n + s * e, c * e - s * n)
+
+    def body(n, e):
+        return c * n + s * e, c * e - s * n
+
     (p_u, p_v), (i_u, i_v) = body(error_n, error_e), body(control.sum_n, control.sum_e)
     want_u, want_v = body(control.speed, jnp.zeros_like(control.speed))
     errors = zip(

@@ -7,7 +7,7 @@ navigation.
 
 import numpy as np
 
-__all__ = ["APART", "FIXES", "KLAX", "KSFO"]
+__all__ = ["APART", "FIXES", "KLAX", "KSFO", "POSITIONS"]
 
 # latitude and longitude (degrees): where all routes begin and end
 KSFO, KLAX = (37.6188, -122.3750), (33.9425, -118.4081)

@@ -15,11 +15,14 @@ import jax.numpy as jnp
 from jast.simulators.fms.geodesic import inverse, wrap
 from jast.simulators.fms.lateral import LEAST
 
-__all__ = ["Misses", "extent", "misses"]
+__all__ = ["EVENTS", "FOOT", "Misses", "extent", "misses"]
 
 FOOT = 0.3048  # m
-RHO, LIMIT, FLOOR = 100.0, 10.0, 1e-9  # eq. 3.4: scale, threshold and least error, both in ft
-KINK, COURSE = 1e-3, jnp.pi / 180  # radians
+RHO = 100.0  # eq. 3.4: the scale
+LIMIT = 10.0  # ft, eq. 3.4: the threshold
+FLOOR = 1e-9  # ft, eq. 3.4: the least error
+KINK = 1e-3  # radians
+COURSE = jnp.pi / 180  # radians
 ROUND = 1e-6  # radians: an arc as near to a whole circle is none
 
 

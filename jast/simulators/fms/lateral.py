@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from jast.simulators.fms.geodesic import Earth, direct, inverse, wrap
 
-__all__ = ["Path"]
+__all__ = ["KNOT", "LEAST", "NMI", "Build", "Path", "lateral"]
 
 NMI = 1852.0  # m
 KNOT = NMI / 3600  # m/s
@@ -101,8 +101,12 @@ def lateral(build, waypoints, winds, count):
     tan = jnp.tan(jnp.abs(turn) / 2)
     radius = jnp.minimum(speed**2 / (GRAVITY * jnp.tan(build.bank)), LEAD / jnp.maximum(tan, 1e-9))
     end = jnp.zeros((1,), tan.dtype)
-    # of the turns at both ends of a leg
-    both = lambda a: (lambda p: p[:-1] + p[1:])(jnp.concatenate([end, a, end]))
+
+    def both(a):
+        """The sum of the turns at both ends of a leg."""
+        padded = jnp.concatenate([end, a, end])
+        return padded[:-1] + padded[1:]
+
     sense = jnp.concatenate([end, jnp.sign(turn), end])
     needs = SHARE * legs < both(radius * tan)
     short = (legs < build.eps) & (build.every | (sense[:-1] * sense[1:] < 0))
@@ -123,16 +127,16 @@ def lateral(build, waypoints, winds, count):
     )
     beta = jnp.abs(turn) * radius
     return Path(
-        waypoints,
-        legs,
-        needs & short,
-        turn,
-        start,
-        finish,
-        course_out,
-        centre,
-        side * radius,
-        beta,
-        ~overlap,
-        beta > LEAST,
+        waypoints=waypoints,
+        legs=legs,
+        skipped=needs & short,
+        turn=turn,
+        start=start,
+        end=finish,
+        course_out=course_out,
+        centre=centre,
+        radius=side * radius,
+        beta=beta,
+        straight=~overlap,
+        arc=beta > LEAST,
     )

@@ -127,23 +127,23 @@ def fms(
         for v in (eps * (0.0 if fixed else NMI), jnp.radians(bank), tas * KNOT)
     )
     build = Build(
-        eps,
-        jnp.asarray(guard == "all"),
-        bank,
-        tas,
-        jnp.asarray(snap),
-        Earth(*(jnp.asarray(v, jnp.float64) for v in EARTHS[earth])),
+        eps=eps,
+        every=jnp.asarray(guard == "all"),
+        bank=bank,
+        tas=tas,
+        snap=jnp.asarray(snap),
+        earth=Earth(*(jnp.asarray(v, jnp.float64) for v in EARTHS[earth])),
     )
     model = Model(build, waypoints, event)
     step, disturbance = (
         (_step_database, _disturbance_database) if database else (_step, _disturbance)
     )
     return Simulator(
-        Partial(_init, model),
-        Partial(step, model),
-        Partial(disturbance, model),
-        Partial(_evaluate, model),
-        waypoints,
+        init=Partial(_init, model),
+        step=Partial(step, model),
+        disturbance=Partial(disturbance, model),
+        evaluate=Partial(_evaluate, model),
+        horizon=waypoints,
         observe=_observe,
         episodic=True,
     )
