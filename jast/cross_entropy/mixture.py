@@ -2,8 +2,10 @@
 maximisation (Bishop 2006, section 9.2).
 """
 
+from __future__ import annotations
+
 import operator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,9 @@ from jast import results
 from jast._jax import is_traced
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
+
+if TYPE_CHECKING:
+    import chex
 
 __all__ = [
     "Mixture",
@@ -41,11 +46,11 @@ class Mixture(NamedTuple):
         (2, 1)
     """
 
-    weights: Any
+    weights: chex.Array
     """[k]"""
-    means: Any
+    means: chex.Array
     """[k, d]"""
-    covariances: Any
+    covariances: chex.Array
     """[k, d, d]"""
 
 
@@ -113,7 +118,16 @@ def log_likelihood(m, x, weights):
     return jnp.sum(jnp.where(counted, weights * values, 0))
 
 
-def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
+def em(
+    m: Mixture,
+    x: jax.Array,
+    weights: jax.Array,
+    iterations: int = 10,
+    regularisation: chex.Numeric = 0.0,
+    least: chex.Numeric | None = None,
+    diagonal: bool = False,
+    least_variance: chex.Numeric = 0.0,
+) -> Mixture:
     """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted
     ``weights[i]`` times: a `Mixture` without NaN.
 
@@ -124,8 +138,11 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
     well. So weights are multiplicities, not only ratios. With no regularisation no iteration lowers
     the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
 
+    With ``diagonal`` the components have diagonal covariances. No variance is below
+    ``least_variance``.
+
     Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0,
-    and a negative regularisation or least (unless traced).
+    and a negative regularisation, least or least_variance (unless traced).
     """
     _check("em", m, x, weights)
     try:
@@ -136,33 +153,48 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
         raise ValueError(
             f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}"
         )
-    least = x.shape[1] if least is None else least
-    for name, value in dict(regularisation=regularisation, least=least).items():
+    numbers = dict(
+        regularisation=regularisation,
+        least=x.shape[1] if least is None else least,
+        least_variance=least_variance,
+    )
+    for name, value in numbers.items():
         if jnp.shape(value) != () or not (is_traced(value) or value >= 0):
             raise ValueError(
                 f"mixture.em: {name} must be a number of at least 0, received {value!r}"
             )
+    numbers = {name: jnp.asarray(value).astype(x.dtype) for name, value in numbers.items()}
     weights = weights.astype(x.dtype)
     counted = weights > 0
     x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
-    regularisation, least = (
-        jnp.asarray(regularisation).astype(x.dtype),
-        jnp.asarray(least).astype(x.dtype),
-    )
-    return lax.fori_loop(
-        0, steps, lambda _, m: _iterate(m, x, w, counted, regularisation, least), m
-    )
+
+    def iterate(_: int, m: Mixture) -> Mixture:
+        return _em_iteration(m, x, w, diagonal, **numbers)
+
+    return lax.fori_loop(0, steps, iterate, m)
 
 
-def _iterate(m, x, w, counted, regularisation, least):
+def _em_iteration(
+    m: Mixture,
+    x: jax.Array,
+    w: jax.Array,
+    diagonal: bool,
+    regularisation: jax.Array,
+    least: jax.Array,
+    least_variance: jax.Array,
+) -> Mixture:
     """One E and one M step, Bishop eq. 9.23 to 9.27."""
     n, d = x.shape
+    eye = jnp.eye(d, dtype=x.dtype)[None]
     tiny, eps = (float(getattr(jnp.finfo(x.dtype), name)) for name in ("tiny", "eps"))
-    r = jnp.where(counted[:, None], w[:, None] * responsibilities(m, x), 0)
+    r = jnp.where(w[:, None] > 0, w[:, None] * responsibilities(m, x), 0)
     count = jnp.sum(r, axis=0)  # eq. 9.27
     r = r / jnp.where(count > 0, count, 1)[None]
     means, covariances = jax.vmap(gaussian.moments, (None, 1))(x, r)  # eq. 9.24, 9.25
-    covariances = covariances + regularisation * jnp.eye(d, dtype=x.dtype)[None]
+    covariances = covariances * eye if diagonal else covariances
+    covariances = covariances + regularisation * eye
+    variances = jnp.diagonal(covariances, axis1=1, axis2=2)
+    covariances = covariances + jnp.maximum(least_variance - variances, 0)[:, :, None] * eye
     # below, the sums of underflowing numbers are no longer averages
     moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)
     spread = (

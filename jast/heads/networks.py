@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Head", "make_head"]
+__all__ = ["ACTIVATIONS", "Head", "adam", "adam_step", "dense", "make_head"]
 
 ACTIVATIONS = {
     "gelu": lambda x: jax.nn.gelu(x, approximate=False),
@@ -126,3 +126,20 @@ def dense(hidden, outputs, activation, first_activation):
 
     network = Dense(hidden, outputs, activation, first_activation)
     return network.init, Partial(network.apply)
+
+
+def adam() -> Any:
+    """Adam without its learning rate, of optax."""
+    import optax  # here: it takes a while, and only learning needs it
+
+    return optax.scale_by_adam()
+
+
+def adam_step(params: Any, optimiser: Any, gradient: Any, rate: Any) -> tuple[Any, Any]:
+    """One step of `adam`, whose state is ``optimiser``, at the learning ``rate``: ``(params,
+    optimiser)``.
+    """
+    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+        update, optimiser = adam().update(gradient, optimiser)
+    params = jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, update)
+    return params, optimiser
