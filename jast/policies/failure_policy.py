@@ -15,7 +15,7 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.distributions.mixtures import Blended
-from jast.heads.heads import observed
+from jast.heads.heads import observation
 from jast.policies.actor import Normalisation, latent_mixture, network_inputs
 from jast.policies.lanes import potential
 from jast.policies.start import Tilt
@@ -203,7 +203,7 @@ def _start(start, tilt):
 
 def _disturbance(sim, apply, dense_reward, actor, normalisation, state, t):
     inputs = network_inputs(
-        normalisation, sim.horizon, observed(sim, state), t, potential(sim, dense_reward, state)
+        normalisation, sim.horizon, observation(sim, state), t, potential(sim, dense_reward, state)
     )
     log_w, mean, deviation = latent_mixture(apply, actor, inputs)
     return Blended(sim.disturbance(state), jnp.exp(log_w), mean, deviation)

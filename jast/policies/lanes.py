@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jast import distributions as D
 from jast import progress
 from jast.distributions.mixtures import x_of
-from jast.heads.heads import observed
+from jast.heads.heads import observation
 from jast.pytrees import select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
@@ -136,15 +136,15 @@ def _lane(sim, dense_reward, episode, t, drift, log_p, live=True, finite=True):
     # 0 at a failure, whatever a simulator gives there: no failure is nearer than another
     counts = (dense_reward | episode.done) & ~episode.failure
     shaping = jnp.where(counts, distance.astype(jnp.float32), 0)
-    observation = observed(sim, episode.state)
-    invalid = episode.invalid | ~(finite & _finite(observation, shaping))
+    seen = observation(sim, episode.state)
+    invalid = episode.invalid | ~(finite & _finite(seen, shaping))
     episode = episode._replace(
         invalid=invalid, done=episode.done | invalid, failure=episode.failure & ~invalid
     )
     return Lane(
         progress=episode,
         t=t,
-        observation=observation,
+        observation=seen,
         potential=shaping,
         drift=drift,
         log_p=log_p,
