@@ -194,7 +194,7 @@ def test_a_polynomial_finds_a_paraboloid(x64):
     x = jnp.asarray(data(30, 3)[0])
     f = lambda x: (x[:, 0] - 1) ** 2 + x[:, 1] * x[:, 2] + 3
     mask = jnp.ones(30, bool)
-    frame = surrogates.frame(x, mask)
+    frame = surrogates.whitening_frame(x, mask)
     new = jnp.asarray(data(10, 3, seed=1)[0])
     np.testing.assert_allclose(
         surrogates.predict("polynomial", surrogates.fit("polynomial", x, f(x), mask, frame), new),
@@ -217,7 +217,7 @@ def test_ranks_are_normal_scores(values, padding):
 
     y = np.array(values + [0.0] * padding, np.float32)
     mask = np.arange(len(y)) < len(values)
-    scores, kept = surrogates.warped("rank", jnp.asarray(y), jnp.asarray(mask))
+    scores, kept = surrogates.warp_values("rank", jnp.asarray(y), jnp.asarray(mask))
     real = np.where(np.isfinite(y), y, np.inf)[mask]  # what is not finite is the worst
     expected = norm.ppf(np.clip((rankdata(real) - 0.5) / len(real), 1e-4, 1 - 1e-4))
     np.testing.assert_array_equal(kept, mask)
@@ -230,16 +230,16 @@ def test_other_warps_leave_out_what_is_not_finite():
         jnp.array([1.0, -4.0, jnp.nan, 2.0, jnp.inf, 9.0]),
         jnp.array([True, True, True, True, True, False]),
     )
-    raw, kept = surrogates.warped("raw", y, mask)
+    raw, kept = surrogates.warp_values("raw", y, mask)
     np.testing.assert_array_equal(kept, [True, True, False, True, False, False])
     np.testing.assert_allclose(raw[kept], [0.25, -1, 0.5])
-    standard, _ = surrogates.warped("standard", y, mask)
+    standard, _ = surrogates.warp_values("standard", y, mask)
     used = np.array([1.0, -4.0, 2.0])
     np.testing.assert_allclose(standard[kept], (used - used.mean()) / used.std(), rtol=1e-5)
     for warp in surrogates.WARPS:
-        scores, _ = surrogates.warped(warp, jnp.full(4, 3.0), jnp.ones(4, bool))
+        scores, _ = surrogates.warp_values(warp, jnp.full(4, 3.0), jnp.ones(4, bool))
         assert np.isfinite(scores).all()
-        scores, _ = surrogates.warped(warp, jnp.full(4, jnp.nan), jnp.ones(4, bool))
+        scores, _ = surrogates.warp_values(warp, jnp.full(4, jnp.nan), jnp.ones(4, bool))
         assert np.isfinite(scores).all()
 
 
@@ -247,8 +247,8 @@ def test_no_monotone_change_alters_the_ranks():
     y = jnp.asarray(data(20, 2, np.float32)[1])
     mask = jnp.ones(20, bool)
     np.testing.assert_array_equal(
-        surrogates.warped("rank", y, mask)[0],
-        surrogates.warped("rank", jnp.exp(3 * y) - 5, mask)[0],
+        surrogates.warp_values("rank", y, mask)[0],
+        surrogates.warp_values("rank", jnp.exp(3 * y) - 5, mask)[0],
     )
 
 
@@ -257,7 +257,7 @@ def test_a_frame_whitens(x64):
     x = jnp.asarray(
         rng.multivariate_normal([5, -3, 1], [[4, 1.5, 0], [1.5, 1, 0], [0, 0, 1e-6]], size=200)
     )
-    f = surrogates.frame(x, jnp.ones(200, bool))
+    f = surrogates.whitening_frame(x, jnp.ones(200, bool))
     z = np.linalg.solve(f.factor, (np.asarray(x) - np.asarray(f.centre)).T)
     np.testing.assert_allclose(z.mean(1), 0, atol=1e-9)
     # a tenth of the identity is kept: between 1 / (0.9 + 0.1 / l) for the eigenvalues l of the
@@ -272,7 +272,7 @@ def test_a_frame_whitens(x64):
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_a_frame_of_few_points_is_sound(rows):
     x = jnp.array([[1.0, 2.0], [1.0, 5.0], [jnp.nan, 0.0]])
-    f = surrogates.frame(x, jnp.arange(3) < rows)
+    f = surrogates.whitening_frame(x, jnp.arange(3) < rows)
     assert np.isfinite(f.factor).all() and (np.diagonal(f.factor) > 0).all()
 
 
@@ -282,6 +282,6 @@ def test_surrogates_of_few_points_are_finite(kind, n):
     x, y = data(3, 4, np.float32)
     mask = jnp.arange(3) < n
     fitted = surrogates.fit(
-        kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.frame(jnp.asarray(x), mask)
+        kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.whitening_frame(jnp.asarray(x), mask)
     )
     assert np.isfinite(surrogates.predict(kind, fitted, jnp.asarray(x) + 1)).all()

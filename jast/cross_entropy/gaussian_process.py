@@ -8,21 +8,20 @@ point of the grid, in closed form; the noise is relative to it.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.tree_util import register_dataclass
 
-__all__ = ["JITTER", "KERNELS", "LENGTHSCALES", "fit", "predict"]
+__all__ = ["JITTER", "KERNELS", "LENGTHSCALES", "fit", "predict", "squared_distances"]
 
 LENGTHSCALES = tuple(10 ** (-1.7 + 2.1 * i / 11) for i in range(12))
-"""The grid, as multiples of a scale: 0.02 to 2.5."""
+"""The grid: 0.02 to 2.5, from neighbours that tell little of one another to a nearly linear
+function."""
 NOISES = (1e-4, 1e-2)
-"""The grid of the noise's variance, as shares of the signal's."""
-JITTER = 1e-6
-"""Added to every noise."""
+"""The grid of the noise's variance, as shares of the signal's; a convention."""
+JITTER = 1e-6  # added to every noise: the least at which float32 factors stay positive definite
 
 
 def _squared_exponential(r2):
@@ -50,22 +49,22 @@ KERNELS = {
 class GaussianProcess:
     """A fitted process: what `predict` needs."""
 
-    x: Any
+    x: jax.Array
     """[n, d]; rows that are masked mean nothing."""
-    mask: Any
+    mask: jax.Array
     """[n] bool"""
-    factor: Any
+    factor: jax.Array
     """[n, n]: lower Cholesky factor of the correlation matrix with noise; a masked row is that of
     the identity.
     """
-    weights: Any
+    weights: jax.Array
     """[n]: the inverse of that matrix times y."""
-    lengthscale: Any
-    variance: Any
+    lengthscale: jax.Array
+    variance: jax.Array
     """Of the signal."""
-    noise: Any
+    noise: jax.Array
     """Relative to ``variance``, jitter included."""
-    log_likelihood: Any
+    log_likelihood: jax.Array
     """Of the observed y, at these hyperparameters (R&W eq. 2.30)."""
     kernel: str = field(default="squared exponential", metadata=dict(static=True))
 
@@ -97,7 +96,15 @@ def fit(x, y, mask, lengthscales, noises=NOISES, kernel="squared exponential"):
     )(lengthscale, noise)
     i = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values))
     return GaussianProcess(
-        x, mask, factors[i], weights[i], lengthscale[i], variances[i], noise[i], values[i], kernel
+        x=x,
+        mask=mask,
+        factor=factors[i],
+        weights=weights[i],
+        lengthscale=lengthscale[i],
+        variance=variances[i],
+        noise=noise[i],
+        log_likelihood=values[i],
+        kernel=kernel,
     )
 
 
@@ -112,14 +119,11 @@ def _factored(r2, y, mask, lengthscale, noise, kernel):
     n = jnp.sum(mask, dtype=y.dtype)
     # of greatest likelihood: d/dv of eq. 2.30 = 0
     variance = jnp.maximum(y @ weights / jnp.maximum(n, 1), jnp.finfo(y.dtype).tiny)
-    return factor, weights, variance, log_likelihood(factor, variance, n)
-
-
-def log_likelihood(factor, variance, n):
-    """R&W eq. 2.30 with the variance of greatest likelihood, for which the data's term is n / 2."""
-    return -0.5 * n * (1 + jnp.log(variance) + math.log(2 * math.pi)) - jnp.sum(
+    # R&W eq. 2.30 with that variance, for which the data's term is n / 2
+    log_likelihood = -0.5 * n * (1 + jnp.log(variance) + math.log(2 * math.pi)) - jnp.sum(
         jnp.log(jnp.diagonal(factor))
     )
+    return factor, weights, variance, log_likelihood
 
 
 def predict(gp, x, variance=False):

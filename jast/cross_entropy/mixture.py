@@ -25,7 +25,6 @@ __all__ = [
     "Mixture",
     "as_mixture",
     "em",
-    "log_likelihood",
     "log_prob",
     "responsibilities",
     "sample",
@@ -61,9 +60,9 @@ def as_mixture(proposal):
     if is_traced(proposal):
         weights, means, covariances = (jnp.asarray(v) for v in proposal)
     else:
-        dtype = gaussian.float_of(*proposal)
+        dtype = gaussian.widest_float(*proposal)
         weights, means, covariances = (
-            gaussian.numbers("proposal", part, value, dtype)
+            gaussian.finite_array("proposal", part, value, dtype)
             for part, value in zip(Mixture._fields, proposal, strict=True)
         )
     k, d = means.shape if means.ndim == 2 else (0, 0)
@@ -107,17 +106,6 @@ def responsibilities(m, x):
     return jnp.where(known, jnp.exp(joint - jnp.where(known, total, 0)), weights)
 
 
-def log_likelihood(m, x, weights):
-    """The sum of weights [n] times the log densities at ``x`` [n, d]; a row of weight 0 may hold
-    anything, NaN too. ValueError for shapes that do not fit.
-    """
-    _check("log_likelihood", m, x, weights)
-    weights = weights.astype(x.dtype)
-    counted = weights > 0
-    values = log_prob(m, jnp.where(counted[:, None], x, 0))
-    return jnp.sum(jnp.where(counted, weights * values, 0))
-
-
 def em(
     m: Mixture,
     x: jax.Array,
@@ -136,7 +124,7 @@ def em(
     d, the rule of R. J. Moss's thesis) keeps its covariance, as does one whose new covariance
     `gaussian.is_definite` refuses; with a count of 0, or data that are not finite, its mean as
     well. So weights are multiplicities, not only ratios. With no regularisation no iteration lowers
-    the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
+    the weighted sum of log densities. A row of weight 0 may hold anything, NaN too.
 
     With ``diagonal`` the components have diagonal covariances. No variance is below
     ``least_variance``.
@@ -144,7 +132,18 @@ def em(
     Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0,
     and a negative regularisation, least or least_variance (unless traced).
     """
-    _check("em", m, x, weights)
+    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
+    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
+        received = [a.shape for a in m]
+        raise ValueError(
+            "mixture.em: weights must be [k], means [k, d] and covariances [k, d, d],"
+            f" received {received}"
+        )
+    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
+        raise ValueError(
+            f"mixture.em: x must be [n, {d}] and its weights [n], received {x.shape} and"
+            f" {weights.shape}"
+        )
     try:
         steps = -1 if isinstance(iterations, bool) else operator.index(iterations)
     except TypeError:
@@ -218,18 +217,3 @@ def _log_joint(m, x):
         lambda mean, covariance: gaussian.log_prob(Gaussian(mean, covariance), x), out_axes=-1
     )(m.means, m.covariances)
     return values + jnp.log(m.weights).reshape((1,) * (values.ndim - 1) + (-1,))
-
-
-def _check(function, m, x, weights):
-    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
-    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
-        received = [a.shape for a in m]
-        raise ValueError(
-            f"mixture.{function}: weights must be [k], means [k, d] and covariances [k, d, d],"
-            f" received {received}"
-        )
-    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
-        raise ValueError(
-            f"mixture.{function}: x must be [n, {d}] and its weights [n], received {x.shape} and"
-            f" {weights.shape}"
-        )

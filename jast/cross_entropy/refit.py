@@ -3,7 +3,7 @@ those of short searches on it.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,22 @@ from jast.cross_entropy import gaussian, mixture, surrogates
 from jast.cross_entropy.gaussian import Gaussian
 from jast.cross_entropy.mixture import Mixture
 
-__all__ = ["draw", "moments", "search_around"]
+__all__ = [
+    "Points",
+    "draw",
+    "moments",
+    "refit_to_elites",
+    "refit_with_surrogate",
+    "search_around",
+]
 
 
 class Points(NamedTuple):
     """Weighted points; one of weight 0 is not there."""
 
-    x: Any
+    x: jax.Array
     """[n, d]"""
-    weights: Any
+    weights: jax.Array
     """[n]"""
 
 
@@ -42,27 +49,27 @@ def moments(proposal):
     )
 
 
-def to_elites(proposal, elites):
+def refit_to_elites(proposal, elites):
     """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are
     too few for a covariance.
     """
     return gaussian.fit(proposal, elites.x, elites.weights)
 
 
-class Sub(NamedTuple):
+class ModelSearch(NamedTuple):
     """The outcome of short searches on the surrogate, one an elite."""
 
-    x: Any
+    x: jax.Array
     """[n, d]: the best point of each"""
-    value: Any
+    value: jax.Array
     """[n]: what the surrogate says there"""
     fitted: Gaussian
     """[n, ...]: their last proposals"""
 
 
 def search_around(key, model, centres, covariance, samples, elites, iterations):
-    """`Sub`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from N(centre,
-    covariance), for each of ``centres`` [n, d] (Algorithm 4).
+    """`ModelSearch`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from
+    N(centre, covariance), for each of ``centres`` [n, d] (Algorithm 4).
     """
 
     def search(key, centre):
@@ -77,12 +84,12 @@ def search_around(key, model, centres, covariance, samples, elites, iterations):
 
         start = Gaussian(centre, covariance), centre, jnp.asarray(jnp.inf, centre.dtype)
         (g, best, value), _ = lax.scan(iterate, start, jax.random.split(key, iterations))
-        return Sub(best, value, g)
+        return ModelSearch(best, value, g)
 
     return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
 
 
-def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
+def refit_with_surrogate(key, plan, settings, proposal, first, elites, seen, chosen):
     """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that
     the surrogate judged [m, d]).
 
@@ -92,15 +99,14 @@ def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
     """
     for_samples, for_searches = jax.random.split(key)
     x, y, mask = seen
-    y, mask = surrogates.warped(plan.warp, y, mask)
-    at = surrogates.frame(x, mask) if plan.frame == "window" else _round(moments(first))
-    model = surrogates.fit(plan.surrogate, x, y, mask, at, plan.detail)
+    y, mask = surrogates.warp_values(plan.warp, y, mask)
+    window = plan.frame == "window"
+    frame = surrogates.whitening_frame(x, mask) if window else _spherical_frame(moments(first))
+    model = surrogates.fit(plan.surrogate, x, y, mask, frame, plan.detail)
     mean = partial(surrogates.predict, plan.surrogate, model)
-    aim = (
-        partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)
-        if plan.optimistic
-        else mean
-    )
+    aim = mean
+    if plan.optimistic:
+        aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)
 
     judged = draw(for_samples, proposal, plan.judged)  # Algorithm 3
     _, i = lax.top_k(-mean(judged), max(plan.chosen))
@@ -108,22 +114,17 @@ def to_model(key, plan, settings, proposal, first, elites, seen, chosen):
 
     spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
     sub = search_around(for_searches, aim, elites.x, spread, *plan.sub)
-    everything = (
-        jnp.concatenate(part)
-        for part in zip(elites, model_elites, (sub.x, elites.weights), strict=True)
-    )
-    together = Points(*everything)  # Algorithm 2: true, model and sub-elites
+    found = Points(sub.x, elites.weights)
+    # Algorithm 2: true, model and sub-elites
+    everything = jax.tree.map(lambda *a: jnp.concatenate(a), elites, model_elites, found)
     best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
     if isinstance(proposal, Gaussian):
-        return to_elites(proposal, together), sub.x[best], judged
-    return (
-        _to_components(plan, settings, proposal, elites, sub, spread, together),
-        sub.x[best],
-        judged,
-    )
+        return refit_to_elites(proposal, everything), sub.x[best], judged
+    new = _refit_mixture(plan, settings, proposal, elites, sub, spread, everything)
+    return new, sub.x[best], judged
 
 
-def _to_components(plan, settings, proposal, elites, sub, spread, together):
+def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
     """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of
     them.
     """
@@ -137,14 +138,14 @@ def _to_components(plan, settings, proposal, elites, sub, spread, together):
     )
     new = mixture.em(
         Mixture(weights, means, covariances),
-        *together,
+        *everything,
         iterations=plan.em_iterations,
         regularisation=settings.regularisation,
     )
     return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
 
 
-def _round(proposal):
+def _spherical_frame(proposal):
     """The frame of one scale for all coordinates: the root of the mean variance."""
     d = proposal.mean.size
     return surrogates.Frame(

@@ -7,8 +7,9 @@ ranking points, which is all that a cross-entropy method does.
 
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jax.scipy.special import ndtri
@@ -16,15 +17,25 @@ from jax.tree_util import register_dataclass
 
 from jast.cross_entropy import gaussian_process
 
-__all__ = ["RADIAL", "SURROGATES", "WARPS", "frame", "fit", "predict", "warped"]
+__all__ = [
+    "RADIAL",
+    "SURROGATES",
+    "WARPS",
+    "Frame",
+    "fit",
+    "lower_bound",
+    "predict",
+    "warp_values",
+    "whitening_frame",
+]
 
 
 class Frame(NamedTuple):
     """Coordinates in which points are compared: z = L^-1 (x - centre)."""
 
-    centre: Any
+    centre: jax.Array
     """[d]"""
-    factor: Any
+    factor: jax.Array
     """[d, d], lower triangular"""
 
 
@@ -32,8 +43,7 @@ class Surrogate(NamedTuple):
     """A fitted model."""
 
     frame: Frame
-    model: Any
-    """A `GaussianProcess`, or a `Basis`."""
+    model: "gaussian_process.GaussianProcess | Basis"
 
 
 @register_dataclass
@@ -41,13 +51,13 @@ class Surrogate(NamedTuple):
 class Basis:
     """Least squares on basis functions, which `predict` finds by the kind of the model."""
 
-    x: Any
+    x: jax.Array
     """[n, d]: the points, which are the centres of radial basis functions"""
-    mask: Any
+    mask: jax.Array
     """[n] bool"""
-    weights: Any
+    weights: jax.Array
     """[features]"""
-    detail: Any = field(default=None, metadata=dict(static=True))
+    detail: int | str | None = field(default=None, metadata=dict(static=True))
     """The degree of a polynomial, the name of a radial function."""
 
 
@@ -60,10 +70,6 @@ RADIAL = {
 """Radial functions of the squared distance r^2 in the frame, in d dimensions (Kochenderfer and
 Wheeler 2019, section 14.4; the names are those of the thesis's code).
 """
-
-
-def _linear(x, centres, mask, detail):
-    return _polynomial(x, centres, mask, 1)
 
 
 def _polynomial(x, centres, mask, degree):
@@ -81,17 +87,17 @@ def _radial(x, centres, mask, name):
     return jnp.where(mask[None, :], RADIAL[name](r2, x.shape[1]), 0)
 
 
-BASES = {"linear": _linear, "polynomial": _polynomial, "radial basis": _radial}
+BASES = {"linear": _polynomial, "polynomial": _polynomial, "radial basis": _radial}
 DETAILS = {
     "gaussian process": "squared exponential",
-    "linear": None,
+    "linear": 1,
     "polynomial": 2,
     "radial basis": "gaussian",
 }
-"""Of each kind: the kernel, nothing, the degree, the radial function where none is given."""
+"""Of each kind, where none is given: the kernel, the degree (twice), the radial function."""
 SURROGATES = tuple(DETAILS)
-RIDGE = 1e-4
-"""Of the least squares, as a share of the features' mean square."""
+RIDGE = 1e-4  # of the least squares, as a share of the features' mean square; a convention
+ROUND = 0.1  # weight of the identity in a frame, so that few points do
 
 
 def _raw(y, mask):
@@ -118,7 +124,7 @@ def _rank(y, mask):
 WARPS = {"raw": _raw, "standard": _standard, "rank": _rank}
 
 
-def warped(warp, y, mask):
+def warp_values(warp, y, mask):
     """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where
     they are the worst.
     """
@@ -128,7 +134,7 @@ def warped(warp, y, mask):
     return WARPS[warp](jnp.where(finite, y, 0), finite), finite
 
 
-def frame(x, mask):
+def whitening_frame(x, mask):
     """The `Frame` in which masked points ``x`` [n, d] have mean 0 and about the identity for
     covariance; a tenth of it is kept round, so that few points do.
     """
@@ -143,7 +149,7 @@ def frame(x, mask):
     spread = variances > (4 * jnp.finfo(x.dtype).eps * centre) ** 2
     variances = jnp.where(spread, variances, largest)
     u = z / jnp.sqrt(variances)[None]
-    correlation = 0.9 * u.T @ u / n + 0.1 * jnp.eye(d, dtype=x.dtype)
+    correlation = (1 - ROUND) * u.T @ u / n + ROUND * jnp.eye(d, dtype=x.dtype)
     return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))
 
 
@@ -152,7 +158,7 @@ def fit(kind, x, y, mask, frame, detail=None):
     ``y`` [n], where ``mask`` [n]; ``detail``: see `DETAILS`.
     """
     detail = DETAILS[kind] if detail is None else detail
-    z = jnp.where(mask[:, None], _framed(frame, jnp.where(mask[:, None], x, 0)), 0)
+    z = jnp.where(mask[:, None], _in_frame(frame, jnp.where(mask[:, None], x, 0)), 0)
     if kind == "gaussian process":
         return Surrogate(
             frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=detail)
@@ -170,7 +176,7 @@ def fit(kind, x, y, mask, frame, detail=None):
 
 def predict(kind, surrogate, x):
     """What the model expects at ``x`` [m, d]: [m], on the scale of the warped values."""
-    z = _framed(surrogate.frame, x)
+    z = _in_frame(surrogate.frame, x)
     if kind == "gaussian process":
         return gaussian_process.predict(surrogate.model, z)
     model = surrogate.model
@@ -182,10 +188,10 @@ def lower_bound(kind, surrogate, optimism, x):
     if kind != "gaussian process":
         return predict(kind, surrogate, x)
     mean, variance = gaussian_process.predict(
-        surrogate.model, _framed(surrogate.frame, x), variance=True
+        surrogate.model, _in_frame(surrogate.frame, x), variance=True
     )
     return mean - optimism * jnp.sqrt(variance)
 
 
-def _framed(frame, x):
+def _in_frame(frame, x):
     return solve_triangular(frame.factor, (x - frame.centre[None]).T, lower=True).T
