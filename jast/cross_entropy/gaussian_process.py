@@ -17,11 +17,10 @@ from jax.tree_util import register_dataclass
 __all__ = ["JITTER", "KERNELS", "LENGTHSCALES", "fit", "predict", "squared_distances"]
 
 LENGTHSCALES = tuple(10 ** (-1.7 + 2.1 * i / 11) for i in range(12))
-"""The grid: 0.02 to 2.5, from neighbours that tell little of one another to a nearly linear
-function."""
+"""The grid, as multiples of a scale: 0.02 to 2.5; a convention."""
 NOISES = (1e-4, 1e-2)
 """The grid of the noise's variance, as shares of the signal's; a convention."""
-JITTER = 1e-6  # added to every noise: the least at which float32 factors stay positive definite
+JITTER = 1e-6  # added to every noise, so that float32 factors stay positive definite
 
 
 def _squared_exponential(r2):

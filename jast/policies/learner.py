@@ -37,7 +37,7 @@ __all__ = [
     "update",
 ]
 
-VALUE_DRAWS = 16  # of the policy, in the value of a start; their mean is smooth enough to fit to
+VALUE_DRAWS = 16  # of the policy, in the value of a start; a convention
 
 
 class Rates(NamedTuple):

@@ -33,9 +33,9 @@ __all__ = ["ppo"]
 
 MOST_STEPS = 128  # of a lane between updates, where nobody says; a convention
 ITERATIONS = 150  # updates of the policy, for which as many lanes are taken where nobody says
-FEWEST_LANES = 8  # fewer make updates of few episodes
-MOST_LANES = 64  # more make no faster programs on a CPU
-EXPLORED = 100_000  # transitions of the exploration whose moments are taken: memory, not accuracy
+FEWEST_LANES = 8  # where nobody says; a convention
+MOST_LANES = 64  # where nobody says; a convention
+EXPLORED = 100_000  # transitions of the exploration whose moments are taken; a convention
 
 
 def ppo(

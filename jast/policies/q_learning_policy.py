@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["q_learning"]
 
-EXPLORED = 100_000  # transitions of the exploration that the ranges are taken of: memory
+EXPLORED = 100_000  # transitions of the exploration that the ranges are taken of; a convention
 
 
 def q_learning(

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["sac"]
 
-UPDATES = 5000  # in all, at the least, where nobody says; fewer learn too little
+UPDATES = 5000  # in all, where nobody says; a convention
 CRITICS_ALONE = 0.1  # fraction of the learning in which the actor does not learn yet
 
 

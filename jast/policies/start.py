@@ -16,7 +16,7 @@ __all__ = ["Tilt", "fit_tilt"]
 
 COMPONENTS = 4  # of the fit; a convention
 EM_ITERATIONS = 30  # in each round; a convention
-LEAST_DEVIATION = 0.1  # narrower components would rest on a few draws
+LEAST_DEVIATION = 0.1  # so that no component shrinks onto a few draws
 DEFENSIVE = 0.05  # weight of p(x0), which keeps importance weights bounded
 CANDIDATES = 256  # draws among which the first means are chosen
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-__all__ = ["logistic", "sigmoid"]
+__all__ = ["fit_logistic", "sigmoid"]
 
 
 def sigmoid(x):
     return 1 / (1 + np.exp(-np.clip(x, -40, 40)))
 
 
-def logistic(rows, failed, mean, precision):
+def fit_logistic(rows, failed, mean, precision):
     """[p]: the most probable coefficients for ``rows`` [m, p] and ``failed`` [m] bool under
     independent normal priors, by Newton's method with halved steps.
     """
