@@ -9,7 +9,7 @@ import pytest
 from jax.tree_util import Partial
 
 from jast import cross_entropy as ce
-from jast.cross_entropy import loop, refit, surrogates
+from jast.cross_entropy import loop, surrogates
 from jast.cross_entropy.gaussian import Gaussian
 from jast.cross_entropy.mixture import Mixture
 from jast.cross_entropy.settle import MODES, make_plan
@@ -133,7 +133,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     for_samples, for_searches = jax.random.split(
         jax.random.fold_in(jax.random.fold_in(before.state.key, k), 1)
     )
-    judged = np.asarray(refit.draw(for_samples, proposal, 200))
+    judged = np.asarray(loop.draw(for_samples, proposal, 200))
     np.testing.assert_array_equal(after.state.model_x[k], judged)
     (last, last_value), (x, value) = (
         batches[k],
@@ -796,10 +796,10 @@ def test_moments_of_a_mixture():
         jnp.array([[-1.0, 0.0], [1.0, 2.0]]),
         jnp.stack([jnp.eye(2), 2 * jnp.eye(2)]),
     )
-    g = refit.moments(m)
+    g = loop.moments(m)
     np.testing.assert_allclose(g.mean, [0.5, 1.5])
     np.testing.assert_allclose(g.covariance, 1.75 * np.eye(2) + [[0.75, 0.75], [0.75, 0.75]])
-    assert refit.moments(g) is g
+    assert loop.moments(g) is g
 
 
 def test_a_short_search_returns_the_best_that_it_drew(key):
@@ -811,7 +811,7 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
         return value
 
     centres = jnp.array([[0.0, 0.0], [9.0, 9.0]])
-    sub = refit.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
+    sub = loop.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
     jax.effects_barrier()
     drawn = np.concatenate([d.reshape(-1, 2) for d in drawn])
     assert len(drawn) == 2 * 6 * 40
@@ -824,7 +824,7 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
 
 
 def test_the_frame_of_one_scale():
-    frame = refit._spherical_frame(
+    frame = loop._spherical_frame(
         Gaussian(jnp.array([1.0, 2.0, 3.0]), jnp.diag(jnp.array([1.0, 4.0, 7.0])))
     )
     np.testing.assert_allclose(frame[1], 2 * np.eye(3))

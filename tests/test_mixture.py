@@ -28,8 +28,9 @@ EM = jax.jit(em, static_argnames="iterations")
 
 def log_likelihood(m, x, weights):
     """The sum of weights times log densities; a row of weight 0 may hold anything."""
+    weights = weights.astype(x.dtype)
     values = log_prob(m, jnp.where(weights[:, None] > 0, x, 0))
-    return jnp.sum(jnp.where(weights > 0, weights.astype(x.dtype) * values, 0))
+    return jnp.sum(jnp.where(weights > 0, weights * values, 0))
 
 
 SCORE, DENSITY, PARTS = jax.jit(log_likelihood), jax.jit(log_prob), jax.jit(responsibilities)

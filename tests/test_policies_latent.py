@@ -15,9 +15,14 @@ from jast.cross_entropy import mixture
 from jast.cross_entropy.mixture import Mixture
 from jast.distributions.mixtures import Blended, Moved, x_of
 from jast.heads.heads import Moments
-from jast.policies.actor import Normalisation, entropy_term, make_networks
+from jast.policies.actor import (
+    Normalisation,
+    count_latents,
+    entropy_term,
+    log_normal,
+    make_networks,
+)
 from jast.policies.lanes import Transitions, add_transitions, empty_buffer, lane_at, step_lane
-from jast.policies.latent import count_latents, log_normal
 from jast.policies.learner import Rates, init_learner, update
 from jast.policies.start import _first_components, fit_tilt
 

@@ -16,7 +16,6 @@ from sklearn.neighbors import NearestNeighbors
 
 from jast import weakness
 from jast.weakness import committee, residual, validate, views
-from jast.weakness import logistic as blend
 from jast.weakness.contract import Seen
 from jast.weakness.data import Data
 
@@ -173,19 +172,21 @@ def test_the_regression_is_the_most_probable(separable):
     rng = np.random.default_rng(0)
     rows = np.c_[rng.normal(size=(80, 2)) * 3, np.ones(80)]
     failed = (
-        rows[:, 0] > 0 if separable else rng.random(80) < blend.sigmoid(rows @ [0.7, -0.2, -1.0])
+        rows[:, 0] > 0 if separable else rng.random(80) < residual.sigmoid(rows @ [0.7, -0.2, -1.0])
     )
     mean, precision = np.array([0.5, 0.0, -0.5]), np.array([4.0, 2.0, 1.0])
     cost = lambda b: (
         np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
     )
-    found = blend.fit_logistic(rows, failed, mean, precision)
+    found = residual.fit_logistic(rows, failed, mean, precision)
     np.testing.assert_allclose(found, minimize(cost, mean, tol=1e-12).x, atol=1e-4)
 
 
 def test_nothing_seen_leaves_the_prior():
     np.testing.assert_array_equal(
-        blend.fit_logistic(np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION),
+        residual.fit_logistic(
+            np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION
+        ),
         selector.PRIOR,
     )
 
@@ -193,7 +194,7 @@ def test_nothing_seen_leaves_the_prior():
 def test_laplace_against_scikit_learn():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(60, 2))
-    failed = rng.random(60) < blend.sigmoid(3 * x[:, 0])
+    failed = rng.random(60) < residual.sigmoid(3 * x[:, 0])
     kernel = ConstantKernel(4.0, "fixed") * RBF(1.5, "fixed")
     theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=1000).fit(x, failed)
     matrix = residual._kernel(views.squared_distances(x, x), 1.5**2, 4.0, 1.0)
@@ -211,7 +212,7 @@ def test_the_mode_on_top_of_given_odds():
     target = (rng.random(40) < 0.3).astype(float)
     matrix = residual._kernel(views.squared_distances(x, x), 1.0, 16.0, 1.0)
     slope = residual._laplace(matrix, target, mean)[1]
-    np.testing.assert_allclose(target - blend.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
+    np.testing.assert_allclose(target - residual.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
 
 
 def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
@@ -233,7 +234,7 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     )
     assert found[labels == 0].max() < 1
     # what the odds say, and no more
-    fair = np.where(rng.random(600) < blend.sigmoid(odds), 1 - labels, labels)
+    fair = np.where(rng.random(600) < residual.sigmoid(odds), 1 - labels, labels)
     np.testing.assert_array_equal(
         residual.residual_log_odds(rng, close, labels, odds, seen_of(order, fair, labels)), 0
     )

@@ -1,5 +1,6 @@
 """One iteration of a cross-entropy method as two pure functions, ask and tell, and their loop in
-one program for objectives in JAX.
+one program for objectives in JAX; and how a proposal is refitted to the elites: those that were
+truly evaluated, those of the surrogate, and those of short searches on it.
 
 Every evaluation is kept in one log, in order; an iteration reads the rows that it may remember from
 there. Batches are padded to the largest one, with masks.
@@ -14,10 +15,9 @@ import numpy as np
 from jax import lax
 
 from jast.counter import tree_keys
-from jast.cross_entropy import refit
+from jast.cross_entropy import gaussian, mixture, surrogates
 from jast.cross_entropy.gaussian import Gaussian
 from jast.cross_entropy.mixture import Mixture
-from jast.cross_entropy.refit import Points
 from jast.cross_entropy.result import CEResult, History
 
 __all__ = ["Plan", "Settings", "State", "ask", "begin", "finish", "run", "tell"]
@@ -102,7 +102,7 @@ class State(NamedTuple):
 @partial(jax.jit, static_argnums=0)
 def begin(plan: Plan, key: jax.Array, proposal: Gaussian | Mixture) -> State:
     """The `State` before the first iteration."""
-    d, dtype = refit.moments(proposal).mean.shape[0], jax.tree.leaves(proposal)[0].dtype
+    d, dtype = moments(proposal).mean.shape[0], jax.tree.leaves(proposal)[0].dtype
     n, steps = sum(plan.counts), len(plan.counts)
     return State(
         key=tree_keys(key, 1)[0],
@@ -124,7 +124,7 @@ def ask(plan: Plan, state: State) -> jax.Array:
     """The points of the next iteration, [max(m), d], of which the first ``plan.counts[k]``
     count.
     """
-    x = refit.draw(_key(state, 0), state.proposal, max(plan.counts))
+    x = draw(_key(state, 0), state.proposal, max(plan.counts))
     known = (state.k > 0) & (
         jnp.arange(plan.evaluated, dtype=jnp.int32) < _at(plan.counts, state.k) // 2
     )
@@ -149,11 +149,11 @@ def tell(plan: Plan, settings: Settings, state: State, x: jax.Array, value: jax.
     )
     proposal, pending = state.proposal, state.pending
     if plan.method == "ce_method":
-        proposal = refit.refit_to_elites(proposal, elites)
+        proposal = refit_to_elites(proposal, elites)
     else:
         since = _at([begins[max(0, i + 1 - plan.memory)] for i in range(len(plan.counts))], k)
         seen = _surrogate_data(plan, state, since, at + count)
-        proposal, better, judged = refit.refit_with_surrogate(
+        proposal, better, judged = refit_with_surrogate(
             _key(state, 1), plan, settings, proposal, state.first, elites, seen, _at(plan.chosen, k)
         )
         pending = better[: plan.evaluated]
@@ -242,3 +242,134 @@ def run(plan, settings, key, objective, proposal):
         return tell(plan, settings, state, x, jax.vmap(objective)(x).astype(x.dtype)), None
 
     return finish(plan, lax.scan(iterate, begin(plan, key, proposal), length=len(plan.counts))[0])
+
+
+class Points(NamedTuple):
+    """Weighted points; one of weight 0 is not there."""
+
+    x: jax.Array
+    """[n, d]"""
+    weights: jax.Array
+    """[n]"""
+
+
+def draw(key, proposal, n):
+    """``n`` draws [n, d]."""
+    return (mixture if isinstance(proposal, Mixture) else gaussian).sample(key, proposal, n)
+
+
+def moments(proposal):
+    """The `Gaussian` of the proposal's mean and covariance."""
+    if isinstance(proposal, Gaussian):
+        return proposal
+    w = proposal.weights / jnp.sum(proposal.weights)
+    mean = w @ proposal.means
+    z = proposal.means - mean[None]
+    return Gaussian(
+        mean, jnp.einsum("k,kde->de", w, proposal.covariances) + jnp.einsum("k,kd,ke->de", w, z, z)
+    )
+
+
+def refit_to_elites(proposal, elites):
+    """Algorithm 1: the `Gaussian` of greatest likelihood for the elites, the old one where they are
+    too few for a covariance.
+    """
+    return gaussian.fit(proposal, elites.x, elites.weights)
+
+
+class ModelSearch(NamedTuple):
+    """The outcome of short searches on the surrogate, one an elite."""
+
+    x: jax.Array
+    """[n, d]: the best point of each"""
+    value: jax.Array
+    """[n]: what the surrogate says there"""
+    fitted: Gaussian
+    """[n, ...]: their last proposals"""
+
+
+def search_around(key, model, centres, covariance, samples, elites, iterations):
+    """`ModelSearch`: the cross-entropy method on a surrogate ``model`` ([n, d] -> [n]) from
+    N(centre, covariance), for each of ``centres`` [n, d] (Algorithm 4).
+    """
+
+    def search(key, centre):
+        def iterate(carry, key):
+            g, best, value = carry
+            x = gaussian.sample(key, g, samples)
+            v = model(x)
+            least, i = lax.top_k(-v, elites)
+            better = -least[0] < value
+            g = gaussian.fit(g, x[i], jnp.ones((elites,), x.dtype))
+            return (g, jnp.where(better, x[i[0]], best), jnp.where(better, -least[0], value)), None
+
+        start = Gaussian(centre, covariance), centre, jnp.asarray(jnp.inf, centre.dtype)
+        (g, best, value), _ = lax.scan(iterate, start, jax.random.split(key, iterations))
+        return ModelSearch(best, value, g)
+
+    return jax.vmap(search)(jax.random.split(key, len(centres)), centres)
+
+
+def refit_with_surrogate(key, plan, settings, proposal, first, elites, seen, chosen):
+    """Algorithms 2 to 5: (the next proposal, points to evaluate best first [n, d], the points that
+    the surrogate judged [m, d]).
+
+    ``first``: the initial proposal; ``elites``: `Points`, best first; ``seen``: the (x, values,
+    mask) that the surrogate is fitted to; ``chosen``: how many of the judged samples are elites,
+    traced.
+    """
+    for_samples, for_searches = jax.random.split(key)
+    x, y, mask = seen
+    y, mask = surrogates.warp_values(plan.warp, y, mask)
+    window = plan.frame == "window"
+    frame = surrogates.whitening_frame(x, mask) if window else _spherical_frame(moments(first))
+    model = surrogates.fit(plan.surrogate, x, y, mask, frame, plan.detail)
+    mean = partial(surrogates.predict, plan.surrogate, model)
+    aim = mean
+    if plan.optimistic:
+        aim = partial(surrogates.lower_bound, plan.surrogate, model, settings.optimism)
+
+    judged = draw(for_samples, proposal, plan.judged)  # Algorithm 3
+    _, i = lax.top_k(-mean(judged), max(plan.chosen))
+    model_elites = Points(judged[i], (jnp.arange(len(i), dtype=jnp.int32) < chosen).astype(x.dtype))
+
+    spread = (moments(proposal) if plan.current else moments(first)).covariance / settings.alpha
+    sub = search_around(for_searches, aim, elites.x, spread, *plan.sub)
+    found = Points(sub.x, elites.weights)
+    # Algorithm 2: true, model and sub-elites
+    everything = jax.tree.map(lambda *a: jnp.concatenate(a), elites, model_elites, found)
+    best = jnp.argsort(jnp.where(elites.weights > 0, sub.value, jnp.inf))
+    if isinstance(proposal, Gaussian):
+        return refit_to_elites(proposal, everything), sub.x[best], judged
+    new = _refit_mixture(plan, settings, proposal, elites, sub, spread, everything)
+    return new, sub.x[best], judged
+
+
+def _refit_mixture(plan, settings, proposal, elites, sub, spread, everything):
+    """Algorithm 5: expectation maximisation from a component an elite, `plan.components` of
+    them.
+    """
+    k = plan.components
+    there = elites.weights[:k]
+    weights = there / jnp.maximum(jnp.sum(there), 1)
+    means, covariances = (
+        (sub.fitted.mean[:k], sub.fitted.covariance[:k])
+        if plan.start == "searches"
+        else (elites.x[:k], jnp.broadcast_to(spread[None], (k, *spread.shape)))
+    )
+    new = mixture.em(
+        Mixture(weights, means, covariances),
+        *everything,
+        iterations=plan.em_iterations,
+        regularisation=settings.regularisation,
+    )
+    return jax.tree.map(lambda a, b: jnp.where(jnp.any(there > 0), a, b), new, proposal)
+
+
+def _spherical_frame(proposal):
+    """The frame of one scale for all coordinates: the root of the mean variance."""
+    d = proposal.mean.size
+    return surrogates.Frame(
+        proposal.mean,
+        jnp.sqrt(jnp.trace(proposal.covariance) / d) * jnp.eye(d, dtype=proposal.mean.dtype),
+    )

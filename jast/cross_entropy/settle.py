@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jast._checks import real, whole
 from jast._jax import is_traced
 from jast.cross_entropy.gaussian import as_gaussian
-from jast.cross_entropy.gaussian_process import KERNELS
 from jast.cross_entropy.loop import Plan, Settings
 from jast.cross_entropy.mixture import Mixture, as_mixture
 from jast.cross_entropy.schedules import counts
-from jast.cross_entropy.surrogates import RADIAL, SURROGATES, WARPS
+from jast.cross_entropy.surrogates import KERNELS, RADIAL, SURROGATES, WARPS
 from jast.rewards import as_pytree
 
 __all__ = ["MODES", "check_objective", "make_plan"]

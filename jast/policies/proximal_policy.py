@@ -15,12 +15,11 @@ from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import proximal, settings
-from jast.policies.actor import make_networks
+from jast.policies.actor import count_latents, make_networks
 from jast.policies.course import Method, train_policy
 from jast.policies.exploring import Config, explore, init_training
 from jast.policies.failure_policy import FailurePolicy
 from jast.policies.lanes import empty_buffer
-from jast.policies.latent import count_latents
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ from jast.contract import OBSERVED, contract
 from jast.memory import require
 from jast.outline import outline
 from jast.policies import settings, tabular
+from jast.policies.actor import count_latents
 from jast.policies.course import Method, train_policy
 from jast.policies.exploring import Config, explore
 from jast.policies.failure_policy import FailurePolicy
-from jast.policies.latent import count_latents
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:

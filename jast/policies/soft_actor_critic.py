@@ -17,11 +17,10 @@ from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
 from jast.policies import learner, settings
-from jast.policies.actor import make_networks
+from jast.policies.actor import count_latents, make_networks
 from jast.policies.course import Method, train_policy
 from jast.policies.exploring import Config, init_training
 from jast.policies.failure_policy import FailurePolicy
-from jast.policies.latent import count_latents
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:

@@ -17,9 +17,8 @@ from jast.contract import OBSERVED, contract
 from jast.heads.heads import Moments
 from jast.outline import outline
 from jast.policies import proximal
-from jast.policies.actor import Normalisation, make_networks
+from jast.policies.actor import Normalisation, count_latents, make_networks
 from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
-from jast.policies.latent import count_latents
 from jast.policies.learner import init_learner
 from jast.policies.start import Tilt
 from jast.policies.tabular import Table

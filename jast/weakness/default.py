@@ -10,8 +10,7 @@ from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.contract import Selector, Step
-from jast.weakness.logistic import fit_logistic, sigmoid
-from jast.weakness.residual import residual_log_odds
+from jast.weakness.residual import fit_logistic, residual_log_odds, sigmoid
 from jast.weakness.views import (
     difficulty_of_neighbours,
     make_views,

@@ -1,5 +1,6 @@
-"""What opinions miss: a Gaussian process over inputs of one label, on top of the log odds that they
-give, by Laplace's approximation.
+"""Log odds of failure from several opinions, by a Bayesian logistic regression on what was run; and
+what these opinions miss, by a Gaussian process over inputs of one label on top of their log odds
+(Laplace's approximation).
 
 Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), algorithms 3.1 and 3.2.
 """
@@ -8,16 +9,45 @@ import itertools
 
 import numpy as np
 
-from jast.weakness.logistic import sigmoid
 from jast.weakness.views import squared_distances
 
-__all__ = ["residual_log_odds"]
+__all__ = ["fit_logistic", "residual_log_odds", "sigmoid"]
 
 MOST_POINTS = 500  # of a label: the fit costs their cube
 NEIGHBOUR = 5  # the fifth nearest, whose distance is the unit of length; a convention
 VARIANCES = (1.0, 4.0, 16.0)  # of the process, tried: deviations of 1, 2 and 4 in log odds
 LENGTHS = (1.0, 2.0)  # of the process, tried, in that unit
 MARGIN = 1.0  # of log evidence, by which it must be better than nothing
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.clip(x, -40, 40)))
+
+
+def fit_logistic(rows, failed, mean, precision):
+    """[p]: the most probable coefficients for ``rows`` [m, p] and ``failed`` [m] bool under
+    independent normal priors, by Newton's method with halved steps.
+    """
+    target = failed.astype(float)
+
+    def cost(b):
+        out = rows @ b
+        return np.sum(np.logaddexp(0, out)) - target @ out + 0.5 * precision @ (b - mean) ** 2
+
+    b = np.array(mean, float)
+    now = cost(b)
+    for _ in range(100):
+        p = sigmoid(rows @ b)
+        slope = rows.T @ (p - target) + precision * (b - mean)
+        move = np.linalg.solve((rows * (p * (1 - p))[:, None]).T @ rows + np.diag(precision), slope)
+        step = 1.0
+        while (new := cost(b - step * move)) > now and step > 1e-8:
+            step /= 2
+        b = b - step * move
+        if now - new < 1e-9 * (1 + abs(now)):
+            break
+        now = new
+    return b
 
 
 def residual_log_odds(rng, close, labels, odds, seen):

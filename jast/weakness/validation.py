@@ -203,16 +203,13 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)
-        return State(
-            state.selector,
-            state.data,
-            state.key,
-            memory,
-            order,
-            predicted,
-            len(seen.order),
-            history,
-            finished,
+        return state._replace(
+            memory=memory,
+            order=order,
+            predicted=predicted,
+            complete=len(seen.order),
+            history=history,
+            finished=finished,
         )
 
     def keep():
