@@ -32,7 +32,7 @@ from benchmarks.fms import mean
 from benchmarks.sizes import options, print_report, printer, size, timed
 from jast import plot, weakness
 from jast.weakness.measures import precision_recall
-from jast.weakness.thesis import halves
+from jast.weakness.thesis import draw_halves
 from jast.weakness.validation import iteration_key
 
 SHARES = (0.05, 0.1, 0.25)  # of the inputs: budgets
@@ -168,7 +168,7 @@ def table(result, failed, replacement):
     sample = json.loads(result.state.selector)[1]["sample"]
     for i, scores in enumerate(result.history.scores, 1):
         key = iteration_key(result.state.key, i)
-        _, rest = halves(key, len(failed), sample, replacement)
+        _, rest = draw_halves(key, len(failed), sample, replacement)
         picked = scores[rest] >= 0.5
         chance = rng.permutation(picked)
         rows.append([precision_recall(p, failed[rest]) for p in (picked, chance)])

@@ -20,7 +20,7 @@ from jast import actions as choices
 from jast import distributions as D
 from jast._jax import jit, quick
 from jast.contract import contract
-from jast.cross_entropy.sequences import player
+from jast.cross_entropy.sequences import latent_policy
 from jast.distributions.numbers import unflat
 from jast.episode import Episode, replay, rollout
 from jast.incidents import hosted
@@ -229,7 +229,7 @@ def _live(q):
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     like = outline(sim)
     size0 = count(like.x0)
-    return player(
+    return latent_policy(
         sim,
         choices.quantiles(),
         unflat(z[:size0], like.x0),

@@ -9,10 +9,10 @@ import pytest
 from jax.tree_util import Partial
 
 from jast import cross_entropy as ce
-from jast.cross_entropy import loop, refit, surrogates
+from jast.cross_entropy import loop, surrogates
 from jast.cross_entropy.gaussian import Gaussian
 from jast.cross_entropy.mixture import Mixture
-from jast.cross_entropy.settle import MODES, settled
+from jast.cross_entropy.settle import MODES, make_plan
 
 METHODS = {"ce_method": ce.ce_method, "ce_surrogate": ce.ce_surrogate, "ce_mixture": ce.ce_mixture}
 CASES = {"1A": (0.0, 200.0, 10, 5), "1B": (-50.0, 2000.0, 10, 5), "1C": (0.0, 200.0, 5, 3)}
@@ -68,7 +68,7 @@ def test_the_method_is_that_of_algorithm_1(mode, key, x64):
 def test_the_surrogate_sees_what_it_may_remember(key, x64):
     counts = (6, 2, 4, 3, 5)
     for memory, best in ((1, 0), (2, 0), (2, 3), (3, 4), (9, 5)):
-        plan, _, _ = settled(
+        plan, _, _ = make_plan(
             "ce_surrogate",
             START,
             samples=1,
@@ -85,9 +85,9 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
         ends = np.cumsum((0, *counts))
         for k in range(5):
             state = loop.begin(
-                key,
                 plan,
-                settled(
+                key,
+                make_plan(
                     "ce_method",
                     START,
                     samples=3,
@@ -101,7 +101,7 @@ def test_the_surrogate_sees_what_it_may_remember(key, x64):
             log[0][: ends[k + 1]], log[1][: ends[k + 1]] = x[: ends[k + 1]], value[: ends[k + 1]]
             state = state._replace(x=jnp.asarray(log[0]), value=jnp.asarray(log[1]))
             since = ends[max(0, k + 1 - memory)]
-            seen = loop._remembered(plan, state, jnp.int32(since), jnp.int32(ends[k + 1]))
+            seen = loop._surrogate_data(plan, state, jnp.int32(since), jnp.int32(ends[k + 1]))
             # NaN sorts last
             older = [i for i in np.argsort(value[:since]) if np.isfinite(value[i])][:best]
             rows = [*range(since, ends[k + 1]), *older]
@@ -133,7 +133,7 @@ def test_true_model_and_sub_elites_make_the_next_proposal(k, key, x64):
     for_samples, for_searches = jax.random.split(
         jax.random.fold_in(jax.random.fold_in(before.state.key, k), 1)
     )
-    judged = np.asarray(refit.draw(for_samples, proposal, 200))
+    judged = np.asarray(loop.draw(for_samples, proposal, 200))
     np.testing.assert_array_equal(after.state.model_x[k], judged)
     (last, last_value), (x, value) = (
         batches[k],
@@ -308,7 +308,7 @@ def test_proposals_and_objectives_share_one_program(key, traced):
 
 
 def test_ratchet_and_empty_iterations():
-    kept = lambda **more: settled(
+    kept = lambda **more: make_plan(
         "ce_method",
         START,
         samples=1,
@@ -323,7 +323,7 @@ def test_ratchet_and_empty_iterations():
 
 
 def test_selection():
-    plan = lambda d, **more: settled(
+    plan = lambda d, **more: make_plan(
         "ce_surrogate",
         (np.zeros(d), 1.0),
         samples=20,
@@ -383,7 +383,7 @@ def test_mixtures_stay_proper(key):
     )
     # weights are shares
     np.testing.assert_allclose(twice.history.x, again.history.x, rtol=1e-4, atol=1e-4)
-    few = settled(
+    few = make_plan(
         "ce_mixture", START, samples=10, elites=5, iterations=1, schedule=None, mode="thesis"
     )
     assert few[0].components == 5 and few[2].weights.tolist() == pytest.approx([0.2] * 5)
@@ -741,7 +741,7 @@ def test_mode_thesis_is_the_published_code():
     assert MODES["ce_mixture"]["thesis"] == published | dict(
         components=None, start="searches", regularisation=0.0
     )
-    plan = settled(
+    plan = make_plan(
         "ce_mixture", START, samples=10, elites=5, iterations=10, schedule=None, mode="thesis"
     )[0]
     assert (plan.judged, plan.chosen[0], plan.sub, plan.components, plan.em_iterations) == (
@@ -790,10 +790,10 @@ def test_moments_of_a_mixture():
         jnp.array([[-1.0, 0.0], [1.0, 2.0]]),
         jnp.stack([jnp.eye(2), 2 * jnp.eye(2)]),
     )
-    g = refit.moments(m)
+    g = loop.moments(m)
     np.testing.assert_allclose(g.mean, [0.5, 1.5])
     np.testing.assert_allclose(g.covariance, 1.75 * np.eye(2) + [[0.75, 0.75], [0.75, 0.75]])
-    assert refit.moments(g) is g
+    assert loop.moments(g) is g
 
 
 def test_a_short_search_returns_the_best_that_it_drew(key):
@@ -805,7 +805,7 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
         return value
 
     centres = jnp.array([[0.0, 0.0], [9.0, 9.0]])
-    sub = refit.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
+    sub = loop.search_around(key, model, centres, jnp.eye(2), samples=40, elites=8, iterations=6)
     jax.effects_barrier()
     drawn = np.concatenate([d.reshape(-1, 2) for d in drawn])
     assert len(drawn) == 2 * 6 * 40
@@ -818,6 +818,8 @@ def test_a_short_search_returns_the_best_that_it_drew(key):
 
 
 def test_the_frame_of_one_scale():
-    frame = refit._round(Gaussian(jnp.array([1.0, 2.0, 3.0]), jnp.diag(jnp.array([1.0, 4.0, 7.0]))))
+    frame = loop._spherical_frame(
+        Gaussian(jnp.array([1.0, 2.0, 3.0]), jnp.diag(jnp.array([1.0, 4.0, 7.0])))
+    )
     np.testing.assert_allclose(frame[1], 2 * np.eye(3))
     np.testing.assert_array_equal(frame[0], [1, 2, 3])

@@ -7,8 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jast.cross_entropy import gaussian_process as gp
 from jast.cross_entropy import surrogates
+from jast.cross_entropy.surrogates import (
+    JITTER,
+    KERNELS,
+    LENGTHSCALES,
+    fit_process,
+    predict_process,
+)
 
 
 def data(n, d, dtype=np.float64, seed=0):
@@ -19,8 +25,8 @@ def data(n, d, dtype=np.float64, seed=0):
 
 def sklearn_process(kernel, x, y, lengthscale, noise, variance):
     pytest.importorskip("sklearn")
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
+    from sklearn.surrogates import GaussianProcessRegressor
+    from sklearn.surrogates.kernels import RBF, ConstantKernel, Matern
 
     shape = (
         RBF(lengthscale)
@@ -32,20 +38,22 @@ def sklearn_process(kernel, x, y, lengthscale, noise, variance):
     ).fit(x, y)
 
 
-@pytest.mark.parametrize("kernel", gp.KERNELS)
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_posterior_and_likelihood_are_those_of_scikit_learn(kernel, x64):
     x, y = data(25, 3)
     new = data(40, 3, seed=1)[0]
-    fitted = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(25, bool), (0.7,), (1e-3,), kernel)
+    fitted = fit_process(
+        jnp.asarray(x), jnp.asarray(y), jnp.ones(25, bool), (0.7,), (1e-3,), kernel
+    )
     noise, variance = float(fitted.noise), float(fitted.variance)
-    assert noise == pytest.approx(1e-3 + gp.JITTER)
+    assert noise == pytest.approx(1e-3 + JITTER)
     peer = sklearn_process(kernel, x, y, 0.7, noise, variance)
     mean, deviation = peer.predict(new, return_std=True)
-    ours, spread = gp.predict(fitted, jnp.asarray(new), variance=True)
+    ours, spread = predict_process(fitted, jnp.asarray(new), variance=True)
     # sqrt(r^2 + tiny) and the Cholesky factors differ in the last digits; condition about 1e3 x 25
     np.testing.assert_allclose(ours, mean, atol=1e-8)
     np.testing.assert_allclose(spread, deviation**2, atol=1e-8 * variance)
-    np.testing.assert_allclose(gp.predict(fitted, jnp.asarray(new)), ours)
+    np.testing.assert_allclose(predict_process(fitted, jnp.asarray(new)), ours)
     assert float(fitted.log_likelihood) == pytest.approx(
         peer.log_marginal_likelihood_value_, abs=1e-7
     )
@@ -53,7 +61,7 @@ def test_posterior_and_likelihood_are_those_of_scikit_learn(kernel, x64):
 
 def test_the_variance_is_the_likeliest(x64):
     x, y = data(25, 2)
-    fitted = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(25, bool), (0.9,), (1e-3,))
+    fitted = fit_process(jnp.asarray(x), jnp.asarray(y), jnp.ones(25, bool), (0.9,), (1e-3,))
     best = float(fitted.log_likelihood)
     for factor in (0.9, 0.99, 1.01, 1.1):
         peer = sklearn_process(
@@ -66,26 +74,28 @@ def test_the_variance_is_the_likeliest(x64):
 def test_the_grid_gives_its_likeliest_point(x64):
     x, y = data(30, 2)
     lengthscales, noises = (0.1, 0.4, 1.0, 3.0), (1e-4, 1e-2, 1.0)
-    fit = lambda a, b: gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(30, bool), a, b)
+    fit = lambda a, b: fit_process(jnp.asarray(x), jnp.asarray(y), jnp.ones(30, bool), a, b)
     each = {(a, b): float(fit((a,), (b,)).log_likelihood) for a in lengthscales for b in noises}
     chosen = fit(lengthscales, noises)
     a, b = max(each, key=each.get)
     assert (float(chosen.lengthscale), float(chosen.noise)) == (
         pytest.approx(a),
-        pytest.approx(b + gp.JITTER),
+        pytest.approx(b + JITTER),
     )
     assert float(chosen.log_likelihood) == pytest.approx(each[a, b])
     noisy = np.random.default_rng(3).normal(size=30)  # white noise: the most noise
     assert float(
-        gp.fit(jnp.asarray(x), jnp.asarray(noisy), jnp.ones(30, bool), lengthscales, noises).noise
-    ) == pytest.approx(1 + gp.JITTER)
+        fit_process(
+            jnp.asarray(x), jnp.asarray(noisy), jnp.ones(30, bool), lengthscales, noises
+        ).noise
+    ) == pytest.approx(1 + JITTER)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])
 def test_masked_rows_do_nothing(dtype, x64):
     x, y = data(20, 2, dtype)
     new = jnp.asarray(data(15, 2, dtype, 1)[0])
-    whole = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.ones(20, bool), gp.LENGTHSCALES)
+    whole = fit_process(jnp.asarray(x), jnp.asarray(y), jnp.ones(20, bool), LENGTHSCALES)
     at = np.sort(np.random.default_rng(0).permutation(29)[:20])
     padded, values, mask = (
         np.full((29, 2), np.nan, dtype),
@@ -93,19 +103,23 @@ def test_masked_rows_do_nothing(dtype, x64):
         np.zeros(29, bool),
     )
     padded[at], values[at], mask[at] = x, y, True
-    part = gp.fit(jnp.asarray(padded), jnp.asarray(values), jnp.asarray(mask), gp.LENGTHSCALES)
+    part = fit_process(jnp.asarray(padded), jnp.asarray(values), jnp.asarray(mask), LENGTHSCALES)
     assert (part.lengthscale, part.noise) == (whole.lengthscale, whole.noise)
     # the weights carry the condition of the matrix, 1e4 to 1e6 here, times the rounding
     tolerance = 2e-2 if dtype == np.float32 else 1e-9
-    np.testing.assert_allclose(gp.predict(part, new), gp.predict(whole, new), atol=tolerance)
-    assert np.isfinite(gp.predict(part, new)).all()
+    np.testing.assert_allclose(
+        predict_process(part, new),
+        predict_process(whole, new),
+        atol=tolerance,
+    )
+    assert np.isfinite(predict_process(part, new)).all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_few_points_are_finite(n):
     x, y = data(3, 2, np.float32)
-    fitted = gp.fit(jnp.asarray(x), jnp.asarray(y), jnp.arange(3) < n, gp.LENGTHSCALES)
-    mean, variance = gp.predict(fitted, jnp.asarray(x), variance=True)
+    fitted = fit_process(jnp.asarray(x), jnp.asarray(y), jnp.arange(3) < n, LENGTHSCALES)
+    mean, variance = predict_process(fitted, jnp.asarray(x), variance=True)
     assert np.isfinite(mean).all() and np.isfinite(variance).all()
     np.testing.assert_allclose(mean[:n], y[:n], rtol=0.05, atol=1e-3)
     if n == 0:
@@ -115,8 +129,8 @@ def test_few_points_are_finite(n):
 def test_equal_points_and_equal_values_are_finite():
     x = jnp.zeros((8, 2))
     for y in (jnp.zeros(8), jnp.ones(8), jnp.arange(8.0)):
-        fitted = gp.fit(x, y, jnp.ones(8, bool), gp.LENGTHSCALES)
-        np.testing.assert_allclose(gp.predict(fitted, x[:1]), y.mean(), rtol=0.02, atol=1e-6)
+        fitted = fit_process(x, y, jnp.ones(8, bool), LENGTHSCALES)
+        np.testing.assert_allclose(predict_process(fitted, x[:1]), y.mean(), rtol=0.02, atol=1e-6)
 
 
 @pytest.mark.long
@@ -124,22 +138,33 @@ def test_it_vmaps():
     x, y = data(12, 2, np.float32)
     xs, ys = jnp.stack([x, 2 * x]), jnp.stack([y, -y])
     both = jax.vmap(
-        lambda x, y: gp.predict(gp.fit(x, y, jnp.ones(12, bool), gp.LENGTHSCALES), x[:3] + 0.1)
+        lambda x, y: predict_process(
+            fit_process(x, y, jnp.ones(12, bool), LENGTHSCALES), x[:3] + 0.1
+        )
     )(xs, ys)
     for i in range(2):
-        one = gp.predict(gp.fit(xs[i], ys[i], jnp.ones(12, bool), gp.LENGTHSCALES), xs[i, :3] + 0.1)
+        one = predict_process(
+            fit_process(xs[i], ys[i], jnp.ones(12, bool), LENGTHSCALES),
+            xs[i, :3] + 0.1,
+        )
         # float32, condition up to 1e4
         np.testing.assert_allclose(both[i], one, rtol=2e-2, atol=2e-2)
 
 
 def test_bad_input_is_named():
     x, y = jnp.zeros((4, 2)), jnp.zeros(4)
-    with pytest.raises(ValueError, match="gaussian_process.fit: kernel must .*received 'cubic'"):
-        gp.fit(x, y, y == 0, (1.0,), kernel="cubic")
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"surrogates.fit_process: kernel must be one of \['squared exponential', .*received"
+            r" 'cubic'"
+        ),
+    ):
+        fit_process(x, y, y == 0, (1.0,), kernel="cubic")
     with pytest.raises(
         ValueError, match=r"x must be \[n, d\], y and mask \[n\], received \(4, 2\), \(3,\)"
     ):
-        gp.fit(x, y[:3], y == 0, (1.0,))
+        fit_process(x, y[:3], y == 0, (1.0,))
 
 
 @pytest.mark.parametrize(
@@ -189,7 +214,7 @@ def test_a_polynomial_finds_a_paraboloid(x64):
     x = jnp.asarray(data(30, 3)[0])
     f = lambda x: (x[:, 0] - 1) ** 2 + x[:, 1] * x[:, 2] + 3
     mask = jnp.ones(30, bool)
-    frame = surrogates.frame(x, mask)
+    frame = surrogates.whitening_frame(x, mask)
     new = jnp.asarray(data(10, 3, seed=1)[0])
     np.testing.assert_allclose(
         surrogates.predict("polynomial", surrogates.fit("polynomial", x, f(x), mask, frame), new),
@@ -212,7 +237,7 @@ def test_ranks_are_normal_scores(values, padding):
 
     y = np.array(values + [0.0] * padding, np.float32)
     mask = np.arange(len(y)) < len(values)
-    scores, kept = surrogates.warped("rank", jnp.asarray(y), jnp.asarray(mask))
+    scores, kept = surrogates.warp_values("rank", jnp.asarray(y), jnp.asarray(mask))
     real = np.where(np.isfinite(y), y, np.inf)[mask]  # what is not finite is the worst
     expected = norm.ppf(np.clip((rankdata(real) - 0.5) / len(real), 1e-4, 1 - 1e-4))
     np.testing.assert_array_equal(kept, mask)
@@ -225,16 +250,16 @@ def test_other_warps_leave_out_what_is_not_finite():
         jnp.array([1.0, -4.0, jnp.nan, 2.0, jnp.inf, 9.0]),
         jnp.array([True, True, True, True, True, False]),
     )
-    raw, kept = surrogates.warped("raw", y, mask)
+    raw, kept = surrogates.warp_values("raw", y, mask)
     np.testing.assert_array_equal(kept, [True, True, False, True, False, False])
     np.testing.assert_allclose(raw[kept], [0.25, -1, 0.5])
-    standard, _ = surrogates.warped("standard", y, mask)
+    standard, _ = surrogates.warp_values("standard", y, mask)
     used = np.array([1.0, -4.0, 2.0])
     np.testing.assert_allclose(standard[kept], (used - used.mean()) / used.std(), rtol=1e-5)
     for warp in surrogates.WARPS:
-        scores, _ = surrogates.warped(warp, jnp.full(4, 3.0), jnp.ones(4, bool))
+        scores, _ = surrogates.warp_values(warp, jnp.full(4, 3.0), jnp.ones(4, bool))
         assert np.isfinite(scores).all()
-        scores, _ = surrogates.warped(warp, jnp.full(4, jnp.nan), jnp.ones(4, bool))
+        scores, _ = surrogates.warp_values(warp, jnp.full(4, jnp.nan), jnp.ones(4, bool))
         assert np.isfinite(scores).all()
 
 
@@ -242,8 +267,8 @@ def test_no_monotone_change_alters_the_ranks():
     y = jnp.asarray(data(20, 2, np.float32)[1])
     mask = jnp.ones(20, bool)
     np.testing.assert_array_equal(
-        surrogates.warped("rank", y, mask)[0],
-        surrogates.warped("rank", jnp.exp(3 * y) - 5, mask)[0],
+        surrogates.warp_values("rank", y, mask)[0],
+        surrogates.warp_values("rank", jnp.exp(3 * y) - 5, mask)[0],
     )
 
 
@@ -252,7 +277,7 @@ def test_a_frame_whitens(x64):
     x = jnp.asarray(
         rng.multivariate_normal([5, -3, 1], [[4, 1.5, 0], [1.5, 1, 0], [0, 0, 1e-6]], size=200)
     )
-    f = surrogates.frame(x, jnp.ones(200, bool))
+    f = surrogates.whitening_frame(x, jnp.ones(200, bool))
     z = np.linalg.solve(f.factor, (np.asarray(x) - np.asarray(f.centre)).T)
     np.testing.assert_allclose(z.mean(1), 0, atol=1e-9)
     # a tenth of the identity is kept: between 1 / (0.9 + 0.1 / l) for the eigenvalues l of the
@@ -267,7 +292,7 @@ def test_a_frame_whitens(x64):
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_a_frame_of_few_points_is_sound(rows):
     x = jnp.array([[1.0, 2.0], [1.0, 5.0], [jnp.nan, 0.0]])
-    f = surrogates.frame(x, jnp.arange(3) < rows)
+    f = surrogates.whitening_frame(x, jnp.arange(3) < rows)
     assert np.isfinite(f.factor).all() and (np.diagonal(f.factor) > 0).all()
 
 
@@ -277,6 +302,6 @@ def test_surrogates_of_few_points_are_finite(kind, n):
     x, y = data(3, 4, np.float32)
     mask = jnp.arange(3) < n
     fitted = surrogates.fit(
-        kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.frame(jnp.asarray(x), mask)
+        kind, jnp.asarray(x), jnp.asarray(y), mask, surrogates.whitening_frame(jnp.asarray(x), mask)
     )
     assert np.isfinite(surrogates.predict(kind, fitted, jnp.asarray(x) + 1)).all()

@@ -20,10 +20,17 @@ from jast import heads as H
 from jast.actions import quantiles, samples, uniform
 from jast.distributions.numbers import flat, unflat
 from jast.heads import Heads, Lesson, Moments, make_head
-from jast.heads.heads import in_bins, moments
-from jast.heads.rounds import best_trees, enrol
-from jast.heads.samples import Samples, _rows, _steps, of_edges, of_episodes, of_roots
-from jast.heads.training import _fit, learn, learner
+from jast.heads.heads import sample_bins, update_moments
+from jast.heads.rounds import best_trees, init_heads
+from jast.heads.samples import (
+    Samples,
+    _episode_rows,
+    _root_rows,
+    samples_of_edges,
+    samples_of_episodes,
+    samples_of_roots,
+)
+from jast.heads.training import _fit, init_head, train_head
 from jast.search import forest
 from jast.search.tree import grow as trees
 from jast.search.tree import run
@@ -115,7 +122,7 @@ numbers = st.integers(-400, 400).map(lambda n: n / 4)
 def test_moments_are_those_of_all_batches_together(batches):
     found = Moments.empty(2)
     for batch in batches:
-        found = moments(found, np.array(batch).reshape(-1, 2))
+        found = update_moments(found, np.array(batch).reshape(-1, 2))
     everything = np.array([row for batch in batches for row in batch])
     assert found.count == len(everything) and all(a.dtype == np.float32 for a in found)
     if len(everything):
@@ -126,21 +133,21 @@ def test_moments_are_those_of_all_batches_together(batches):
 
 
 def test_moments_of_single_numbers_and_of_none():
-    found = moments(moments(Moments.empty(), np.array([1.0, 2.0])), np.array([6.0]))
+    found = update_moments(update_moments(Moments.empty(), np.array([1.0, 2.0])), np.array([6.0]))
     np.testing.assert_allclose(
         [found.count, found.mean, found.deviation], [3, 3, np.std([1, 2, 6])], rtol=1e-6
     )
-    assert moments(found, np.zeros(0)) is found
+    assert update_moments(found, np.zeros(0)) is found
     np.testing.assert_array_equal(
         Moments.empty(2).normalise(np.array([3.0, 4.0], np.float32)), [3.0, 4.0]
     )
-    constant = moments(Moments.empty(1), np.full((5, 1), 3.0))
+    constant = update_moments(Moments.empty(1), np.full((5, 1), 3.0))
     np.testing.assert_array_equal(constant.normalise(np.array([3.5], np.float32)), [0.5])
     np.testing.assert_array_equal(constant.restore(np.array([0.5], np.float32)), [3.5])
 
 
 def test_moments_normalise_and_restore():
-    found = moments(Moments.empty(3), np.random.default_rng(0).normal(5.0, 3.0, (100, 3)))
+    found = update_moments(Moments.empty(3), np.random.default_rng(0).normal(5.0, 3.0, (100, 3)))
     x = np.arange(3, dtype=np.float32)
     np.testing.assert_allclose(found.restore(found.normalise(x)), x, rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(found.first(2).normalise(x[:2]), found.normalise(x)[:2])
@@ -175,7 +182,7 @@ def test_flat_makes_one_row_of_any_disturbance():
 # --- histograms
 # ----------------------------------------------------------------------------
 
-binned = jax.jit(in_bins)
+binned = jax.jit(sample_bins)
 logit = st.floats(-20, 20, width=32)
 
 
@@ -201,7 +208,7 @@ def test_draws_have_the_density_of_the_histogram(key):
     """Of two numbers at once: the share of each cell and the mean within it, in standard errors."""
     logits, n = jnp.asarray([[0.0, 1.0, -1.0, 2.0], [1.0, 1.0, 1.0, -8.0]], jnp.float32), 20_000
     x = np.asarray(
-        jax.vmap(lambda k: in_bins(logits, jax.random.uniform(k, (2,), jnp.float32)))(
+        jax.vmap(lambda k: sample_bins(logits, jax.random.uniform(k, (2,), jnp.float32)))(
             jax.random.split(key, n)
         )
     )
@@ -219,20 +226,22 @@ def test_histograms_at_their_ends():
     u = jnp.asarray([0.0, 0.25, 0.999, 1 - 2.0**-24], jnp.float32)
     rows = lambda logits: jnp.broadcast_to(jnp.asarray(logits, jnp.float32), (4, len(logits)))
     for k in range(4):  # all in one cell
-        x = np.asarray(in_bins(rows([200.0 * (j == k) for j in range(4)]), u))
+        x = np.asarray(sample_bins(rows([200.0 * (j == k) for j in range(4)]), u))
         assert (k / 4 <= x).all() and (x < (k + 1) / 4).all()
         np.testing.assert_allclose(x, (k + np.asarray(u)) / 4, atol=1e-6)
     for logits in ([jnp.nan] * 4, [-jnp.inf] * 4, [0.0, jnp.nan, 1.0, 2.0]):  # nothing is known
-        np.testing.assert_allclose(in_bins(rows(logits), u), u, atol=2e-6)
+        np.testing.assert_allclose(sample_bins(rows(logits), u), u, atol=2e-6)
     some = np.random.default_rng(0).normal(size=(5000, 40)).astype(np.float32)
     # the greatest number that is drawn stays below the end of the last cell that has mass
     for last, bins in ((1.0, 40), (0.75, 30)):
         logits = jnp.asarray(np.where(np.arange(40) < bins, some, -200), jnp.float32)
         assert float(binned(logits, jnp.full(5000, 1 - 2.0**-23, jnp.float32)).max()) < last
     np.testing.assert_allclose(
-        in_bins(rows([-jnp.inf, 0.0]), u), (1 + np.asarray(u)) / 2, atol=1e-6
+        sample_bins(rows([-jnp.inf, 0.0]), u), (1 + np.asarray(u)) / 2, atol=1e-6
     )
-    np.testing.assert_allclose(in_bins(rows([0.0, jnp.inf]), u), (1 + np.asarray(u)) / 2, atol=1e-6)
+    np.testing.assert_allclose(
+        sample_bins(rows([0.0, jnp.inf]), u), (1 + np.asarray(u)) / 2, atol=1e-6
+    )
 
 
 # --- samples
@@ -267,7 +276,7 @@ def some_roots(turns=3, trees=4, children=6):
 def test_samples_of_roots(first):
     """Tree by tree, root by root, and for a value head child by child."""
     roots, good, bins = some_roots(), np.array([True, False, True, True]), 5
-    policy, value = of_roots(PLANE, samples(), roots, bins, good, first)
+    policy, value = samples_of_roots(PLANE, samples(), roots, bins, good, first)
     shares, edges = [], []
     for tree, turn in np.ndindex(4, 3):
         at = turn, tree
@@ -291,7 +300,7 @@ def test_samples_of_roots(first):
             np.testing.assert_allclose(a, np.array(b), rtol=1e-6)
         assert all(a.dtype == np.float32 for a in found[:3]) and found.dropped == 0
     np.testing.assert_allclose(policy.target.sum(2), 1, rtol=1e-6)
-    none, same_value = of_roots(PLANE, samples(), roots, None, good, first)
+    none, same_value = samples_of_roots(PLANE, samples(), roots, None, good, first)
     assert none is None and (same_value.target == value.target).all()
 
 
@@ -300,7 +309,7 @@ def test_samples_of_roots_that_are_not_finite_are_left_out_and_counted():
     roots.state[0, 0, 1] = np.nan
     roots.q[1, 2, 3] = np.inf
     roots.visits[1, 2, 3] = roots.visits[0, 0, 0] = 2
-    policy, value = of_roots(PLANE, samples(), roots, 5, good)
+    policy, value = samples_of_roots(PLANE, samples(), roots, 5, good)
     assert policy.dropped == 1 and value.dropped == 1 + (roots.visits[0, 0] > 0).sum()
     assert len(policy.seen) == roots.valid.sum() - 2
     assert len(value.seen) == (roots.visits[roots.valid] > 0).sum() - value.dropped
@@ -328,7 +337,7 @@ def test_samples_of_edges():
             and np.isfinite(values[i, tree])
             and np.isfinite(edges.seen[i, tree]).all()
         ]
-        found = of_edges(edges, target)
+        found = samples_of_edges(edges, target)
         assert found.dropped == dropped
         for a, b in zip(found[:3], (edges.seen, edges.x, values), strict=True):
             np.testing.assert_array_equal(a, [b[i, tree] for tree, i in taught])
@@ -341,7 +350,7 @@ def test_samples_of_episodes(sim, n, d):
         jax.vmap(lambda key: jast.rollout(key, sim))(jax.random.split(jax.random.key(0), 9))
     )
     good, bins = np.arange(9) % 3 > 0, 4
-    found = of_episodes(sim, samples(), episodes, bins, good)
+    found = samples_of_episodes(sim, samples(), episodes, bins, good)
     there = jax.tree.map(lambda a: a[:, :-1], episodes.states)
     located = lambda state, x: (
         sim.observe(state),
@@ -426,9 +435,9 @@ def loss_of(loss, params, samples):
 def test_the_loss_is_the_formula_and_falls_to_its_least(loss, key):
     samples, shape = CASES[loss]
     params = np.random.default_rng(4).normal(size=shape).astype(np.float32)
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key,
-        learner(jnp.asarray(params)),
+        init_head(jnp.asarray(params)),
         jax.tree_util.Partial(linear),
         PLAIN,
         samples,
@@ -439,9 +448,9 @@ def test_the_loss_is_the_formula_and_falls_to_its_least(loss, key):
         pytest.approx(loss_of(loss, params, samples), rel=1e-4), 1, 40, 0, False
     )
     np.testing.assert_array_equal(pupil.params, params)
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key,
-        learner(jnp.asarray(params)),
+        init_head(jnp.asarray(params)),
         jax.tree_util.Partial(linear),
         PLAIN,
         samples,
@@ -469,9 +478,9 @@ def test_what_a_head_sees_and_says_is_normalised(key):
     )
     once = HOW | dict(rate=0.0, batch=40, steps=1)
     right, wrong = (
-        learn(
+        train_head(
             key,
-            learner(jnp.asarray(p, jnp.float32)),
+            init_head(jnp.asarray(p, jnp.float32)),
             jax.tree_util.Partial(linear),
             (inputs, targets),
             samples,
@@ -495,9 +504,9 @@ def test_a_pass_visits_each_sample_once(passes, key):
         np.arange(1, m + 1, dtype=np.float32),
     )
     how = HOW | dict(rate=0.0, batch=1, steps=None if passes == 1 else passes * m)
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key,
-        learner(jnp.zeros(m, jnp.float32)),
+        init_head(jnp.zeros(m, jnp.float32)),
         jax.tree_util.Partial(linear),
         PLAIN,
         samples,
@@ -521,9 +530,9 @@ def test_latest_samples_are_kept_up_to_the_capacity(key):
         for part in (slice(0, 25), slice(25, 40))
     )
     how = dict(loss="squared", rate=0.01, batch=8, steps=5)
-    pupil, _ = learn(
+    pupil, _ = train_head(
         key,
-        learner(jnp.zeros(2, jnp.float32)),
+        init_head(jnp.zeros(2, jnp.float32)),
         jax.tree_util.Partial(linear),
         PLAIN,
         first,
@@ -531,13 +540,13 @@ def test_latest_samples_are_kept_up_to_the_capacity(key):
         **how,
     )
     assert len(pupil.kept.seen) == 25
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key, pupil, jax.tree_util.Partial(linear), PLAIN, second, capacity=30, **how
     )
     assert lesson.samples == 15
     for kept, column in zip(pupil.kept[:3], VALUES[:3], strict=True):
         np.testing.assert_array_equal(kept, column[-30:])
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key,
         pupil,
         jax.tree_util.Partial(linear),
@@ -547,9 +556,9 @@ def test_latest_samples_are_kept_up_to_the_capacity(key):
         **how | dict(steps=None, batch=1),
     )
     assert lesson.steps == 30
-    pupil, lesson = learn(
+    pupil, lesson = train_head(
         key,
-        learner(jnp.zeros(2, jnp.float32)),
+        init_head(jnp.zeros(2, jnp.float32)),
         jax.tree_util.Partial(linear),
         PLAIN,
         first,
@@ -570,11 +579,9 @@ def test_a_lesson_that_is_not_finite_is_rejected(bad, key, equal):
         apply = lambda params, x: linear(params, x) * jnp.nan
     else:
         how |= dict(rate=1e30)
-    before = learner(jnp.asarray([0.5, -0.25], jnp.float32))
-    after, lesson = learn(key, before, jax.tree_util.Partial(apply), PLAIN, samples, **how)
-    assert lesson.rejected
-    assert not np.isfinite(lesson.loss)
-    assert lesson.steps == 20
+    before = init_head(jnp.asarray([0.5, -0.25], jnp.float32))
+    after, lesson = train_head(key, before, jax.tree_util.Partial(apply), PLAIN, samples, **how)
+    assert lesson.rejected and not np.isfinite(lesson.loss) and lesson.steps == 20
     equal(after._replace(kept=None), before)
 
 
@@ -583,8 +590,8 @@ def test_a_lesson_that_is_not_finite_is_rejected(bad, key, equal):
     [(VALUES, 0), (Samples(np.zeros((0, 2)), np.zeros((0, 0)), np.zeros(0), dropped=3), 10)],
 )
 def test_nothing_is_learned_without_steps_or_samples(samples, steps, key, equal):
-    before = learner(jnp.asarray([0.5, -0.25], jnp.float32))
-    after, lesson = learn(
+    before = init_head(jnp.asarray([0.5, -0.25], jnp.float32))
+    after, lesson = train_head(
         key,
         before,
         jax.tree_util.Partial(linear),
@@ -632,7 +639,7 @@ def test_rounds_and_searches_share_their_programs(traced):
     second one with other settings and another simulator of the kind adds none.
     """
     jax.clear_caches()  # of what other tests have compiled
-    shared = run._make, run._grow, run._prune, run._rebuild, _fit, _rows, _steps
+    shared = run._make, run._grow, run._prune, run._rebuild, _fit, _root_rows, _episode_rows
     searched()
     assert [traced.count(f.__name__) for f in shared] == [1, 1, 1, 1, 2, 1, 1]
     traced.clear()
@@ -668,12 +675,14 @@ def test_forests_of_all_kinds_learn(name, heads, actions):
         replays(result.failures.episode(i), SYSTEMS[name], BONUS)
     assert [tuple(lesson) for lesson in result.lessons] == [TRAINED[heads]] * 2
     for of in (of for lesson in result.lessons for of in lesson.values()):
-        assert of.steps == 50
-        assert of.samples > 0
-        assert of.dropped == 0
-        assert not of.rejected
-        assert np.isfinite(of.loss)
-    made = enrol(
+        assert (
+            of.steps == 50
+            and of.samples > 0
+            and of.dropped == 0
+            and not of.rejected
+            and np.isfinite(of.loss)
+        )
+    made = init_heads(
         jax.random.fold_in(jax.random.key(5), 8), SYSTEMS[name], ACTIONS[actions], heads, QUICK
     ).heads
     for part, shape in (("policy", (d, 8)), ("value", ())):
@@ -757,7 +766,7 @@ def test_threads_and_lanes_change_nothing():
 
 def made(heads="both", settings=QUICK, key=5, trees=8):
     """Heads as `searched` makes them."""
-    return enrol(
+    return init_heads(
         jax.random.fold_in(jax.random.key(key), trees), PLANE, samples(), heads, settings
     ).heads
 
@@ -887,7 +896,7 @@ def test_a_search_interrupted_in_a_lesson_says_so(monkeypatch, equal):
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trees, "teach", interrupted)
+    monkeypatch.setattr(trees, "train_heads", interrupted)
     result = searched()
     assert result.episodes == 40 * result.roots.valid.sum()
     assert result.best_reward_per_tree.shape == (4,)

@@ -10,14 +10,14 @@ import jast
 from jast import actions, heads
 from jast.distributions import Independent, Normal
 from jast.heads import Heads, as_policy
-from jast.heads.rounds import filled
+from jast.heads.rounds import with_moments
 
 LOGITS = jnp.asarray([[0.0, 1.0, -1.0, 0.5], [2.0, 0.0, 0.0, -2.0]], jnp.float32)
 
 
 def fixed(logits, n):
     """Heads whose policy gives these logits everywhere."""
-    return filled(Heads(policy=(logits, lambda params, seen: params)), n, logits.shape[0])
+    return with_moments(Heads(policy=(logits, lambda params, seen: params)), n, logits.shape[0])
 
 
 def plane():
@@ -95,7 +95,9 @@ def test_it_is_a_policy_like_any_other():
 def test_what_cannot_be_a_policy_is_refused():
     with pytest.raises(ValueError, match="expected heads with a policy head"):
         as_policy(
-            walk(), filled(Heads(value=(0.0, lambda params, x: x.sum())), 1, 1), actions.samples()
+            walk(),
+            with_moments(Heads(value=(0.0, lambda params, x: x.sum())), 1, 1),
+            actions.samples(),
         )
     with pytest.raises(ValueError, match="expected a disturbance of floats"):
         as_policy(ring(), fixed(jnp.zeros((3, 4)), 5), actions.samples())

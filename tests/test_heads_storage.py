@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 
 import jast
 from jast.heads import Head, Heads, Moments, make_head, networks
-from jast.heads.heads import histogram, value
+from jast.heads.heads import policy_logits, predicted_value
 from jast.search.tree import run
 
 WALK = jast.simulators.walk1d(threshold=4.0)  # one number observed, a disturbance of one
@@ -62,7 +62,9 @@ def searched(heads):
 
 
 def outputs(heads, seen, x):
-    return (heads.policy and histogram(heads, seen)), (heads.value and value(heads, seen, x))
+    return (heads.policy and policy_logits(heads, seen)), (
+        heads.value and predicted_value(heads, seen, x)
+    )
 
 
 # --- round trips

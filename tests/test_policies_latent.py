@@ -11,13 +11,20 @@ from systems import mark_long, ring, walk
 
 import jast
 from jast import distributions as D
+from jast.cross_entropy import mixture
+from jast.cross_entropy.mixture import Mixture
 from jast.distributions.mixtures import Blended, Moved, x_of
 from jast.heads.heads import Moments
-from jast.policies import lanes as L
-from jast.policies.actor import Net, entropy_term
-from jast.policies.latent import log_normal, sizes
-from jast.policies.learner import Rates, learner, networks, update
-from jast.policies.start import Tilt, _first, fit, log_density
+from jast.policies.actor import (
+    Normalisation,
+    count_latents,
+    entropy_term,
+    log_normal,
+    make_networks,
+)
+from jast.policies.lanes import Transitions, add_transitions, empty_buffer, lane_at, step_lane
+from jast.policies.learner import Rates, init_learner, update
+from jast.policies.start import _first_components, fit_tilt
 
 DISTRIBUTIONS = dict(
     normal=lambda: D.Normal(jnp.float32(1.0), jnp.float32(2.0)),
@@ -66,12 +73,14 @@ def test_a_joint_disturbance_is_moved_number_by_number(key):
 
 def test_sizes_count_floats_and_name_what_cannot_be_tilted():
     start = lambda: D.Normal(jnp.zeros(3), 1.0)
-    assert sizes(walk(), "sac") == (1, 0)
-    assert sizes(walk(lambda x0: x0.sum(), start=lambda: D.Independent(start(), 1)), "sac") == (
+    assert count_latents(walk(), "sac") == (1, 0)
+    assert count_latents(
+        walk(lambda x0: x0.sum(), start=lambda: D.Independent(start(), 1)), "sac"
+    ) == (
         1,
         3,
     )
-    assert sizes(
+    assert count_latents(
         walk(
             lambda x0: x0.astype(jnp.zeros(()).dtype),
             start=lambda: D.Categorical(probs=jnp.array([0.5, 0.5])),
@@ -79,7 +88,7 @@ def test_sizes_count_floats_and_name_what_cannot_be_tilted():
         "sac",
     ) == (1, 0)
     with pytest.raises(ValueError, match="sac: disturbance: expected floats, received float.*int"):
-        sizes(ring(), "sac")
+        count_latents(ring(), "sac")
     beta = jast.Simulator(
         lambda x0: jnp.zeros(()),
         lambda s, x: s + x,
@@ -88,18 +97,18 @@ def test_sizes_count_floats_and_name_what_cannot_be_tilted():
         4,
     )
     with pytest.raises(ValueError, match="sac: disturbance: VonMises cannot be tilted"):
-        sizes(beta, "sac")
+        count_latents(beta, "sac")
 
 
 def play(sim, x0, zs, dense=True):
     """The lane, its rows [steps] and flags once the latents ``zs`` were played."""
 
     def body(lane, z):
-        lane, row, valid, invalid = L.step(sim, dense, lane, z[None])
+        lane, row, valid, invalid = step_lane(sim, dense, lane, z[None])
         return lane, (row, valid, invalid)
 
     lane, (rows, valid, invalid) = jax.jit(
-        lambda x0, zs: jax.lax.scan(body, L.at(sim, dense, x0), zs)
+        lambda x0, zs: jax.lax.scan(body, lane_at(sim, dense, x0), zs)
     )(x0, jnp.asarray(zs, jnp.float32))
     return (
         lane,
@@ -184,7 +193,7 @@ def test_what_is_not_finite_is_invalid_and_ends_the_episode(where):
 
 
 def test_the_ring_buffer_holds_the_latest_valid_rows():
-    buffer, stored = L.empty(5, 1, 1), jnp.int32(0)
+    buffer, stored = empty_buffer(5, 1, 1), jnp.int32(0)
     kept = []
     for i in range(4):
         number = jnp.arange(3 * i, 3 * i + 3)
@@ -196,7 +205,7 @@ def test_the_ring_buffer_holds_the_latest_valid_rows():
         )
         valid = jnp.array([True, i % 2 == 0, True])
         kept += [3 * i + j for j in range(3) if valid[j]]
-        buffer, stored = L.put(buffer, stored, new, valid)
+        buffer, stored = add_transitions(buffer, stored, new, valid)
     assert int(stored) == len(kept) == 10
     assert sorted(np.asarray(buffer.t).tolist()) == kept[-5:]
     np.testing.assert_array_equal(buffer.z[:, 0], buffer.t)
@@ -207,9 +216,10 @@ def test_the_fit_of_a_start_finds_unequal_modes(key):
     component is the model itself.
     """
     parts = [0.8, 0.2], [[4.0, 0.0], [-5.0, 1.0]], [[0.5, 1.0], [0.7, 0.6]]
-    truth = Tilt(*(jnp.array(part, jnp.float32) for part in parts))
-    value = lambda z: log_density(truth, z)[0] - log_normal(z) - 40.0
-    tilt = jax.jit(lambda k: fit(k, value, 2))(key)
+    weights, means, deviations = (jnp.array(part, jnp.float32) for part in parts)
+    truth = Mixture(weights, means, jax.vmap(jnp.diag)(deviations**2))
+    value = lambda z: mixture.log_prob(truth, z) - log_normal(z) - 40.0
+    tilt = jax.jit(lambda k: fit_tilt(k, value, 2))(key)
     np.testing.assert_allclose(tilt.weights.sum(), 1, rtol=1e-5)
     np.testing.assert_allclose(
         [tilt.weights[0], *tilt.means[0], *tilt.deviations[0]], [0.05, 0, 0, 1, 1], rtol=1e-5
@@ -227,13 +237,13 @@ def test_first_components_are_far_apart_in_deviations(seed):
     those few are among the first two components.
     """
     z = jnp.array([[-5.0, 0.0]] * 15 + [[5.0, 0.0]] * 15 + [[0.0, 2.0]] * 2, jnp.float32)
-    tilt = _first(jax.random.key(seed), z, jnp.ones(32, jnp.float32), 2)
-    assert sorted(tilt.means[:, 1].tolist()) == [0, 2]
+    first = _first_components(jax.random.key(seed), z, jnp.ones(32, jnp.float32), 2)
+    assert sorted(first.means[:, 1].tolist()) == [0, 2]
 
 
 @pytest.mark.parametrize("value", [-jnp.inf, jnp.nan])
 def test_where_nothing_is_known_the_start_is_the_model(value, key):
-    tilt = fit(key, lambda z: jnp.full((), value, jnp.float32), 1, samples=64, rounds=1)
+    tilt = fit_tilt(key, lambda z: jnp.full((), value, jnp.float32), 1, samples=64, rounds=1)
     np.testing.assert_allclose(tilt.weights[0], 1, atol=1e-6)
     assert all(bool(jnp.all(jnp.isfinite(a))) for a in tilt)
 
@@ -255,7 +265,7 @@ def test_the_entropy_of_the_model_neither_gains_nor_loses():
 
 def test_networks_start_as_those_of_heads(key):
     """Uniform in +-1/sqrt(fan-in), all arrays different."""
-    new = learner(key, 2, 1, (64, 32), 2, jnp.float32(1.0))
+    new = init_learner(key, 2, 1, (64, 32), 2, jnp.float32(1.0))
     layers = [new.actor["params"][f"Dense_{i}"] for i in range(3)]
     assert [layer["kernel"].shape for layer in layers] == [(4, 64), (64, 32), (32, 6)]
     for layer in layers:
@@ -266,7 +276,7 @@ def test_networks_start_as_those_of_heads(key):
     one, other = (jax.tree.map(lambda a, i=i: a[i], new.critic) for i in range(2))
     assert not np.allclose(one["params"]["Dense_0"]["kernel"], other["params"]["Dense_0"]["kernel"])
     assert jax.tree.structure(new.actor) == jax.tree.structure(
-        jax.eval_shape(networks(2, 1, (64, 32), 2)[0][0], key, jnp.zeros(4, jnp.float32))
+        jax.eval_shape(make_networks(1, (64, 32), 2)[0][0], key, jnp.zeros(4, jnp.float32))
     )
 
 
@@ -277,13 +287,13 @@ def test_an_update_moves_all_by_the_learning_rate(acting, key):
     they do not learn alone the actor and the temperature too, which rises while more entropy is
     wanted; averages follow by ``polyak`` of it.
     """
-    rates = Rates(*(jnp.float32(v) for v in (0.01, 0.25, 1.0, 10.0, 0.0, 1.0)))
-    applies = tuple(apply for _, apply in networks(2, 1, (8,), 2))
-    old = learner(key, 2, 1, (8,), 2, rates.alpha)
-    net = Net(Moments(*(jnp.asarray(a) for a in Moments.empty(2))), jnp.float32(1.0))
+    rates = Rates(*(jnp.float32(v) for v in (0.01, 0.25, 1.0, 10.0, 0.0, 1.0, 0.0, 1.0)))
+    _, applies = make_networks(1, (8,), 2)
+    old = init_learner(key, 2, 1, (8,), 2, rates.alpha)
+    net = Normalisation(Moments(*(jnp.asarray(a) for a in Moments.empty(2))), jnp.float32(1.0))
     columns = jax.random.normal(key, (8, 4), jnp.float32)
     no = jnp.zeros(4, bool)
-    rows = L.Rows(
+    rows = Transitions(
         columns[:2].T, jnp.zeros(4), columns[2], columns[3:4].T, columns[4], no, no, columns[5:7].T
     )
     noise = jnp.broadcast_to(columns[7][:, None], (2, 4, 1))

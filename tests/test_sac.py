@@ -173,12 +173,12 @@ def test_a_checkpoint_of_another_training_is_refused(whole_run):
 
 
 def test_an_interruption_before_anything_was_learned_is_raised(monkeypatch):
-    from jast.policies import training
+    from jast.policies import learner
 
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training, "stretch", stop)
+    monkeypatch.setattr(learner, "train", stop)
     with pytest.raises(KeyboardInterrupt):
         sac(jax.random.key(3), WALK, **TINY)
 

@@ -12,7 +12,15 @@ from systems import ring, walk
 import jast
 from jast import actions
 from jast import distributions as D
-from jast.cross_entropy import sequences as S
+from jast.cross_entropy.sequences import (
+    Steps,
+    disturbance_at,
+    fit,
+    latent_policy,
+    log_ratio,
+    sample,
+    standard_normal,
+)
 from jast.distributions.numerics import normal_score
 from jast.outline import outline
 
@@ -27,12 +35,12 @@ def test_fit(dtype):
     """
     z = jnp.array([[1.0, 5.0, 9.0], [3.0, 5.0, 0.0], [100.0, 0.0, 0.0]], dtype)
     counts = jnp.array([[1, 1, 1], [1, 1, 0], [0, 0, 0]], bool)
-    old = S.standard(scalar(dtype), 3)
+    old = standard_normal(scalar(dtype), 3)
     for smoothing, mean, deviation in (
         (0.0, [2, 5, 0], [1, 0.2, 1]),
         (0.5, [1, 2.5, 0], [1, 0.5, 1]),
     ):
-        new = S.fit(old, z, counts, jnp.asarray(smoothing), jnp.asarray(0.2))
+        new = fit(old, z, counts, jnp.asarray(smoothing), jnp.asarray(0.2))
         np.testing.assert_allclose(new.mean, mean)
         np.testing.assert_allclose(new.deviation, deviation, rtol=1e-6)
         assert new.mean.dtype == new.deviation.dtype == dtype
@@ -43,8 +51,8 @@ def test_fit_of_shares(dtype):
     moves nothing.
     """
     z = jnp.array([[1.0, 1.0], [3.0, 3.0], [9.0, 9.0]], dtype)
-    new = S.fit(
-        S.standard(scalar(dtype), 2),
+    new = fit(
+        standard_normal(scalar(dtype), 2),
         z,
         jnp.array([[1.5, 1.5], [1.0, 0.4], [0.0, 0.0]], dtype),
         jnp.asarray(0.0),
@@ -80,7 +88,7 @@ def test_other_disturbances_by_their_quantile_function(dtype):
     np.testing.assert_allclose(x, 2 + 2 * scipy.stats.norm.cdf(np.asarray(z, float)), rtol=1e-6)
     coin = D.Bernoulli(probs=jnp.asarray(0.1, dtype))
     assert [int(D.from_normal(coin, v)) for v in z] == [0, 0, 0, 1, 1]
-    box = S.place(
+    box = disturbance_at(
         actions.uniform(-1.0, 1.0), D.Normal(jnp.zeros((), dtype), jnp.ones((), dtype)), z[4]
     )
     assert box.dtype == dtype and 0.999 < box <= 1
@@ -98,8 +106,8 @@ def test_log_ratio(dtype):
         norm.logpdf(np.asarray(z, float))
         - norm.logpdf(np.asarray(z, float), np.asarray(m, float), np.asarray(s, float))
     ).sum(axis=1)
-    np.testing.assert_allclose(S.log_ratio(S.Steps(m, s), z), expected, rtol=1e-5)
-    assert S.log_ratio(S.standard(scalar(dtype), 3), jnp.arange(3, dtype=dtype)).tolist() == [
+    np.testing.assert_allclose(log_ratio(Steps(m, s), z), expected, rtol=1e-5)
+    assert log_ratio(standard_normal(scalar(dtype), 3), jnp.arange(3, dtype=dtype)).tolist() == [
         0,
         0,
         0,
@@ -108,9 +116,9 @@ def test_log_ratio(dtype):
 
 def test_noise_is_addressed(key):
     """z_t does not depend on the horizon, and levels are those of the offset."""
-    short, long = (S.noise(key, S.standard(scalar("float32"), n), 1) for n in (3, 7))
+    short, long = (sample(key, standard_normal(scalar("float32"), n), 1) for n in (3, 7))
     assert short.tolist() == long[:3].tolist()
-    assert S.noise(key, S.standard(scalar("float32"), 2), 2).tolist() == long[1:3].tolist()
+    assert sample(key, standard_normal(scalar("float32"), 2), 2).tolist() == long[1:3].tolist()
 
 
 @pytest.mark.parametrize("make", [walk, ring], ids=["walk", "ring"])
@@ -127,12 +135,15 @@ def test_player_at_standard_noise_is_the_model(key, make):
         def one(key):
             a, b, c, d = jax.random.split(key, 4)
             z0 = (
-                jax.tree.map(lambda v: v[0], S.noise(a, S.standard(like0, 1), 0))
+                jax.tree.map(lambda v: v[0], sample(a, standard_normal(like0, 1), 0))
                 if jax.tree.leaves(like0)
                 else ()
             )
-            player = S.player(
-                sim, actions.quantiles(), z0, S.noise(b, S.standard(like, sim.horizon), 0)
+            player = latent_policy(
+                sim,
+                actions.quantiles(),
+                z0,
+                sample(b, standard_normal(like, sim.horizon), 0),
             )
             return jast.rollout(c, sim, player).failure, jast.rollout(d, sim).failure
 

@@ -16,7 +16,6 @@ from sklearn.neighbors import NearestNeighbors
 
 from jast import weakness
 from jast.weakness import committee, residual, validate, views
-from jast.weakness import logistic as blend
 from jast.weakness.contract import Seen
 from jast.weakness.data import Data
 
@@ -79,7 +78,8 @@ def adam_by_hand(start, x, targets, weights, order, rate):
 
 
 def test_the_committee_learns_as_adam_by_hand(monkeypatch):
-    monkeypatch.setattr(committee, "STEPS", (30, 30))
+    monkeypatch.setattr(committee, "LEAST_STEPS", 30)
+    monkeypatch.setattr(committee, "MOST_STEPS", 30)
     monkeypatch.setattr(committee, "BATCH", 16)
     kept = {}
     real = committee._fit
@@ -130,12 +130,14 @@ def test_who_has_not_learned_from_an_input_judges_it(monkeypatch):
     trained = committee.fit(rng, x, labels, learn, 3, 8)
     p = forward(trained, x)
     by_hand = [p[~learn[:, i], i, labels[i]].mean() for i in range(53)]
-    np.testing.assert_allclose(committee.held_out(trained, x, labels, learn), by_hand, rtol=1e-4)
+    np.testing.assert_allclose(
+        committee.held_out_probability(trained, x, labels, learn), by_hand, rtol=1e-4
+    )
 
 
 def test_an_answer_does_not_move_its_own_score():
     inputs, labels = table(200)
-    x, rng = views.scaled(Data(inputs, labels, 3)), lambda: np.random.default_rng(5)
+    x, rng = views.scale_inputs(Data(inputs, labels, 3)), lambda: np.random.default_rng(5)
     learn, data = committee.folds(rng(), 200), Data(inputs, labels, 3)
     other = labels.copy()
     other[17] = (labels[17] + 1) % 3
@@ -154,7 +156,7 @@ def test_the_gradient_is_that_of_the_log_odds():
         p = forward(trained, row[None])[:, 0, label].mean()
         return np.log1p(-p) - np.log(p)
 
-    slope = np.asarray(committee.gradient(trained, x[:5], targets[:5].astype(np.int32)))
+    slope = np.asarray(committee.failure_gradient(trained, x[:5], targets[:5].astype(np.int32)))
     for i in range(5):
         numbers = [
             (odds(x[i] + h, targets[i]) - odds(x[i] - h, targets[i])) / 2e-6
@@ -168,19 +170,21 @@ def test_the_regression_is_the_most_probable(separable):
     rng = np.random.default_rng(0)
     rows = np.c_[rng.normal(size=(80, 2)) * 3, np.ones(80)]
     failed = (
-        rows[:, 0] > 0 if separable else rng.random(80) < blend.sigmoid(rows @ [0.7, -0.2, -1.0])
+        rows[:, 0] > 0 if separable else rng.random(80) < residual.sigmoid(rows @ [0.7, -0.2, -1.0])
     )
     mean, precision = np.array([0.5, 0.0, -0.5]), np.array([4.0, 2.0, 1.0])
     cost = lambda b: (
         np.logaddexp(0, rows @ b).sum() - failed @ (rows @ b) + 0.5 * precision @ (b - mean) ** 2
     )
-    found = blend.logistic(rows, failed, mean, precision)
+    found = residual.fit_logistic(rows, failed, mean, precision)
     np.testing.assert_allclose(found, minimize(cost, mean, tol=1e-12).x, atol=1e-4)
 
 
 def test_nothing_seen_leaves_the_prior():
     np.testing.assert_array_equal(
-        blend.logistic(np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION),
+        residual.fit_logistic(
+            np.zeros((0, 5)), np.zeros(0, bool), selector.PRIOR, selector.PRECISION
+        ),
         selector.PRIOR,
     )
 
@@ -188,7 +192,7 @@ def test_nothing_seen_leaves_the_prior():
 def test_laplace_against_scikit_learn():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(60, 2))
-    failed = rng.random(60) < blend.sigmoid(3 * x[:, 0])
+    failed = rng.random(60) < residual.sigmoid(3 * x[:, 0])
     kernel = ConstantKernel(4.0, "fixed") * RBF(1.5, "fixed")
     theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=1000).fit(x, failed)
     matrix = residual._kernel(views.squared_distances(x, x), 1.5**2, 4.0, 1.0)
@@ -206,7 +210,7 @@ def test_the_mode_on_top_of_given_odds():
     target = (rng.random(40) < 0.3).astype(float)
     matrix = residual._kernel(views.squared_distances(x, x), 1.0, 16.0, 1.0)
     slope = residual._laplace(matrix, target, mean)[1]
-    np.testing.assert_allclose(target - blend.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
+    np.testing.assert_allclose(target - residual.sigmoid(mean + matrix @ slope), slope, atol=2e-3)
 
 
 def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
@@ -215,7 +219,7 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     odds = np.full(600, -4.0)
     region = (labels == 1) & (close[:, 0] > 0.5)
     order = rng.permutation(600)[:300]
-    found = residual.residual(
+    found = residual.residual_log_odds(
         rng, close, labels, odds, seen_of(order, np.where(region, 0, labels), labels)
     )
     rest = np.setdiff1d(np.arange(600), order)
@@ -228,9 +232,9 @@ def test_the_residual_finds_a_region_and_nothing_where_there_is_none():
     )
     assert found[labels == 0].max() < 1
     # what the odds say, and no more
-    fair = np.where(rng.random(600) < blend.sigmoid(odds), 1 - labels, labels)
+    fair = np.where(rng.random(600) < residual.sigmoid(odds), 1 - labels, labels)
     np.testing.assert_array_equal(
-        residual.residual(rng, close, labels, odds, seen_of(order, fair, labels)), 0
+        residual.residual_log_odds(rng, close, labels, odds, seen_of(order, fair, labels)), 0
     )
 
 
@@ -238,7 +242,7 @@ def test_views_of_a_table_do_not_depend_on_units():
     inputs, labels = table(300)
     inputs = np.c_[inputs, np.full(300, 7.0)]  # a column that never varies
     a, b = (
-        views.views(Data(x, labels, 3), np.zeros((300, 0)))
+        views.make_views(Data(x, labels, 3), np.zeros((300, 0)))
         for x in (inputs, inputs * [1, 0.001, 5, 1, 1, 1, 3] + 4)
     )
     np.testing.assert_allclose(a.scaled, b.scaled, atol=1e-5)
@@ -252,7 +256,9 @@ def test_views_of_a_table_do_not_depend_on_units():
 
 def test_small_differences_on_a_large_mean_are_seen():
     images = np.random.default_rng(0).normal(size=(30, 4, 4))
-    near, far = (views.scaled(Data(x, np.zeros(30, np.int32), 2)) for x in (images, images + 1e8))
+    near, far = (
+        views.scale_inputs(Data(x, np.zeros(30, np.int32), 2)) for x in (images, images + 1e8)
+    )
     np.testing.assert_allclose(near, far, atol=1e-5)
 
 
@@ -260,14 +266,14 @@ def test_views_of_images_keep_their_shades():
     images = np.random.default_rng(0).uniform(0, 255, (40, 5, 5)).astype(np.uint8)
     images[0, 0, 0], images[0, 0, 1] = 0, 255
     data = Data(images, np.zeros(40, np.int32), 2)
-    assert views.reduce(None, data).shape == (40, 0)
-    seen_as = views.views(data, views.reduce(None, data))
+    assert views.reduce_inputs(None, data).shape == (40, 0)
+    seen_as = views.make_views(data, views.reduce_inputs(None, data))
     np.testing.assert_allclose(seen_as.scaled, images.reshape(40, 25) / np.float32(255), atol=1e-6)
     assert np.std(seen_as.centred) == pytest.approx(0.4, rel=1e-4)
     assert all(a.dtype == np.float32 for a in seen_as)
     centred, close = (
         seen_as.centred.astype(float),
-        views.components(None, seen_as.centred, 64).astype(float),
+        views.principal_components(None, seen_as.centred, 64).astype(float),
     )
     assert close.shape == (40, 25)
     distance = np.linalg.norm(centred[3] - centred[9])
@@ -282,11 +288,13 @@ def test_wide_inputs_are_seen_by_their_components(monkeypatch):
     hidden = rng.normal(size=(200, 3)) * [5, 3, 2]
     wide = (hidden @ rng.normal(size=(3, 400))).reshape(200, 20, 20)
     data = Data(wide, np.zeros(200, np.int32), 2)
-    reduced = views.reduce(np.random.default_rng(1), data)
-    seen_as = views.views(data, reduced)
-    assert seen_as.scaled.shape == (200, 4)
-    assert np.abs(seen_as.scaled).max() == pytest.approx(1)
-    assert seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
+    reduced = views.reduce_inputs(np.random.default_rng(1), data)
+    seen_as = views.make_views(data, reduced)
+    assert (
+        seen_as.scaled.shape == (200, 4)
+        and np.abs(seen_as.scaled).max() == pytest.approx(1)
+        and seen_as.centred.std() == pytest.approx(0.4, rel=1e-4)
+    )
     flat = wide.reshape(200, -1) - wide.reshape(200, -1).mean(0)
     true = np.linalg.svd(flat, full_matrices=False)[0][:, :3]
     ours = np.linalg.qr(reduced[:, :3].astype(float))[0]
@@ -462,7 +470,7 @@ def test_noise_is_told_apart_by_nobody(brief):
 def test_one_value_far_out_does_not_hide_a_column(far):
     x = np.random.default_rng(0).normal(size=(300, 2))
     x[7, 0] = far
-    seen_as = views.views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
+    seen_as = views.make_views(Data(x, np.zeros(300, np.int32), 2), np.zeros((300, 0)))
     assert len(np.unique(seen_as.scaled[:, 0])) == 300
     rest = np.arange(300) != 7
     assert np.corrcoef(seen_as.centred[rest, 0], x[rest, 0])[0, 1] > 0.99

@@ -14,20 +14,20 @@ from systems import mark_long
 from jast import plot
 from jast.weakness import auc, digits, encoded, from_idx, judge, load, save, thesis, validate
 from jast.weakness.contract import Seen
-from jast.weakness.data import arrays
+from jast.weakness.data import check_data
 from jast.weakness.networks import (
     _entropy,
     _fit,
     adversary,
     autoencoder,
     codes_of,
+    default_widths,
     fit_adversary,
     fit_autoencoder,
     logits,
-    sizes,
 )
-from jast.weakness.thesis import halves
-from jast.weakness.views import scaled
+from jast.weakness.thesis import draw_halves
+from jast.weakness.views import scale_inputs
 
 MNIST = Path(__file__).resolve().parents[2] / "shared" / "data" / "mnist"
 QUICK = dict(sample=120, epochs=2, encoder_epochs=2, hidden=(24, 12))
@@ -53,12 +53,14 @@ def leaky(x):
 # ----------------------------------------------------------------------------
 
 
-def test_sizes():
-    assert sizes(784) == (392, 64)
-    assert sizes(5000) == (392, 64)
-    assert sizes(64) == (32, 16)
-    assert sizes(20) == (10, 5)
-    assert sizes(1) == (1, 1)
+def test_default_widths():
+    assert (
+        default_widths(784) == (392, 64)
+        and default_widths(5000) == (392, 64)
+        and default_widths(64) == (32, 16)
+        and default_widths(20) == (10, 5)
+        and default_widths(1) == (1, 1)
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,9 +173,8 @@ def test_an_epoch_is_every_row_once(key, batch):
     )
     number = np.array([8, 8, 8, 0, 1, 2, 7, 0, 0, 0], np.int32)
     params = adversary(6).init(key)
-    new, losses = _fit(
-        key, params, codes, failed, number, 7, 3, 0.0, adversary(6).apply, _entropy, batch
-    )
+    data, apply = (codes, failed, number, 7), adversary(6).apply
+    new, losses = _fit(key, params, data, apply, epochs=3, rate=0.0, loss=_entropy, batch=batch)
     p = 1 / (1 + np.exp(-forward(layers(params), codes[number[:7]])[0]))
     np.testing.assert_allclose(
         losses, -np.mean(np.where(failed[number[:7]] > 0, np.log(p), np.log(1 - p))), rtol=1e-5
@@ -200,7 +201,7 @@ def test_other_sizes_in_the_same_room_compile_nothing(key, traced):
 def test_draws_with_replacement_repeat(key):
     """The published loop's; without, as many different inputs as were drawn."""
     for replacement, least, most in ((False, 240, 240), (True, 150, 239)):
-        lesson, rest = halves(key, 300, 240, replacement)
+        lesson, rest = draw_halves(key, 300, 240, replacement)
         assert len(lesson) == len(rest) == 120
         assert least <= len(set([*lesson, *rest])) <= most
     with pytest.raises(ValueError, match="replacement must be True or False, received 1"):
@@ -230,7 +231,7 @@ def encoded_digits():
 def test_the_autoencoder_comes_back_from_the_key(encoded_digits):
     """To the weights that made the codes, and the scores that the result ended with."""
     result, inputs, labels, _, networks = encoded_digits
-    rows = scaled(arrays("test", inputs, labels))
+    rows = scale_inputs(check_data("test", inputs, labels))
     np.testing.assert_array_equal(networks.codes, result.state.memory["codes"])
     np.testing.assert_allclose(networks.score(rows), result.scores, atol=1e-6)
     np.testing.assert_allclose(networks.scores, result.scores, atol=1e-6)
@@ -344,7 +345,7 @@ class Desk:
 
 def test_an_iteration_is_what_the_thesis_says(key):
     inputs, labels, answers = problem()
-    data, chosen = arrays("test", inputs, labels), thesis(iterations=4, **QUICK)
+    data, chosen = check_data("test", inputs, labels), thesis(iterations=4, **QUICK)
     desk, memory = Desk(data, answers), chosen.start(key, data)
     assert memory["codes"].shape == (1797, 12)
     assert memory["losses"].shape == (2,)
@@ -388,7 +389,7 @@ def test_an_iteration_is_what_the_thesis_says(key):
 
 def test_candidates_are_exactly_the_second_half_above_the_threshold(key):
     inputs, labels, answers = problem()
-    data, common = arrays("test", inputs, labels), dict(iterations=3, **QUICK)
+    data, common = check_data("test", inputs, labels), dict(iterations=3, **QUICK)
     everything = Desk(data, answers)
     step = everything.step(
         thesis(threshold=0, **common), key, memory := thesis(**common).start(key, data)
@@ -406,7 +407,7 @@ def test_candidates_are_exactly_the_second_half_above_the_threshold(key):
 
 def test_what_was_not_answered_is_not_learned_from(key):
     inputs, labels, answers = problem()
-    data, chosen = arrays("test", inputs, labels), thesis(iterations=3, **QUICK)
+    data, chosen = check_data("test", inputs, labels), thesis(iterations=3, **QUICK)
     memory = chosen.start(key, data)
     desk = Desk(data, answers, budget=20)
     step = desk.step(chosen, key, memory)
@@ -532,14 +533,18 @@ def test_tables_and_fewer_inputs_than_the_sample(key, n):
 
 def test_scaling():
     images = np.array([[[0, 100], [200, 0]], [[50, 0], [0, 0]]], np.uint8)
-    np.testing.assert_allclose(scaled(arrays("test", images, [0, 1])), images.reshape(2, 4) / 200)
+    np.testing.assert_allclose(
+        scale_inputs(check_data("test", images, [0, 1])), images.reshape(2, 4) / 200
+    )
     table = np.array([[1.0, -5, 7], [3, 5, 7], [2, 0, 7]])
-    rows = scaled(arrays("test", table, [0, 1, 0]))
+    rows = scale_inputs(check_data("test", table, [0, 1, 0]))
     assert rows.dtype == np.float32
     np.testing.assert_allclose(rows, [[0, 0, 0], [1, 1, 0], [0.5, 0.5, 0]])
     inputs, labels, _ = problem()
     # as they were
-    np.testing.assert_array_equal(scaled(arrays("test", inputs, labels)), inputs.reshape(1797, 64))
+    np.testing.assert_array_equal(
+        scale_inputs(check_data("test", inputs, labels)), inputs.reshape(1797, 64)
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 surrogates and mixtures.
 """
 
-from jast._doors import door, listed
+from jast._doors import listed
 from jast.cross_entropy import schedules
 from jast.cross_entropy.gaussian import Gaussian, normal
 from jast.cross_entropy.methods import (
@@ -45,6 +45,4 @@ __all__ = [
     "tell",
 ]
 
-_MOVED = ("FailureProposal", "failure_proposal")
-__getattr__ = door(__name__, renamed={name: f"jast.estimate:{name}" for name in _MOVED})
 __dir__ = listed(__all__)

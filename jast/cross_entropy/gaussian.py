@@ -19,7 +19,19 @@ from jast._jax import is_traced
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Gaussian", "as_gaussian", "fit", "is_definite", "log_prob", "normal", "sample"]
+__all__ = [
+    "Gaussian",
+    "as_gaussian",
+    "check_covariance",
+    "finite_array",
+    "fit",
+    "is_definite",
+    "log_prob",
+    "moments",
+    "normal",
+    "sample",
+    "widest_float",
+]
 
 
 @results.shown()
@@ -35,9 +47,9 @@ class Gaussian(NamedTuple):
         True
     """
 
-    mean: Any
+    mean: chex.Array
     """[d]"""
-    covariance: Any
+    covariance: chex.Array
     """[d, d]"""
 
 
@@ -65,7 +77,7 @@ def normal(mean: chex.Array, covariance: chex.Numeric) -> Gaussian:
     return _normal("normal", mean, covariance)
 
 
-def as_gaussian(proposal):
+def as_gaussian(proposal: Any) -> Gaussian:
     """The `Gaussian` that is meant by one, by a pair (mean, covariance), or by a distribution with
     ``mean()`` and ``covariance()``, as distrax's are.
 
@@ -73,9 +85,7 @@ def as_gaussian(proposal):
     """
     if isinstance(proposal, tuple | list) and len(proposal) == 2:
         return _normal("proposal", *proposal)
-    if callable(getattr(proposal, "mean", None)) and callable(
-        getattr(proposal, "covariance", None)
-    ):
+    if all(callable(getattr(proposal, name, None)) for name in ("mean", "covariance")):
         return _normal("proposal", proposal.mean(), proposal.covariance())
     raise ValueError(
         "proposal: expected a Gaussian, a pair (mean, covariance), or a distribution with mean()"
@@ -84,13 +94,12 @@ def as_gaussian(proposal):
 
 
 def _normal(name, mean, covariance):
-    given, dtype = (mean, covariance), float_of(mean, covariance)
-    traced = [is_traced(value) for value in given]
-    parts = [
-        jnp.asarray(value) if skip else numbers(name, part, value, dtype)
-        for part, value, skip in zip(("mean", "covariance"), given, traced, strict=True)
-    ]
-    m, c = parts
+    dtype = widest_float(mean, covariance)
+    traced = is_traced(covariance)
+    m, c = (
+        jnp.asarray(value) if is_traced(value) else finite_array(name, part, value, dtype)
+        for part, value in (("mean", mean), ("covariance", covariance))
+    )
     if m.ndim != 1 or m.size == 0:
         raise ValueError(
             f"{name}: mean must be a vector of one or more numbers, received shape {m.shape}"
@@ -101,13 +110,13 @@ def _normal(name, mean, covariance):
             f"{name}: covariance must be a number, {d} variances or a {d} x {d} matrix, received"
             f" shape {c.shape}"
         )
-    if not traced[1]:
+    if not traced:
         check_covariance(name, c)
     m, c = jnp.asarray(m, dtype), jnp.asarray(c, dtype)
     return Gaussian(m, c if c.ndim == 2 else jnp.diag(jnp.broadcast_to(c, (d,))))
 
 
-def float_of(*values):
+def widest_float(*values):
     """The float dtype of these arrays, the widest, as far as JAX has it; the default where none is
     of floats.
     """
@@ -119,7 +128,7 @@ def float_of(*values):
     )
 
 
-def numbers(name, part, value, dtype):
+def finite_array(name, part, value, dtype):
     """``value`` on the host, in the dtype in which it will be used; ValueError unless it is finite
     there.
     """
@@ -152,7 +161,7 @@ def check_covariance(name, c):
         raise ValueError(f"{name}: covariance must be positive definite, received\n{c}")
 
 
-def sample(key, g, n):
+def sample(key: jax.Array, g: Gaussian, n: int) -> jax.Array:
     """``n`` draws [n, d]: mean + L z, L the Cholesky factor of the covariance."""
     z = jax.random.normal(key, (n, *g.mean.shape), g.mean.dtype)
     return g.mean[None] + jnp.matmul(
@@ -160,7 +169,7 @@ def sample(key, g, n):
     )
 
 
-def log_prob(g, x):
+def log_prob(g: Gaussian, x: jax.Array) -> jax.Array:
     """Log density [...] at ``x`` [..., d]."""
     factor = jnp.linalg.cholesky(g.covariance)
     rows = x.reshape(-1, x.shape[-1]) - g.mean[None]
@@ -169,7 +178,7 @@ def log_prob(g, x):
     return (-0.5 * jnp.sum(z**2, axis=0) - constant).reshape(x.shape[:-1])
 
 
-def fit(g, x, weights):
+def fit(g: Gaussian, x: jax.Array, weights: jax.Array) -> Gaussian:
     """The `Gaussian` of greatest likelihood for ``x`` [n, d] with ``weights`` [n], at least 0: the
     covariance is divided by their sum.
 
@@ -195,9 +204,12 @@ def fit(g, x, weights):
     return jax.tree.map(lambda new, old: jnp.where(good, new, old), Gaussian(mean, covariance), g)
 
 
-def moments(x, w):
+def moments(x: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean [d] and covariance [d, d] of ``x`` [n, d] with weights ``w`` [n] that sum to 1."""
-    average = lambda a: jnp.matmul(w, a, precision=Precision.HIGHEST)
+
+    def average(a):
+        return jnp.matmul(w, a, precision=Precision.HIGHEST)
+
     mean = average(x)
     # The mean is rounded relative to its own size, which may be far above the spread: the second
     # pass takes the remainder out

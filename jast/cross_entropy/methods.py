@@ -5,8 +5,7 @@ objectives in JAX, and as ask and tell for any other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import jax
@@ -15,7 +14,7 @@ import numpy as np
 
 from jast._checks import random_key
 from jast.cross_entropy import loop
-from jast.cross_entropy.settle import MODES, checked, settled
+from jast.cross_entropy.settle import MODES, check_objective, make_plan
 
 if TYPE_CHECKING:
     import chex
@@ -234,11 +233,10 @@ def ce_mixture(
 
 def _run(method: str, *, key: chex.PRNGKey, objective: Objective, **given: Any) -> CEResult:
     random_key(method, key)
-    plan, settings, proposal = settled(method, **given)
-    leaf = jax.tree.leaves(proposal)[1]
-    return loop.run(
-        key, plan, settings, checked(method, objective, leaf.shape[-1], leaf.dtype), proposal
-    )
+    plan, settings, proposal = make_plan(method, **given)
+    mean = jax.tree.leaves(proposal)[-2]
+    objective = check_objective(method, objective, mean.shape[-1], mean.dtype)
+    return loop.run(plan, settings, key, objective, proposal)
 
 
 @jax.tree_util.register_dataclass
@@ -306,7 +304,7 @@ def start(
     if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
     random_key("start", key)
-    plan, real, proposal = settled(
+    plan, real, proposal = make_plan(
         method,
         proposal,
         samples=samples,
@@ -316,7 +314,7 @@ def start(
         mode=mode,
         **settings,
     )
-    return Search(_begin(key, plan, proposal), real, plan)
+    return Search(loop.begin(plan, key, proposal), real, plan)
 
 
 def ask(search: Search) -> np.ndarray | chex.Array:
@@ -335,7 +333,7 @@ def ask(search: Search) -> np.ndarray | chex.Array:
         >>> ce.ask(search).shape
         (4, 2)
     """
-    return _ask(search.plan, search.state)[: _count("ask", search)]
+    return loop.ask(search.plan, search.state)[: _count("ask", search)]
 
 
 def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) -> Search:
@@ -373,9 +371,8 @@ def tell(search: Search, x: chex.Array, values: chex.Array | Sequence[float]) ->
         raise ValueError("tell: x must be finite")
     pad = max(search.plan.counts) - len(x)
     x, values = (jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1))) for a in (x, values))
-    return Search(
-        _tell(search.plan, search.settings, search.state, x, values), search.settings, search.plan
-    )
+    state = loop.tell(search.plan, search.settings, search.state, x, values)
+    return replace(search, state=state)
 
 
 def finish(search: Search) -> CEResult:
@@ -393,7 +390,7 @@ def finish(search: Search) -> CEResult:
         >>> bool(result.best_value == (x**2).sum(1).min())
         True
     """
-    return _finish(search.plan, search.state)
+    return loop.finish(search.plan, search.state)
 
 
 def _count(caller, search):
@@ -403,9 +400,3 @@ def _count(caller, search):
             f"{caller}: the search is over: all {sum(search.plan.counts)} evaluations are spent"
         )
     return search.plan.counts[int(search.state.k)]
-
-
-_begin, _ask, _tell, _finish = (
-    partial(jax.jit, static_argnums=i)(f)
-    for f, i in ((loop.begin, 1), (loop.ask, 0), (loop.tell, 0), (loop.finish, 0))
-)

@@ -2,8 +2,10 @@
 maximisation (Bishop 2006, section 9.2).
 """
 
+from __future__ import annotations
+
 import operator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +18,13 @@ from jast._jax import is_traced
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = [
     "Mixture",
     "as_mixture",
     "em",
-    "log_likelihood",
     "log_prob",
     "responsibilities",
     "sample",
@@ -41,11 +45,11 @@ class Mixture(NamedTuple):
         (2, 1)
     """
 
-    weights: Any
+    weights: chex.Array
     """[k]"""
-    means: Any
+    means: chex.Array
     """[k, d]"""
-    covariances: Any
+    covariances: chex.Array
     """[k, d, d]"""
 
 
@@ -56,9 +60,9 @@ def as_mixture(proposal):
     if is_traced(proposal):
         weights, means, covariances = (jnp.asarray(v) for v in proposal)
     else:
-        dtype = gaussian.float_of(*proposal)
+        dtype = gaussian.widest_float(*proposal)
         weights, means, covariances = (
-            gaussian.numbers("proposal", part, value, dtype)
+            gaussian.finite_array("proposal", part, value, dtype)
             for part, value in zip(Mixture._fields, proposal, strict=True)
         )
     k, d = means.shape if means.ndim == 2 else (0, 0)
@@ -102,18 +106,16 @@ def responsibilities(m, x):
     return jnp.where(known, jnp.exp(joint - jnp.where(known, total, 0)), weights)
 
 
-def log_likelihood(m, x, weights):
-    """The sum of weights [n] times the log densities at ``x`` [n, d]; a row of weight 0 may hold
-    anything, NaN too. ValueError for shapes that do not fit.
-    """
-    _check("log_likelihood", m, x, weights)
-    weights = weights.astype(x.dtype)
-    counted = weights > 0
-    values = log_prob(m, jnp.where(counted[:, None], x, 0))
-    return jnp.sum(jnp.where(counted, weights * values, 0))
-
-
-def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
+def em(
+    m: Mixture,
+    x: jax.Array,
+    weights: jax.Array,
+    iterations: int = 10,
+    regularisation: chex.Numeric = 0.0,
+    least: chex.Numeric | None = None,
+    diagonal: bool = False,
+    least_variance: chex.Numeric = 0.0,
+) -> Mixture:
     """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted
     ``weights[i]`` times: a `Mixture` without NaN.
 
@@ -122,12 +124,26 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
     d, the rule of R. J. Moss's thesis) keeps its covariance, as does one whose new covariance
     `gaussian.is_definite` refuses; with a count of 0, or data that are not finite, its mean as
     well. So weights are multiplicities, not only ratios. With no regularisation no iteration lowers
-    the `log_likelihood`. A row of weight 0 may hold anything, NaN too.
+    the weighted sum of log densities. A row of weight 0 may hold anything, NaN too.
+
+    With ``diagonal`` the components have diagonal covariances. No variance is below
+    ``least_variance``.
 
     Raises ValueError for shapes that do not fit, iterations that are no whole number of at least 0,
-    and a negative regularisation or least (unless traced).
+    and a negative regularisation, least or least_variance (unless traced).
     """
-    _check("em", m, x, weights)
+    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
+    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
+        received = [a.shape for a in m]
+        raise ValueError(
+            "mixture.em: weights must be [k], means [k, d] and covariances [k, d, d],"
+            f" received {received}"
+        )
+    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
+        raise ValueError(
+            f"mixture.em: x must be [n, {d}] and its weights [n], received {x.shape} and"
+            f" {weights.shape}"
+        )
     try:
         steps = -1 if isinstance(iterations, bool) else operator.index(iterations)
     except TypeError:
@@ -136,33 +152,48 @@ def em(m, x, weights, iterations=10, regularisation=0.0, least=None):
         raise ValueError(
             f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}"
         )
-    least = x.shape[1] if least is None else least
-    for name, value in dict(regularisation=regularisation, least=least).items():
+    numbers = dict(
+        regularisation=regularisation,
+        least=x.shape[1] if least is None else least,
+        least_variance=least_variance,
+    )
+    for name, value in numbers.items():
         if jnp.shape(value) != () or not (is_traced(value) or value >= 0):
             raise ValueError(
                 f"mixture.em: {name} must be a number of at least 0, received {value!r}"
             )
+    numbers = {name: jnp.asarray(value).astype(x.dtype) for name, value in numbers.items()}
     weights = weights.astype(x.dtype)
     counted = weights > 0
     x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
-    regularisation, least = (
-        jnp.asarray(regularisation).astype(x.dtype),
-        jnp.asarray(least).astype(x.dtype),
-    )
-    return lax.fori_loop(
-        0, steps, lambda _, m: _iterate(m, x, w, counted, regularisation, least), m
-    )
+
+    def iterate(_: int, m: Mixture) -> Mixture:
+        return _em_iteration(m, x, w, diagonal, **numbers)
+
+    return lax.fori_loop(0, steps, iterate, m)
 
 
-def _iterate(m, x, w, counted, regularisation, least):
+def _em_iteration(
+    m: Mixture,
+    x: jax.Array,
+    w: jax.Array,
+    diagonal: bool,
+    regularisation: jax.Array,
+    least: jax.Array,
+    least_variance: jax.Array,
+) -> Mixture:
     """One E and one M step, Bishop eq. 9.23 to 9.27."""
     n, d = x.shape
+    eye = jnp.eye(d, dtype=x.dtype)[None]
     tiny, eps = (float(getattr(jnp.finfo(x.dtype), name)) for name in ("tiny", "eps"))
-    r = jnp.where(counted[:, None], w[:, None] * responsibilities(m, x), 0)
+    r = jnp.where(w[:, None] > 0, w[:, None] * responsibilities(m, x), 0)
     count = jnp.sum(r, axis=0)  # eq. 9.27
     r = r / jnp.where(count > 0, count, 1)[None]
     means, covariances = jax.vmap(gaussian.moments, (None, 1))(x, r)  # eq. 9.24, 9.25
-    covariances = covariances + regularisation * jnp.eye(d, dtype=x.dtype)[None]
+    covariances = covariances * eye if diagonal else covariances
+    covariances = covariances + regularisation * eye
+    variances = jnp.diagonal(covariances, axis1=1, axis2=2)
+    covariances = covariances + jnp.maximum(least_variance - variances, 0)[:, :, None] * eye
     # below, the sums of underflowing numbers are no longer averages
     moved = (count > tiny / eps) & jnp.all(jnp.isfinite(means), axis=1)
     spread = (
@@ -186,18 +217,3 @@ def _log_joint(m, x):
         lambda mean, covariance: gaussian.log_prob(Gaussian(mean, covariance), x), out_axes=-1
     )(m.means, m.covariances)
     return values + jnp.log(m.weights).reshape((1,) * (values.ndim - 1) + (-1,))
-
-
-def _check(function, m, x, weights):
-    k, d = m.means.shape if m.means.ndim == 2 else (None, None)
-    if m.weights.shape != (k,) or m.covariances.shape != (k, d, d):
-        received = [a.shape for a in m]
-        raise ValueError(
-            f"mixture.{function}: weights must be [k], means [k, d] and covariances [k, d, d],"
-            f" received {received}"
-        )
-    if x.ndim != 2 or x.shape[1] != d or weights.shape != x.shape[:1]:
-        raise ValueError(
-            f"mixture.{function}: x must be [n, {d}] and its weights [n], received {x.shape} and"
-            f" {weights.shape}"
-        )

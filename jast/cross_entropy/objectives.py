@@ -17,7 +17,7 @@ from jax.scipy.special import logsumexp
 from jax.tree_util import Partial
 
 from jast._jax import is_traced
-from jast.cross_entropy.gaussian import float_of
+from jast.cross_entropy.gaussian import widest_float
 
 if TYPE_CHECKING:
     import chex
@@ -90,7 +90,7 @@ def sierra(
     ).items():
         _finite(name, value, (), positive=name in ("variance", "sharpness"))
     given = (mean, variance, spacing, sharpness, decay)
-    dtype = float_of(*given)
+    dtype = widest_float(*given)
     mean, variance, spacing, sharpness, decay = (jnp.asarray(v).astype(dtype) for v in given)
 
     corners = jnp.asarray(_CORNERS[:, None, None], dtype)  # [corner, path, way, coordinate]

@@ -5,7 +5,9 @@ Shared by the search `jast.search.cem`, the objective of `jast.cross_entropy.ove
 `jast.estimate.failure_proposal`.
 """
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +17,17 @@ from jast import actions as choices
 from jast import distributions as D
 from jast.policy import Policy
 
+if TYPE_CHECKING:
+    import chex
+
 __all__ = [
     "Steps",
     "fit",
     "log_ratio",
-    "noise",
-    "place",
-    "player",
-    "standard",
+    "sample",
+    "disturbance_at",
+    "latent_policy",
+    "standard_normal",
 ]
 
 
@@ -31,21 +36,24 @@ class Steps(NamedTuple):
     floats.
     """
 
-    mean: Any
-    deviation: Any
+    mean: chex.ArrayTree
+    deviation: chex.ArrayTree
 
 
-def standard(like, steps, deviation=1):
+def standard_normal(like, steps, deviation=1):
     """The `Steps` N(0, deviation^2) over ``steps`` disturbances of these shapes and dtypes; by
     default u = Phi(z) is uniform.
     """
-    full = lambda value: jax.tree.map(
-        lambda s: jnp.full((steps, *s.shape), value, D.float_dtype(s.dtype)), like
-    )
+
+    def full(value):
+        return jax.tree.map(
+            lambda s: jnp.full((steps, *s.shape), value, D.float_dtype(s.dtype)), like
+        )
+
     return Steps(full(0), full(deviation))
 
 
-def noise(key, steps, offset):
+def sample(key, steps, offset):
     """z [T, ...] of one episode, by its ``key``: that of step t is drawn at level ``offset +
     t``.
     """
@@ -108,7 +116,7 @@ def fit(steps, z, counts, smoothing, floor):
     return Steps(*(treedef.unflatten(part) for part in zip(*fitted, strict=True)))
 
 
-def place(actions, dist, z):
+def disturbance_at(actions, dist, z):
     """The disturbance at z ~ N(0, I): of the box by the uniform number Phi(z), else of ``dist``, or
     the actions' proposal, by its quantile function.
     """
@@ -117,7 +125,7 @@ def place(actions, dist, z):
     return D.from_normal(actions.of(dist), z)
 
 
-def player(sim, actions, z0, z):
+def latent_policy(sim, actions, z0, z):
     """The `Policy` that plays the latents ``z0`` (like x0; ``()``: the start is drawn from its own
     distribution) and ``z`` [T, ...].
     """
@@ -133,7 +141,7 @@ def _start(start, z0):
 
 def _disturbance(disturbance, actions, z, state, t):
     return D.Deterministic(
-        place(
+        disturbance_at(
             actions,
             disturbance(state),
             jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], z),

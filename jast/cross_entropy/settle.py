@@ -9,14 +9,13 @@ import jax.numpy as jnp
 from jast._checks import real, whole
 from jast._jax import is_traced
 from jast.cross_entropy.gaussian import as_gaussian
-from jast.cross_entropy.gaussian_process import KERNELS
 from jast.cross_entropy.loop import Plan, Settings
 from jast.cross_entropy.mixture import Mixture, as_mixture
 from jast.cross_entropy.schedules import counts
-from jast.cross_entropy.surrogates import RADIAL, SURROGATES, WARPS
+from jast.cross_entropy.surrogates import KERNELS, RADIAL, SURROGATES, WARPS
 from jast.rewards import as_pytree
 
-__all__ = ["MODES", "settled"]
+__all__ = ["MODES", "check_objective", "make_plan"]
 
 _MODEL = dict(
     surrogate="gaussian process",
@@ -60,7 +59,7 @@ MODES = {
 """What each method does where the user does not say; no ``components``: as many as elites."""
 
 
-def settled(
+def make_plan(
     method, proposal, *, samples, elites, iterations, schedule, mode, ratchet=False, **given
 ):
     """``(Plan, Settings, proposal)`` of ``method``; ``given``: settings of `MODES`, None where the
@@ -124,7 +123,7 @@ def settled(
         )
     ]
     if method == "ce_mixture":
-        proposal = _mixture(
+        proposal = _first_mixture(
             method, proposal, max(kept), chosen["components"], given.get("components")
         )
         chosen["components"] = len(proposal.weights)
@@ -132,7 +131,7 @@ def settled(
         proposal = as_gaussian(proposal)
     mean = jax.tree.leaves(proposal)[-2]
     if method != "ce_method":
-        chosen |= _model(
+        chosen |= _surrogate_plan(
             method, chosen, given_optimism, max(sizes), mean_size, kept, mean.shape[-1]
         )
     settings = Settings(*(value.astype(mean.dtype) for value in numbers))
@@ -148,7 +147,7 @@ def settled(
     )
 
 
-def _model(method, chosen, optimism, most, each, kept, d):
+def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
     """The static settings of a surrogate, as `Plan` has them; ``most``, ``each``: the evaluations
     of the largest and of the mean iteration.
     """
@@ -167,7 +166,7 @@ def _model(method, chosen, optimism, most, each, kept, d):
         sub=(10 * elites, elites, 2),
         chosen=tuple(
             max(fewest, round(s * judged))
-            for s in _selection(method, chosen["selection"], each, kept, d)
+            for s in _elite_shares(method, chosen["selection"], each, kept, d)
         ),
         detail={
             "gaussian process": chosen["kernel"],
@@ -177,7 +176,7 @@ def _model(method, chosen, optimism, most, each, kept, d):
     )
 
 
-def checked(method, objective, d, dtype):
+def check_objective(method, objective, d, dtype):
     """``objective`` as a pytree, once it is a function [d] -> scalar that JAX can trace."""
     if not callable(objective):
         raise ValueError(
@@ -203,9 +202,9 @@ def checked(method, objective, d, dtype):
     return objective
 
 
-def _selection(method, given, each, kept, d):
+def _elite_shares(method, given, each, kept, d):
     """The share of judged samples that are elites, in each iteration: a number, that of the
-    evaluated ones, or at most one in d (`_model` takes 2 d at least).
+    evaluated ones, or at most one in d (`_surrogate_plan` takes 2 d at least).
 
     One in d, as a share s shrinks a Gaussian of d dimensions by about s^(1/d) a side: with half of
     the samples, ten dimensions would halve in ten iterations.
@@ -220,7 +219,7 @@ def _selection(method, given, each, kept, d):
     return [given] * len(kept)
 
 
-def _mixture(method, proposal, elites, components, asked):
+def _first_mixture(method, proposal, elites, components, asked):
     """The first `Mixture`: that given, or of ``components`` equal ones."""
     if isinstance(proposal, Mixture):
         proposal = as_mixture(proposal)

@@ -16,10 +16,10 @@ from jax.tree_util import Partial
 
 from jast import actions as choices
 from jast import distributions as D
-from jast import failures as archive
+from jast import failures
 from jast.contract import contract
 from jast.cross_entropy.gaussian import normal
-from jast.cross_entropy.sequences import player
+from jast.cross_entropy.sequences import latent_policy
 from jast.episode import rollout
 from jast.outline import outline
 from jast.rewards import LogLikelihood, as_pytree
@@ -49,10 +49,10 @@ class Stress:
         (False, True)
     """
 
-    sim: Any
-    reward: Any
+    sim: Simulator
+    reward: Reward
     """That of the episodes; `LogLikelihood` where none was given"""
-    actions: Any
+    actions: Actions
 
     @property
     def objective(self) -> Objective:
@@ -88,11 +88,11 @@ class Stress:
         # a search that goes on has rows to come
         known = np.flatnonzero(np.isfinite(rows).all(axis=1))
         if not known.size:
-            return archive.empty(self.sim)
+            return failures.empty(self.sim)
         episodes = jax.device_get(_episodes(self.sim, self.reward, self.actions, jnp.asarray(rows)))
         failing = known[episodes.failure[known] & np.isfinite(episodes.reward[known])]
         kept = jax.tree.map(lambda a: a[failing], episodes)
-        return archive.collect(
+        return failures.collect(
             self.sim, self.reward, kept, failing // x.shape[-2], failing % x.shape[-2], top=top
         )
 
@@ -177,9 +177,10 @@ def _value(sim, reward, actions, z):
 
 @jax.jit
 def _episodes(sim, reward, actions, rows):
-    play = lambda z: rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)._replace(
-        states=None
-    )
+    def play(z):
+        episode = rollout(jax.random.key(0), sim, _policy(sim, actions, z), reward)
+        return episode._replace(states=None)
+
     return jax.vmap(play)(rows)
 
 
@@ -189,7 +190,7 @@ def _policy(sim, actions, z):
     z = jnp.asarray(z)
     if z.shape != like.shape:
         raise ValueError(f"over: a point must have the shape {like.shape}, received {z.shape}")
-    return player(sim, actions, *unflat(z.astype(like.dtype)))
+    return latent_policy(sim, actions, *unflat(z.astype(like.dtype)))
 
 
 def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:
@@ -197,7 +198,8 @@ def _flat(sim: Simulator) -> tuple[jax.Array, Callable[[jax.Array], Any]]:
     latents (of x0, of x [horizon, ...]).
     """
     about = outline(sim)
-    full = lambda like, *rows: jax.tree.map(
-        lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like
-    )
-    return ravel_pytree((full(about.x0), full(about.x, sim.horizon)))
+
+    def zeros(like, *rows):
+        return jax.tree.map(lambda s: jnp.zeros((*rows, *s.shape), D.float_dtype(s.dtype)), like)
+
+    return ravel_pytree((zeros(about.x0), zeros(about.x, sim.horizon)))

@@ -3,28 +3,172 @@ process, or least squares on a few basis functions.
 
 Points are centred and scaled first, and values may be warped. What is predicted is only good for
 ranking points, which is all that a cross-entropy method does.
+
+The Gaussian process has zero mean and one lengthscale for all coordinates (Rasmussen and Williams
+2006, Gaussian processes for machine learning, ch. 2, 4 and 5). Its hyperparameters are chosen from
+a grid: no branch, no iteration, so it vmaps. The signal's variance is that of greatest likelihood
+at each point of the grid, in closed form; the noise is relative to it.
 """
 
+import math
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jax.scipy.special import ndtri
 from jax.tree_util import register_dataclass
 
-from jast.cross_entropy import gaussian_process
+__all__ = [
+    "KERNELS",
+    "RADIAL",
+    "SURROGATES",
+    "WARPS",
+    "Frame",
+    "fit",
+    "lower_bound",
+    "predict",
+    "warp_values",
+    "whitening_frame",
+]
 
-__all__ = ["RADIAL", "SURROGATES", "WARPS", "frame", "fit", "predict", "warped"]
+
+LENGTHSCALES = tuple(10 ** (-1.7 + 2.1 * i / 11) for i in range(12))
+"""The grid, as multiples of a scale: 0.02 to 2.5; a convention."""
+NOISES = (1e-4, 1e-2)
+"""The grid of the noise's variance, as shares of the signal's; a convention."""
+JITTER = 1e-6  # added to every noise, so that float32 factors stay positive definite
+
+
+def _squared_exponential(r2):
+    return jnp.exp(-0.5 * r2)  # R&W eq. 4.9
+
+
+def _matern(terms, r2):
+    """R&W eq. 4.17: a polynomial of sqrt(2 nu) r times its decaying exponential."""
+    # sqrt has no derivative at 0
+    r = jnp.sqrt((2 * len(terms) - 1) * r2 + jnp.finfo(r2.dtype).tiny)
+    return jnp.exp(-r) * sum(c * r**i for i, c in enumerate(terms))
+
+
+KERNELS = {
+    "squared exponential": _squared_exponential,
+    "matern12": lambda r2: _matern((1.0,), r2),
+    "matern32": lambda r2: _matern((1.0, 1.0), r2),
+    "matern52": lambda r2: _matern((1.0, 1.0, 1 / 3), r2),
+}
+"""Correlation as a function of the squared distance in lengthscales."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class GaussianProcess:
+    """A fitted process: what `predict_process` needs."""
+
+    x: jax.Array
+    """[n, d]; rows that are masked mean nothing."""
+    mask: jax.Array
+    """[n] bool"""
+    factor: jax.Array
+    """[n, n]: lower Cholesky factor of the correlation matrix with noise; a masked row is that of
+    the identity.
+    """
+    weights: jax.Array
+    """[n]: the inverse of that matrix times y."""
+    lengthscale: jax.Array
+    variance: jax.Array
+    """Of the signal."""
+    noise: jax.Array
+    """Relative to ``variance``, jitter included."""
+    log_likelihood: jax.Array
+    """Of the observed y, at these hyperparameters (R&W eq. 2.30)."""
+    kernel: str = field(default="squared exponential", metadata=dict(static=True))
+
+
+def fit_process(x, y, mask, lengthscales, noises=NOISES, kernel="squared exponential"):
+    """The `GaussianProcess` of points ``x`` [n, d] with values ``y`` [n] where ``mask`` [n]; of the
+    grid ``lengthscales`` [a] x ``noises`` [b], the likeliest.
+
+    Rows that are masked may hold anything, NaN too. ValueError for an unknown kernel and shapes
+    that do not fit.
+    """
+    if kernel not in KERNELS:
+        raise ValueError(
+            f"surrogates.fit_process: kernel must be one of {list(KERNELS)}, received {kernel!r}"
+        )
+    if x.ndim != 2 or y.shape != x.shape[:1] or mask.shape != y.shape:
+        raise ValueError(
+            f"surrogates.fit_process: x must be [n, d], y and mask [n], received {x.shape},"
+            f" {y.shape} and {mask.shape}"
+        )
+    x, y = jnp.where(mask[:, None], x, 0), jnp.where(mask, y, 0)
+    grid = jnp.meshgrid(
+        jnp.asarray(lengthscales, x.dtype), jnp.asarray(noises, x.dtype) + JITTER, indexing="ij"
+    )
+    lengthscale, noise = (a.ravel() for a in grid)
+    r2 = squared_distances(x, x)
+    factors, weights, variances, values = jax.vmap(
+        lambda l, s: _factored(r2, y, mask, l, s, kernel)
+    )(lengthscale, noise)
+    i = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values))
+    return GaussianProcess(
+        x=x,
+        mask=mask,
+        factor=factors[i],
+        weights=weights[i],
+        lengthscale=lengthscale[i],
+        variance=variances[i],
+        noise=noise[i],
+        log_likelihood=values[i],
+        kernel=kernel,
+    )
+
+
+def _factored(r2, y, mask, lengthscale, noise, kernel):
+    """Cholesky factor, weights, signal variance and log likelihood at one point of the grid."""
+    both = mask[:, None] & mask[None, :]
+    k = jnp.where(both, KERNELS[kernel](r2 / lengthscale**2), 0) + jnp.diag(
+        jnp.where(mask, noise, 1)
+    )
+    factor = jnp.linalg.cholesky(k)
+    weights = cho_solve((factor, True), y)
+    n = jnp.sum(mask, dtype=y.dtype)
+    # of greatest likelihood: d/dv of eq. 2.30 = 0
+    variance = jnp.maximum(y @ weights / jnp.maximum(n, 1), jnp.finfo(y.dtype).tiny)
+    # R&W eq. 2.30 with that variance, for which the data's term is n / 2
+    log_likelihood = -0.5 * n * (1 + jnp.log(variance) + math.log(2 * math.pi)) - jnp.sum(
+        jnp.log(jnp.diagonal(factor))
+    )
+    return factor, weights, variance, log_likelihood
+
+
+def predict_process(gp, x, variance=False):
+    """Posterior mean [m] of the noise-free process at ``x`` [m, d], and with ``variance=True`` its
+    variance [m] too (R&W eq. 2.25 and 2.26).
+    """
+    k = jnp.where(gp.mask, KERNELS[gp.kernel](squared_distances(x, gp.x) / gp.lengthscale**2), 0)
+    mean = k @ gp.weights
+    if not variance:
+        return mean
+    v = solve_triangular(gp.factor, k.T, lower=True)
+    return mean, gp.variance * jnp.maximum(1 - jnp.sum(v**2, axis=0), 0)
+
+
+def squared_distances(a, b):
+    """[n, m] of the points ``a`` [n, d] and ``b`` [m, d]: differences first, as the expanded square
+    cancels far from the origin.
+    """
+    return jnp.sum((a[:, None, :] - b[None, :, :]) ** 2, axis=-1)
 
 
 class Frame(NamedTuple):
     """Coordinates in which points are compared: z = L^-1 (x - centre)."""
 
-    centre: Any
+    centre: jax.Array
     """[d]"""
-    factor: Any
+    factor: jax.Array
     """[d, d], lower triangular"""
 
 
@@ -32,8 +176,7 @@ class Surrogate(NamedTuple):
     """A fitted model."""
 
     frame: Frame
-    model: Any
-    """A `GaussianProcess`, or a `Basis`."""
+    model: "GaussianProcess | Basis"
 
 
 @register_dataclass
@@ -41,13 +184,13 @@ class Surrogate(NamedTuple):
 class Basis:
     """Least squares on basis functions, which `predict` finds by the kind of the model."""
 
-    x: Any
+    x: jax.Array
     """[n, d]: the points, which are the centres of radial basis functions"""
-    mask: Any
+    mask: jax.Array
     """[n] bool"""
-    weights: Any
+    weights: jax.Array
     """[features]"""
-    detail: Any = field(default=None, metadata=dict(static=True))
+    detail: int | str | None = field(default=None, metadata=dict(static=True))
     """The degree of a polynomial, the name of a radial function."""
 
 
@@ -62,10 +205,6 @@ Wheeler 2019, section 14.4; the names are those of the thesis's code).
 """
 
 
-def _linear(x, centres, mask, detail):
-    return _polynomial(x, centres, mask, 1)
-
-
 def _polynomial(x, centres, mask, degree):
     """All monomials up to the degree: [m, C(d + degree, degree)]."""
     products = [
@@ -77,21 +216,21 @@ def _polynomial(x, centres, mask, degree):
 
 
 def _radial(x, centres, mask, name):
-    r2 = gaussian_process.squared_distances(x, centres)
+    r2 = squared_distances(x, centres)
     return jnp.where(mask[None, :], RADIAL[name](r2, x.shape[1]), 0)
 
 
-BASES = {"linear": _linear, "polynomial": _polynomial, "radial basis": _radial}
+BASES = {"linear": _polynomial, "polynomial": _polynomial, "radial basis": _radial}
 DETAILS = {
     "gaussian process": "squared exponential",
-    "linear": None,
+    "linear": 1,
     "polynomial": 2,
     "radial basis": "gaussian",
 }
-"""Of each kind: the kernel, nothing, the degree, the radial function where none is given."""
+"""Of each kind, where none is given: the kernel, the degree (twice), the radial function."""
 SURROGATES = tuple(DETAILS)
-RIDGE = 1e-4
-"""Of the least squares, as a share of the features' mean square."""
+RIDGE = 1e-4  # of the least squares, as a share of the features' mean square; a convention
+ROUND = 0.1  # weight of the identity in a frame, so that few points do
 
 
 def _raw(y, mask):
@@ -118,7 +257,7 @@ def _rank(y, mask):
 WARPS = {"raw": _raw, "standard": _standard, "rank": _rank}
 
 
-def warped(warp, y, mask):
+def warp_values(warp, y, mask):
     """(values to model [n], their mask): non-finite ones are left out, but for the ranks, where
     they are the worst.
     """
@@ -128,7 +267,7 @@ def warped(warp, y, mask):
     return WARPS[warp](jnp.where(finite, y, 0), finite), finite
 
 
-def frame(x, mask):
+def whitening_frame(x, mask):
     """The `Frame` in which masked points ``x`` [n, d] have mean 0 and about the identity for
     covariance; a tenth of it is kept round, so that few points do.
     """
@@ -143,7 +282,7 @@ def frame(x, mask):
     spread = variances > (4 * jnp.finfo(x.dtype).eps * centre) ** 2
     variances = jnp.where(spread, variances, largest)
     u = z / jnp.sqrt(variances)[None]
-    correlation = 0.9 * u.T @ u / n + 0.1 * jnp.eye(d, dtype=x.dtype)
+    correlation = (1 - ROUND) * u.T @ u / n + ROUND * jnp.eye(d, dtype=x.dtype)
     return Frame(centre, jnp.sqrt(variances)[:, None] * jnp.linalg.cholesky(correlation))
 
 
@@ -152,11 +291,9 @@ def fit(kind, x, y, mask, frame, detail=None):
     ``y`` [n], where ``mask`` [n]; ``detail``: see `DETAILS`.
     """
     detail = DETAILS[kind] if detail is None else detail
-    z = jnp.where(mask[:, None], _framed(frame, jnp.where(mask[:, None], x, 0)), 0)
+    z = jnp.where(mask[:, None], _in_frame(frame, jnp.where(mask[:, None], x, 0)), 0)
     if kind == "gaussian process":
-        return Surrogate(
-            frame, gaussian_process.fit(z, y, mask, gaussian_process.LENGTHSCALES, kernel=detail)
-        )
+        return Surrogate(frame, fit_process(z, y, mask, LENGTHSCALES, kernel=detail))
     features = jnp.where(mask[:, None], BASES[kind](z, z, mask, detail), 0)
     normal = features.T @ features
     # a masked centre is no feature
@@ -170,9 +307,9 @@ def fit(kind, x, y, mask, frame, detail=None):
 
 def predict(kind, surrogate, x):
     """What the model expects at ``x`` [m, d]: [m], on the scale of the warped values."""
-    z = _framed(surrogate.frame, x)
+    z = _in_frame(surrogate.frame, x)
     if kind == "gaussian process":
-        return gaussian_process.predict(surrogate.model, z)
+        return predict_process(surrogate.model, z)
     model = surrogate.model
     return BASES[kind](z, model.x, model.mask, model.detail) @ model.weights
 
@@ -181,11 +318,9 @@ def lower_bound(kind, surrogate, optimism, x):
     """[m]: the mean less ``optimism`` standard deviations; only a Gaussian process knows any."""
     if kind != "gaussian process":
         return predict(kind, surrogate, x)
-    mean, variance = gaussian_process.predict(
-        surrogate.model, _framed(surrogate.frame, x), variance=True
-    )
+    mean, variance = predict_process(surrogate.model, _in_frame(surrogate.frame, x), variance=True)
     return mean - optimism * jnp.sqrt(variance)
 
 
-def _framed(frame, x):
+def _in_frame(frame, x):
     return solve_triangular(frame.factor, (x - frame.centre[None]).T, lower=True).T

@@ -174,8 +174,8 @@ def failure_proposal(
 def _search(key, sim, settings, tilt_start, samples, iterations):
     like = outline(sim)
     first = (
-        sequences.standard(like.x0, 1) if tilt_start else (),
-        sequences.standard(like.x, sim.horizon),
+        sequences.standard_normal(like.x0, 1) if tilt_start else (),
+        sequences.standard_normal(like.x, sim.horizon),
     )
 
     def iterate(proposal, key):
@@ -241,9 +241,9 @@ def _play(key, sim, proposal):
     """
     for_noise, for_start = jax.random.split(key)
     start, steps = proposal
-    z0 = sequences.noise(for_noise, start, 0) if start != () else ()
-    z = sequences.noise(for_noise, steps, 1)
-    player = sequences.player(sim, choices.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
+    z0 = sequences.sample(for_noise, start, 0) if start != () else ()
+    z = sequences.sample(for_noise, steps, 1)
+    player = sequences.latent_policy(sim, choices.quantiles(), jax.tree.map(lambda a: a[0], z0), z)
     e = rollout(for_start, sim, player)._replace(states=None, disturbances=None)
     # W = f(X; u) / f(X; v) in the latents, in which f is N(0, 1); to the end of the episode, as
     # later steps decide nothing

@@ -19,14 +19,16 @@ from jast.pytrees import bound
 if TYPE_CHECKING:
     import chex
 
+    from jast.simulator import Simulator
+
 __all__ = [
     "Heads",
     "Moments",
-    "histogram",
-    "in_bins",
-    "moments",
-    "observed",
-    "value",
+    "observation",
+    "policy_logits",
+    "predicted_value",
+    "sample_bins",
+    "update_moments",
 ]
 
 
@@ -41,11 +43,11 @@ class Moments(NamedTuple):
         2.0
     """
 
-    count: Any
+    count: chex.Array
     """scalar float32."""
-    mean: Any
+    mean: chex.Array
     """[n] float32."""
-    deviation: Any
+    deviation: chex.Array
     """[n] float32: 0 where nothing varies; 1 is used in its place."""
 
     @classmethod
@@ -68,9 +70,9 @@ class Moments(NamedTuple):
         return Moments(self.count, self.mean[:n], self.deviation[:n])
 
 
-def moments(before, x):
-    """``before`` and the rows of ``x`` [m, n] (or [m]), on the host (the pairwise update of Chan,
-    Golub and LeVeque).
+def update_moments(before: Moments, x: np.ndarray) -> Moments:
+    """The `Moments` ``before`` with the rows of ``x`` [m, n] (or [m]) added, on the host (the
+    pairwise update of Chan, Golub and LeVeque).
     """
     if not len(x):
         return before
@@ -78,10 +80,9 @@ def moments(before, x):
     squares = before.count * np.float64(before.deviation) ** 2 if before.count else 0.0
     gap = x.mean(0) - mean
     variance = (squares + len(x) * x.var(0) + gap**2 * before.count * len(x) / count) / count
-    deviation = np.where(variance > 1e-12, np.sqrt(variance), 0)
-    return Moments(
-        *(np.asarray(a, np.float32) for a in (count, mean + gap * len(x) / count, deviation))
-    )
+    deviation = np.where(variance > 1e-12, np.sqrt(variance), 0)  # less is rounding
+    updated = count, mean + gap * len(x) / count, deviation
+    return Moments(*(np.asarray(a, np.float32) for a in updated))
 
 
 @results.shown()
@@ -103,14 +104,14 @@ class Heads:
         True
     """
 
-    policy: Any = None
-    value: Any = None
-    inputs: Any = None
-    """`Moments` of the n + d inputs."""
-    returns: Any = None
-    """`Moments` of the value head's targets."""
-    levels: Any = 0
-    """int: the first levels of an episode that they have learned of; a default search is not guided
+    policy: Head | None = None
+    value: Head | None = None
+    inputs: Moments | None = None
+    """Of the n + d inputs."""
+    returns: Moments | None = None
+    """Of the value head's targets."""
+    levels: int = 0
+    """The first levels of an episode that they have learned of; a default search is not guided
     by them deeper down. Give those that you trained yourself the horizon.
     """
 
@@ -122,25 +123,24 @@ class Heads:
                 object.__setattr__(self, name, Head(head[0], apply))
 
 
-def observed(sim, state):
+def observation(sim: Simulator, state: Any) -> jax.Array:
     """[n] float32: what networks see of a state."""
     return jnp.ravel(jnp.asarray(sim.observe(state))).astype(jnp.float32)
 
 
-def histogram(heads, seen):
-    """Logits [d, bins] of the policy head at an observation [n]."""
-    return heads.policy.apply(
-        heads.policy.params, heads.inputs.first(seen.shape[0]).normalise(seen)
-    )
+def policy_logits(heads: Heads, seen: jax.Array) -> jax.Array:
+    """Logits [d, bins] of the policy head at an `observation` [n]."""
+    inputs = heads.inputs.first(seen.shape[0]).normalise(seen)
+    return heads.policy.apply(heads.policy.params, inputs)
 
 
-def in_bins(logits, u):
+def sample_bins(logits: jax.Array, u: jax.Array) -> jax.Array:
     """Points [d] of the unit interval with the histogram density of ``logits`` [d, bins], from
     uniform ``u`` [d]: the inverse of its distribution function.
     """
     bins = logits.shape[1]
     mass = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True))
-    mass = jnp.where(jnp.isfinite(mass), mass, 1)  # a head that knows nothing here
+    mass = jnp.where(jnp.isfinite(mass), mass, 1)  # uniform where a head gives no number
     # summed as below, so that no rounding leads past the last bin that has mass
     u = u * sum(mass[:, k] for k in range(bins))
     below = bin = beneath = jnp.zeros_like(u)
@@ -149,20 +149,17 @@ def in_bins(logits, u):
     for k in range(1, bins):
         below = below + mass[:, k - 1]
         past = u >= below
-        bin, beneath, own = (
-            jnp.where(past, jnp.float32(k), bin),
-            jnp.where(past, below, beneath),
-            jnp.where(past, mass[:, k], own),
-        )
+        bin = jnp.where(past, jnp.float32(k), bin)
+        beneath = jnp.where(past, below, beneath)
+        own = jnp.where(past, mass[:, k], own)
     # of 1, so far that no rounding leads into the next bin
     inside = jnp.clip((u - beneath) / jnp.maximum(own, 1e-12), 0, 1 - bins * 2.0**-22)
     return (bin + inside) / bins
 
 
-def value(heads, seen, x):
-    """v(s, a), a scalar: the value head's word on the reward from the observation ``seen`` [n] on,
+def predicted_value(heads: Heads, seen: jax.Array, x: jax.Array) -> jax.Array:
+    """v(s, a), a scalar: the value head's reward to come from the `observation` ``seen`` [n] on,
     with the disturbance ``x`` [d].
     """
-    return heads.returns.restore(
-        heads.value.apply(heads.value.params, heads.inputs.normalise(jnp.concatenate([seen, x])))
-    )
+    inputs = heads.inputs.normalise(jnp.concatenate([seen, x]))
+    return heads.returns.restore(heads.value.apply(heads.value.params, inputs))

@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast.distributions.numbers import flat, unflat
-from jast.heads.heads import Heads, histogram, in_bins, observed
+from jast.heads.heads import Heads, observation, policy_logits, sample_bins
 from jast.outline import outline
 from jast.policy import Policy
 from jast.simulator import Simulator
@@ -45,7 +45,7 @@ class Histogram(D.Distribution):
                 f"Histogram: sample_shape must be (), received {sample_shape!r}: use jax.vmap over"
                 " keys"
             )
-        u = in_bins(self._logits, jax.random.uniform(seed, self._logits.shape[:1], jnp.float32))
+        u = sample_bins(self._logits, jax.random.uniform(seed, self._logits.shape[:1], jnp.float32))
         event = D.event_like(self._dist)
         return jax.tree.map(
             lambda a, s: a.astype(s.dtype), self._actions.at(unflat(u, event), self._dist), event
@@ -105,5 +105,5 @@ def as_policy(sim: Simulator, heads: Heads, actions: Actions, power: chex.Numeri
 
 def _disturbance(sim, heads, actions, power, state, t):
     return Histogram(
-        power * histogram(heads, observed(sim, state)), actions, sim.disturbance(state)
+        power * policy_logits(heads, observation(sim, state)), actions, sim.disturbance(state)
     )

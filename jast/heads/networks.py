@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Head", "make_head"]
+__all__ = ["ACTIVATIONS", "Head", "adam", "adam_step", "dense", "make_head"]
 
 ACTIVATIONS = {
     "gelu": lambda x: jax.nn.gelu(x, approximate=False),
@@ -40,7 +40,7 @@ class Head(NamedTuple):
 
     params: Any
     """A pytree of arrays: what training changes."""
-    apply: Any
+    apply: Callable[..., Any]
     """A policy head returns logits [d, bins] for x the n numbers that ``observe`` gives; a value
     head a scalar for those n and the d of the disturbance.
     """
@@ -111,13 +111,10 @@ def dense(hidden, outputs, activation, first_activation):
             for i, width in enumerate((*self.hidden, math.prod(self.outputs))):
                 # both from one range: variance 1 / (3 fan-in), as a uniform of +-1/sqrt(fan-in) has
                 bound = 1 / math.sqrt(x.shape[-1])
-                bias = lambda key, shape, dtype, bound=bound: jax.random.uniform(
-                    key, shape, dtype, -bound, bound
-                )
                 x = nn.Dense(
                     width,
                     kernel_init=nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform"),
-                    bias_init=bias,
+                    bias_init=functools.partial(jax.random.uniform, minval=-bound, maxval=bound),
                     param_dtype=jnp.float32,
                 )(x)
                 if i < len(self.hidden) and (i > 0 or self.first_activation):
@@ -126,3 +123,20 @@ def dense(hidden, outputs, activation, first_activation):
 
     network = Dense(hidden, outputs, activation, first_activation)
     return network.init, Partial(network.apply)
+
+
+def adam() -> Any:
+    """Adam without its learning rate, of optax."""
+    import optax  # here: it takes a while, and only learning needs it
+
+    return optax.scale_by_adam()
+
+
+def adam_step(params: Any, optimiser: Any, gradient: Any, rate: Any) -> tuple[Any, Any]:
+    """One step of `adam`, whose state is ``optimiser``, at the learning ``rate``: ``(params,
+    optimiser)``.
+    """
+    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+        update, optimiser = adam().update(gradient, optimiser)
+    params = jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, update)
+    return params, optimiser

@@ -2,6 +2,7 @@
 finished.
 """
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -12,62 +13,73 @@ import numpy as np
 from jast import distributions as D
 from jast._jax import is_traced
 from jast.contract import contract
-from jast.heads.heads import Heads, Moments, histogram, moments, observed, value
+from jast.heads.heads import (
+    Heads,
+    Moments,
+    observation,
+    policy_logits,
+    predicted_value,
+    update_moments,
+)
 from jast.heads.networks import make_head
-from jast.heads.samples import joined, of_edges, of_episodes, of_roots
-from jast.heads.training import learn, learner
+from jast.heads.samples import (
+    join_samples,
+    samples_of_edges,
+    samples_of_episodes,
+    samples_of_roots,
+)
+from jast.heads.training import HeadState, init_head, train_head
 from jast.outline import ask, outline
 from jast.pytrees import count
 from jast.simulator import Simulator
 
-__all__ = ["enrol"]
+__all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
 
 
-class School(NamedTuple):
-    """Heads in training."""
+class HeadTraining(NamedTuple):
+    """Heads, and where their training stands."""
 
     heads: Heads
-    policy: Any
-    """`Learner`, or None without such a head."""
-    value: Any
-    lessons: tuple = ()
+    policy: HeadState | None
+    value: HeadState | None
+    lessons: tuple[dict, ...] = ()
     """Of each round, name of the head -> `Lesson`."""
 
 
-def enrol(key, sim, actions, heads, settings):
-    """The `School` of ``heads``: "rollout", "value" or "both" to be made, or `Heads` to be taught
-    on. ValueError where they do not fit the simulator.
+def init_heads(key, sim, actions, heads, settings):
+    """The `HeadTraining` of ``heads``: "rollout", "value" or "both" to be made, or `Heads` to be
+    trained further. ValueError where they do not fit the simulator.
     """
-    n, d = sizes(sim, actions, heads)
+    n, d = count_inputs(sim, actions, heads)
     start = sim.init(D.sample(sim.start(), key))
-    if not is_traced(start_seen := observed(sim, start)) and not bool(
-        jnp.all(jnp.isfinite(start_seen))
-    ):
+    seen = observation(sim, start)
+    if not is_traced(seen) and not bool(jnp.all(jnp.isfinite(seen))):
         raise ValueError(
             "observe: must return finite numbers where heads learn from them, received"
-            f" {np.asarray(start_seen)} at the start"
+            f" {np.asarray(seen)} at the start"
         )
     if isinstance(heads, str):
         keys = jax.random.split(key)
-        new = lambda i, inputs, outputs: make_head(
-            keys[i],
-            inputs,
-            outputs,
-            hidden=settings.hidden,
-            activation=settings.activation[i],
-            first_activation=settings.first_activation,
-        )
-        policy = new(0, n, (d, settings.bins)) if heads in ("rollout", "both") else None
-        heads = Heads(policy, new(1, n + d, ()) if heads in ("value", "both") else None)
-    heads = filled(heads, n, d)
+
+        def make(i, inputs, outputs):
+            return make_head(
+                keys[i],
+                inputs,
+                outputs,
+                hidden=settings.hidden,
+                activation=settings.activation[i],
+                first_activation=settings.first_activation,
+            )
+
+        policy = make(0, n, (d, settings.bins)) if heads in ("rollout", "both") else None
+        heads = Heads(policy, make(1, n + d, ()) if heads in ("value", "both") else None)
+    heads = with_moments(heads, n, d)
     _check_outputs(heads, n, d)
-    return School(
-        heads,
-        *(None if head is None else learner(head.params) for head in (heads.policy, heads.value)),
-    )
+    both = heads.policy, heads.value
+    return HeadTraining(heads, *(head and init_head(head.params) for head in both))
 
 
-def sizes(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
+def count_inputs(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
     """The numbers that ``observe`` gives and that a disturbance has; ValueError where heads cannot
     serve.
     """
@@ -95,7 +107,7 @@ def sizes(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int, int]:
     return math.prod(about.observation), count(about.x)
 
 
-def filled(heads, n, d):
+def with_moments(heads: Heads, n: int, d: int) -> Heads:
     """``heads`` with moments that leave everything as it is, where there are none."""
     inputs = Moments.empty(n + d) if heads.inputs is None else heads.inputs
     if inputs.mean.shape != (n + d,):
@@ -103,25 +115,20 @@ def filled(heads, n, d):
             f"forest: heads must take {n + d} numbers ({n} observed, {d} of the disturbance),"
             f" received heads that take {inputs.mean.shape[0]}"
         )
-    return Heads(
-        heads.policy,
-        heads.value,
-        inputs,
-        Moments.empty() if heads.returns is None else heads.returns,
-        heads.levels,
-    )
+    returns = Moments.empty() if heads.returns is None else heads.returns
+    return dataclasses.replace(heads, inputs=inputs, returns=returns)
 
 
 def _check_outputs(heads, n, d):
-    zeros = jnp.zeros((n,), jnp.float32), jnp.zeros((d,), jnp.float32)
-    for name, run in (
-        ("policy", lambda: histogram(heads, zeros[0])),
-        ("value", lambda: value(heads, *zeros)),
+    """ValueError unless the heads return what they must."""
+    seen, x = jnp.zeros((n,), jnp.float32), jnp.zeros((d,), jnp.float32)
+    logits = f"logits of shape ({d}, bins), bins at least 2"
+    for name, takes, wanted, run in (
+        ("policy", n, logits, lambda: policy_logits(heads, seen)),
+        ("value", n + d, "a scalar", lambda: predicted_value(heads, seen, x)),
     ):
         if getattr(heads, name) is None:
             continue
-        takes = n if name == "policy" else n + d
-        wanted = f"logits of shape ({d}, bins), bins at least 2" if name == "policy" else "a scalar"
         try:
             out = jax.eval_shape(run)
         except Exception as e:  # of whatever framework
@@ -141,92 +148,88 @@ def _check_outputs(heads, n, d):
             )
 
 
-def teach(key, school, sim, actions, settings, harvests):
-    """The `School` after the lesson of a round's ``harvests``: what has ``log``, ``roots``,
-    ``found`` and, for ``settings.edges="all"``, ``edges``.
+def train_heads(key, training, sim, actions, settings, batches):
+    """The `HeadTraining` after learning from a round's ``batches`` of trees, which have ``log``,
+    ``roots``, ``found`` and, for ``settings.edges="all"``, ``edges``.
 
     A head whose loss or parameters come out NaN or infinite keeps those from before, and the
     `Lesson` says so.
     """
-    heads = school.heads
-    shares, edges = _samples(heads, sim, actions, settings, harvests)
+    heads = training.heads
+    shares, edges = _samples(heads, sim, actions, settings, batches)
     inputs, returns = heads.inputs, heads.returns
     if settings.normalise:
-        inputs, returns = (
-            moments(inputs, np.concatenate([edges.seen, edges.x], axis=1)),
-            moments(returns, edges.target),
-        )
-    keys, lesson, pupils = jax.random.split(key), {}, dict(policy=school.policy, value=school.value)
-
-    def one(i, name, loss, samples, normalise):
-        pick = lambda pair: pair[i]
-        pupils[name], lesson[name] = learn(
-            keys[i],
-            pupils[name],
-            getattr(heads, name).apply,
-            normalise,
-            samples,
-            loss=loss,
-            rate=pick(settings.learning_rate),
-            batch=pick(settings.batch),
-            steps=pick(settings.steps),
-            capacity=pick(settings.replay),
-        )
-
-    if heads.policy is not None:
-        one(
-            0, "policy", settings.loss, shares, (inputs.first(edges.seen.shape[1]), Moments.empty())
-        )
-    if heads.value is not None and not (settings.untrained_alone and heads.policy is None):
-        one(1, "value", "squared", edges, (inputs, returns))
+        inputs = update_moments(inputs, np.concatenate([edges.seen, edges.x], axis=1))
+        returns = update_moments(returns, edges.target)
+    observed = inputs.first(edges.seen.shape[1]), Moments.empty()
+    work = dict(
+        policy=(settings.loss, shares, observed), value=("squared", edges, (inputs, returns))
+    )
+    if settings.untrained_alone and heads.policy is None:
+        del work["value"]
+    keys, trained, lesson = jax.random.split(key), {}, {}
+    for i, name in enumerate(("policy", "value")):
+        head, state = getattr(heads, name), getattr(training, name)
+        if head is not None and name in work:
+            loss, samples, moments = work[name]
+            state, lesson[name] = train_head(
+                keys[i],
+                state,
+                head.apply,
+                moments,
+                samples,
+                loss=loss,
+                rate=settings.learning_rate[i],
+                batch=settings.batch[i],
+                steps=settings.steps[i],
+                capacity=settings.replay[i],
+            )
+        trained[name] = state
     levels = heads.levels
     if any(of.steps > 0 and not of.rejected for of in lesson.values()):
         deepest = (
             sim.horizon
             if settings.episodes
-            else max(int(np.where(h.roots.valid, h.roots.depth, 0).max()) for h in harvests)
+            else max(int(np.where(b.roots.valid, b.roots.depth, 0).max()) for b in batches)
         )
         levels = max(levels, deepest + 1)
     new = (
-        None if pupil is None else getattr(heads, name)._replace(params=pupil.params)
-        for name, pupil in pupils.items()
+        state and getattr(heads, name)._replace(params=state.params)
+        for name, state in trained.items()
     )
-    return School(Heads(*new, inputs, returns, levels), **pupils, lessons=(*school.lessons, lesson))
+    return HeadTraining(
+        Heads(*new, inputs, returns, levels), **trained, lessons=(*training.lessons, lesson)
+    )
 
 
-def _samples(heads, sim, actions, settings, harvests):
+def _samples(heads, sim, actions, settings, batches):
     """What the policy head (None without one) and the value head learn from."""
     about = outline(sim)
     n, first = heads.inputs.mean.shape[0] - count(about.x), int(about.random_start)
-    bins = (
-        None
-        if heads.policy is None
-        else jax.eval_shape(lambda: histogram(heads, jnp.zeros((n,), jnp.float32))).shape[1]
-    )
-    good = best_trees(harvests, settings.elite)
-    shares, edges = zip(
-        *(
-            of_roots(sim, actions, h.roots, bins, g, first)
-            for h, g in zip(harvests, good, strict=True)
-        ),
-        strict=True,
-    )
+    bins = None
+    if heads.policy is not None:
+        seen = jnp.zeros((n,), jnp.float32)
+        bins = jax.eval_shape(lambda: policy_logits(heads, seen)).shape[1]
+    good = best_trees(batches, settings.elite)
+    pairs = [
+        samples_of_roots(sim, actions, b.roots, bins, g, first)
+        for b, g in zip(batches, good, strict=True)
+    ]
+    shares, edges = ([pair[i] for pair in pairs] for i in range(2))
     if heads.policy is not None and settings.episodes:
-        # the best episode of each tree stands first
-        best = [
-            (jax.tree.map(lambda a, g=g: a[: len(g)], h.found), g)
-            for h, g in zip(harvests, good, strict=True)
-        ]
-        shares = (*shares, *(of_episodes(sim, actions, episodes, bins, g) for episodes, g in best))
+        for b, g in zip(batches, good, strict=True):
+            # the best episode of each tree stands first
+            best = jax.tree.map(lambda a, g=g: a[: len(g)], b.found)
+            shares.append(samples_of_episodes(sim, actions, best, bins, g))
     if heads.value is not None and settings.edges == "all":
-        edges = [of_edges(h.edges, settings.target) for h in harvests]
-    return None if heads.policy is None else joined(shares), joined(edges)
+        edges = [samples_of_edges(b.edges, settings.target) for b in batches]
+    return None if heads.policy is None else join_samples(shares), join_samples(edges)
 
 
-def best_trees(harvests, share):
-    """Of each harvest, [B] bool: the trees among this ``share`` of all by the reward of their best
+def best_trees(batches, share):
+    """Of each batch, [B] bool: the trees among this ``share`` of all by the reward of their best
     episode.
     """
-    best = [np.where(np.isfinite(h.log), h.log, -np.inf).max(0) for h in harvests]
+    best = [np.where(np.isfinite(b.log), b.log, -np.inf).max(0) for b in batches]
     least = np.quantile(np.concatenate(best), 1 - share, method="lower")
-    return [b >= least for b in best]
+    return [rewards >= least for rewards in best]

@@ -1,7 +1,7 @@
 """What heads learn from: the statistics of roots, and of all edges, as rows of numbers."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,25 +10,31 @@ import numpy as np
 from jast import rewards
 from jast.distributions.numbers import flat
 from jast.episode import play_back
-from jast.heads.heads import observed
+from jast.heads.heads import observation
 
-__all__ = ["Samples", "of_edges", "of_episodes", "of_roots"]
+__all__ = [
+    "Samples",
+    "join_samples",
+    "samples_of_edges",
+    "samples_of_episodes",
+    "samples_of_roots",
+]
 
 
 class Samples(NamedTuple):
     """Rows of numbers, float32 on the host; only finite ones."""
 
-    seen: Any
+    seen: np.ndarray
     """[m, n] observations."""
-    x: Any
+    x: np.ndarray
     """[m, d] disturbances; [m, 0] for a policy head."""
-    target: Any
+    target: np.ndarray
     """[m, d, bins] shares of the visits, or [m] rewards to come."""
     dropped: int = 0
     """Rows left out because something in them was not finite."""
 
 
-def of_roots(sim, actions, roots, bins, good, first=0):
+def samples_of_roots(sim, actions, roots, bins, good, first=0):
     """`Samples` for a policy head, one a root, and for a value head, one an edge of a root, from
     `Roots` [turns, B].
 
@@ -40,19 +46,20 @@ def of_roots(sim, actions, roots, bins, good, first=0):
     """
     turns = len(roots.depth)
     roots = _tree_by_tree(roots._replace(starts=()))
-    seen, x, shares = _rows(sim, actions, roots, bins)
+    seen, x, shares = _root_rows(sim, actions, roots, bins)
     good = np.repeat(good, turns)
     use = roots.valid & good & (roots.depth >= first) & (jnp.sum(roots.visits, axis=1) > 0)
-    policy = None if bins is None else _finite(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
+    policy = (
+        None if bins is None else _finite_samples(use, seen, jnp.zeros((seen.shape[0], 0)), shares)
+    )
     edges = roots.visits > 0
     each = jnp.broadcast_to(seen[:, None], (*edges.shape, seen.shape[1]))
     use = roots.valid & (roots.depth >= first)
-    merge = lambda a: a.reshape(-1, *a.shape[2:])
-    value = _finite(merge(use[:, None] & edges), merge(each), merge(x), merge(roots.q))
+    value = _finite_samples(*map(_merge, (use[:, None] & edges, each, x, roots.q)))
     return policy, value
 
 
-def joined(parts):
+def join_samples(parts):
     """Several `Samples` as one."""
     return Samples(
         *(np.concatenate(columns) for columns in zip(*(p[:3] for p in parts), strict=True)),
@@ -60,25 +67,27 @@ def joined(parts):
     )
 
 
-def of_edges(edges, target="own"):
+def samples_of_edges(edges, target="own"):
     """`Samples` for a value head from `jast.search.tree.edges.Edges`: Q(s, a), or the Q of the edge
     that leads to s, as published (``target="parent"``).
     """
     edges = _tree_by_tree(edges)
-    return _finite(edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q)
+    return _finite_samples(
+        edges.valid, edges.seen, edges.x, edges.q if target == "own" else edges.parent_q
+    )
 
 
-def of_episodes(sim, actions, episodes, bins, good):
+def samples_of_episodes(sim, actions, episodes, bins, good):
     """`Samples` for a policy head from whole episodes [B, ...], those of ``good`` [B]: at each
     state, all of the histogram in the cell of what came next.
     """
-    seen, shares, use = _steps(sim, actions, episodes._replace(states=None), bins)
-    merge = lambda a: a.reshape(-1, *a.shape[2:])
-    return _finite(merge(use & good[:, None]), merge(seen), np.zeros((use.size, 0)), merge(shares))
+    seen, shares, use = _episode_rows(sim, actions, episodes._replace(states=None), bins)
+    use, seen, shares = map(_merge, (use & good[:, None], seen, shares))
+    return _finite_samples(use, seen, np.zeros((use.size, 0)), shares)
 
 
 @functools.partial(jax.jit, static_argnames="bins")
-def _steps(sim, actions, episodes, bins):
+def _episode_rows(sim, actions, episodes, bins):
     def one(episode):
         states = play_back(
             sim, rewards.STANDARD, episode.x0, episode.disturbances, episode.length
@@ -86,7 +95,7 @@ def _steps(sim, actions, episodes, bins):
 
         def step(state, x):
             u = flat(actions.locate(x, sim.disturbance(state)))
-            return observed(sim, state), jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+            return observation(sim, state), jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
 
         rows = jax.vmap(step)(jax.tree.map(lambda a: a[:-1], states), episode.disturbances)
         return *rows, jnp.arange(sim.horizon, dtype=jnp.int32) < episode.length
@@ -94,33 +103,38 @@ def _steps(sim, actions, episodes, bins):
     return jax.vmap(one)(episodes)
 
 
-def cells(u, bins):
+def _cells(u, bins):
     """The cell of each point of the unit interval."""
     return jnp.clip(jnp.floor(u * bins).astype(jnp.int32), 0, bins - 1)
 
 
 @functools.partial(jax.jit, static_argnames="bins")
-def _rows(sim, actions, roots, bins):
+def _root_rows(sim, actions, roots, bins):
     def one(state, xs, visits):
         if bins is None:
-            return observed(sim, state), jax.vmap(flat)(xs), ()
+            return observation(sim, state), jax.vmap(flat)(xs), ()
         dist = sim.disturbance(state)
         u = jax.vmap(lambda x: flat(actions.locate(x, dist)))(xs)  # [K, d]
         n = visits.astype(jnp.float32)
         shares = jnp.einsum(
-            "k,kdb->db", n, jax.nn.one_hot(cells(u, bins), bins, dtype=jnp.float32)
+            "k,kdb->db", n, jax.nn.one_hot(_cells(u, bins), bins, dtype=jnp.float32)
         ) / jnp.maximum(jnp.sum(n), 1)
-        return observed(sim, state), jax.vmap(flat)(xs), shares
+        return observation(sim, state), jax.vmap(flat)(xs), shares
 
     return jax.vmap(one)(roots.state, roots.actions, roots.visits)
 
 
+def _merge(a):
+    """[n, m, ...] as [n * m, ...]."""
+    return a.reshape(-1, *a.shape[2:])
+
+
 def _tree_by_tree(rows):
     """Rows [n, B, ...] as [B * n, ...]."""
-    return jax.tree.map(lambda a: np.swapaxes(a, 0, 1).reshape(-1, *a.shape[2:]), rows)
+    return jax.tree.map(lambda a: _merge(np.swapaxes(a, 0, 1)), rows)
 
 
-def _finite(use, *columns):
+def _finite_samples(use, *columns):
     use, columns = np.asarray(use), [np.asarray(c, np.float32) for c in columns]
     good = use & np.all([np.isfinite(c.reshape(len(c), -1)).all(1) for c in columns], axis=0)
     return Samples(*(c[good] for c in columns), int((use & ~good).sum()))

@@ -4,9 +4,10 @@ that work, each by its name.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-__all__ = ["MODES", "HeadSettings", "checked", "settings"]
+__all__ = ["MODES", "HeadSettings", "check_settings", "settings"]
 
 
 class HeadSettings(NamedTuple):
@@ -19,14 +20,14 @@ class HeadSettings(NamedTuple):
         ((16,), 8)
     """
 
-    round: Any
+    round: int | None
     """Trees that grow between two trainings; None: a fifth of all, at most 128."""
     bins: int
     """Cells of the histogram, per number of the disturbance."""
-    hidden: Any
+    hidden: tuple[int, ...]
     """Widths of the hidden layers, where jast makes the network (`jast.heads.make_head`)."""
-    activation: Any
-    """Pair of names."""
+    activation: tuple[str, str]
+    """Names, of `make_head`."""
     first_activation: bool
     """Whether there is one after the first layer."""
     normalise: bool
@@ -35,14 +36,14 @@ class HeadSettings(NamedTuple):
     """Of the policy head: "cross_entropy" of the visits' shares, or "squared_shares", the squared
     error of the probabilities.
     """
-    learning_rate: Any
-    """Pair: of Adam."""
-    batch: Any
-    """Pair: samples in a step of Adam."""
-    steps: Any
-    """Pair: steps a round; None for one pass over the round's samples and those kept."""
-    replay: Any
-    """Pair: samples of earlier rounds and this one that are kept to learn from; 0: this round's
+    learning_rate: tuple[float, float]
+    """Of Adam."""
+    batch: tuple[int, int]
+    """Samples in a step of Adam."""
+    steps: tuple[int | None, int | None]
+    """Steps a round; None for one pass over the round's samples and those kept."""
+    replay: tuple[int, int]
+    """Samples of earlier rounds and this one that are kept to learn from; 0: this round's
     alone.
     """
     elite: float
@@ -144,6 +145,14 @@ MODES = {
 }
 
 
+def _whole(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _pair(value: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2 and all(map(holds, value))
+
+
 CHOICES = dict(
     loss=("cross_entropy", "squared_shares"),
     target=("own", "parent"),
@@ -151,6 +160,21 @@ CHOICES = dict(
     counted=("turn", "tree"),
     candidates=("one", "all"),
 )
+RULES = {name: (allowed.__contains__, f"one of {allowed}") for name, allowed in CHOICES.items()}
+RULES |= dict(
+    round=(lambda v: v is None or _whole(v, 1), "None or an integer of at least 1"),
+    bins=(lambda v: _whole(v, 2), "an integer of at least 2"),
+    learning_rate=(lambda v: _pair(v, lambda r: r > 0), "a pair of numbers above 0"),
+    batch=(lambda v: _pair(v, lambda n: _whole(n, 1)), "a pair of integers of at least 1"),
+    steps=(
+        lambda v: _pair(v, lambda n: n is None or _whole(n, 0)),
+        "a pair of integers of at least 0, or None",
+    ),
+    replay=(lambda v: _pair(v, lambda n: _whole(n, 0)), "a pair of integers of at least 0"),
+    elite=(lambda v: 0 < v <= 1, "above 0 and at most 1"),
+    power=(lambda v: v >= 0, "at least 0"),
+)
+"""Setting -> (what holds for it, in words)."""
 
 
 def settings(
@@ -195,41 +219,17 @@ def settings(
             f"heads.settings: expected settings among {', '.join(HeadSettings._fields)}, received"
             f" {', '.join(unknown)}"
         )
-    return checked(MODES[mode]._replace(**changes))
+    return check_settings(MODES[mode]._replace(**changes))
 
 
-def checked(settings):
+def check_settings(settings: HeadSettings) -> HeadSettings:
     """``settings`` themselves, or a ValueError that names the one that is out of range."""
     if not isinstance(settings, HeadSettings):
         raise ValueError(
             "head_settings must be those of jast.heads.settings(...), received"
             f" {type(settings).__name__}"
         )
-    s = settings
-    whole = lambda v, least: isinstance(v, int) and not isinstance(v, bool) and v >= least
-    pair = lambda v, fits: (
-        isinstance(v, tuple | list) and len(v) == 2 and all(fits(each) for each in v)
-    )
-    rules = {
-        name: (getattr(s, name) in choices, f"one of {choices}")
-        for name, choices in CHOICES.items()
-    }
-    rules |= dict(
-        round=(s.round is None or whole(s.round, 1), "None or an integer of at least 1"),
-        bins=(whole(s.bins, 2), "an integer of at least 2"),
-        learning_rate=(pair(s.learning_rate, lambda v: v > 0), "a pair of numbers above 0"),
-        batch=(pair(s.batch, lambda v: whole(v, 1)), "a pair of integers of at least 1"),
-        steps=(
-            pair(s.steps, lambda v: v is None or whole(v, 0)),
-            "a pair of integers of at least 0, or None",
-        ),
-        replay=(pair(s.replay, lambda v: whole(v, 0)), "a pair of integers of at least 0"),
-        elite=(0 < s.elite <= 1, "above 0 and at most 1"),
-        power=(s.power >= 0, "at least 0"),
-    )
-    for name, (fits, wanted) in rules.items():
-        if not fits:
-            raise ValueError(
-                f"heads.settings: {name} must be {wanted}, received {getattr(s, name)!r}"
-            )
+    for name, (holds, wanted) in RULES.items():
+        if not holds(value := getattr(settings, name)):
+            raise ValueError(f"heads.settings: {name} must be {wanted}, received {value!r}")
     return settings

@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jast.heads.networks import adam, adam_step
 from jast.heads.samples import Samples
 
-__all__ = ["Lesson", "learn", "learner"]
+__all__ = ["HeadState", "Lesson", "init_head", "train_head"]
 
 
-class Learner(NamedTuple):
+class HeadState(NamedTuple):
     """A head in training."""
 
     params: Any
     optimiser: Any
     """Adam's state."""
-    kept: Samples
+    kept: Samples | None
     """The latest samples, up to the capacity."""
 
 
@@ -39,25 +40,19 @@ class Lesson(NamedTuple):
         [5, 5]
     """
 
-    loss: float
+    loss: float = float("nan")
     """Mean over the last tenth of the steps."""
-    steps: int
-    samples: int
+    steps: int = 0
+    samples: int = 0
     """Of this round; ``dropped`` ones are not among them."""
-    dropped: int
-    rejected: bool
+    dropped: int = 0
+    rejected: bool = False
     """The loss or a parameter was not finite: the parameters from before are kept."""
 
 
-def learner(params):
-    """A `Learner` that has seen nothing."""
-    return Learner(params, adam().init(params), None)
-
-
-def adam():
-    import optax  # here: it takes a while, and only searches with heads need it
-
-    return optax.scale_by_adam()
+def init_head(params: Any) -> HeadState:
+    """The `HeadState` of a head that has learned nothing."""
+    return HeadState(params, adam().init(params), None)
 
 
 def squared(out, target):
@@ -76,61 +71,49 @@ def squared_shares(logits, target):
 LOSSES = {"squared": squared, "cross_entropy": cross_entropy, "squared_shares": squared_shares}
 
 
-def keep(kept, new, capacity):
-    """The latest ``capacity`` samples."""
-    columns = (
-        new[:3]
-        if kept is None
-        else (np.concatenate([a, b]) for a, b in zip(kept[:3], new[:3], strict=True))
-    )
-    return Samples(*(c[-capacity:] for c in columns))
+def train_head(key, head, apply, moments, samples, *, loss, rate, batch, steps, capacity):
+    """Train a head on ``samples`` and those kept: (`HeadState`, `Lesson`).
 
-
-def learn(key, learner, apply, normalise, samples, *, loss, rate, batch, steps, capacity):
-    """Train a head on ``samples`` and those kept: (`Learner`, `Lesson`).
-
-    ``normalise``: the moments (inputs, target) that its numbers pass through. ``steps`` minibatches
-    of ``batch``; None: one pass. ``capacity``: samples that are kept for the next rounds; 0: none,
-    and each round has but its own.
+    ``moments``: of the inputs and the target, which normalise them. ``steps`` minibatches of
+    ``batch``; None: one pass. ``capacity``: samples that are kept for the next rounds; 0: none, and
+    each round has but its own.
     """
-    kept = keep(learner.kept, samples, capacity) if capacity else samples
-    size = len(kept.seen)
+    data, kept = samples, None
+    if capacity:
+        old = head.kept or Samples(*(column[:0] for column in samples[:3]))
+        columns = (np.concatenate(pair) for pair in zip(old[:3], samples[:3], strict=True))
+        data = kept = Samples(*(column[-capacity:] for column in columns))
+    size = len(data.seen)
     if size == 0 or steps == 0:
-        return learner._replace(kept=kept if capacity else None), Lesson(
-            float("nan"), 0, 0, samples.dropped, False
-        )
+        return head._replace(kept=kept), Lesson(dropped=samples.dropped)
     steps = -(-size // batch) if steps is None else steps
     room = capacity or 1 << (size - 1).bit_length()  # few shapes, few programs
-    data = jax.tree.map(
+    padded = jax.tree.map(
         lambda a: np.concatenate([a, np.zeros((room - size, *a.shape[1:]), a.dtype)]),
-        tuple(kept[:3]),
+        tuple(data[:3]),
     )
     params, optimiser, last = _fit(
-        key,
-        learner.params,
-        learner.optimiser,
-        apply,
-        normalise,
-        data,
-        size,
-        steps,
-        rate,
-        loss,
-        batch,
+        key, head.params, head.optimiser, apply, moments, padded, size, steps, rate, loss, batch
     )
     last = float(last)
     finite = bool(np.isfinite(last)) and all(
         bool(jnp.all(jnp.isfinite(a))) for a in jax.tree.leaves(params)
     )
-    lesson = Lesson(last, steps, len(samples.seen), samples.dropped, not finite)
-    kept = kept if capacity else None
-    return (Learner(params, optimiser, kept) if finite else learner._replace(kept=kept)), lesson
+    lesson = Lesson(
+        loss=last,
+        steps=steps,
+        samples=len(samples.seen),
+        dropped=samples.dropped,
+        rejected=not finite,
+    )
+    head = HeadState(params, optimiser, kept) if finite else head._replace(kept=kept)
+    return head, lesson
 
 
 @functools.partial(jax.jit, static_argnames=("loss", "batch"))
-def _fit(key, params, optimiser, apply, normalise, data, size, steps, rate, loss, batch):
+def _fit(key, params, optimiser, apply, moments, data, size, steps, rate, loss, batch):
     seen, x, target = data
-    inputs, targets = normalise
+    inputs, targets = moments
     rows = jnp.concatenate([seen, x], axis=1)
     rows, target = jax.vmap(inputs.normalise)(rows), jax.vmap(targets.normalise)(target)
     number = jnp.arange(rows.shape[0], dtype=jnp.int32)
@@ -147,9 +130,7 @@ def _fit(key, params, optimiser, apply, normalise, data, size, steps, rate, loss
         # a shape
         at = order[(i * batch + jnp.arange(batch, dtype=jnp.int32)) % size]
         value, gradient = jax.value_and_grad(mean_loss)(params, rows[at], target[at])
-        with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-            update, optimiser = adam().update(gradient, optimiser)
-        params = jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, update)
+        params, optimiser = adam_step(params, optimiser, gradient, rate)
         late = i >= steps - (steps + 9) // 10
         return params, optimiser, total + jnp.where(late, value, 0).astype(total.dtype)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jast._checks import whole
 from jast.plot import style
 from jast.plot.weakness import checked_result
-from jast.weakness.data import arrays
+from jast.weakness.data import check_data
 
 if TYPE_CHECKING:
     import chex
@@ -66,7 +66,7 @@ def first_failures(
     caller = "first_failures"
     failures, n = np.asarray(checked_result(caller, result).failures), len(result.scores)
     count = whole(f"plot.{caller}", "count", count)
-    inputs, labels, _ = arrays(f"plot.{caller}", inputs, labels)
+    inputs, labels, _ = check_data(f"plot.{caller}", inputs, labels)
     if len(inputs) != n:
         raise ValueError(
             f"plot.{caller}: inputs must be those of the result, {n}, received {len(inputs)}"

@@ -1,5 +1,6 @@
-"""The network that acts: a mixture of normal distributions of the latents, from what is seen of a
-state; how networks begin, and how they descend.
+"""The network that acts, in latent normal numbers: x = Q(Phi(z)), z ~ N(0, I) under the model,
+whatever the units and the family of p. It gives a mixture of normal distributions of z, by what is
+observed of a state.
 """
 
 import itertools
@@ -12,79 +13,141 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 
+from jast import distributions as D
+from jast.heads.heads import Moments
 from jast.heads.networks import dense
-from jast.policies.latent import LOG_2PI, log_normal
+from jast.outline import ask, outline
+from jast.pytrees import count
+from jast.simulator import Simulator
 
-__all__ = ["Net", "act", "adam", "descend", "draw", "drawn", "entropy_term", "network", "see"]
+__all__ = [
+    "Networks",
+    "Normalisation",
+    "count_latents",
+    "entropy_term",
+    "init_parameters",
+    "latent_mixture",
+    "make_networks",
+    "network_inputs",
+    "sample_latents",
+]
+
+UNIFORM_WEIGHT = 0.2
+"""Part of the mixture's weights that is spread evenly: a component without weight would learn no
+more.
+"""
 
 
-EVEN = 0.2
-"""Share of the policy's mixture that all components have alike."""
+LOG_2PI = math.log(2 * math.pi)
 
 
-class Net(NamedTuple):
-    """What goes in and out of the networks."""
+def log_normal(
+    z: jax.Array, mean: jax.Array | None = None, deviation: jax.Array | None = None
+) -> jax.Array:
+    """log N(z; mean, deviation^2) [] of ``z`` [n]; of N(0, I) where no mean is given."""
+    if mean is None:
+        return -0.5 * jnp.sum(z**2 + LOG_2PI)
+    return -0.5 * jnp.sum(((z - mean) / deviation) ** 2 + LOG_2PI) - jnp.sum(jnp.log(deviation))
 
-    inputs: Any
-    """`jast.heads.Moments` of the observation."""
-    unit: Any
-    """float32: the distance that an episode comes nearer by, about; times lambda what the critics
-    answer in.
+
+def count_latents(sim: Simulator, function: str) -> tuple[int, int]:
+    """``(n, n0)``: how many numbers x and x0 have. n0 is 0 where the start is fixed, or is not of
+    floats with quantiles; it is then drawn from its own distribution.
+
+    ValueError of ``function``, naming ``disturbance``, where x is not of floats or has no quantile
+    function with an inverse.
+    """
+    like = outline(sim)
+    if not _floats(like.x):
+        kinds = ", ".join(f"{s.dtype}{list(s.shape)}" for s in jax.tree.leaves(like.x)) or "nothing"
+        raise ValueError(f"{function}: disturbance: expected floats, received {kinds}")
+    start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
+    if step is not None:
+        raise ValueError(f"{function}: disturbance: {step}")
+    return count(like.x), count(like.x0) if _floats(like.x0) and start is None else 0
+
+
+def _floats(like: Any) -> bool:
+    return all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(like))
+
+
+class Normalisation(NamedTuple):
+    """What the numbers that go into and out of the networks are divided by."""
+
+    inputs: Moments
+    """Of the observation."""
+    unit: jax.Array
+    """float32: how far an episode typically approaches failure; times lambda, the unit of the
+    critics.
     """
 
 
-def network(n: int, hidden: tuple[int, ...], components: int) -> tuple:
-    """The actor's ``(init, apply)``, for ``n`` latents."""
-    return dense(hidden, (components, 2 * n + 1), "relu", True)
+Networks = tuple[Callable, Callable]
+"""``apply`` of the actor and of the critic."""
 
 
-def drawn(key: jax.Array, shapes: Sequence[Any]) -> list:
-    """Networks' parameters, uniform in +-1/sqrt(fan-in) as `make_head` has them, in one draw: one
-    for each array is much to compile.
+def make_networks(n: int, hidden: tuple[int, ...], components: int) -> tuple[Networks, Networks]:
+    """``(init, init)`` and ``(apply, apply)`` of the actor and the critic, for ``n`` latents."""
+    actor = dense(hidden, (components, 2 * n + 1), "relu", True)
+    return tuple(zip(actor, dense(hidden, (), "relu", True), strict=True))
+
+
+def init_parameters(key: jax.Array, shapes: Sequence[Any]) -> list[Any]:
+    """Parameters of networks of these ``shapes``, uniform in +-1/sqrt(fan-in) as those of
+    `make_head`, by one call of the generator: one for each array takes long to compile.
     """
-    leaves, structure = jax.tree.flatten([params["params"] for params in shapes])
-    fan_in = lambda layer: dict.fromkeys(layer, layer["kernel"].shape[0])
+
+    def fan_in(layer: dict) -> dict:
+        return dict.fromkeys(layer, layer["kernel"].shape[0])
+
+    networks = [params["params"] for params in shapes]
+    leaves, structure = jax.tree.flatten(networks)
     fans = jax.tree.leaves(
-        [{name: fan_in(layer) for name, layer in params["params"].items()} for params in shapes]
+        [{name: fan_in(layer) for name, layer in network.items()} for network in networks]
     )
-    ends = list(itertools.accumulate(math.prod(s.shape) for s in leaves))
+    sizes = [math.prod(s.shape) for s in leaves]
+    ends = list(itertools.accumulate(sizes))
     flat = jax.random.uniform(key, (ends[-1],), jnp.float32, -1, 1)
     drawn = [
-        flat[b - math.prod(s.shape) : b].reshape(s.shape) / math.sqrt(fan)
-        for s, fan, b in zip(leaves, fans, ends, strict=True)
+        flat[end - size : end].reshape(s.shape) / math.sqrt(fan)
+        for s, fan, size, end in zip(leaves, fans, sizes, ends, strict=True)
     ]
     return [{"params": params} for params in structure.unflatten(drawn)]
 
 
-def see(net: Net, horizon: int, seen: jax.Array, t: Any, potential: jax.Array) -> jax.Array:
-    """[m + 2]: the actor's inputs, the observation in its moments, the share of the horizon that is
-    gone (the best policy depends on the time left), and the miss distance as it shapes the reward:
-    the value of a state has its kinks.
+def network_inputs(
+    normalisation: Normalisation, horizon: int, observation: jax.Array, t: Any, potential: jax.Array
+) -> jax.Array:
+    """[m + 2]: the normalised observation [m], the fraction of the horizon that has passed (the
+    best policy depends on the time left), and the miss distance as it shapes the reward, at whose
+    kinks the value of a state has its own.
     """
-    gone = jnp.asarray(t).astype(jnp.float32) / horizon
+    passed = jnp.asarray(t).astype(jnp.float32) / horizon
     return jnp.concatenate(
-        [net.inputs.normalise(seen), jnp.stack([gone - 0.5, potential / net.unit])]
+        [
+            normalisation.inputs.normalise(observation),
+            jnp.stack([passed - 0.5, potential / normalisation.unit]),
+        ]
     )
 
 
-def act(apply: Callable, actor: Any, inputs: jax.Array) -> tuple[jax.Array, ...]:
-    """The policy: a mixture of the latents, its log weights [K], means and deviations [K, n]; a
+def latent_mixture(apply: Callable, actor: Any, inputs: jax.Array) -> tuple[jax.Array, ...]:
+    """The policy, a mixture of the latents: its log weights [K], means and deviations [K, n]; a
     deviation is from e^-2 to e^2.
     """
     out = apply(actor, inputs)
-    n = (out.shape[1] - 1) // 2
-    # no component may die out: it would learn no more, and never come to see its own way
-    weights = (1 - EVEN) * jax.nn.softmax(out[:, 0]) + EVEN / out.shape[0]
+    components, n = out.shape[0], (out.shape[1] - 1) // 2
+    weights = (1 - UNIFORM_WEIGHT) * jax.nn.softmax(out[:, 0]) + UNIFORM_WEIGHT / components
     return (
         jnp.log(weights),
-        out[:, 1 : n + 1] + _apart(out.shape[0], n),
+        out[:, 1 : n + 1] + _initial_means(components, n),
         jnp.exp(2 * jnp.tanh(out[:, n + 1 :] / 2)),
     )
 
 
-def _apart(k: int, n: int) -> jax.Array:
-    """[k, n]: where the components are before anything was learned, on opposite sides, so that each
-    goes its own way.
+def _initial_means(k: int, n: int) -> jax.Array:
+    """[k, n]: means of an untrained policy, on opposite sides, so that each component goes its own
+    way.
     """
     side = np.random.default_rng(0).choice([-1.0, 1.0], size=(1, n))
     if k == 1:
@@ -92,8 +155,8 @@ def _apart(k: int, n: int) -> jax.Array:
     return jnp.asarray(np.linspace(-1, 1, k)[:, None] * side, jnp.float32)
 
 
-def draw(mixture: tuple[jax.Array, ...], noise: jax.Array) -> jax.Array:
-    """Latents [n] of a mixture of `act`, by n + 1 standard normal numbers."""
+def sample_latents(mixture: tuple[jax.Array, ...], noise: jax.Array) -> jax.Array:
+    """Latents [n] of a `latent_mixture`, by n + 1 standard normal numbers."""
     log_w, mean, deviation = mixture
     k = jnp.sum(ndtr(noise[-1]) > jnp.cumsum(jnp.exp(log_w))[:-1], dtype=jnp.int32)
     return mean[k] + deviation[k] * noise[:-1]
@@ -102,21 +165,8 @@ def draw(mixture: tuple[jax.Array, ...], noise: jax.Array) -> jax.Array:
 def entropy_term(
     z: jax.Array, log_w: jax.Array, mean: jax.Array, deviation: jax.Array
 ) -> jax.Array:
-    """log pi(z | s) less the log density of N(0, I) at its mode: so measured, an episode that ends
+    """log pi(z | s) less the log density of N(0, I) at its mode: measured so, an episode that ends
     early neither gains nor loses.
     """
     log_pi = jax.nn.logsumexp(log_w + jax.vmap(log_normal, (None, 0, 0))(z, mean, deviation))
     return log_pi + 0.5 * z.shape[0] * LOG_2PI
-
-
-def adam() -> Any:
-    import optax  # here: it takes a while, and only learning needs it
-
-    return optax.scale_by_adam()
-
-
-def descend(gradient: Any, optimiser: Any, params: Any, rate: Any) -> tuple[Any, Any]:
-    """One step of Adam: ``(params, optimiser)``."""
-    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-        step, optimiser = adam().update(gradient, optimiser)
-    return jax.tree.map(lambda p, u: p - jnp.asarray(rate, p.dtype) * u, params, step), optimiser

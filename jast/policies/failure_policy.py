@@ -4,8 +4,9 @@ its training.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,17 +15,22 @@ from jax.tree_util import Partial
 
 from jast import results
 from jast.distributions.mixtures import Blended
-from jast.heads.heads import observed
-from jast.policies.actor import act, see
+from jast.heads.heads import observation
+from jast.policies.actor import Normalisation, latent_mixture, network_inputs
 from jast.policies.lanes import potential
+from jast.policies.start import Tilt
 from jast.policy import Policy
+from jast.simulator import Simulator
 
-__all__ = ["FailurePolicy", "History"]
+if TYPE_CHECKING:
+    from jast.policies.exploring import Totals
+
+__all__ = ["FailurePolicy", "History", "Learned", "append_row", "assemble", "history_of"]
 
 
 @results.shown()
 class History(NamedTuple):
-    """The training, a row for each stretch of it: [rows] each.
+    """The training, a row for each twentieth of it: [rows] each.
 
     Example:
         >>> import jax, jast
@@ -35,53 +41,57 @@ class History(NamedTuple):
         True
     """
 
-    episodes: Any
+    episodes: np.ndarray
     """Simulated so far, including those of the exploration before the learning."""
-    steps: Any
+    steps: np.ndarray
     """Steps of the simulator so far."""
-    mean_return: Any
-    """Of the stretch's episodes: log p in the latents relative to the mode, -|z|^2 / 2, and lambda
-    (d(s0) - d(s_T)).
+    mean_return: np.ndarray
+    """Of the episodes since the row before: log p in the latents relative to the mode, -|z|^2 / 2,
+    and lambda (d(s0) - d(s_T)).
     """
-    failing_share: Any
-    log_p: Any
+    failing_share: np.ndarray
+    log_p: np.ndarray
     """Mean of -|z|^2 / 2 over its failing episodes; NaN where none failed."""
-    alpha: Any
-    critic_loss: Any
+    alpha: np.ndarray
+    critic_loss: np.ndarray
     """In squares of the unit that the critics answer in."""
-    scale: Any
+    scale: np.ndarray
     """lambda."""
-    invalid: Any
+    invalid: np.ndarray
     """Transitions so far in which a number was not finite: they are left out of the training."""
 
 
-FAILING_SHARE = History._fields.index("failing_share")
-WHOLE = {"episodes": np.int64, "steps": np.int64, "invalid": np.int64}
+COUNTS = ("episodes", "steps", "invalid")
+"""Fields that are whole numbers, and go on from row to row."""
 
 
-def history(rows):
+def history_of(rows: np.ndarray) -> History:
     """The `History` of ``rows`` [n, fields], float64."""
     return History(
-        *(rows[:, i].astype(WHOLE.get(name, np.float64)) for i, name in enumerate(History._fields))
+        *(
+            column.astype(np.int64 if name in COUNTS else np.float64)
+            for name, column in zip(History._fields, rows.T, strict=True)
+        )
     )
 
 
-def row(rows, training, count):
-    """``rows`` and that of a stretch more, by its `Count`."""
-    episodes, steps, invalid = (
-        rows[-1, History._fields.index(name)] if len(rows) else 0 for name in WHOLE
-    )
-    share = lambda a, b: float(a) / float(b) if b else np.nan
+def append_row(rows: np.ndarray, training: Any, totals: Totals) -> np.ndarray:
+    """``rows`` and one more, by the `TrainingState` and its `Totals` since the last row."""
+    last = History(*(rows[-1] if len(rows) else np.zeros(len(History._fields))))
+
+    def ratio(a: Any, b: Any) -> float:
+        return float(a) / float(b) if b else np.nan
+
     new = History(
-        episodes=episodes + count.episodes,
-        steps=steps + count.steps,
-        mean_return=share(count.log_p + float(training.scale) * count.gain, count.whole),
-        failing_share=share(count.failures, count.whole),
-        log_p=share(count.failing_log_p, count.failures),
+        episodes=last.episodes + totals.episodes,
+        steps=last.steps + totals.steps,
+        mean_return=ratio(totals.log_p + float(training.scale) * totals.gain, totals.valid),
+        failing_share=ratio(totals.failures, totals.valid),
+        log_p=ratio(totals.failing_log_p, totals.failures),
         alpha=np.exp(float(training.learner.log_alpha)),
-        critic_loss=share(count.loss, count.updates),
+        critic_loss=ratio(totals.loss, totals.updates),
         scale=float(training.scale),
-        invalid=invalid + count.invalid,
+        invalid=last.invalid + totals.invalid,
     )
     return np.concatenate([rows, np.array([new], np.float64)])
 
@@ -90,15 +100,14 @@ class Learned(NamedTuple):
     """All that was learned, as arrays."""
 
     actor: Any
-    """Parameters: the latents' mixture from what is seen."""
+    """Parameters: the latents' mixture from what is observed; of `q_learning` the `Table`."""
     critic: Any
     """Parameters: of `sac` those of two, stacked in front."""
-    net: Any
-    """`Net`: moments of the observation, unit of the critics."""
-    tilt: Any
-    """`Tilt` of the start, or () where it was not tilted."""
-    alpha: Any
-    scale: Any
+    net: Normalisation
+    tilt: Tilt | tuple[()]
+    """Of the start; () where it was not tilted."""
+    alpha: jax.Array
+    scale: jax.Array
 
 
 @results.result("episodes")
@@ -143,59 +152,58 @@ class FailurePolicy(Policy):
 
     def __str__(self) -> str:
         h, last = self.history, len(self.history.episodes) - 1
-        formats = dict(
-            episodes="9d",
-            mean_return="10.4g",
-            failing_share="8.1%",
-            log_p="9.4g",
-            alpha="7.3f",
-            critic_loss="10.3g",
-            scale="9.4g",
+        columns = (  # field, heading, format
+            ("episodes", "episodes", "9d"),
+            ("mean_return", "return", "10.4g"),
+            ("failing_share", "failing", "8.1%"),
+            ("log_p", "log p", "9.4g"),
+            ("alpha", "alpha", "7.3f"),
+            ("critic_loss", "loss", "10.3g"),
+            ("scale", "lambda", "9.4g"),
         )
-        names = ("episodes", "return", "failing", "log p", "alpha", "loss", "lambda")
-        table = [
-            " ".join(
-                f"{name:>{form.split('.')[0].rstrip('d')}}"
-                for name, form in zip(names, formats.values(), strict=True)
-            )
-        ]
+        table = [" ".join(f"{name:>{form.split('.')[0].rstrip('d')}}" for _, name, form in columns)]
         for i in sorted({*range(0, last, max(1, last // 8)), last}):
-            table.append(
-                " ".join(f"{getattr(h, name)[i].item():{form}}" for name, form in formats.items())
-            )
+            cells = (f"{getattr(h, field)[i].item():{form}}" for field, _, form in columns)
+            table.append(" ".join(cells))
         if h.invalid[-1]:
             table.append(
                 f"{h.invalid[-1]} transitions were not finite and were left out of the training"
             )
         if self.learned.tilt != ():
-            text = lambda a: np.array2string(np.asarray(a), precision=2, suppress_small=True)
-            parts = (
-                f"{w:.2f} N({text(m)}, {text(s)})"
+            components = (
+                f"{w:.2f} N({_text(m)}, {_text(s)})"
                 for w, m, s in zip(*self.learned.tilt, strict=True)
             )
-            table.append("start, mean and deviation of its latents: " + " + ".join(parts))
+            table.append("start, mean and deviation of its latents: " + " + ".join(components))
         return "\n".join(table)
 
 
-def assemble(sim, apply, dense, learned, history):
+def _text(array: Any) -> str:
+    return np.array2string(np.asarray(array), precision=2, suppress_small=True)
+
+
+def assemble(
+    sim: Simulator, apply: Callable, dense_reward: bool, learned: Learned, history: History
+) -> FailurePolicy:
     """The `FailurePolicy` of ``sim`` with what was ``learned``; ``apply``: the actor's function;
-    ``dense``: whether it sees the distance.
+    ``dense_reward``: whether it sees the distance.
     """
     start = sim.start if learned.tilt == () else Partial(_start, sim.start, learned.tilt)
     return FailurePolicy(
         start,
-        Partial(_disturbance, sim, apply, jnp.asarray(dense), learned.actor, learned.net),
+        Partial(_disturbance, sim, apply, jnp.asarray(dense_reward), learned.actor, learned.net),
         learned,
         history,
     )
 
 
 def _start(start, tilt):
-    dist = start()
-    return Blended(dist, *tilt)
+    return Blended(start(), *tilt)
 
 
-def _disturbance(sim, apply, dense, actor, net, state, t):
-    inputs = see(net, sim.horizon, observed(sim, state), t, potential(sim, dense, state))
-    log_w, mean, deviation = act(apply, actor, inputs)
+def _disturbance(sim, apply, dense_reward, actor, normalisation, state, t):
+    inputs = network_inputs(
+        normalisation, sim.horizon, observation(sim, state), t, potential(sim, dense_reward, state)
+    )
+    log_w, mean, deviation = latent_mixture(apply, actor, inputs)
     return Blended(sim.disturbance(state), jnp.exp(log_w), mean, deviation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -10,17 +11,15 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
-from jast.policies import course, settings
-from jast.policies import exploring as E
-from jast.policies import proximal_training as T
-from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
-from jast.policies.lanes import empty
-from jast.policies.latent import sizes
-from jast.policies.proximal import Rates, networks
+from jast.policies import proximal, settings
+from jast.policies.actor import count_latents, make_networks
+from jast.policies.course import Method, train_policy
+from jast.policies.exploring import Config, explore, init_training
+from jast.policies.failure_policy import FailurePolicy
+from jast.policies.lanes import empty_buffer
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -31,12 +30,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ppo"]
 
-LONGEST = 128
-"""Steps of a lane between updates, at most, where nobody says."""
-ITERATIONS, LANES = 150, (8, 64)
-"""Of the lanes, where nobody says: as many as let the policy change this often; their bounds."""
-LOOKED_AT = 100_000
-"""Transitions of the exploration whose moments are taken."""
+MOST_STEPS = 128  # of a lane between updates, where nobody says; a convention
+ITERATIONS = 150  # updates of the policy, for which as many lanes are taken where nobody says
+FEWEST_LANES = 8  # where nobody says; a convention
+MOST_LANES = 64  # where nobody says; a convention
+EXPLORED = 100_000  # transitions of the exploration whose moments are taken; a convention
 
 
 def ppo(
@@ -99,7 +97,7 @@ def ppo(
 
     Returns:
         `FailurePolicy`; its ``history.alpha`` is ``alpha`` and ``critic_loss`` that of V. A
-        KeyboardInterrupt ends the training after its last whole stretch and gives what was learned
+        KeyboardInterrupt ends the training after its last whole chunk and gives what was learned
         by then (it is raised again where there is none).
 
     Raises:
@@ -116,85 +114,58 @@ def ppo(
     """
     random_key("ppo", key)
     contract("ppo", sim, observed=OBSERVED)
-    if settings.auto(steps):
-        steps = min(sim.horizon, LONGEST)
+    if settings.is_auto(steps):
+        steps = min(sim.horizon, MOST_STEPS)
     counts = dict(episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps)
     episodes, batch, epochs, components, steps = (
         whole("ppo", name, value) for name, value in counts.items()
     )
-    if settings.auto(lanes):
-        fewest, most = LANES
-        lanes = min(max(fewest, episodes * sim.horizon // (steps * ITERATIONS)), most)
+    if settings.is_auto(lanes):
+        lanes = episodes * sim.horizon // (steps * ITERATIONS)
+        lanes = min(max(FEWEST_LANES, lanes), MOST_LANES)
     lanes = whole("ppo", "lanes", lanes)
-    plan = settings.plan("ppo", episodes, sim.horizon, lanes, steps)
-    hidden = settings.widths("ppo", hidden)
-    dense = settings.shaped("ppo", shaping, sim)
-    auto_scale = settings.auto(scale)
-    scale = None if auto_scale else settings.positive("ppo", "scale", scale)
-    number = lambda name, value, holds, expected: settings.number(
-        "ppo", name, value, holds, expected
-    )
-    rates = Rates(
-        learning_rate=settings.positive("ppo", "learning_rate", learning_rate),
+    plan = settings.make_plan("ppo", episodes, sim.horizon, lanes, steps)
+    hidden = settings.check_hidden("ppo", hidden)
+    dense_reward = settings.check_shaping("ppo", shaping, sim)
+    number = functools.partial(settings.check_number, "ppo")
+    positive = functools.partial(settings.check_positive, "ppo")
+    rates = proximal.Rates(
+        learning_rate=positive("learning_rate", learning_rate),
         clip=number("clip", clip, lambda v: 0 < v < 1, "above 0 and below 1"),
         trace=number("trace", trace, lambda v: 0 <= v <= 1, "of 0 to 1"),
-        alpha=settings.positive("ppo", "alpha", alpha),
+        alpha=positive("alpha", alpha),
         bonus=number("bonus", bonus, math.isfinite, "that is finite"),
         total=float(plan.total),
     )
-    widen = settings.widening("ppo", widen)
-    n, n0 = sizes(sim, "ppo")
+    n, n0 = count_latents(sim, "ppo")
     (m,) = outline(sim).observation
-    shape, pace = (
-        E.Shape(m, n, n0, hidden, components, dense, lanes, batch, max(LOOKED_AT, lanes)),
-        (steps, epochs),
-    )
-    about = dict(
-        sim=sim,
-        shape=shape,
-        steps=steps,
-        epochs=epochs,
-        plan=plan,
-        rates=rates,
-        scale=scale,
-        widen=widen,
-    )
+    learning = dict(hidden=hidden, components=components, dense_reward=dense_reward, batch=batch)
+    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(EXPLORED, lanes), **learning)
+    _, networks = make_networks(n, hidden, components)
+    act, criticise = networks
+    traced = jax.tree.map(jnp.float32, rates)
 
-    for_first, for_steps, for_start = jax.random.split(key, 3)
-    applies = tuple(apply for _, apply in networks(n, hidden, components))
-    rates = jax.tree.map(jnp.float32, rates)
-    begin = lambda: T.first(for_first, sim, shape, rates.alpha)
-    like, between = jax.eval_shape(begin), jax.eval_shape(lambda: empty(steps * lanes, m, n))
-    held = f"{steps} steps of {lanes} lanes between updates, and the networks"
-    require("ppo", 2 * (size(like) + size(between)), held, "use fewer lanes or steps")
-    look = lambda training, steps: E.look(for_steps, sim, shape, applies[0], training, steps)
-    run = lambda training, n: jax.block_until_ready(
-        T.stretch(for_steps, sim, shape, pace, applies, rates, training, n // steps)
-    )
+    def begin(key):
+        return init_training(key, sim, config, proximal.init_learner, traced.alpha)
 
-    def first():
-        training, rows = course.look(begin(), look, plan, sim.horizon, scale, widen)
-        return training._replace(buffer=()), rows
-
-    with stored("ppo", checkpoint, key, **about) as store:
-        training, rows = course.learn(
-            "ppo",
-            first,
-            run,
-            plan,
-            auto_scale=auto_scale,
-            progress=progress,
-            callback=callback,
-            store=store,
-            like=like._replace(buffer=()),
+    def learn(key, training, n):
+        return proximal.train(
+            key, sim, config, steps, epochs, networks, traced, training, n // steps
         )
-    tilt = T.tilt(for_start, sim, shape, applies[1], training, rates.bonus) if n0 else ()
-    learned = Learned(
-        training.learner.actor,
-        training.learner.critic,
-        training.net,
-        tilt,
-        rates.alpha,
-        training.scale,
+
+    needed = jax.eval_shape(begin, key), jax.eval_shape(lambda: empty_buffer(steps * lanes, m, n))
+    held = f"{steps} steps of {lanes} lanes between updates, and the networks"
+    require("ppo", 2 * sum(map(size, needed)), held, "use fewer lanes or steps")
+    method = Method(
+        function="ppo",
+        actor=act,
+        begin=begin,
+        explore=lambda key, *args: explore(key, sim, config, act, *args),
+        learn=learn,
+        learned=lambda training: (training.learner.actor, training.learner.critic, traced.alpha),
+        start_value=proximal.start_value(criticise),
+        bonus=bonus,
     )
-    return assemble(sim, applies[0], dense, learned, history(rows[1:]))
+    course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
+    about = dict(steps=steps, epochs=epochs, rates=rates)
+    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)

@@ -4,24 +4,24 @@ learner that Lipkis and Agogino (NASA) name beside soft actor-critic.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
 from jast.contract import OBSERVED, contract
 from jast.memory import require
 from jast.outline import outline
-from jast.policies import course, settings
-from jast.policies import exploring as E
-from jast.policies import tabular as T
-from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
-from jast.policies.latent import sizes
+from jast.policies import settings, tabular
+from jast.policies.actor import count_latents
+from jast.policies.course import Method, train_policy
+from jast.policies.exploring import Config, explore
+from jast.policies.failure_policy import FailurePolicy
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["q_learning"]
 
-LOOKED_AT = 100_000
-"""Transitions of the exploration that the ranges are taken of."""
+EXPLORED = 100_000  # transitions of the exploration that the ranges are taken of; a convention
 
 
 def q_learning(
@@ -96,7 +95,7 @@ def q_learning(
     Returns:
         `FailurePolicy`; its ``history.alpha`` is 0 and ``critic_loss`` the mean square of the
         table's errors. Its start is a mixture fitted to p(x0) exp(V(s0)), V the best of a row. A
-        KeyboardInterrupt ends the training after its last whole stretch and gives what was learned
+        KeyboardInterrupt ends the training after its last whole chunk and gives what was learned
         by then (it is raised again where there is none). `jast.save` does not take it.
 
     Raises:
@@ -117,75 +116,44 @@ def q_learning(
     counts = dict(episodes=episodes, lanes=lanes)
     episodes, lanes = (whole("q_learning", name, value) for name, value in counts.items())
     values = whole("q_learning", "values", values, 2)
-    plan = settings.plan("q_learning", episodes, sim.horizon, lanes)
-    auto_scale = settings.auto(scale)
-    scale = None if auto_scale else settings.positive("q_learning", "scale", scale)
-    number = lambda name, value, holds, expected: settings.number(
-        "q_learning", name, value, holds, expected
-    )
-    rates = T.Rates(
+    plan = settings.make_plan("q_learning", episodes, sim.horizon, lanes)
+    number = functools.partial(settings.check_number, "q_learning")
+    rates = tabular.Rates(
         learning_rate=number(
             "learning_rate", learning_rate, lambda v: 0 < v <= 1, "above 0 and at most 1"
         ),
         epsilon=number("epsilon", epsilon, lambda v: 0 <= v <= 1, "of 0 to 1"),
         total=float(plan.total),
     )
-    reach = settings.positive("q_learning", "reach", reach)
-    widen = settings.widening("q_learning", widen)
-    n, n0 = sizes(sim, "q_learning")
+    reach = settings.check_positive("q_learning", "reach", reach)
+    n, n0 = count_latents(sim, "q_learning")
     (m,) = outline(sim).observation
     ranges = _ranges(ranges, m)
     cell, rows = _cells(cells, cell, m, sim.horizon)
     kept = f"a table of {rows} cells and {values}^{n} values of the disturbance"
     require("q_learning", 8 * rows * values**n, kept, "use fewer cells or values")
-    shape = E.Shape(m, n, n0, (), 1, False, lanes, 0, max(LOOKED_AT, lanes))
-    about = dict(
-        sim=sim,
-        shape=shape,
-        plan=plan,
-        rates=rates,
-        cell=cell,
-        rows=rows,
-        ranges=ranges,
-        values=values,
-        reach=reach,
-        scale=scale,
-        widen=widen,
+    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(EXPLORED, lanes))
+    actor = tabular.greedy_actor(cell, sim.horizon)
+    traced = jax.tree.map(jnp.float32, rates)
+    actions = tabular.action_grid(n, values, reach)
+    method = Method(
+        function="q_learning",
+        actor=actor,
+        begin=lambda key: tabular.begin_table_training(key, sim, config, rows, actions),
+        explore=lambda key, *args: explore(key, sim, config, actor, *args),
+        learn=lambda key, *args: tabular.train(key, sim, config, cell, traced, *args),
+        learned=lambda training: (training.learner.actor, (), jnp.zeros(())),
+        start_value=tabular.start_value(cell, sim.horizon),
+        explored=lambda training: tabular.set_ranges(training, ranges),
     )
-
-    for_first, for_steps, for_start = jax.random.split(key, 3)
-    rates = jax.tree.map(jnp.float32, rates)
-    apply = T.lookup(cell, sim.horizon)
-    begin = lambda: T.first(for_first, sim, shape, rows, T.actions(n, values, reach))
-    look = lambda training, steps: E.look(for_steps, sim, shape, apply, training, steps)
-    run = lambda training, steps: jax.block_until_ready(
-        T.stretch(for_steps, sim, shape, cell, rates, training, steps)
-    )
-
-    def first():
-        training, curve = course.look(begin(), look, plan, sim.horizon, scale, widen)
-        return T.spread(training, ranges), curve
-
-    with stored("q_learning", checkpoint, key, **about) as store:
-        training, curve = course.learn(
-            "q_learning",
-            first,
-            run,
-            plan,
-            auto_scale=auto_scale,
-            progress=progress,
-            callback=callback,
-            store=store,
-            like=jax.eval_shape(begin)._replace(buffer=()),
-        )
-    tilt = T.tilt(for_start, sim, shape, cell, training) if n0 else ()
-    learned = Learned(training.learner.actor, (), training.net, tilt, jnp.zeros(()), training.scale)
-    return assemble(sim, apply, False, learned, history(curve[1:]))
+    course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
+    about = dict(rates=rates, cell=cell, rows=rows, ranges=ranges, values=values, reach=reach)
+    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)
 
 
-def _ranges(ranges, m):
+def _ranges(ranges: Any, m: int) -> np.ndarray | None:
     """[m, 2], or None for "auto"."""
-    if settings.auto(ranges):
+    if settings.is_auto(ranges):
         return None
     try:
         known = np.asarray(ranges, np.float64)
@@ -201,7 +169,9 @@ def _ranges(ranges, m):
     return known
 
 
-def _cells(cells, cell, m, horizon):
+def _cells(
+    cells: int | Sequence[int], cell: Callable | None, m: int, horizon: int
+) -> tuple[Callable[..., jax.Array], int]:
     """The function of a cell, and how many there are."""
     if cell is None:
         several = isinstance(cells, Sequence) and not isinstance(cells, str)
@@ -211,11 +181,11 @@ def _cells(cells, cell, m, horizon):
                 f"q_learning: cells must be a whole number or {m} of them, one for each number"
                 f" observed, received {cells!r}"
             )
-        return T.grid(each), horizon * math.prod(each)
+        return tabular.grid_cell(each), horizon * math.prod(each)
     cells = whole("q_learning", "cells", cells)
     like = jax.eval_shape(cell, *(jax.ShapeDtypeStruct(*s) for s in (((m,), "f4"), ((), "i4"))))
     if not (getattr(like, "shape", None) == () and jnp.issubdtype(like.dtype, np.integer)):
         raise ValueError(
             f"q_learning: cell must return one whole number, the number of a cell, received {like}"
         )
-    return T.given(cell, cells), cells
+    return tabular.user_cell(cell, cells), cells

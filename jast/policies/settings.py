@@ -1,4 +1,4 @@
-"""Settings that the learners of failures share, checked, and the course of a training by them."""
+"""Settings that the learners of failures share, checked, and how a training is divided by them."""
 
 import math
 from collections.abc import Callable
@@ -9,48 +9,62 @@ from jast._jax import is_traced
 from jast.incidents import hosted
 from jast.simulator import Simulator
 
-__all__ = ["Plan", "auto", "number", "plan", "positive", "shaped", "widening", "widths"]
+__all__ = [
+    "Plan",
+    "check_hidden",
+    "check_number",
+    "check_positive",
+    "check_scale",
+    "check_shaping",
+    "check_widen",
+    "is_auto",
+    "make_plan",
+]
 
-STRETCHES = 20
-NOMINAL, AROUND = 0.03, 0.05
-"""Shares of the steps: of the model itself and of the exploration, before the learning."""
+CHUNKS = 20  # of the learning, between which it is watched and kept; a convention
+NOMINAL = 0.03  # fraction of the steps that are of the model itself
+EXPLORATION = 0.05  # fraction around the model, before the learning
+LEAST_EPISODES = 4  # of each lane
 
 
 class Plan(NamedTuple):
-    """Steps of all lanes: int each."""
+    """Steps of all lanes in each part of a training."""
 
     nominal: int
-    around: int
+    exploration: int
     learning: int
-    stretch: int
+    chunk: int
+    """Steps of the learning between two rows of the history."""
 
     @property
     def total(self) -> int:
-        return self.nominal + self.around + self.learning
+        return self.nominal + self.exploration + self.learning
 
 
-def plan(function: str, episodes: int, horizon: int, lanes: int, piece: int = 1) -> Plan:
-    """The `Plan` of ``episodes`` of full length; what is learned by, in ``piece`` steps at once.
+def make_plan(function: str, episodes: int, horizon: int, lanes: int, multiple: int = 1) -> Plan:
+    """The `Plan` of ``episodes`` of full length; what is learned by, in a ``multiple`` of steps.
 
     Raises:
         ValueError: for fewer than 4 episodes a lane.
     """
-    if episodes < 4 * lanes:
+    if episodes < LEAST_EPISODES * lanes:
         raise ValueError(
-            f"{function}: episodes must be at least 4 for each lane, {4 * lanes}, received"
-            f" {episodes}"
+            f"{function}: episodes must be at least {LEAST_EPISODES} for each lane,"
+            f" {LEAST_EPISODES * lanes}, received {episodes}"
         )
     steps = -(-episodes * horizon // lanes)
-    nominal, around = (max(horizon, int(share * steps)) for share in (NOMINAL, AROUND))
-    pieces = -(-(steps - nominal - around) // piece)
-    return Plan(nominal, around, piece * pieces, piece * -(-pieces // STRETCHES))
+    nominal, exploration = (
+        max(horizon, int(fraction * steps)) for fraction in (NOMINAL, EXPLORATION)
+    )
+    pieces = -(-(steps - nominal - exploration) // multiple)
+    return Plan(nominal, exploration, multiple * pieces, multiple * -(-pieces // CHUNKS))
 
 
-def auto(setting: Any) -> bool:
+def is_auto(setting: Any) -> bool:
     return isinstance(setting, str) and setting == "auto"
 
 
-def number(
+def check_number(
     function: str, name: str, value: Any, holds: Callable[[float], bool], expected: str
 ) -> float:
     """``value`` as a float for which ``holds``, and that is not traced."""
@@ -63,19 +77,24 @@ def number(
     return float(value)
 
 
-def positive(function: str, name: str, value: Any) -> float:
+def check_positive(function: str, name: str, value: Any) -> float:
     """``value`` as a finite float above 0."""
-    return number(function, name, value, lambda v: 0 < v < math.inf, "above 0")
+    return check_number(function, name, value, lambda v: 0 < v < math.inf, "above 0")
 
 
-def widening(function: str, widen: Any) -> float | None:
+def check_scale(function: str, scale: Any) -> float | None:
+    """``scale`` as a float above 0, None for "auto"."""
+    return None if is_auto(scale) else check_positive(function, "scale", scale)
+
+
+def check_widen(function: str, widen: Any) -> float | None:
     """``widen`` as a float of at least 1, None for "auto"."""
-    if auto(widen):
+    if is_auto(widen):
         return None
-    return number(function, "widen", widen, lambda v: 1 <= v < math.inf, "of at least 1")
+    return check_number(function, "widen", widen, lambda v: 1 <= v < math.inf, "of at least 1")
 
 
-def widths(function: str, hidden: Any) -> tuple[int, ...]:
+def check_hidden(function: str, hidden: Any) -> tuple[int, ...]:
     """``hidden`` as widths of layers."""
     if not isinstance(hidden, tuple | list) or not hidden:
         raise ValueError(
@@ -84,7 +103,7 @@ def widths(function: str, hidden: Any) -> tuple[int, ...]:
     return tuple(whole(function, "hidden", width) for width in hidden)
 
 
-def shaped(function: str, shaping: Any, sim: Simulator) -> bool:
+def check_shaping(function: str, shaping: Any, sim: Simulator) -> bool:
     """Whether the distance counts at every state."""
     if shaping not in ("auto", "steps", "end"):
         raise ValueError(

@@ -4,6 +4,7 @@ arXiv:1812.05905).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -12,16 +13,14 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
-from jast.policies import course, settings
-from jast.policies import training as T
-from jast.policies.exploring import Shape
-from jast.policies.failure_policy import FailurePolicy, Learned, assemble, history
-from jast.policies.latent import sizes
-from jast.policies.learner import Rates, networks
+from jast.policies import learner, settings
+from jast.policies.actor import count_latents, make_networks
+from jast.policies.course import Method, train_policy
+from jast.policies.exploring import Config, init_training
+from jast.policies.failure_policy import FailurePolicy
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -32,9 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["sac"]
 
-UPDATES = 5000
-ALONE = 0.1
-"""Share of the learning of the critics alone."""
+UPDATES = 5000  # in all, where nobody says; a convention
+CRITICS_ALONE = 0.1  # fraction of the learning in which the actor does not learn yet
 
 
 def sac(
@@ -111,12 +109,12 @@ def sac(
         progress: whether to show a progress bar.
         callback: called twenty times as ``callback(done, total, history)``, with the steps of all
             lanes and the `History` so far.
-        checkpoint: a folder that keeps where the training stands after each stretch. The same call
+        checkpoint: a folder that keeps where the training stands after each chunk. The same call
             then goes on from there, to the same bits (docs/scale.md).
 
     Returns:
         `FailurePolicy`. A KeyboardInterrupt or SIGTERM ends the training after its last whole
-        stretch and gives what was learned by then (it is raised again where there is none).
+        chunk and gives what was learned by then (it is raised again where there is none).
 
     Raises:
         ValueError: for settings out of range, a simulator that breaks its contract, a disturbance
@@ -136,82 +134,56 @@ def sac(
     episodes, lanes, batch, buffer, components = (
         whole("sac", name, value) for name, value in counts.items()
     )
-    plan = settings.plan("sac", episodes, sim.horizon, lanes)
-    hidden = settings.widths("sac", hidden)
-    dense = settings.shaped("sac", shaping, sim)
-    auto_scale, auto_alpha = settings.auto(scale), settings.auto(alpha)
-    scale = None if auto_scale else settings.positive("sac", "scale", scale)
-    number = lambda name, value, holds, expected: settings.number(
-        "sac", name, value, holds, expected
-    )
-    rates = Rates(
-        learning_rate=settings.positive("sac", "learning_rate", learning_rate),
+    plan = settings.make_plan("sac", episodes, sim.horizon, lanes)
+    hidden = settings.check_hidden("sac", hidden)
+    dense_reward = settings.check_shaping("sac", shaping, sim)
+    auto_alpha = settings.is_auto(alpha)
+    number = functools.partial(settings.check_number, "sac")
+    positive = functools.partial(settings.check_positive, "sac")
+    rates = learner.Rates(
+        learning_rate=positive("learning_rate", learning_rate),
         polyak=number("polyak", polyak, lambda v: 0 < v <= 1, "above 0 and at most 1"),
-        alpha=1.0 if auto_alpha else settings.positive("sac", "alpha", alpha),
+        alpha=1.0 if auto_alpha else positive("alpha", alpha),
         entropy=number("entropy", entropy, math.isfinite, "that is finite"),
         bonus=number("bonus", bonus, math.isfinite, "that is finite"),
         adapt=float(auto_alpha),
+        acts=float(plan.nominal + plan.exploration + int(CRITICS_ALONE * plan.learning)),
+        total=float(plan.total),
     )
-    widen = settings.widening("sac", widen)
-    if settings.auto(updates):
+    if settings.is_auto(updates):
         updates = -(-UPDATES // plan.learning)
     updates = whole("sac", "updates", updates)
-    n, n0 = sizes(sim, "sac")
+    n, n0 = count_latents(sim, "sac")
     (m,) = outline(sim).observation
-    shape = Shape(m, n, n0, hidden, components, dense, lanes, batch, max(buffer, lanes))
-    about = dict(
-        sim=sim,
-        shape=shape,
-        plan=plan,
-        updates=updates,
-        rates=rates,
-        scale=scale,
-        widen=widen,
-    )
+    learning = dict(hidden=hidden, components=components, dense_reward=dense_reward, batch=batch)
+    config = Config(m=m, n=n, n0=n0, lanes=lanes, capacity=max(buffer, lanes), **learning)
+    _, networks = make_networks(n, hidden, components)
+    traced = jax.tree.map(jnp.float32, rates)
 
-    for_first, for_steps, for_start = jax.random.split(key, 3)
-    applies = tuple(apply for _, apply in networks(m, n, hidden, components))
-    rates = jax.tree.map(jnp.float32, rates)
-    acts = plan.nominal + plan.around + int(ALONE * plan.learning)
-    phase = T.Phase(jnp.int32(0), jnp.int32(acts), jnp.float32(plan.total))
-    begin = lambda: T.first(for_first, sim, shape, rates.alpha)
-    like = jax.eval_shape(begin)
-    kept = f"a buffer of {shape.capacity} steps and the networks"
-    require("sac", 2 * size(like), kept, "use a smaller buffer")
-    run = lambda updates: (
-        lambda training, steps: jax.block_until_ready(
-            T.stretch(
-                for_steps,
-                sim,
-                shape,
-                applies,
-                rates,
-                training,
-                phase._replace(updates=jnp.int32(updates)),
-                steps,
-            )
-        )
+    def begin(key):
+        return init_training(key, sim, config, learner.init_learner, traced.alpha)
+
+    def learn(key, training, steps, updates=updates):
+        count = jnp.int32(updates)
+        return learner.train(key, sim, config, networks, traced, training, count, steps)
+
+    kept = f"a buffer of {config.capacity} steps and the networks"
+    require("sac", 2 * size(jax.eval_shape(begin, key)), kept, "use a smaller buffer")
+    method = Method(
+        function="sac",
+        actor=networks[0],
+        begin=begin,
+        explore=functools.partial(learn, updates=0),
+        learn=learn,
+        learned=lambda training: (
+            training.learner.average,
+            training.learner.target,
+            jnp.exp(training.learner.log_alpha),
+        ),
+        start_value=learner.start_value(networks, n),
+        bonus=bonus,
+        keeps_buffer=True,
     )
-    look = lambda: course.look(begin(), run(0), plan, sim.horizon, scale, widen)
-    with stored("sac", checkpoint, key, **about) as store:
-        training, rows = course.learn(
-            "sac",
-            look,
-            run(updates),
-            plan,
-            auto_scale=auto_scale,
-            progress=progress,
-            callback=callback,
-            store=store,
-            like=like,
-        )
-    tilt = T.tilt(for_start, sim, shape, applies, training, rates.bonus) if n0 else ()
-    learned = Learned(
-        training.learner.average,
-        training.learner.target,
-        training.net,
-        tilt,
-        jnp.exp(training.learner.log_alpha),
-        training.scale,
-    )
-    return assemble(sim, applies[0], dense, learned, history(rows[1:]))
+    course = dict(scale=scale, widen=widen, progress=progress, callback=callback)
+    about = dict(updates=updates, rates=rates)
+    return train_policy(key, sim, method, config, plan, about, checkpoint=checkpoint, **course)

@@ -17,10 +17,9 @@ from jast.contract import OBSERVED, contract
 from jast.heads.heads import Moments
 from jast.outline import outline
 from jast.policies import proximal
-from jast.policies.actor import Net, network
+from jast.policies.actor import Normalisation, count_latents, make_networks
 from jast.policies.failure_policy import FailurePolicy, History, Learned, assemble
-from jast.policies.latent import sizes
-from jast.policies.learner import learner
+from jast.policies.learner import init_learner
 from jast.policies.start import Tilt
 from jast.policies.tabular import Table
 from jast.simulator import Simulator
@@ -88,15 +87,15 @@ def parts(policy: FailurePolicy) -> tuple[dict, dict[str, np.ndarray]]:
         raise ValueError("save: a policy of q_learning has no file: learn it again, with its key")
     layers = learned.actor["params"]
     widths = [int(layers[f"Dense_{i}"]["bias"].shape[0]) for i in range(len(layers))]
-    sim, _, dense = policy.disturbance.args[:3]
-    n, _ = sizes(sim, "load")
+    sim, _, dense_reward = policy.disturbance.args[:3]
+    n, _ = count_latents(sim, "load")
     components = widths[-1] // (2 * n + 1)
     header = dict(
         hidden=widths[:-1],
         components=components,
         horizon=sim.horizon,
         tilted=learned.tilt != (),
-        dense=bool(dense),
+        dense=bool(dense_reward),
         # two critics of state and action, stacked in front, or one of the state
         critics=2 if learned.critic["params"]["Dense_0"]["bias"].ndim == 2 else 1,
     )
@@ -120,7 +119,7 @@ def whole(
             f"load: {path} does not fit sim: its horizon is {header['horizon']}, expected"
             f" {sim.horizon}"
         )
-    n, n0 = sizes(sim, "load")
+    n, n0 = count_latents(sim, "load")
     if header["tilted"] != bool(n0):
         raise ValueError(
             f"load: {path} does not fit sim: it holds {'a' if header['tilted'] else 'no'} learned"
@@ -128,27 +127,25 @@ def whole(
         )
     (m,) = outline(sim).observation
     hidden, components = tuple(header["hidden"]), header["components"]
-    teach = proximal.learner if header.get("critics") == 1 else learner
-    new = jax.eval_shape(lambda: teach(jax.random.key(0), m, n, hidden, components, jnp.float32(1)))
-    number, vector = (jax.ShapeDtypeStruct(s, jnp.float32) for s in ((), (m,)))
+    init = proximal.init_learner if header.get("critics") == 1 else init_learner
+    new = jax.eval_shape(lambda: init(jax.random.key(0), m, n, hidden, components, jnp.float32(1)))
+
+    def floats(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, jnp.float32)
+
     k = len(arrays["tilt.0"]) if n0 else 0
-    tilt = (
-        Tilt(*(jax.ShapeDtypeStruct(s, jnp.float32) for s in ((k,), (k, n0), (k, n0))))
-        if n0
-        else ()
-    )
     like = Learned(
-        new.actor, new.critic, Net(Moments(number, vector, vector), number), tilt, number, number
+        actor=new.actor,
+        critic=new.critic,
+        net=Normalisation(Moments(floats(), floats(m), floats(m)), floats()),
+        tilt=Tilt(floats(k), floats(k, n0), floats(k, n0)) if n0 else (),
+        alpha=floats(),
+        scale=floats(),
     )
     learned = Learned(*(_part(path, name, arrays, part) for name, part in like._asdict().items()))
-    _, act = network(n, hidden, components)
-    return assemble(
-        sim,
-        act,
-        header["dense"],
-        learned,
-        History(*(np.asarray(a) for a in arrays_of(arrays, "history"))),
-    )
+    _, (apply, _) = make_networks(n, hidden, components)
+    history = History(*(np.asarray(a) for a in arrays_of(arrays, "history")))
+    return assemble(sim, apply, header["dense"], learned, history)
 
 
 def _part(path, name, arrays, like):

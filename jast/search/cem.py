@@ -305,7 +305,7 @@ def _propose(keys, sim, real, plan, pool, proposals):
 
     def rows(part):
         if plan.kinds[part] == "latent":
-            return jax.vmap(lambda k: sequences.noise(k, proposals[part], int(start) * part))(keys)
+            return jax.vmap(lambda k: sequences.sample(k, proposals[part], int(start) * part))(keys)
         return jax.vmap(lambda k: P.copies(k, *parents[part], real.fresh, part))(keys)
 
     return rows(0) if start else (), rows(1)
@@ -350,7 +350,7 @@ def _nothing(sim, plan, trees, k, width, around=()):
         for kind, like in zip(plan.kinds, likes, strict=True)
     ]
     proposals = tuple(
-        sequences.standard(like, steps, width) if use else ()
+        sequences.standard_normal(like, steps, width) if use else ()
         for use, like, steps in zip(latent, likes, (1, sim.horizon), strict=True)
     )
     if around:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import actions as choices
-from jast.cross_entropy.sequences import place
+from jast.cross_entropy.sequences import disturbance_at
 from jast.failures import Failures
 from jast.limit_state import latents
 from jast.outline import outline
@@ -54,7 +54,7 @@ def drawer(kind, actions, anew):
     """
 
     def latent(key, z, dist):
-        return place(actions, dist, z)
+        return disturbance_at(actions, dist, z)
 
     def copied(key, row, dist):
         value, use = row

@@ -2,28 +2,32 @@
 think of every input, in one program.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["folds", "fit", "gradient", "held_out"]
+__all__ = ["failure_gradient", "fit", "folds", "held_out_probability"]
 
-HIDDEN, BATCH, ROWS, RATE = 32, 256, 1024, 3e-3
-STEPS = (300, 1500)  # least and most
+HIDDEN = 32  # units of a member's one hidden layer; a convention
+BATCH = 256  # inputs of a step, fewer where there are few inputs; a convention
+RATE = 3e-3  # of Adam, falling to 0; a convention
+LEAST_STEPS = 300  # of Adam, however few the inputs; a convention
+MOST_STEPS = 1500  # however many: time
+ROWS = 1024  # inputs judged at once: all logits of many classes would not fit into memory
 
 
 class Committee(NamedTuple):
     """Weights of M networks, d inputs, ReLU, k classes."""
 
-    first: Any
+    first: np.ndarray
     """[d, M, h] float32"""
-    first_bias: Any
+    first_bias: np.ndarray
     """[M, h]"""
-    second: Any
+    second: np.ndarray
     """[M, h, k]"""
-    second_bias: Any
+    second_bias: np.ndarray
     """[M, k]"""
 
 
@@ -43,29 +47,33 @@ def fit(rng, x, targets, weights, classes, passes):
     by Adam.
 
     All members see the same minibatches, so that their first layers are one matrix product.
-    ``passes``: over the inputs, as long as these are 300 to 1500 steps.
+    ``passes``: over the inputs, within 300 to 1500 steps.
     """
     members, (n, d) = len(weights), x.shape
     # few inputs: small batches, so that they are not passed over too often
     batch = min(BATCH, max(n // 8, min(n, 16)))
-    steps = max(STEPS[0], min(passes * n // batch, STEPS[1]))
+    steps = max(LEAST_STEPS, min(passes * n // batch, MOST_STEPS))
+    epochs = -(-steps // (n // batch))
     order = np.concatenate(
-        [
-            rng.permutation(n)[: n // batch * batch].reshape(-1, batch)
-            for _ in range(-(-steps // (n // batch)))
-        ]
+        [rng.permutation(n)[: n // batch * batch].reshape(-1, batch) for _ in range(epochs)]
     )[:steps].astype(np.int32)
-    normal = lambda *shape: rng.standard_normal(shape, np.float32)
+    first, second = (
+        rng.standard_normal(shape, np.float32) * np.float32(scale)
+        for shape, scale in (
+            ((d, members, HIDDEN), np.sqrt(2 / d)),
+            ((members, HIDDEN, classes), np.sqrt(1 / HIDDEN)),
+        )
+    )
     start = Committee(
-        normal(d, members, HIDDEN) * np.float32(np.sqrt(2 / d)),
+        first,
         np.zeros((members, HIDDEN), np.float32),
-        normal(members, HIDDEN, classes) * np.float32(np.sqrt(1 / HIDDEN)),
+        second,
         np.zeros((members, classes), np.float32),
     )
     return _fit(start, x, targets.astype(np.int32), weights.astype(np.float32), order)
 
 
-def held_out(committee, x, labels, learn):
+def held_out_probability(committee, x, labels, learn):
     """[n]: the mean probability that members who have not learned from an input (``learn`` [M, n]
     bool) give to its label.
     """
@@ -82,7 +90,6 @@ def _label_log_probs(committee, x, labels):
         with jax.numpy_rank_promotion("allow"):
             return jax.nn.log_softmax(logits(committee, row[0]))[:, row[1]]
 
-    # in blocks: all logits of many classes would not fit
     return jax.lax.map(one, (x, labels), batch_size=ROWS)
 
 
@@ -93,7 +100,7 @@ def logits(committee, x):
 
 
 @jax.jit
-def gradient(committee, x, labels):
+def failure_gradient(committee, x, labels):
     """[m, d]: the gradient at each row of ``x`` of the log odds that its label is not what the
     committee says.
     """

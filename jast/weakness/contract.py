@@ -24,11 +24,11 @@ class Seen(NamedTuple):
         ([True, False, True], [False, False, True])
     """
 
-    order: Any
+    order: np.ndarray
     """[calls] int: the inputs it was run on, in order"""
-    predicted: Any
+    predicted: np.ndarray
     """[n] int32: its answers, -1 where it was not run"""
-    labels: Any
+    labels: np.ndarray
     """[n] int32: the true classes"""
 
     @property
@@ -53,11 +53,11 @@ class Step(NamedTuple):
         0
     """
 
-    memory: dict[str, Any]
+    memory: dict[str, np.ndarray]
     """Arrays by name: what the next iteration needs of this one"""
-    scores: Any
+    scores: np.ndarray
     """[n] in [0, 1]: how suspect each input is"""
-    candidates: Any
+    candidates: np.ndarray
     """[k] int: the inputs that it ran because it held them for failures; their share of failures is
     the iteration's precision
     """
@@ -83,9 +83,9 @@ class Selector(NamedTuple):
     name: str
     settings: dict[str, Any]
     """Plain numbers and texts: a state of other settings is refused"""
-    start: Callable[..., Any]
+    start: Callable[..., dict[str, np.ndarray]]
     """``start(key, data) -> memory``, before any call"""
-    step: Callable[..., Any]
+    step: Callable[..., Step | None]
     """``step(key, data, memory, seen, ask) -> Step``, or None when there is nothing left to do.
     ``ask(indices)`` runs the system on those of ``indices`` that were not run yet, as far as the
     budget goes, and returns the new `Seen`.

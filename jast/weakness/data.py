@@ -9,7 +9,7 @@ import hashlib
 import math
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,13 +19,23 @@ from jast.weakness.result import Result
 if TYPE_CHECKING:
     from jast.typing import PathLike
 
-__all__ = ["Data", "arrays", "digits", "from_idx", "idx"]
+__all__ = [
+    "Data",
+    "are_indices",
+    "check_data",
+    "data_of_result",
+    "digits",
+    "fingerprint",
+    "from_idx",
+    "idx",
+]
 
 # of IDX files, which are big-endian
 TYPES = {0x08: "u1", 0x09: "i1", 0x0B: "i2", 0x0C: "i4", 0x0D: "f4", 0x0E: "f8"}
 
 
-LARGEST, MOST = 1e30, 65_536  # number among the inputs; classes
+LARGEST = 1e30  # among the inputs: squares of larger ones overflow float32 networks
+MOST_CLASSES = 65_536  # the committee has an output for each
 
 
 class Data(NamedTuple):
@@ -38,9 +48,9 @@ class Data(NamedTuple):
         True
     """
 
-    inputs: Any
+    inputs: np.ndarray
     """[n, ...]: n inputs of one shape, as the user's ``predict`` takes them"""
-    labels: Any
+    labels: np.ndarray
     """[n] int32: the true class of each, in 0 ... classes - 1"""
     classes: int
 
@@ -56,7 +66,7 @@ class Data(NamedTuple):
         return self.inputs.ndim > 2
 
 
-def arrays(function, inputs, labels, classes=None):
+def check_data(function, inputs, labels, classes=None):
     """A `Data` of ``inputs`` [n, ...] and ``labels`` [n]. ``classes``: how many there are; default:
     the largest label and 1.
 
@@ -94,10 +104,10 @@ def arrays(function, inputs, labels, classes=None):
     classes = (
         max(int(labels.max()) + 1, 2) if classes is None else whole(function, "classes", classes, 2)
     )
-    if classes > MOST:
+    if classes > MOST_CLASSES:
         raise ValueError(
-            f"{function}: there may be {MOST} classes, received {classes}; np.unique(labels,"
-            " return_inverse=True)[1] leaves no gaps"
+            f"{function}: there may be {MOST_CLASSES} classes, received {classes};"
+            " np.unique(labels, return_inverse=True)[1] leaves no gaps"
         )
     bad = np.flatnonzero((labels < 0) | (labels >= classes))
     if len(bad):
@@ -108,18 +118,18 @@ def arrays(function, inputs, labels, classes=None):
     return Data(inputs, labels.astype(np.int32), classes)
 
 
-def within(at, n):
+def are_indices(at, n):
     """Whether all of the array ``at`` are numbers of inputs, 0 ... ``n`` - 1."""
     return not at.size or bool(at.dtype.kind in "iu" and at.min() >= 0 and at.max() < n)
 
 
-def of_result(function, result, inputs, labels, classes=None):
+def data_of_result(function, result, inputs, labels, classes=None):
     """The `Data` of a ``result``; ValueError for other inputs or labels than its own."""
     if not isinstance(result, Result):
         raise ValueError(f"{function}: result must be a Result, received {type(result).__name__}")
     if classes is None and np.size(labels) and np.asarray(labels).dtype.kind in "iub":
         classes = max(2, int(np.max(result.predicted)) + 1, int(np.max(labels)) + 1)
-    data = arrays(function, inputs, labels, classes)
+    data = check_data(function, inputs, labels, classes)
     if fingerprint(data) != result.state.data:
         raise ValueError(f"{function}: inputs and labels are not those of the result")
     return data

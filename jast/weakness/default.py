@@ -10,22 +10,29 @@ from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import committee
 from jast.weakness.contract import Selector, Step
-from jast.weakness.logistic import logistic, sigmoid
-from jast.weakness.residual import residual
-from jast.weakness.views import components, difficulty_of_neighbours, reduce, require_room, views
+from jast.weakness.residual import fit_logistic, residual_log_odds, sigmoid
+from jast.weakness.views import (
+    difficulty_of_neighbours,
+    make_views,
+    principal_components,
+    reduce_inputs,
+    require_memory,
+)
 
-__all__ = ["default"]
+__all__ = ["PASSES", "STRENGTH", "default"]
 
-# over images, whose many pixels are soon learned by heart, and over tables
 PASSES = {True: 8, False: 50}
-CLOSE = 64  # principal components in which distances are measured
+"""Over images, whose many pixels are soon learned by heart, and over tables."""
+CLOSE = 64  # principal components in which distances are measured; a convention
 STRENGTH = 10  # weight of an answer of the system in the committee that imitates it; a label's is 1
-# failures that the scores' sum over easy inputs is worth, where at least so many random calls
-# correct it
-SURE, ENOUGH = 2, 20
-# log odds of failure = b . (difficulty, imitation by two views, neighbours, 1): mean and precision
-# of the prior of b
-PRIOR, PRECISION = np.array([0.3, 0.25, 0.25, 0.1, -0.5]), np.array([4.0, 4.0, 4.0, 4.0, 1.0])
+PRIOR_FAILURES = 2  # that the scores' sum over easy inputs is worth; a convention
+LEAST_RANDOM = 20  # random calls that correct that sum: fewer say little
+PRIOR = np.array([0.3, 0.25, 0.25, 0.1, -0.5])
+"""Prior mean of b in log odds of failure = b . (difficulty, imitation by two views, neighbours, 1):
+about an average of the opinions, and below it."""
+PRECISION = np.array([4.0, 4.0, 4.0, 4.0, 1.0])
+"""Of that prior: deviations of a half, and of 1 for the constant."""
+MOST_RANDOM = 0.2  # of a batch
 
 
 def default(
@@ -70,11 +77,15 @@ def default(
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):
-        require_room(data)
+        require_memory(data)
         rng = generator(key)
-        reduced = reduce(rng, data)
-        seen_as = views(data, reduced)
-        close = reduced[:, :CLOSE] if reduced.shape[1] else components(rng, seen_as.centred, CLOSE)
+        reduced = reduce_inputs(rng, data)
+        seen_as = make_views(data, reduced)
+        close = (
+            reduced[:, :CLOSE]
+            if reduced.shape[1]
+            else principal_components(rng, seen_as.centred, CLOSE)
+        )
         learn = committee.folds(rng, data.size, min(5, data.size), repeats)
         difficulty = sum(
             _odds(rng, view, data.labels, learn, learn, data) for view in seen_as
@@ -100,28 +111,24 @@ def default(
         )
         seen = ask(chosen)
         tried = seen.tried
-        answers, weights = (
-            np.where(tried, seen.predicted, data.labels),
-            memory["learn"] * np.where(tried, STRENGTH, 1),
-        )
+        answers = np.where(tried, seen.predicted, data.labels)
+        weights = memory["learn"] * np.where(tried, STRENGTH, 1)
         imitations = [
             _odds(rng, view, answers, weights, memory["learn"], data)
-            for view in views(data, memory["reduced"])
+            for view in make_views(data, memory["reduced"])
         ]
         rows = np.stack(
             [memory["difficulty"], *imitations, memory["neighbours"], np.ones(data.size)], axis=1
         )
-        blend = logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
+        blend = fit_logistic(rows[tried], seen.failed[tried], PRIOR, PRECISION)
         # an input that was run is judged by the blend from before its outcome was known
         blends = np.where(tried[:, None], memory["blends"], blend)
         odds = np.sum(rows * blends, axis=1)
-        suspicion = np.where(
-            tried, odds, odds + residual(rng, memory["close"], data.labels, rows @ blend, seen)
-        )
-        scores, drawn = (
-            sigmoid(suspicion),
-            memory["drawn"] | tried & np.isin(np.arange(data.size), np.setdiff1d(chosen, likely)),
-        )
+        missed = residual_log_odds(rng, memory["close"], data.labels, rows @ blend, seen)
+        suspicion = np.where(tried, odds, odds + missed)
+        scores = sigmoid(suspicion)
+        random = np.isin(np.arange(data.size), np.setdiff1d(chosen, likely))
+        drawn = memory["drawn"] | tried & random
         memory = memory | dict(suspicion=suspicion, drawn=drawn, blends=blends)
         return Step(memory, scores, likely, _expected(scores, seen, drawn))
 
@@ -135,16 +142,16 @@ def _expected(scores, seen, drawn):
     left = scores[~seen.tried]
     # those that would not have been run by now for their scores
     alike = drawn & (scores <= left.max(initial=0))
-    # a gamma prior of mean 1, worth SURE failures
-    more = (SURE + seen.failed[alike].sum()) / (SURE + scores[alike].sum())
-    return float(left.sum() * (more if alike.sum() >= ENOUGH else 1))
+    # a gamma prior of mean 1, worth so many failures
+    more = (PRIOR_FAILURES + seen.failed[alike].sum()) / (PRIOR_FAILURES + scores[alike].sum())
+    return float(left.sum() * (more if alike.sum() >= LEAST_RANDOM else 1))
 
 
 def _odds(rng, x, answers, weights, learn, data):
     """[n] log odds against each input's label, by the members that have not learned from it."""
     trained = committee.fit(rng, x, answers, weights, data.classes, PASSES[data.image])
     right = np.clip(
-        committee.held_out(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6
+        committee.held_out_probability(trained, x, data.labels, learn).astype(float), 1e-6, 1 - 1e-6
     )
     return np.log1p(-right) - np.log(right)
 
@@ -156,7 +163,7 @@ def _batch(rng, suspicion, seen, size, exploration):
     free = np.flatnonzero(~seen.tried)
     size = min(size, len(free))
     ranked = free[np.argsort(-suspicion[free], kind="stable")]
-    share = min(exploration / max(sigmoid(suspicion[ranked[size - 1]]), 1e-6), 0.2)
+    share = min(exploration / max(sigmoid(suspicion[ranked[size - 1]]), 1e-6), MOST_RANDOM)
     # the first batch tells how the prior was
     random = rng.binomial(size, share) if len(seen.order) else 0
     likely = ranked[: size - random]

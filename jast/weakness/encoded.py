@@ -10,10 +10,10 @@ import numpy as np
 
 from jast import results
 from jast.weakness import networks
-from jast.weakness.data import of_result
-from jast.weakness.thesis import encoder, nested
+from jast.weakness.data import data_of_result
+from jast.weakness.thesis import adversary_of, train_encoder
 from jast.weakness.validation import iteration_key
-from jast.weakness.views import scaled
+from jast.weakness.views import scale_inputs
 
 if TYPE_CHECKING:
     import chex
@@ -38,17 +38,17 @@ class Encoded(NamedTuple):
         (3, 8, 8)
     """
 
-    codes: Any
+    codes: np.ndarray
     """[n, h]: E(x) of each input"""
-    scores: Any
+    scores: np.ndarray
     """[n]: A(E(x)), how suspect the adversary finds each input, in [0, 1]"""
-    shape: tuple[Any, ...]
+    shape: tuple[int, ...]
     """Of an input"""
     autoencoder: Any
     """Parameters"""
     adversary: Any
     """Parameters"""
-    hidden: tuple[Any, ...]
+    hidden: tuple[int, ...]
     """The autoencoder's widths"""
 
     def score(self, rows: chex.Array) -> chex.Array:
@@ -93,21 +93,27 @@ def encoded(
         >>> jast.weakness.encoded(found, inputs, labels).scores.shape
         (200,)
     """
-    data = of_result("encoded", result, inputs, labels, classes)
+    data = data_of_result("encoded", result, inputs, labels, classes)
     name, settings = json.loads(result.state.selector)
     if name != "thesis":
         raise ValueError(f"encoded: result must be of the selector thesis, received one of {name}")
     first, _ = jax.random.split(iteration_key(result.state.key, 0))
-    hidden, params, _ = encoder(
+    hidden, params, _ = train_encoder(
         first,
-        scaled(data),
+        scale_inputs(data),
         settings["hidden"],
         settings["encoder_epochs"],
         settings["encoder_rate"],
         settings["batch"],
     )
     memory = result.state.memory
-    adversary = nested(memory)
+    adversary = adversary_of(memory)
     codes = np.asarray(memory["codes"])
-    scores = np.asarray(jax.nn.sigmoid(networks.logits(adversary, codes)))
-    return Encoded(codes, scores, data.inputs.shape[1:], params, adversary, hidden)
+    return Encoded(
+        codes=codes,
+        scores=np.asarray(jax.nn.sigmoid(networks.logits(adversary, codes))),
+        shape=data.inputs.shape[1:],
+        autoencoder=params,
+        adversary=adversary,
+        hidden=hidden,
+    )

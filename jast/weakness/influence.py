@@ -12,9 +12,9 @@ import numpy as np
 from jast._checks import random_key
 from jast.counter import generator
 from jast.weakness import committee
-from jast.weakness.data import of_result, within
+from jast.weakness.data import are_indices, data_of_result
 from jast.weakness.default import PASSES, STRENGTH
-from jast.weakness.views import centred, scaled
+from jast.weakness.views import centre, scale_inputs
 
 if TYPE_CHECKING:
     import chex
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["influence"]
 
-MEMBERS, EFFORT = 5, 4
+MEMBERS = 5  # of the committee that imitates; a convention
+EFFORT = 4  # times the passes of the selector's committee: there is one fit, not one a batch
 
 
 def influence(
@@ -63,9 +64,9 @@ def influence(
         (2, 8, 8)
     """
     random_key("influence", key)
-    data = of_result("influence", result, inputs, labels, classes)
+    data = data_of_result("influence", result, inputs, labels, classes)
     at = np.asarray(result.failures if at is None else at)
-    if at.ndim != 1 or not within(at, data.size):
+    if at.ndim != 1 or not are_indices(at, data.size):
         raise ValueError(
             f"influence: at must be indices [k] in 0 ... {data.size - 1}, received {at!r}"
         )
@@ -73,7 +74,7 @@ def influence(
     tried = result.predicted >= 0
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
     rng = generator(key)
-    x = centred(scaled(data), data.image)
+    x = centre(scale_inputs(data), data.image)
     imitation = committee.fit(
         rng,
         x,
@@ -82,5 +83,5 @@ def influence(
         data.classes,
         EFFORT * PASSES[data.image],
     )
-    slope = np.asarray(committee.gradient(imitation, x[at], data.labels[at]))
+    slope = np.asarray(committee.failure_gradient(imitation, x[at], data.labels[at]))
     return (slope * (x[at] - x.mean(0))).reshape(-1, *data.inputs.shape[1:])

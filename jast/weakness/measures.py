@@ -4,7 +4,7 @@ recall.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from jast.weakness.result import Result
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Judgement", "Roc", "auc", "judge", "roc"]
+__all__ = ["Judgement", "Roc", "auc", "judge", "precision_recall", "roc"]
 
 
 @results.shown()
@@ -29,11 +29,11 @@ class Roc(NamedTuple):
         1.0
     """
 
-    false_positive: Any
+    false_positive: np.ndarray
     """[m]: share of the inputs that pass whose score is at least the threshold"""
-    true_positive: Any
+    true_positive: np.ndarray
     """[m]: share of the failures"""
-    threshold: Any
+    threshold: np.ndarray
     """[m]: falling, from infinity"""
 
     @property
@@ -58,13 +58,13 @@ class Judgement(NamedTuple):
         True
     """
 
-    auc: Any
+    auc: np.ndarray
     """[R]: area under the ROC curve; NaN where all inputs fail or none"""
-    precision: Any
+    precision: np.ndarray
     """[R]: share of failures among the candidates; NaN without candidates"""
-    recall: Any
+    recall: np.ndarray
     """[R]: share of all failures that are candidates; NaN without failures"""
-    candidates: Any
+    candidates: np.ndarray
     """[R] int: inputs with a score of at least the threshold, or the ``top``"""
 
 
@@ -87,21 +87,18 @@ def roc(scores: chex.Array, failed: chex.Array) -> Roc:
         >>> curve.true_positive.tolist()
         [0.0, 0.5, 1.0, 1.0]
     """
-    scores, failed = _pair("roc", scores, failed)
+    scores, failed = _check_scores("roc", scores, failed)
     order = np.argsort(-scores, kind="stable")
-    last = (
-        np.flatnonzero(np.append(np.diff(scores[order]) != 0, True))
-        if len(scores)
-        else np.zeros(0, int)
-    )
+    last = np.flatnonzero(np.append(np.diff(scores[order]) != 0, True)[: len(scores)])
     hits, count = np.cumsum(failed[order])[last], last + 1
-    share = lambda part, whole: np.append(
-        0.0, part / whole if whole else np.full(len(part), np.nan)
-    )
+
+    def share(part, whole):
+        return np.append(0.0, part / whole if whole else np.full(len(part), np.nan))
+
     return Roc(
-        share(count - hits, np.sum(~failed)),
-        share(hits, np.sum(failed)),
-        np.append(np.inf, scores[order][last]),
+        false_positive=share(count - hits, np.sum(~failed)),
+        true_positive=share(hits, np.sum(failed)),
+        threshold=np.append(np.inf, scores[order][last]),
     )
 
 
@@ -181,17 +178,13 @@ def judge(
         raise ValueError(f"judge: top must be at most {n}, the inputs there are, received {top!r}")
     rows = []
     for scores in every:
-        chosen = (
-            scores >= threshold
-            if top is None
-            else np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
-        )
+        if top is None:
+            chosen = scores >= threshold
+        else:
+            chosen = np.isin(np.arange(n), np.argsort(-scores, kind="stable")[:top])
         rows.append((auc(scores, failed), *precision_recall(chosen, failed), int(np.sum(chosen))))
-    return (
-        Judgement(*(np.asarray(column) for column in zip(*rows, strict=True)))
-        if rows
-        else Judgement(*(np.zeros(0) for _ in range(4)))
-    )
+    columns = zip(*rows, strict=True) if rows else np.zeros((4, 0))
+    return Judgement(*map(np.asarray, columns))
 
 
 def precision_recall(chosen, failed):
@@ -202,7 +195,7 @@ def precision_recall(chosen, failed):
     return hits / k if k else np.nan, hits / every if every else np.nan
 
 
-def _pair(function, scores, failed):
+def _check_scores(function, scores, failed):
     scores, failed = np.asarray(scores, float), np.asarray(failed)
     if scores.ndim != 1 or scores.shape != failed.shape or failed.dtype != bool:
         raise ValueError(

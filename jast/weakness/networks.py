@@ -5,6 +5,7 @@ R. J. Moss, "Algorithms for Efficient Validation of Black-Box Systems", Stanford
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,13 +18,13 @@ __all__ = [
     "adversary",
     "autoencoder",
     "codes_of",
+    "default_widths",
     "fit_adversary",
     "fit_autoencoder",
     "logits",
-    "sizes",
 ]
 
-ADVERSARY = (128, 64)
+ADVERSARY = (128, 64)  # widths, of chapter 4
 LEAK = 0.01  # of the autoencoder's leaky ReLU; Flux's default, which the published code takes
 
 
@@ -32,19 +33,19 @@ class Network(NamedTuple):
     for: programs that hold it are not compiled again.
     """
 
-    init: Any
+    init: Callable[..., Any]
     """``init(key) -> params``: weights uniform as Glorot's, biases zero, float32"""
-    apply: Any
+    apply: Callable[..., Any]
     """``apply(params, x [..., inputs])``: of the autoencoder the reconstruction [..., inputs], of
     the adversary the logits [...]
     """
-    encode: Any
+    encode: Callable[..., Any] | None
     """``encode(params, x [..., inputs])``: the code [..., hidden[-1]]; None of the adversary"""
-    decode: Any
+    decode: Callable[..., Any] | None
     """``decode(params, code [..., hidden[-1]])``: [..., inputs]; None of the adversary"""
 
 
-def sizes(inputs):
+def default_widths(inputs):
     """The autoencoder's layers for so many numbers: half of them, at most 392, and a quarter, at
     most 64. The thesis's (392, 64) for its 784 pixels.
     """
@@ -87,20 +88,9 @@ def fit_autoencoder(key, rows, hidden, *, epochs=20, batch=1000, rate=1e-3):
     network = autoencoder(rows.shape[1], hidden)
     first, then = jax.random.split(key)
     n = len(rows)
-    number = np.arange(n, dtype=np.int32)
-    return _fit(
-        then,
-        network.init(first),
-        rows,
-        rows,
-        number,
-        n,
-        epochs,
-        rate,
-        network.apply,
-        _squared,
-        min(batch, n),
-    )
+    data = rows, rows, np.arange(n, dtype=np.int32), n
+    how = dict(epochs=epochs, rate=rate, loss=_squared, batch=min(batch, n))
+    return _fit(then, network.init(first), data, network.apply, **how)
 
 
 def codes_of(params, rows, hidden):
@@ -117,19 +107,9 @@ def fit_adversary(key, params, codes, failed, number, size, *, epochs=20, batch=
     ``failed`` [m] float32: the targets, of the binary cross-entropy. ``size`` is a number, not a
     shape: other sizes in the same room compile nothing.
     """
-    return _fit(
-        key,
-        params,
-        codes,
-        failed,
-        number,
-        size,
-        epochs,
-        rate,
-        adversary(codes.shape[1]).apply,
-        _entropy,
-        batch,
-    )
+    data = codes, failed, number, size
+    how = dict(epochs=epochs, rate=rate, loss=_entropy, batch=batch)
+    return _fit(key, params, data, adversary(codes.shape[1]).apply, **how)
 
 
 @jax.jit
@@ -152,12 +132,13 @@ def _entropy(logit, target):
 
 
 @functools.partial(jax.jit, static_argnames=("epochs", "loss", "batch"))
-def _fit(key, params, rows, targets, number, size, epochs, rate, apply, loss, batch):
-    """``epochs`` passes in minibatches over the first ``size`` of the rows' ``number``, by Adam
-    that starts anew: (params, mean loss of each epoch).
+def _fit(key, params, data, apply, *, epochs, rate, loss, batch):
+    """``epochs`` passes in minibatches over ``data`` (rows, targets, number, size), the first
+    ``size`` of the rows' ``number``, by Adam that starts anew: (params, mean loss of each epoch).
     """
     import optax  # here: it takes a while
 
+    rows, targets, number, size = data
     optimiser = optax.adam(rate)
     place = jnp.arange(len(number), dtype=jnp.int32)
     size = jnp.asarray(size, jnp.int32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,26 +30,26 @@ class History(NamedTuple):
         (50, True)
     """
 
-    calls: Any
+    calls: np.ndarray
     """[R] int: calls after each iteration"""
-    found: Any
+    found: np.ndarray
     """[R] int: failures found by then"""
-    precision: Any
+    precision: np.ndarray
     """[R]: share of failures among the iteration's candidates, all of which were run; NaN where
     there were none
     """
-    recall: Any
+    recall: np.ndarray
     """[R]: failures found, as a share of these and ``expected``, and so no better than that
     guess"""
-    auc: Any
+    auc: np.ndarray
     """[R]: area under the ROC curve of the iteration's scores on the inputs run so far, which were
     chosen (`judge`: on all); NaN where all failed or none
     """
-    expected: Any
+    expected: np.ndarray
     """[R]: how many failures the selector expects among the inputs not yet run: rough, unless all
     inputs were run at random
     """
-    scores: Any
+    scores: np.ndarray
     """[R, n] float32: the scores after each iteration"""
 
 
@@ -76,13 +76,13 @@ class State(NamedTuple):
     """The selector's name and settings, as JSON"""
     data: str
     """Fingerprint of the inputs and labels"""
-    key: Any
+    key: np.ndarray
     """The key's numbers"""
-    memory: dict[str, Any]
+    memory: dict[str, np.ndarray]
     """What the selector has learned: arrays by name"""
-    order: Any
+    order: np.ndarray
     """[calls] int: the inputs that were run"""
-    predicted: Any
+    predicted: np.ndarray
     """[n] int32: the answers"""
     complete: int
     """How many of ``order`` belong to whole iterations"""
@@ -108,24 +108,24 @@ class Result(NamedTuple):
         150
     """
 
-    failures: Any
+    failures: np.ndarray
     """[found] int: the inputs that the system gets wrong, in the order found"""
     calls: int
     """Inputs that the system was run on, each once"""
-    order: Any
+    order: np.ndarray
     """[calls] int: those inputs, in order"""
-    predicted: Any
+    predicted: np.ndarray
     """[n] int32: the system's answers, -1 where it was not run"""
-    scores: Any
+    scores: np.ndarray
     """[n] float32: how suspect each input is now, in [0, 1]; default selector: the probability that
     it fails, without its own outcome
     """
-    ranked: Any
+    ranked: np.ndarray
     """[n - calls] int: the inputs not yet run, the most suspect first"""
     expected: float
     """How many failures the selector expects among these; NaN before and within an iteration"""
     history: History
-    incidents: tuple[Any, ...]
+    incidents: tuple[str, ...]
     """Texts: why it ended before its budget was spent, empty if it did not"""
     state: State
     """Give it to `validate` again to go on"""
@@ -149,7 +149,7 @@ class Result(NamedTuple):
         h, n = self.history, len(self.scores)
         rows = zip(h.calls, h.found, h.precision, h.recall, h.auc, h.expected, strict=True)
         table = "\n".join(
-            f"{i:9d} {c:7d} {f:8d} {_share(p):>10} {_share(r):>9} {_share(a):>7} {e:9.0f}"
+            f"{i:9d} {c:7d} {f:8d} {_number(p):>10} {_number(r):>9} {_number(a):>7} {e:9.0f}"
             for i, (c, f, p, r, a, e) in enumerate(rows, 1)
         )
         left = (
@@ -165,5 +165,5 @@ class Result(NamedTuple):
         return "\n".join([head, names + table, *(f"stopped: {i}" for i in self.incidents)]).strip()
 
 
-def _share(value):
+def _number(value):
     return "-" if np.isnan(value) else f"{value:.2f}"

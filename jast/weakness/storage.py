@@ -75,9 +75,11 @@ def parts(state: State) -> tuple[dict, dict[str, np.ndarray]]:
 
 def whole(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray], _: Any) -> State:
     """The state of `parts`."""
-    part = lambda name: {
-        k.removeprefix(f"{name}."): a for k, a in arrays.items() if k.startswith(f"{name}.")
-    }
+
+    def part(name):
+        prefix = f"{name}."
+        return {k.removeprefix(prefix): a for k, a in arrays.items() if k.startswith(prefix)}
+
     return State(
         memory=part("memory"),
         history=History(**part("history")),

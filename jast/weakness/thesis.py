@@ -14,9 +14,9 @@ from jast._checks import number, whole
 from jast.counter import generator
 from jast.weakness import networks
 from jast.weakness.contract import Selector, Step
-from jast.weakness.views import require_room, scaled
+from jast.weakness.views import require_memory, scale_inputs
 
-__all__ = ["thesis"]
+__all__ = ["adversary_of", "draw_halves", "thesis", "train_encoder"]
 
 ADVERSARY = "adversary/"
 
@@ -55,8 +55,8 @@ def thesis(
         copies: how many more times a failure is learned from in an epoch.
         epochs: of the adversary, by Adam.
         rate: of its Adam.
-        hidden: widths of the autoencoder. Default: `networks.sizes`, the published 392 and 64 for
-            784 pixels.
+        hidden: widths of the autoencoder. Default: half of an input's numbers and a quarter, at
+            most the published 392 and 64 for 784 pixels.
         encoder_epochs: of the autoencoder, by Adam.
         encoder_rate: of its Adam.
         batch: its minibatches. Default: a tenth of the inputs, at most 1000; the text's 1000 for
@@ -69,27 +69,21 @@ def thesis(
         >>> jast.weakness.thesis(iterations=3).settings["iterations"]
         3
     """
-    whole_ = functools.partial(whole, "thesis")
-    iterations, sample, epochs, encoder_epochs = (
-        whole_(name, value)
-        for name, value in dict(
-            iterations=iterations, sample=sample, epochs=epochs, encoder_epochs=encoder_epochs
-        ).items()
-    )
-    batch = None if batch is None else whole_("batch", batch)
-    copies = whole_("copies", copies, 0)
-    threshold = number("thesis", "threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
-    rate = number("thesis", "rate", rate, lambda v: 0 < v < np.inf, "above 0")
-    encoder_rate = number(
-        "thesis", "encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0"
-    )
+    whole_number = functools.partial(whole, "thesis")
+    iterations = whole_number("iterations", iterations)
+    sample = whole_number("sample", sample)
+    copies = whole_number("copies", copies, 0)
+    epochs = whole_number("epochs", epochs)
+    encoder_epochs = whole_number("encoder_epochs", encoder_epochs)
+    batch = None if batch is None else whole_number("batch", batch)
+    real = functools.partial(number, "thesis")
+    threshold = real("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
+    rate = real("rate", rate, lambda v: 0 < v < np.inf, "above 0")
+    encoder_rate = real("encoder_rate", encoder_rate, lambda v: 0 < v < np.inf, "above 0")
     if not isinstance(replacement, bool):
         raise ValueError(f"thesis: replacement must be True or False, received {replacement!r}")
-    hidden = (
-        None
-        if hidden is None
-        else tuple(whole_("hidden", width) for width in np.atleast_1d(hidden).tolist())
-    )
+    if hidden is not None:
+        hidden = tuple(whole_number("hidden", width) for width in np.atleast_1d(hidden).tolist())
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
     settings = dict(
@@ -106,16 +100,48 @@ def thesis(
     )
     if replacement:  # named only then, so that earlier states go on
         settings["replacement"] = True
-    start = functools.partial(_start, hidden, encoder_epochs, encoder_rate, batch)
-    return Selector(
-        "thesis",
-        settings,
-        start,
-        functools.partial(_step, iterations, sample, replacement, threshold, copies, epochs, rate),
-    )
+
+    def start(key, data):
+        require_memory(data)
+        first, then = jax.random.split(key)
+        rows = scale_inputs(data)
+        widths, params, losses = train_encoder(
+            first, rows, hidden, encoder_epochs, encoder_rate, batch
+        )
+        codes = networks.codes_of(params, rows, widths)
+        adversary = networks.adversary(codes.shape[1]).init(then)
+        counts = dict.fromkeys(("iteration", "drawn", "failed"), np.zeros((), np.int64))
+        codes, losses = np.asarray(codes), np.asarray(losses)
+        return dict(codes=codes, losses=losses, **counts) | _flat(adversary)
+
+    def step(key, data, memory, seen, ask):
+        if memory["iteration"] >= iterations:
+            return None
+        _, for_training = jax.random.split(key)
+        lesson, rest = draw_halves(key, data.size, sample, replacement)
+
+        now = ask(lesson)
+        once = np.unique(lesson)
+        new = once[~seen.tried[once] & now.tried[once]]
+        codes, before = memory["codes"], adversary_of(memory)
+        params = _train_adversary(for_training, before, codes, lesson, now, copies, epochs, rate)
+        scores = np.asarray(jax.nn.sigmoid(networks.logits(params, codes)))
+
+        candidates = rest[scores[rest] >= threshold]
+        now = ask(candidates)
+        counts = dict(
+            iteration=memory["iteration"] + 1,
+            drawn=memory["drawn"] + len(new),
+            failed=memory["failed"] + now.failed[new].sum(),
+        )
+        expected = counts["failed"] / max(counts["drawn"], 1) * np.sum(~now.tried)
+        counts = {name: np.asarray(count, np.int64) for name, count in counts.items()}
+        return Step(memory | _flat(params) | counts, scores, candidates, float(expected))
+
+    return Selector("thesis", settings, start, step)
 
 
-def halves(key, size, sample, replacement):
+def draw_halves(key, size, sample, replacement):
     """The ``sample`` inputs of an iteration, by its key and the ``size`` of the data: (those that
     the adversary learns from, those that it proposes from), indices.
     """
@@ -125,63 +151,18 @@ def halves(key, size, sample, replacement):
     return drawn[:half], drawn[half:]
 
 
-def encoder(key, rows, hidden, epochs, rate, batch):
+def train_encoder(key, rows, hidden, epochs, rate, batch):
     """The autoencoder trained on ``rows`` [n, d]: (its widths, params, losses [epochs]); None for
     the default widths and batch.
     """
-    hidden = tuple(hidden) if hidden else networks.sizes(rows.shape[1])
+    hidden = tuple(hidden) if hidden else networks.default_widths(rows.shape[1])
     batch = batch or max(1, min(1000, len(rows) // 10))
     return hidden, *networks.fit_autoencoder(
         key, rows, hidden, epochs=epochs, batch=batch, rate=rate
     )
 
 
-def _start(hidden, epochs, rate, batch, key, data):
-    require_room(data)
-    first, then = jax.random.split(key)
-    rows = scaled(data)
-    hidden, params, losses = encoder(first, rows, hidden, epochs, rate, batch)
-    codes = networks.codes_of(params, rows, hidden)
-    adversary = networks.adversary(codes.shape[1]).init(then)
-    counts = {name: np.zeros((), np.int64) for name in ("iteration", "drawn", "failed")}
-    return {"codes": np.asarray(codes), "losses": np.asarray(losses), **counts, **_flat(adversary)}
-
-
-def _step(
-    iterations, sample, replacement, threshold, copies, epochs, rate, key, data, memory, seen, ask
-):
-    if memory["iteration"] >= iterations:
-        return None
-    _, train = jax.random.split(key)
-    lesson, rest = halves(key, data.size, sample, replacement)
-
-    now = ask(lesson)
-    once = np.unique(lesson)
-    new = once[~seen.tried[once] & now.tried[once]]
-    params = _taught(train, nested(memory), memory["codes"], lesson, now, copies, epochs, rate)
-    scores = np.asarray(jax.nn.sigmoid(networks.logits(params, memory["codes"])))
-
-    candidates = rest[scores[rest] >= threshold]
-    now = ask(candidates)
-    counts = dict(
-        iteration=memory["iteration"] + 1,
-        drawn=memory["drawn"] + len(new),
-        failed=memory["failed"] + now.failed[new].sum(),
-    )
-    expected = counts["failed"] / max(counts["drawn"], 1) * np.sum(~now.tried)
-    return Step(
-        {
-            **memory,
-            **_flat(params),
-            **{name: np.asarray(count, np.int64) for name, count in counts.items()},
-        },
-        scores,
-        candidates,
-        float(expected),
-    )
-
-
-def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
+def _train_adversary(key, params, codes, lesson, seen, copies, epochs, rate):
     """The adversary after training on those of ``lesson`` that were answered: a budget may end in
     the midst of it.
     """
@@ -194,16 +175,8 @@ def _taught(key, params, codes, lesson, seen, copies, epochs, rate):
     # of one size, whatever failed: one program for all iterations
     room = np.zeros(len(lesson) * (1 + copies), np.int32)
     room[: len(rows)] = rows
-    return networks.fit_adversary(
-        key,
-        params,
-        codes[lesson],
-        failed.astype(np.float32),
-        room,
-        len(rows),
-        epochs=epochs,
-        rate=rate,
-    )[0]
+    failed, how = failed.astype(np.float32), dict(epochs=epochs, rate=rate)
+    return networks.fit_adversary(key, params, codes[lesson], failed, room, len(rows), **how)[0]
 
 
 def _flat(params):
@@ -214,7 +187,7 @@ def _flat(params):
     }
 
 
-def nested(memory):
+def adversary_of(memory):
     """The adversary's parameters in the ``memory`` of a state."""
     from flax.traverse_util import unflatten_dict
 

@@ -16,7 +16,7 @@ from jast.checkpoints import stored
 from jast.counter import generator
 from jast.watch import Watch, terminable
 from jast.weakness.contract import Seen, Selector
-from jast.weakness.data import arrays, fingerprint, within
+from jast.weakness.data import are_indices, check_data, fingerprint
 from jast.weakness.measures import auc
 from jast.weakness.result import History, Result, State
 from jast.weakness.storage import parts
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback, PathLike, Predict
 
-__all__ = ["validate"]
+__all__ = ["iteration_key", "validate"]
 
-CHUNK = 1024  # inputs of one call of predict
-IDLE = 20  # iterations in a row that ask for nothing new
+CHUNK = 1024  # inputs of one call of predict: memory, and what is lost at an interruption
+IDLE = 20  # iterations in a row without a new call, after which a selector is stuck
 
 
-class _Stop(Exception):
+class _NoAnswer(Exception):
     """The system did not answer."""
 
 
@@ -100,7 +100,7 @@ def validate(
         >>> found.calls, len(found.failures) > 20
         (50, True)
     """
-    data = arrays("validate", inputs, labels, classes)
+    data = check_data("validate", inputs, labels, classes)
     chosen = _selector(selector)
     n = data.size
     if not callable(predict):
@@ -203,16 +203,13 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)
-        return State(
-            state.selector,
-            state.data,
-            state.key,
-            memory,
-            order,
-            predicted,
-            len(seen.order),
-            history,
-            finished,
+        return state._replace(
+            memory=memory,
+            order=order,
+            predicted=predicted,
+            complete=len(seen.order),
+            history=history,
+            finished=finished,
         )
 
     def keep():
@@ -224,7 +221,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
     def ask(indices):
         nonlocal current
         indices = np.asarray(indices)
-        if indices.size and indices.ndim != 1 or not within(indices, data.size):
+        if indices.size and indices.ndim != 1 or not are_indices(indices, data.size):
             raise ValueError(
                 f"validate: the selector {selector.name} must ask for indices [m] in 0 ..."
                 f" {data.size - 1}, received {indices!r}"
@@ -267,7 +264,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
                 incidents.append(f"the selector asked for nothing new in {IDLE} iterations")
                 break
         keep()
-    except _Stop as stop:
+    except _NoAnswer as stop:
         if not answered:
             raise ValueError(f"validate: {stop}") from stop.__cause__
         incidents.append(str(stop))
@@ -302,11 +299,11 @@ def _answers(predict, data, batch):
     try:
         given = predict(data.inputs[batch])
     except Exception as error:
-        raise _Stop(f"predict raised {type(error).__name__}: {error}, on {where}") from error
+        raise _NoAnswer(f"predict raised {type(error).__name__}: {error}, on {where}") from error
     try:
         said = np.asarray(given)
     except Exception as error:
-        raise _Stop(
+        raise _NoAnswer(
             f"predict must return labels [{len(batch)}], received {type(given).__name__}, on"
             f" {where}"
         ) from error
@@ -318,13 +315,13 @@ def _answers(predict, data, batch):
             if said.dtype.kind == "f"
             else ""
         )
-        raise _Stop(
+        raise _NoAnswer(
             f"predict must return whole numbers [{len(batch)}], received {said.dtype} of shape"
             f" {said.shape}{hint}, on {where}"
         )
     out = np.flatnonzero((said < 0) | (said >= data.classes))
     if len(out):
-        raise _Stop(
+        raise _NoAnswer(
             f"predict must return labels in 0 ... {data.classes - 1} (classes={data.classes}),"
             f" received {said[out[0]]} for input {batch[out[0]]}, on {where}"
         )

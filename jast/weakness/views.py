@@ -1,64 +1,68 @@
 """How networks and neighbourhoods see the inputs: numbers of order 1, and few of them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jast.memory import require
 
 __all__ = [
-    "components",
+    "principal_components",
+    "centre",
     "difficulty_of_neighbours",
-    "reduce",
-    "require_room",
-    "scaled",
+    "reduce_inputs",
+    "require_memory",
+    "scale_inputs",
     "squared_distances",
-    "views",
+    "make_views",
 ]
 
-# inputs of more numbers than WIDE are seen by their first KEPT principal components
-WIDE, KEPT = 2048, 512
-NEIGHBOURS, REFERENCE, ROWS = 15, 20_000, 1024
+WIDE = 2048  # numbers of an input, above which networks see its principal components: time
+KEPT = 512  # so many of them
+SPREAD = 0.4  # deviation of centred inputs; a convention
+NEIGHBOURS = 15  # that vote on the difficulty of an input; a convention
+REFERENCE = 20_000  # inputs among which neighbours are sought: time
+ROWS = 1024  # inputs whose neighbours are sought at once: memory
 
 
 class Views(NamedTuple):
     """Of n inputs, float32."""
 
-    scaled: Any
+    scaled: np.ndarray
     """[n, d]: images: from 0 to 1, over the least and the greatest shade of all; tables: ranks
     within each column, from -0.7 to 0.7; components of wide inputs: by their largest
     """
-    centred: Any
+    centred: np.ndarray
     """[n, d]: mean 0, a deviation of 0.4: of all shades, or of each column"""
 
 
-def require_room(data):
-    """`jast.memory.require` for the two copies of the inputs that `scaled` and `views` make."""
+def require_memory(data):
+    """`jast.memory.require` for the two copies of the inputs that `make_views` needs."""
     needed = 2 * 4 * data.inputs.size
     require("validate", needed, f"{data.size} inputs as the selector sees them", "use fewer")
 
 
-def views(data, reduced):
-    """The `Views` of a `Data`; of its components ``reduced``, of `reduce`, where it has any."""
+def make_views(data, reduced):
+    """The `Views` of a `Data`, or of its components ``reduced`` where `reduce_inputs` gave any."""
     if reduced.shape[1]:
         return Views(
             reduced / np.float32(max(np.abs(reduced).max(), 1e-6)),
-            reduced * np.float32(0.4 / max(reduced.std(), 1e-6)),
+            reduced * np.float32(SPREAD / max(reduced.std(), 1e-6)),
         )
-    x = scaled(data)
-    return Views(x if data.image else _ranks(data.inputs), centred(x, data.image))
+    x = scale_inputs(data)
+    return Views(x if data.image else _column_ranks(data.inputs), centre(x, data.image))
 
 
-def reduce(rng, data):
+def reduce_inputs(rng, data):
     """[n, 512]: the first principal components of inputs of more than 2048 numbers; [n, 0] of
     others.
     """
     if data.inputs[0].size <= WIDE:
         return np.zeros((data.size, 0), np.float32)
-    return components(rng, centred(scaled(data), data.image), KEPT)
+    return principal_components(rng, centre(scale_inputs(data), data.image), KEPT)
 
 
-def scaled(data):
+def scale_inputs(data):
     """[n, d] float32: the inputs as rows, from 0 to 1 over the least and the greatest number of all
     images, or of each column of a table, where what lies further out than a column's first and last
     hundredth, by more than these are apart, is brought in.
@@ -76,7 +80,7 @@ def scaled(data):
     return ((x - low) / np.where(high > low, high - low, 1)).astype(np.float32)
 
 
-def _ranks(x):
+def _column_ranks(x):
     """[n, d]: a table's numbers by their place in their column, equal ones by their middle."""
     out = np.zeros(x.shape, np.float32)
     for j, column in enumerate(x.T):
@@ -85,7 +89,7 @@ def _ranks(x):
     return out
 
 
-def centred(x, image):
+def centre(x, image):
     """Rows ``x`` [n, d] with mean 0 and a deviation of 0.4: of all numbers of an image together, or
     of each column of a table.
     """
@@ -95,10 +99,10 @@ def centred(x, image):
     # not
     return np.clip(x / np.where(deviation > 0, deviation, 1), -8, 8).astype(
         np.float32
-    ) * np.float32(0.4)
+    ) * np.float32(SPREAD)
 
 
-def components(rng, x, k):
+def principal_components(rng, x, k):
     """[n, k]: the first k principal components; of wide inputs, those of a random subspace that two
     power iterations turn towards them (Halko, Martinsson and Tropp, 2011).
     """

@@ -10,7 +10,7 @@ from jax import lax
 
 from jast import results
 from jast.distributions.numbers import flat
-from jast.heads.heads import observed
+from jast.heads.heads import observation
 from jast.outline import outline
 from jast.search.tree.incumbent import fed_of
 from jast.search.tree.layout import (
@@ -65,7 +65,7 @@ def edges_of(problem, axes, tree, children):
 
         def edge(parent, slot):
             state = jax.tree.map(lambda a: a[parent], states)
-            return observed(problem.sim, state), flat(
+            return observation(problem.sim, state), flat(
                 choose_child(problem, node_keys(keys[None], parent[None])[0], slot, state)[1]
             )
 

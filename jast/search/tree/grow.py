@@ -16,9 +16,9 @@ from jast._jax import is_traced
 from jast.actions import samples
 from jast.checkpoints import stored
 from jast.counter import tree_keys
-from jast.heads.rounds import School, enrol, teach
+from jast.heads.rounds import HeadTraining, init_heads, train_heads
 from jast.heads.settings import MODES as HEAD_MODES
-from jast.heads.settings import HeadSettings, checked
+from jast.heads.settings import HeadSettings, check_settings
 from jast.incidents import hosted, incidents, merged, since
 from jast.rewards import STANDARD, Lexicographic, lexicographic
 from jast.search.ending import ended, planned, usual
@@ -59,7 +59,7 @@ class Job(NamedTuple):
     """What was asked for, for the result; None in a traced search."""
     pilot: Pilot | None = None
     """The episodes that gave the scales."""
-    school: School | None = None
+    school: HeadTraining | None = None
     """The heads, where there are any."""
     head_settings: HeadSettings | None = None
 
@@ -217,9 +217,9 @@ def enlist(
     """The `Job` with heads that guide it; ValueError where these do not fit its settings."""
     if head_settings is None:
         head_settings = HEAD_MODES.get(chosen["mode"], HEAD_MODES["default"])
-    head_settings = checked(head_settings)
+    head_settings = check_settings(head_settings)
     sim, actions = job.problem.sim, job.problem.choice.actions
-    school = enrol(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
+    school = init_heads(jax.random.fold_in(key, job.trees), sim, actions, heads, head_settings)
     if chosen["follow"] and school.value is not None:
         raise ValueError(
             f"{job.method}: follow must be False with a value head, since that judges each child"
@@ -255,7 +255,7 @@ def enlist(
 
 def grow_rounds(
     job: Job, key: jax.Array, threads: int, lanes: int, top: int, watch: Watch, ways: units.Ways
-) -> tuple[units.Ran, School | None]:
+) -> tuple[units.Ran, HeadTraining | None]:
     """Grow all trees, a round at a time, and teach the heads between two rounds.
 
     Args:
@@ -285,7 +285,7 @@ def grow_rounds(
             if school is not None and job.head_settings.train:
                 own = jax.random.fold_in(key, job.trees + 1 + first)
                 actions = problem.choice.actions
-                school = teach(own, school, sim, actions, job.head_settings, new.state)
+                school = train_heads(own, school, sim, actions, job.head_settings, new.state)
                 problem = problem._replace(guide=guide(school.heads, job.head_settings))
         except KeyboardInterrupt:
             if not ran.state:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast.distributions.numbers import flat, unflat
-from jast.heads.heads import histogram, in_bins, observed, value
+from jast.heads.heads import observation, policy_logits, predicted_value, sample_bins
 
 __all__ = ["Guide", "child_value", "guide", "rolled"]
 
@@ -68,11 +68,11 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
     """A rollout's disturbance by the policy head; ``otherwise`` at levels that it has learned
     nothing of, and in the simulations that are not its share.
     """
-    logits = guide.power * histogram(guide.heads, observed(sim, state))
+    logits = guide.power * policy_logits(guide.heads, observation(sim, state))
     own = jax.random.uniform(jax.random.fold_in(simulation, _SHARE), (), jnp.float32) < guide.share
     key = jax.random.fold_in(key, _HEAD)
     u = jax.random.uniform(key, logits.shape[:1], jnp.float32)
-    x = actions.at(unflat(in_bins(logits, u), D.event_like(dist)), dist)
+    x = actions.at(unflat(sample_bins(logits, u), D.event_like(dist)), dist)
     return jax.tree.map(
         lambda a, b: jnp.where(own & (level < guide.levels), a.astype(b.dtype), b), x, otherwise
     )
@@ -80,5 +80,5 @@ def rolled(guide, sim, actions, simulation, key, level, state, dist, otherwise):
 
 def child_value(guide, sim, state, x):
     """v(s, a); 0 where it is not finite."""
-    v = value(guide.heads, observed(sim, state), flat(x))
+    v = predicted_value(guide.heads, observation(sim, state), flat(x))
     return jnp.where(jnp.isfinite(v), v, 0)
