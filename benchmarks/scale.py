@@ -36,9 +36,8 @@ import jast  # noqa: E402
 from benchmarks.sizes import options, size  # noqa: E402
 from jast import places, units  # noqa: E402
 from jast.blackbox import from_python  # noqa: E402
-from jast.checkpoints import PARTS  # noqa: E402
+from jast.checkpoints import PARTS, read_records  # noqa: E402
 from jast.distributions import Normal  # noqa: E402
-from jast.ledger import records  # noqa: E402
 from jast.simulators import ferry, landing  # noqa: E402
 from jast.weakness import default  # noqa: E402
 
@@ -95,9 +94,9 @@ def chains():
 def plain(task, n, fold, state, watch, ways=units.HERE, **_):
     """`jast.units.run` as a loop: without threads, checkpoints and interrupts."""
     for number in range(n):
-        result = jax.device_get(task.function(task.shared, number, places.Post()))
+        result = jax.device_get(task.function(task.shared, number, places.UnitContext()))
         state = fold(state, number, result)
-    return units.Ran(state, n)
+    return units.UnitsRun(state, n)
 
 
 def looped(call):
@@ -233,7 +232,7 @@ def killed(name, sizes, moment, folder, programs):
 def parts(checkpoint):
     """Names of the parts in the folder, where it is there yet."""
     path = checkpoint / PARTS
-    return [r.header["name"] for r in records(path)] if path.exists() else []
+    return [r.header["name"] for r in read_records(path)] if path.exists() else []
 
 
 def kills(name, sizes, runs):

@@ -18,13 +18,13 @@ from jast import distributions as D
 from jast import results, rewards, units
 from jast._checks import random_key
 from jast._jax import jit, quick
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.episode import Episode, rollout
-from jast.incidents import incidents, merged, since
+from jast.incidents import incidents, merge_incidents, since
 from jast.intervals import clopper_pearson
 from jast.outline import outline
-from jast.places import Post, Task
+from jast.places import Task, UnitContext
 from jast.policy import undisturbed
 from jast.progress import Progress, advance, begin, conclude
 from jast.pytrees import clear
@@ -159,20 +159,20 @@ def nominal(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
     contract("nominal", sim)
-    ways = units.ways("nominal", executor, devices)
+    ways = units.placement("nominal", executor, devices)
     asked, before = int(episodes), incidents(sim)
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
     with (
-        stored("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
+        open_checkpoint("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
         Watch("nominal", asked, "episode", progress, callback) as watch,
     ):
-        ran = _played(key, sim, asked, watch, ways._replace(store=store))
+        ran = _play(key, sim, asked, watch, ways._replace(store=store))
     episodes, failures, invalid, mean, first = ran.state
     before = since(before, incidents(sim)), ran.incidents
     settings = results.asked("nominal", key, episodes=asked)
-    if short := units.note("episodes", ran, episodes, asked):
+    if short := units.describe_missing("episodes", ran, episodes, asked):
         settings["interrupted"] = short
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
@@ -185,7 +185,7 @@ def nominal(
             f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number"
             " that is not finite; they count as not failing"
         )
-        warnings.warn("\n  ".join([said, *map(str, merged(*before))]), stacklevel=2)
+        warnings.warn("\n  ".join([said, *map(str, merge_incidents(*before))]), stacklevel=2)
     return Nominal(
         quiet,
         failures,
@@ -232,17 +232,19 @@ class Seen(NamedTuple):
     first: int | None
 
 
-def _played(key: Any, sim: Any, episodes: int, watch: Watch, ways: units.Ways) -> units.Ran:
-    """`jast.units.Ran` with `Seen` of all episodes, unless interrupted."""
+def _play(
+    key: chex.PRNGKey, sim: Simulator, episodes: int, watch: Watch, where: units.Placement
+) -> units.UnitsRun:
+    """`jast.units.UnitsRun` with `Seen` of all episodes, unless interrupted."""
     chunks = -(-episodes // LANES)
     job = Job(key, sim, episodes, min(-(-chunks // UNITS), CHUNKS))
     seen = Seen(0, 0, 0, np.zeros((), outline(sim).dtype), None)
     played = lambda done: min(done * job.chunks * LANES, episodes)
     task, n = Task(_unit, job, lambda: Counts(*Counts._fields)), -(-chunks // job.chunks)
-    return units.run(task, n, _with, seen, watch, ways, size=played)
+    return units.run(task, n, _with, seen, watch, where, size=played)
 
 
-def _unit(job: Job, number: int, post: Post) -> Counts:
+def _unit(job: Job, number: int, post: UnitContext) -> Counts:
     end = min((number + 1) * job.chunks, -(-job.episodes // LANES))
     bounds = job.episodes, number * job.chunks, end
     count = _count_quickly if job.episodes <= BRIEF else _count

@@ -152,12 +152,10 @@ def incidents(sim: Simulator) -> tuple[Incident, ...]:
     return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
 
 
-def merged(some, more):
-    """``some`` incidents and ``more`` as one tuple: those of one kind and message are counted
-    together.
-    """
-    groups = {(i.kind, i.message): i for i in some}
-    for i in more:
+def merge_incidents(first, second):
+    """All incidents as one tuple, in which those of one kind and message are counted together."""
+    groups = {(i.kind, i.message): i for i in first}
+    for i in second:
         known = groups.get((i.kind, i.message))
         groups[i.kind, i.message] = (
             i if known is None else known._replace(count=known.count + i.count)

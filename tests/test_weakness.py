@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from jast import archive, weakness
-from jast.checkpoints import Store
+from jast.checkpoints import Checkpoint
 from jast.counter import generator
 from jast.weakness import Selector, Step, validate
 
@@ -370,9 +370,9 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
     if where in ("selector", "scores"):
         selector = selector._replace(step=step)
     if where == "checkpoint":
-        calls, real = [], Store.replace
+        calls, real = [], Checkpoint.replace
         monkeypatch.setattr(
-            Store,
+            Checkpoint,
             "replace",
             lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a),
         )

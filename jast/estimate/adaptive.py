@@ -13,7 +13,7 @@ from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
 from jast._jax import briefly
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.estimate import budgets, few_calls
 from jast.estimate.by_proposal import Asked, by_proposal
 from jast.estimate.estimate import Estimate, or_rough
@@ -23,7 +23,6 @@ from jast.estimate.population import by_populations
 from jast.estimate.redrawn import fits
 from jast.estimate.sample import Sample
 from jast.intervals import checked_level
-from jast.journal import kept
 from jast.results import asked
 
 if TYPE_CHECKING:
@@ -161,10 +160,14 @@ def failure_probability(
         budget = budgets.DEAR if guided else of_time()
     settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     few = not budgets.cheap(sim, budget)
-    with stored(name, checkpoint, key, **about) as store, kept(store), briefly(few):
+    with (
+        open_checkpoint(name, checkpoint, key, **about) as store,
+        keep_answers(store),
+        briefly(few),
+    ):
         if alone and not few:
             ways, watched = ways._replace(store=store), (progress, callback)
             found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)

@@ -34,7 +34,7 @@ from jast.failures import Failures
 from jast.incidents import hosted
 from jast.rounding import rounded
 from jast.simulator import Simulator
-from jast.units import HERE, Ways
+from jast.units import HERE, Placement
 from jast.watch import Watch
 
 __all__ = ["by_proposal"]
@@ -58,7 +58,7 @@ class Asked(NamedTuple):
     level: float = 0.95
     watched: tuple[bool, Any] = (False, None)
     """progress and callback"""
-    ways: Ways = HERE
+    ways: Placement = HERE
     settings: SearchSettings = SETTINGS
 
 

@@ -12,8 +12,8 @@ from jax import lax
 
 from jast._jax import quick
 from jast.boundary import EPISODES, STEPS, descents
+from jast.checkpoints import answer_once
 from jast.counter import generator
-from jast.journal import answered
 from jast.limit_state import dimension, normal_numbers, unit
 from jast.products import product
 
@@ -52,7 +52,7 @@ def descended(sim, starts):
     n = len(starts)
     z = np.zeros((MOST, dimension(sim)), normal_numbers(sim))
     z[:n] = starts
-    points, failing = (a[:n] for a in answered(partial(_in_blocks, sim), z, np.int32(n)))
+    points, failing = (a[:n] for a in answer_once(partial(_in_blocks, sim), z, np.int32(n)))
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
     return DesignPoints(points, n * (STEPS * GRADIENT + EPISODES))
 

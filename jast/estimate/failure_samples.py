@@ -13,7 +13,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast import results
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import answer_once, keep_answers, open_checkpoint
 from jast.episode import Episode
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
@@ -25,7 +25,6 @@ from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, redrawn
 from jast.estimate.sample import Sample
 from jast.frames import dataset
-from jast.journal import answered, kept
 from jast.memory import require_episodes
 
 if TYPE_CHECKING:
@@ -144,7 +143,7 @@ def failure_samples(
         )
     require_episodes(name, sim, PER_SAMPLE * samples)
     about = dict(sim=sim, source=q, samples=samples, moves=moves)
-    with stored(name, checkpoint, key, **about) as store, kept(store):
+    with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
         return _sampled(name, key, sim, q, samples, moves)
 
 
@@ -172,7 +171,7 @@ def _sampled(name, key, sim, q, samples, moves):
         failure = o.failure
     else:
         q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
-        e, log_w = answered(lambda _: played(for_draws, sim, q, n), key_data)
+        e, log_w = answer_once(lambda _: played(for_draws, sim, q, n), key_data)
         z, failure = latent.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
@@ -182,7 +181,7 @@ def _sampled(name, key, sim, q, samples, moves):
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
     people, chain = settled(key, sim, z[rows], moves)
-    episodes = answered(partial(latent.episodes, sim), people.z)
+    episodes = answer_once(partial(latent.episodes, sim), people.z)
     # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
     # side in another program
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)

@@ -17,7 +17,7 @@ from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts
 from jast.simulator import Simulator
-from jast.units import Ways
+from jast.units import Placement
 from jast.watch import Watch
 
 __all__ = ["estimated"]
@@ -32,7 +32,7 @@ def estimated(
     q: latent.Latent | Tilts,
     lanes: int,
     watch: Watch,
-    ways: Ways,
+    ways: Placement,
     *,
     spent: int,
     reasons: Sequence[str],

@@ -22,7 +22,7 @@ from jast import distributions as D
 from jast import results, units
 from jast._checks import random_key, whole
 from jast._jax import jit
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
@@ -187,11 +187,11 @@ def importance(
     settings = asked("importance", key, samples=samples, mode=mode, level=level)
     whole_key = key
     key, for_probes = jax.random.split(key)
-    ways = units.ways("importance", executor, devices)
+    ways = units.placement("importance", executor, devices)
     about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = even(samples)
-    with stored("importance", checkpoint, whole_key, **about) as store:
+    with open_checkpoint("importance", checkpoint, whole_key, **about) as store:
         shared = key, sim, proposal, lanes, mode == "paper"
         watch = Watch("importance", samples, "episode", progress, callback)
         total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
@@ -226,7 +226,7 @@ def chunks(simulate, shared, lanes, watch, ways=units.HERE, plain=None):
     with watch:
         ran = units.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
     total, done = ran.state
-    short = units.note("episodes", ran, done, samples)
+    short = units.describe_missing("episodes", ran, done, samples)
     if ran.left_out:
         return total, (), (short, *map(str, ran.incidents))
     return total, () if short is None else (f"interrupted {short}",), ()

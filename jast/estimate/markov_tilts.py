@@ -18,11 +18,11 @@ from jax import lax
 from jax.scipy.special import logsumexp, ndtr
 
 from jast._jax import jit
+from jast.checkpoints import answer_once
 from jast.counter import generator
 from jast.distributions.parts import Parts, parts
 from jast.estimate.gaussians import log_sum
 from jast.incidents import hosted
-from jast.journal import answered
 from jast.limit_state import Outcomes, normal_numbers
 from jast.outline import asked, outline
 from jast.progress import advance, begin, conclude
@@ -320,7 +320,7 @@ def _in_lanes(sim, n, run, given):
     lanes, out = n if hosted(sim) else LANES, []
     for i in range(0, n, lanes):
         m = min(lanes, n - i)
-        o, x, trace = answered(
+        o, x, trace = answer_once(
             lambda rows, _: run(rows), np.minimum(np.arange(i, i + lanes), n - 1), given
         )
         of_steps = (a[:, :m] for a in trace[3:])

@@ -14,7 +14,7 @@ from jax import lax
 from jast import units
 from jast._checks import random_key, whole
 from jast._jax import jit
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.crude import outcome
 from jast.estimate.batches import plain_chunk, rows_of
@@ -97,8 +97,8 @@ def monte_carlo(
     by_points = outline(sim).closed
     simulate = of_points if by_points else _of_keys
     lanes = lanes_of_points(sim) if by_points else LANES
-    ways = units.ways(name, executor, devices)
-    with stored(name, checkpoint, key, sim=sim, samples=samples) as store:
+    ways = units.placement(name, executor, devices)
+    with open_checkpoint(name, checkpoint, key, sim=sim, samples=samples) as store:
         watch = Watch(name, samples, "episode", progress, callback)
         shared = key, sim, lanes, samples
         total, notes, lost = chunks(simulate, shared, lanes, watch, ways._replace(store=store))

@@ -14,7 +14,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast import units
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.counter import counter_key
 from jast.estimate.descents import SETTINGS, Settings, size
 from jast.estimate.estimate import Estimate
@@ -116,9 +116,9 @@ def population(
     particles = whole(name, "particles", particles, 128)
     level = checked_level(name, level)
     latent.check(name, sim)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     about = dict(sim=sim, budget=budget, particles=particles)
-    with stored(name, checkpoint, key, **about) as store:
+    with open_checkpoint(name, checkpoint, key, **about) as store:
         found = by_populations(
             name,
             key,
@@ -161,7 +161,7 @@ def by_populations(
     particles: int = SETTINGS.particles,
     level: float = 0.95,
     watched: tuple = (False, None),
-    ways: units.Ways = units.HERE,
+    ways: units.Placement = units.HERE,
     settings: Settings = SETTINGS,
 ) -> Estimate:
     """The `Estimate` of `population`, for the function of this ``name``."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.archive import arrays_of, named
-from jast.checkpoints import Store
+from jast.checkpoints import Checkpoint
 from jast.policies.exploring import Count, Training, settle
 from jast.policies.failure_policy import FAILING_SHARE, History, history, row
 from jast.policies.settings import Plan
@@ -77,7 +77,7 @@ def learn(
     auto_scale: bool,
     progress: bool,
     callback: Callable[..., Any] | None,
-    store: Store | None,
+    store: Checkpoint | None,
     like: Training,
 ) -> tuple[Training, np.ndarray]:
     """``(Training, rows)`` after all stretches; ``first()``: those before. ``store`` keeps them
@@ -85,7 +85,6 @@ def learn(
     """
     training, rows = _kept(store, like) or first()
     kept, lanes = (training, rows), training.lanes.t.shape[0]
-    last = lambda h: jax.tree.map(lambda a: a[-1], h)
     watch = Watch(
         function,
         plan.total * lanes,
@@ -93,7 +92,6 @@ def learn(
         progress,
         callback,
         done=int(training.at) * lanes,
-        former=lambda done, total, h: (int(h.episodes[-1]), last(h)),
     )
     try:
         with terminable():
@@ -121,7 +119,7 @@ def learn(
     return kept
 
 
-def _kept(store: Store | None, like: Training) -> tuple[Training, np.ndarray] | None:
+def _kept(store: Checkpoint | None, like: Training) -> tuple[Training, np.ndarray] | None:
     """``(Training, rows)`` that a checkpoint holds; None where there is none."""
     state = None if store is None else store.state()
     if state is None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
@@ -176,7 +176,7 @@ def ppo(
         training, rows = course.look(begin(), look, plan, sim.horizon, scale, widen)
         return training._replace(buffer=()), rows
 
-    with stored("ppo", checkpoint, key, **about) as store:
+    with open_checkpoint("ppo", checkpoint, key, **about) as store:
         training, rows = course.learn(
             "ppo",
             first,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import OBSERVED, contract
 from jast.memory import require
 from jast.outline import outline
@@ -166,7 +166,7 @@ def q_learning(
         training, curve = course.look(begin(), look, plan, sim.horizon, scale, widen)
         return T.spread(training, ranges), curve
 
-    with stored("q_learning", checkpoint, key, **about) as store:
+    with open_checkpoint("q_learning", checkpoint, key, **about) as store:
         training, curve = course.learn(
             "q_learning",
             first,

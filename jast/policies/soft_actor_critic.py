@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
@@ -193,7 +193,7 @@ def sac(
         )
     )
     look = lambda: course.look(begin(), run(0), plan, sim.horizon, scale, widen)
-    with stored("sac", checkpoint, key, **about) as store:
+    with open_checkpoint("sac", checkpoint, key, **about) as store:
         training, rows = course.learn(
             "sac",
             look,

@@ -16,8 +16,8 @@ from jax import lax
 
 from jast import failures as archive
 from jast._threads import apart
+from jast.checkpoints import step_once
 from jast.episode import Episode, replay
-from jast.journal import stepped
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
@@ -264,7 +264,7 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
         make = lambda: chunk(carry, done, end)
         run = lambda: jax.block_until_ready(make())
         step = (lambda: apart(run)) if host else run
-        carry, *news = stepped(step, carry, like=make)
+        carry, *news = step_once(step, carry, like=make)
         return carry, note(noted, end, *jax.device_get(news))
 
     whole = ends[-1] * trees

@@ -8,12 +8,11 @@ import jax
 import numpy as np
 
 from jast import _checks, results
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.counter import generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
 from jast.incidents import hosted
-from jast.journal import kept
 from jast.limit_state import check, normal_of, played, unit
 from jast.outline import outline
 from jast.pytrees import count
@@ -147,7 +146,7 @@ def refine(
         given = jax.tree.map(lambda a: np.asarray(a)[None], given)
     given = jax.device_get(given._replace(states=None))
     about = dict(sim=sim, failures=given, budget=budget, gradients=gradients)
-    with stored(name, checkpoint, key, **about) as store, kept(store):
+    with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
         work = _Work(generator(key), sim, given, gradients)
         work.run(budget)
         return work.result(settings)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._jax import quick
+from jast.checkpoints import step_once
 from jast.episode import rollout
 from jast.incidents import hosted
-from jast.journal import stepped
 from jast.judge import judged
 from jast.limit_state import Outcomes, policy_of
 from jast.pytrees import in_lanes
@@ -101,7 +101,7 @@ def _gradients(sim, points):
     v = (1 - np.minimum(points.gap, OUTSIDE))[:, None] * points.v
     v = np.where(v == 0, -ASIDE * np.sign(points.slope), v).astype(points.v.dtype)
     run = lambda v: in_lanes(GROUP, lambda v: _slopes(sim, v), v)
-    found = stepped(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
+    found = step_once(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
     return found[:, 0], found[:, 1]
 
 

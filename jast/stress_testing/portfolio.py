@@ -13,7 +13,7 @@ import numpy as np
 from jast import _checks, units
 from jast import limit_state as latent
 from jast._jax import briefly
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.contract import check
 from jast.crude import BRIEF, nominal
 from jast.episode import rollout
@@ -26,7 +26,6 @@ from jast.estimate.population import by_populations
 from jast.estimate.redrawn import redrawn
 from jast.estimate.sample import Sample
 from jast.failures import Failures, collect, empty, merge
-from jast.journal import kept
 from jast.outline import outline
 from jast.results import asked
 from jast.rewards import likelihood
@@ -142,10 +141,10 @@ def stress(
     if budget is None:
         budget = budgets.budget_of(name, key, sim, seconds, LEAST, PORTFOLIO)
     settings = asked(name, key, budget=budget, top=top)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     with (
-        stored(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
-        kept(store),
+        open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
+        keep_answers(store),
         briefly(not budgets.cheap(sim, budget)),
         Watch(name, budget, "sim", progress, callback) as watch,
     ):

@@ -12,10 +12,10 @@ import numpy as np
 
 from jast import files, units
 from jast._jax import was_interrupted
-from jast.places import Post, Task
+from jast.places import Task, UnitContext
 
 if TYPE_CHECKING:
-    from jast.checkpoints import Store
+    from jast.checkpoints import Checkpoint
     from jast.simulator import Simulator
     from jast.typing import Executor
     from jast.watch import Watch
@@ -57,7 +57,7 @@ def options_of(
     return [{**options, "checkpoint": Path(folder) / f"row-{i}"} for i in range(n)]
 
 
-def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
+def here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -> Found:
     """One row after the other in this thread; ``follow``: each is given the result before it.
     KeyboardInterrupt where one meets the first row.
     """
@@ -65,7 +65,7 @@ def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
     try:
         for i, sim in enumerate(rows.made):
             kept = None if store is None else store.get(i, ROW)
-            outcome = _unit(rows, i, Post(), near) if kept is None else kept[0]
+            outcome = _unit(rows, i, UnitContext(), near) if kept is None else kept[0]
             if kept is None and store is not None and _is_kept(outcome):
                 store.put(i, [outcome], ROW)
             result, error = _opened(outcome, sim)
@@ -81,12 +81,12 @@ def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
     return Found(found)
 
 
-def elsewhere(rows: Rows, executor: Executor, store: Store | None, watch: Watch) -> Found:
+def elsewhere(rows: Rows, executor: Executor, store: Checkpoint | None, watch: Watch) -> Found:
     """Each row a unit of `jast.units` in the processes of ``executor``: one whose process dies is
     tried again twice, and then has an error.
     """
     fold = lambda done, i, outcome: {**done, i: _opened(outcome, rows.made[i])}
-    ways = units.Ways(executor, None, store, ROW, _is_kept)
+    ways = units.Placement(executor, None, store, ROW, _is_kept)
     ran = units.run(Task(_unit, rows, lambda: 0), len(rows.made), fold, {}, watch, ways)
     lost = "left out, since its process failed in every attempt"
     found = [ran.state.get(i, (None, RuntimeError(lost))) for i in range(ran.done)]
@@ -95,7 +95,7 @@ def elsewhere(rows: Rows, executor: Executor, store: Store | None, watch: Watch)
 
 
 def _unit(
-    rows: Rows, i: int, post: Post, near: Mapping[str, Any] | None = None
+    rows: Rows, i: int, post: UnitContext, near: Mapping[str, Any] | None = None
 ) -> np.ndarray[Any, Any]:
     """Row ``i``: the bytes of its result where that is to be kept, else an array [] that holds its
     `Outcome`.

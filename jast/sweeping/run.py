@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from jast._checks import random_key
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.estimate import failure_probability
-from jast.places import executor_of
+from jast.places import check_executor
 from jast.results import asked
 from jast.simulator import Simulator
 from jast.sweeping.batch import batch, kinds
@@ -111,7 +111,7 @@ def sweep(
     columns, settings_of = _rows(values)
     if not callable(function):
         raise ValueError(f"sweep: function must be callable, received {function!r}")
-    executor_of("sweep", executor)
+    check_executor("sweep", executor)
     if follow is None:
         follow = function is failure_probability and executor is None
     if follow and executor is not None:
@@ -124,7 +124,7 @@ def sweep(
     keys = [jax.random.fold_in(key, i) for i in range(n)]
     about = dict(row=function, follow=bool(follow), values=columns, simulators=made)
     with (
-        stored("sweep", checkpoint, key, **about, options=options) as store,
+        open_checkpoint("sweep", checkpoint, key, **about, options=options) as store,
         Watch("sweep", n, "value", progress, callback) as watch,
         terminable(),
     ):

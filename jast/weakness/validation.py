@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.counter import generator
 from jast.watch import Watch, terminable
 from jast.weakness.contract import Seen, Selector
@@ -114,7 +114,7 @@ def validate(
     else:
         _fits(state, data, chosen)
     about = dict(predict=predict, data=fingerprint(data), selector=_described(chosen), state=state)
-    with stored("validate", checkpoint, key, **about) as store, terminable():
+    with open_checkpoint("validate", checkpoint, key, **about) as store, terminable():
         kept = None if store is None else store.state()
         if kept is not None:
             state = restored("", *kept, None)
@@ -191,15 +191,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
     # what whole iterations have seen of it
     seen = _seen(state.order[: state.complete], answers, data.labels)
     memory, history, finished, incidents = state.memory, state.history, state.finished, []
-    watch = Watch(
-        "validate",
-        budget,
-        "call",
-        progress,
-        callback,
-        done=len(answered),
-        former=lambda done, total, result: (len(result.history.calls), result),
-    )
+    watch = Watch("validate", budget, "call", progress, callback, done=len(answered))
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)
