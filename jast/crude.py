@@ -43,10 +43,9 @@ BRIEF = 4096
 closed loops that takes .4 CPU seconds in place of 2.8, and the episodes .08 to .9 in place of .02
 to .2.
 """
-LANES = 1024
-"""Episodes of a chunk."""
-UNITS, CHUNKS = 64, 64
-"""Units of a call, about, and chunks of a unit at most."""
+LANES = 1024  # episodes of a chunk, which run side by side
+UNITS = 64  # of a call, about: enough for the cores of a machine, few enough to be kept one by one
+CHUNKS = 64  # of a unit at most: the size of what it returns
 
 
 @results.result("episodes")
@@ -187,23 +186,23 @@ def nominal(
         )
         warnings.warn("\n  ".join([said, *map(str, merge_incidents(*before))]), stacklevel=2)
     return Nominal(
-        quiet,
-        failures,
-        episodes,
-        failures / episodes,
-        clopper_pearson(failures, episodes),
-        float(mean) if invalid < episodes else math.nan,
-        invalid,
-        first,
-        settings,
+        undisturbed=quiet,
+        failing=failures,
+        episodes=episodes,
+        rate=failures / episodes,
+        interval=clopper_pearson(failures, episodes),
+        mean_distance=float(mean) if invalid < episodes else math.nan,
+        invalid=invalid,
+        first=first,
+        settings=settings,
     )
 
 
 class Job(NamedTuple):
     """What all units of a call have in common."""
 
-    key: Any
-    sim: Any
+    key: chex.PRNGKey
+    sim: Simulator
     episodes: int
     chunks: int
     """Of a unit."""
@@ -212,12 +211,12 @@ class Job(NamedTuple):
 class Counts(NamedTuple):
     """Of the chunks of a unit, [CHUNKS]; zeros where it has fewer."""
 
-    failures: Any
-    invalid: Any
-    valid: Any
-    distance: Any
+    failures: chex.Array
+    invalid: chex.Array
+    valid: chex.Array
+    distance: chex.Array
     """Sum over the valid ones."""
-    first: Any
+    first: chex.Array
     """Number of the first failure; that of all episodes where there is none."""
 
 
@@ -227,7 +226,7 @@ class Seen(NamedTuple):
     episodes: int
     failures: int
     invalid: int
-    mean: Any
+    mean: np.ndarray
     """Miss distance of the valid ones."""
     first: int | None
 
@@ -239,9 +238,13 @@ def _play(
     chunks = -(-episodes // LANES)
     job = Job(key, sim, episodes, min(-(-chunks // UNITS), CHUNKS))
     seen = Seen(0, 0, 0, np.zeros((), outline(sim).dtype), None)
-    played = lambda done: min(done * job.chunks * LANES, episodes)
-    task, n = Task(_unit, job, lambda: Counts(*Counts._fields)), -(-chunks // job.chunks)
-    return units.run(task, n, _with, seen, watch, where, size=played)
+    task = Task(_unit, job, lambda: Counts(*Counts._fields))
+
+    def episodes_of(done: int) -> int:
+        return min(done * job.chunks * LANES, episodes)
+
+    n = -(-chunks // job.chunks)
+    return units.run(task, n, _add, seen, watch, where, size=episodes_of)
 
 
 def _unit(job: Job, number: int, post: UnitContext) -> Counts:
@@ -251,7 +254,7 @@ def _unit(job: Job, number: int, post: UnitContext) -> Counts:
     return count(job.key, job.sim, *(np.int32(n) for n in bounds))
 
 
-def _with(seen: Seen, number: int, counts: Counts) -> Seen:
+def _add(seen: Seen, number: int, counts: Counts) -> Seen:
     """``seen`` with the chunks of a unit as well."""
     mean, valid = seen.mean, seen.episodes - seen.invalid
     for count, total in zip(counts.valid, counts.distance, strict=True):
@@ -279,8 +282,10 @@ def _counts(key, sim, episodes, begin, end):
     def chunk(i, counts):
         index = i * LANES + jnp.arange(LANES, dtype=jnp.int32)
         live = (index < episodes) & (index >= 0)
-        reward = rewards.standard()
-        play = lambda k, on: outcome(jax.random.fold_in(key, k), sim, on, reward)[0]
+
+        def play(number, live):
+            return outcome(jax.random.fold_in(key, number), sim, live, rewards.STANDARD)[0]
+
         last = jax.vmap(play)(index, live)
         valid, failing = live & ~last.invalid, live & last.failure
         new = Counts(

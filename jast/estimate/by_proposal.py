@@ -32,7 +32,7 @@ from jast.estimate.tilt_family import TiltFamily
 from jast.estimate.tilt_start import cooled, given, led_down, with_given
 from jast.failures import Failures
 from jast.incidents import hosted
-from jast.rounding import rounded
+from jast.rounding import rounding_problem
 from jast.simulator import Simulator
 from jast.units import HERE, Placement
 from jast.watch import Watch
@@ -82,7 +82,7 @@ class Search(NamedTuple):
 
 def by_proposal(asked: Asked) -> Estimate:
     """The `Estimate` of a call."""
-    chance, coarse = begun(asked.key), rounded(asked.sim)
+    chance, coarse = begun(asked.key), rounding_problem(asked.sim)
     against = [] if coarse is None else [coarse]
     try:
         return _drawn(asked, _sought(asked, chance), against)
