@@ -165,7 +165,7 @@ class Checkpoint:
         one.
         """
         try:
-            return archive.read(self._state, STATE, VERSION, "the state of a checkpoint")
+            return archive.read(self._state, {STATE: VERSION}, "the state of a checkpoint")
         except (FileNotFoundError, ValueError):  # not there, or damaged with the machine
             return None
 
@@ -248,7 +248,7 @@ def _require_same_call(function: str, folder: Path, about: dict[str, str]) -> No
             )
         with _name_errors(function, folder):
             return archive.write(path, ABOUT, VERSION, dict(about=about), {})
-    header, _ = archive.read(path, ABOUT, VERSION, "a checkpoint")
+    header, _ = archive.read(path, {ABOUT: VERSION}, "a checkpoint")
     if unlike := differences(header["about"], about):
         raise ValueError(
             f"{function}: checkpoint {folder} belongs to another call: {unlike}; give another"

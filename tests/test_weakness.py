@@ -217,7 +217,7 @@ def test_a_checkpoint_holds_every_answer(tmp_path):
     system = Flaky(answers, 38, SystemExit())  # what nothing catches
     with pytest.raises(SystemExit):
         validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path)
-    _, state = archive.read(path / "state.jast", "jast checkpoint state", 1, "a state")
+    _, state = archive.read(path / "state.jast", {"jast checkpoint state": 1}, "a state")
     assert len(state["order"]) == 35
     same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
     assert len(system.asked) == 60

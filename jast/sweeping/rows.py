@@ -105,7 +105,7 @@ def _unit(
             raise rows.made[i]
         result = rows.function(rows.keys[i], rows.made[i], **rows.options[i], **(near or {}))
         if rows.keeps and not _ended_early(result):
-            return np.frombuffer(files.packed(result), np.uint8)
+            return np.frombuffer(files.to_bytes(result), np.uint8)
         outcome = result, None
     except Exception as error:
         if was_interrupted(error):
@@ -125,7 +125,7 @@ def _is_kept(outcome: np.ndarray[Any, Any]) -> bool:
 
 def _opened(outcome: np.ndarray[Any, Any], sim: Any) -> Outcome:
     if _is_kept(outcome):
-        return files.unpacked(outcome.tobytes(), "sweep: a row of the checkpoint", sim), None
+        return files.from_bytes(outcome.tobytes(), "sweep: a row of the checkpoint", sim), None
     return outcome[()]
 
 
