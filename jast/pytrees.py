@@ -11,7 +11,19 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-__all__ = ["count"]
+__all__ = [
+    "Key",
+    "bound",
+    "clear",
+    "count",
+    "fitted",
+    "in_lanes",
+    "in_parts",
+    "padded",
+    "select",
+    "strong",
+    "traceable",
+]
 
 
 class Key(NamedTuple):
@@ -37,22 +49,26 @@ def traceable(function: Partial) -> Partial:
     given = function.args, function.keywords
     if not any(map(callable, jax.tree.leaves(given))):
         return function
-    kept = lambda which: jax.tree.map(lambda a: a if callable(a) == which else None, given)
-    return Partial(_Beside(function.func, kept(True)), *kept(False))
+    functions = jax.tree.map(lambda a: a if callable(a) else None, given)
+    others = jax.tree.map(lambda a: None if callable(a) else a, given)
+    return Partial(_WithFunctions(function.func, functions), *others)
 
 
 @dataclass(frozen=True, eq=False)
-class _Beside:
+class _WithFunctions:
     """A function, and the functions among the leaves of its arguments; equal where these are."""
 
     function: Callable
     static: Any
-    """(args, keywords) with None where JAX traces"""
+    """(args, keywords) with None where JAX traces."""
 
     def __call__(self, args: tuple, keywords: dict, *more: Any) -> Any:
-        whole = lambda a, b: b if a is None else a
-        given, absent = (args, keywords), lambda a: a is None
-        args, keywords = jax.tree.map(whole, given, self.static, is_leaf=absent)
+        args, keywords = jax.tree.map(
+            lambda a, b: b if a is None else a,
+            (args, keywords),
+            self.static,
+            is_leaf=lambda a: a is None,
+        )
         return self.function(*args, *more, **keywords)
 
     def _parts(self) -> tuple:
@@ -60,7 +76,7 @@ class _Beside:
         return self.function, *leaves, tree
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Beside) and self._parts() == other._parts()
+        return isinstance(other, _WithFunctions) and self._parts() == other._parts()
 
     def __hash__(self) -> int:
         return hash(self._parts())
