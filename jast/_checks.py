@@ -12,6 +12,8 @@ import numpy as np
 
 from jast._jax import is_traced
 
+__all__ = ["library", "number", "random_key", "real", "whole"]
+
 
 def library(function: str, module: str, extra: str) -> Any:
     """The ``module`` of an ``extra`` of pyproject.toml; ImportError where that is not installed."""

@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+__all__ = ["door", "listed"]
+
 
 def door(
     package: str,

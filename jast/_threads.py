@@ -11,6 +11,8 @@ import jax
 
 from jast._jax import briefly, is_brief
 
+__all__ = ["apart", "settings", "under"]
+
 SETTINGS = {
     "jax_enable_x64": jax.enable_x64,
     "jax_default_device": jax.default_device,

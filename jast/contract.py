@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from jast.typing import Actions
 
-__all__ = ["OBSERVED", "check", "contract"]
+__all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
 OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)

@@ -17,7 +17,7 @@ from jax import lax
 
 from jast._jax import define_prng_impl
 
-__all__ = ["COUNTER", "counter_key", "generator", "tree_keys"]
+__all__ = ["COUNTER", "coin", "counter_key", "generator", "tree_keys"]
 
 
 def _mix(h):

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["BRIEF", "nominal", "outcome"]
+__all__ = ["BRIEF", "Nominal", "nominal", "outcome"]
 
 BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jast.typing import Reward
 
 
-__all__ = ["Episode", "play_back", "replay", "rollout"]
+__all__ = ["Episode", "play_back", "played", "replay", "rollout"]
 
 
 @results.shown()

@@ -206,11 +206,12 @@ def _check(path: Any, result: Any, sim: Any) -> None:
 
     like = outline(sim)
     parts = ("x0", like.x0, ()), ("disturbances", like.x, (sim.horizon,))
-    episodes = [result, *(result if isinstance(result, tuple) else ())]
-    for e in (e for e in episodes if isinstance(e, Episode)):
+    for e in [result, *(result if isinstance(result, tuple) else ())]:
+        if not isinstance(e, Episode):
+            continue
         for name, own, rows in parts:
-            value = getattr(e, name)
-            leaves, axes = jax.tree.leaves(value), np.ndim(e.length)
+            value, axes = getattr(e, name), np.ndim(e.length)
+            leaves = jax.tree.leaves(value)
             archive.check_part(path, name, archive.describe(value), leaves, own, rows, axes)
 
 

@@ -91,14 +91,13 @@ class VersionMismatch(Exception):
     """A process of the executor has other versions."""
 
 
-def check_executor(function: str, executor: Any) -> Any:
-    """``executor`` as the argument of a call. ValueError unless it has ``submit``."""
+def check_executor(function: str, executor: Any) -> None:
+    """ValueError unless ``executor``, the argument of a call, is None or has ``submit``."""
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise ValueError(
             f"{function}: executor must have submit(function, *args), as those of"
             f" concurrent.futures have, received {executor!r}"
         )
-    return executor
 
 
 def check_devices(function: str, devices: Any, executor: Any) -> tuple[jax.Device, ...] | None:

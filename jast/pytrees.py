@@ -21,6 +21,7 @@ __all__ = [
     "in_parts",
     "padded",
     "select",
+    "shapes_text",
     "strong",
     "traceable",
 ]
@@ -138,7 +139,7 @@ def fitted(name: str, value: Any, like: Any) -> Any:
     """
 
     def refusal() -> ValueError:
-        return ValueError(f"{name} must be {_text(like)}, received {_text(value)}")
+        return ValueError(f"{name} must be {shapes_text(like)}, received {shapes_text(value)}")
 
     def fit(v: Any, s: Any) -> jax.Array:
         v = jnp.asarray(v)
@@ -152,5 +153,6 @@ def fitted(name: str, value: Any, like: Any) -> Any:
     return jax.tree.map(fit, value, like)
 
 
-def _text(tree: Any) -> str:
+def shapes_text(tree: Any) -> str:
+    """Dtypes and shapes of the arrays of ``tree``, for messages."""
     return str(jax.tree.map(lambda a: f"{jnp.result_type(a)}{list(jnp.shape(a))}", tree))

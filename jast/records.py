@@ -15,6 +15,8 @@ import numpy as np
 from jast._jax import is_traced
 from jast.archive import children_of
 
+__all__ = ["decode", "encode", "place_of"]
+
 RECORDS = {
     "Episode": "jast.episode:Episode",
     "Incident": "jast.incidents:Incident",

@@ -19,7 +19,16 @@ from jax.tree_util import Partial
 
 from jast._jax import is_traced
 
-__all__ = ["VOCABULARY", "html_table"]
+__all__ = [
+    "VOCABULARY",
+    "Former",
+    "asked",
+    "batch_shape",
+    "html_table",
+    "renamed",
+    "result",
+    "shown",
+]
 
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",

@@ -18,7 +18,7 @@ from jast.pytrees import bound, traceable
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 
-__all__ = ["Simulator", "require_simulator"]
+__all__ = ["Simulator", "fixed", "never", "ravel", "require_simulator", "translating"]
 
 
 def fixed():

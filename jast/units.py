@@ -85,9 +85,8 @@ def placement(
     function: str, executor: Any, devices: Any, store: Checkpoint | None = None
 ) -> Placement:
     """The `Placement` of a call by its arguments; ValueError where these cannot be."""
-    return Placement(
-        check_executor(function, executor), check_devices(function, devices, executor), store
-    )
+    check_executor(function, executor)
+    return Placement(executor, check_devices(function, devices, executor), store)
 
 
 def require_untraced(function: str, **given: Any) -> None:

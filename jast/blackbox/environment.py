@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._checks import whole
+
 __all__ = ["Moment", "gymnasium_system"]
 
 
@@ -142,10 +144,7 @@ def gymnasium_system(
         >>> jast.rollout(jax.random.key(0), sim).disturbances.shape
         (5, 1)
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(
-            f"gymnasium_system: seed must be a whole number of at least 0, received {seed!r}"
-        )
+    seed = whole("gymnasium_system", "seed", seed, 0)
     needed, optional = (
         dict(make=make, distance=distance),
         dict(event=event, agent=agent, apply=apply),
@@ -159,9 +158,7 @@ def gymnasium_system(
             " without it no disturbance reaches the environment"
         )
     event = _terminated if event is None else event
-    return _System(
-        make=make, agent=agent, apply=apply, event=event, distance=distance, seed=int(seed)
-    )
+    return _System(make=make, agent=agent, apply=apply, event=event, distance=distance, seed=seed)
 
 
 def _terminated(moment):

@@ -14,7 +14,7 @@ import numpy as np
 from jast.blackbox.worker import fill, history
 from jast.incidents import Log
 
-__all__ = ["Calls"]
+__all__ = ["Calls", "Host"]
 
 REMEMBERED = 1 << 16  # outcomes kept to be compared with, of failures and of others each: some MB
 

@@ -16,7 +16,7 @@ import numpy as np
 from jast._checks import library
 from jast.blackbox import environment, programs, worker
 
-__all__ = ["Pool"]
+__all__ = ["Pool", "pack"]
 
 NEEDS = "jast.blackbox with workers >= 1"
 GRACE = 1.0  # seconds that a worker has beyond the time limits of its rows before it is killed

@@ -24,7 +24,7 @@ from jast.contract import OBSERVED
 from jast.distributions.containers import accepted
 from jast.distributions.kinds import Seeds
 from jast.incidents import sources
-from jast.pytrees import select
+from jast.pytrees import select, shapes_text
 from jast.simulator import Simulator, fixed, translating
 
 if TYPE_CHECKING:
@@ -417,7 +417,7 @@ def _shape(disturbance, blank, like):
         try:
             found = jax.eval_shape(value)
         except Exception as error:
-            tried = f"on a state with disturbances {_text(blank(like).disturbances)}{hint}"
+            tried = f"on a state with disturbances {shapes_text(blank(like).disturbances)}{hint}"
             raise ValueError(
                 f"{NAME}: disturbance: {type(error).__name__}: {error} ({tried})"
             ) from error
@@ -426,12 +426,8 @@ def _shape(disturbance, blank, like):
         like = found
     raise ValueError(
         f"{NAME}: the shape of what disturbance returns changes with the shape of the state's"
-        f" disturbances, the last was {_text(like)}; give like=, an example of a disturbance"
+        f" disturbances, the last was {shapes_text(like)}; give like=, an example of a disturbance"
     )
-
-
-def _text(tree):
-    return str(jax.tree.map(lambda a: f"{a.dtype}{list(a.shape)}", tree))
 
 
 def _structure(name, like):

@@ -18,7 +18,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["METHODS", "Runner", "Spec", "fill", "history", "line_of", "takes"]
+__all__ = [
+    "METHODS",
+    "NAME",
+    "Reply",
+    "Runner",
+    "Spec",
+    "WrongAnswer",
+    "blank",
+    "fill",
+    "history",
+    "install",
+    "line_of",
+    "takes",
+]
 
 METHODS = ("initialize", "transition", "miss_distance", "is_event")
 KEPT = 8192  # objects that are kept at most for the next transitions of their episodes
