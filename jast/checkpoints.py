@@ -145,7 +145,8 @@ class Checkpoint:
         if found is None:
             return None
         header, data = found
-        arrays, begin, buffer = [], 0, np.frombuffer(data, np.uint8)
+        buffer = np.frombuffer(data, np.uint8)
+        arrays, begin = [], 0
         for dtype, shape in header["arrays"]:
             end = begin + math.prod(shape) * jnp.dtype(dtype).itemsize
             # a copy: the bytes of an array within others' may lie across what its dtype wants

@@ -49,7 +49,8 @@ def dataset(e: Any, **attributes: Any) -> Any:
     for root, tree, late in (("x0", e.x0, None), ("x", e.disturbances, 1), ("state", e.states, 0)):
         for f in fields(tree, root, lead=1 if late is None else 2):
             own = f.name == root or f.name.startswith(f"{root}.")
-            name, values, dims = f.name if own else f"{root}.{f.name}", f.values, ("chain", "draw")
+            name = f.name if own else f"{root}.{f.name}"
+            values, dims = f.values, ("chain", "draw")
             if late is not None:
                 values = np.pad(values, ((0, 0), (late, 0), (0, 0)), constant_values=np.nan)
                 values, dims = np.where(blank, np.nan, values), (*dims, "step")

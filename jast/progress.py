@@ -143,14 +143,16 @@ def _arrive(
         none = jnp.zeros((), dtype)
         paid = _pay(reward, before.reward, counted, False, none, False, none)
         total, owed = jnp.where(ends, before.reward, paid), jnp.where(ends, counted, 0)
-        event, distance, done = jnp.zeros((), bool), before.distance, ends
+        event, done = jnp.zeros((), bool), ends
+        distance = before.distance
     else:
         event, own, *told = sim.evaluate(state)
         event, own = jnp.asarray(event), jnp.asarray(own).astype(dtype)
         for p in told:
             log_prob, counted = (a + jnp.asarray(p).astype(dtype) for a in (log_prob, counted))
         # the order at a state: failure, then is_terminal, then the horizon
-        done, distance, owed = event | ends, jnp.minimum(before.distance, own), ()
+        done, owed = event | ends, ()
+        distance = jnp.minimum(before.distance, own)
         nearer = approach(own).astype(dtype)
         total = _pay(reward, before.reward, counted, event, distance, done, nearer)
     invalid = _wrong(log_prob) | _wrong(total)

@@ -139,7 +139,8 @@ def run(
     """
     with open_backend(watch.name, task, where.executor, where.devices, threads) as backend:
         scheduler = _Scheduler(task, backend, where, watch)
-        merged, sent, ended = _Merged(state), 0, None
+        merged = _Merged(state)
+        sent, ended = 0, None
         try:
             with terminable():
                 while merged.done < n:

@@ -57,7 +57,8 @@ class Host:
 
     def __init__(self, runner, spec, x, starts):
         """``x``: the structure of a disturbance; ``starts``: how many leaves x0 has."""
-        self.runner, self.spec, self.x, self.starts, self.log = runner, spec, x, starts, Log()
+        self.runner, self.spec, self.x, self.starts = runner, spec, x, starts
+        self.log = Log()
         self.done = Calls(0, 0, 0, 0, 0.0)
         self.failing, self.others = {}, {}
         self.lock = threading.Lock()

@@ -135,7 +135,8 @@ class Pool:
     def __init__(self, payload, workers, spec):
         self.payload, self.spec = payload, spec
         self.workers = [Worker(payload) for _ in range(workers)]
-        self.x, self.size, self.pace = 0, 0, None
+        self.x, self.size = 0, 0
+        self.pace: float | None = None  # seconds a row
         weakref.finalize(self, _close, self.workers)
 
     def __reduce__(self):  # another process has workers of its own

@@ -126,7 +126,9 @@ class Runner:
 
     def __init__(self, system, spec):
         self.system, self.spec = system, spec
-        self.kept, self.count, self.spare = {}, 0, []
+        self.kept: dict[tuple, list] = {}  # history -> objects that have it
+        self.count = 0  # of these
+        self.spare: list = []  # objects for new episodes
         self.x, self.size = 0, 0
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
@@ -176,7 +178,8 @@ class Runner:
         """
         n = len(t)
         event, distance, terminal, log_p, seen = blank(n, self.size)
-        problems, self.episodes, self.transitions, begin = [], 0, 0, time.perf_counter()
+        problems, begin = [], time.perf_counter()
+        self.episodes = self.transitions = 0
         one = self._episode if self.spec.episodic else self._step
         for i in range(n):
             try:
