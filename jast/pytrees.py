@@ -117,8 +117,8 @@ def in_parts(size: int, function: Callable, *trees: Any) -> Any:
 
 
 def in_lanes(size: int, function: Callable, *trees: Any) -> Any:
-    """`in_parts` for any number n of rows from 1 on: the last part is filled up with rows that are
-    played twice. So one program serves every n.
+    """`in_parts` for any number n of rows from 1 on: the last part is filled up with rows again, so
+    one program serves every n.
     """
     n = len(jax.tree.leaves(trees)[0])
     rows = np.arange(-(-n // size) * size) % n

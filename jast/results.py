@@ -95,7 +95,7 @@ def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
 
 
 def result(scalar: str, batches: bool = False) -> Callable[[C], C]:
-    """A class decorator of results: `shown`, and every name of `VOCABULARY` that the class lacks is
+    """A class decorator of results: `shown`, and a name of `VOCABULARY` that the class lacks is
     None.
     """
 
