@@ -18,8 +18,8 @@ from jast.simulator import Simulator
 
 __all__ = ["traps"]
 
-SLOW_EQUATIONS = 3000
-"""Of step and evaluate, from which on they take minutes to compile. On two shared cores one
+EQUATIONS = 3000
+"""Of a step and evaluate, from which on they take minutes to compile. On two shared cores one
 program of 50 steps compiles in 4 to 14 CPU seconds for 3200 to 7000 of them (brax, mjx, two cars of
 ARCH-COMP), one with its gradient in 22 and 51 for 3200; `jast.stress` then compiles for 190 and 275
 seconds (an inverted pendulum of brax, the cars), for 63 with 700 (a transmission of ARCH-COMP).
@@ -32,18 +32,17 @@ def traps(sim: Simulator) -> list[str]:
     """
     if hosted(sim):
         return []
-    seen = probe(sim)
-    equations, flat = _program(sim)
+    seen, about, (equations, level) = probe(sim), outline(sim), _program(sim)
     found = [f"step: {text}" for text in (describe(seen), _jumps(seen)) if text is not None]
-    found += _keys(outline(sim).state, seen)
-    if seen.distance_differs and flat:
+    found += _keys(about.state, seen)
+    if seen.distance_differs and level:
         found.append(
             "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
             " all ways from one to the other pass through jax.lax.stop_gradient, comparisons or"
             " whole numbers, so that what follows gradients finds nothing; let them through (of a"
             " gymnax environment: env.with_transition_gradients())"
         )
-    if equations > SLOW_EQUATIONS:
+    if equations > EQUATIONS:
         found.append(
             f"step: {equations:,} operations of JAX take minutes to compile, in the programs"
             " of a search or an estimate together; jast.cache() keeps these for the next process,"
@@ -57,21 +56,17 @@ def _jumps(seen: Probe) -> str | None:
         return None
     return (
         f"the state jumps back to its start, as that of an environment which resets itself does, at"
-        f" step {seen.jump_back} of one of 16 episodes: evaluate never sees the failure before; use"
-        " the step that does not reset (of gymnax step_env, of brax an environment without"
+        f" step {seen.jump_back} of one of 16 episodes: evaluate never sees the failure before; use the"
+        " step that does not reset (of gymnax step_env, of brax an environment without"
         " AutoResetWrapper)"
     )
 
 
 def _keys(state: Any, seen: Probe) -> Iterator[str]:
-    def is_key(leaf: Any) -> bool:  # a user of `jast.adapters` says what is random
-        return isinstance(leaf, Key)
-
-    leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=is_key)
-    for (path, leaf), unmoved in zip(leaves, seen.unmoved, strict=True):
-        if is_key(leaf) or not unmoved:
-            continue
-        if leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)):
+    own = lambda leaf: isinstance(leaf, Key)  # a user of `jast.adapters` says what is random
+    leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=own)
+    for (path, leaf), still in zip(leaves, seen.unmoved, strict=True):
+        if not own(leaf) and leaf.dtype == jnp.uint32 and leaf.shape[-1:] in ((2,), (4,)) and still:
             yield (
                 f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
                 " random key that no disturbance reaches: the simulator's own noise is the same in"
@@ -88,7 +83,7 @@ def _program(sim: Simulator, start: Any, state: Any, dist: Any) -> tuple[int, bo
     x = D.sample(dist, jax.random.key(0))
     program = jax.make_jaxpr(lambda s, x: (sim.step(s, x), sim.evaluate(s)))(state, x)
     names = [equation.primitive.name for equation in _equations(program.jaxpr)]
-    return len(names), "stop_gradient" in names and _is_flat(sim)
+    return len(names), "stop_gradient" in names and _level(sim)
 
 
 def _equations(program: Any) -> Iterator[Any]:
@@ -102,7 +97,7 @@ def _equations(program: Any) -> Iterator[Any]:
                     yield from _equations(inner)
 
 
-def _is_flat(sim: Simulator) -> bool:
+def _level(sim: Simulator) -> bool:
     """Whether the rules of derivatives alone say that the slopes of the miss distance by the floats
     of the disturbances are 0. Nothing is run or compiled; False where there are no such rules.
     """

@@ -152,7 +152,7 @@ def test_a_step_that_is_large(monkeypatch):
     def looped(s, x):
         return jax.lax.fori_loop(0, 1000, lambda i, s: jnp.where(s > i, s * 0.5, s), s) + x
 
-    monkeypatch.setattr(T, "SLOW_EQUATIONS", 60)
+    monkeypatch.setattr(T, "EQUATIONS", 60)
     assert told(line(step=partial(many, n=30)), "operations of JAX take minutes to compile")
     assert traps(line(step=partial(many, n=3))) == traps(line(step=looped)) == []
 
