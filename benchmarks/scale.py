@@ -33,9 +33,8 @@ import jast
 from benchmarks.sizes import options, print_report, size, timed
 from jast import places, units
 from jast.blackbox import from_python
-from jast.checkpoints import PARTS
+from jast.checkpoints import PARTS, read_records
 from jast.distributions import Normal
-from jast.ledger import records
 from jast.simulators import ferry, landing
 from jast.weakness import default
 
@@ -93,9 +92,9 @@ def chains():
 def plain(task, n, fold, state, watch, ways=units.HERE, **_):
     """`jast.units.run` as a loop: without threads, checkpoints and interrupts."""
     for number in range(n):
-        result = jax.device_get(task.function(task.shared, number, places.Post()))
+        result = jax.device_get(task.function(task.shared, number, places.UnitContext()))
         state = fold(state, number, result)
-    return units.Ran(state, n)
+    return units.UnitsRun(state, n)
 
 
 def looped(call):
@@ -228,7 +227,7 @@ def killed(name, sizes, moment, folder, programs):
 def parts(checkpoint):
     """Names of the parts in the folder, where it is there yet."""
     path = checkpoint / PARTS
-    return [r.header["name"] for r in records(path)] if path.exists() else []
+    return [r.header["name"] for r in read_records(path)] if path.exists() else []
 
 
 def kills(name, sizes, runs):

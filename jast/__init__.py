@@ -2,7 +2,7 @@
 probability on them.
 """
 
-from jast._doors import door, listed
+from jast._doors import dir_function, door
 from jast.contract import check
 from jast.crude import nominal
 from jast.episode import Episode, replay, rollout
@@ -53,4 +53,4 @@ _CALLS = {
     "sweep": "jast.sweeping:sweep",
 }
 __getattr__ = door(__name__, lazy={room: f"jast.{room}" for room in _ROOMS} | _CALLS)
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

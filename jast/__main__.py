@@ -50,6 +50,12 @@ SYSTEMS = {  # name: the simulator, the reward and the actions of a search
     ),
 }
 ITERATIONS = 10  # of the cross-entropy method, which keeps a tenth of the samples of each
+OPTIONS = [  # of one search: the option, and the methods that have it
+    ("prunes", ("forest",)),
+    ("heads", ("forest",)),
+    ("paper", ("forest", "mcts")),
+]
+SEARCH_OPTIONS = "trees", "simulations", "prunes", "heads", "paper"  # those of `jast.stress` aside
 
 
 def main(argv=None):
@@ -58,28 +64,27 @@ def main(argv=None):
     """
     parser = _parser()
     options = parser.parse_args(argv)
+    a_search = any(getattr(options, name) for name in SEARCH_OPTIONS)
     if options.method is None:
-        options.method = "forest" if _of_a_search(options) and not options.system else "stress"
+        options.method = "forest" if a_search and not options.system else "stress"
     if options.system and options.method != "stress":
         parser.error("argument --method: a system of your own has stress, no other")
-    if options.method == "stress" and _of_a_search(options):
+    if options.method == "stress" and a_search:
         parser.error("argument --budget: stress has a budget; the other counts are of searches")
-    if options.prunes is not None and options.method != "forest":
-        parser.error(f"argument --prunes: only of --method forest, not of {options.method}")
-    if options.heads and options.method != "forest":
-        parser.error(f"argument --heads: only of --method forest, not of {options.method}")
-    if options.paper and options.method not in ("forest", "mcts"):
-        parser.error(
-            f"argument --paper: only with --method forest or mcts, not with {options.method}"
-        )
+    for name, methods in OPTIONS:
+        if getattr(options, name) and options.method not in methods:
+            parser.error(
+                f"argument --{name}: only of --method {' or '.join(methods)}, not of"
+                f" {options.method}"
+            )
     try:
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         parser.error(f"argument --output: {e}")
     try:
         if not options.no_cache:
-            _kept()
-        own = _loaded(parser, options.system) if options.system else None
+            _keep_programs()
+        own = _load(parser, options.system) if options.system else None
         return _stress(options, own) if options.method == "stress" else _run(options)
     except ValueError as e:
         # a count that the search refuses
@@ -94,7 +99,7 @@ def main(argv=None):
 def _parser():
     parser = argparse.ArgumentParser(
         "python -m jast",
-        description=("Find the likeliest failures of a system, their modes and their probability."),
+        description="Find the likeliest failures of a system, their modes and their probability.",
     )
     add = parser.add_argument
     add(
@@ -108,10 +113,8 @@ def _parser():
         "--simulator",
         choices=SYSTEMS,
         default="ferry",
-        help=(
-            "system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids"
-            " collisions with late sensors)"
-        ),
+        help="system under test (default: ferry; ferry-b is its easier variant S0b; colav avoids"
+        " collisions with late sensors)",
     )
     add(
         "--method",
@@ -119,20 +122,16 @@ def _parser():
         help="jast.stress, or one search with its Monte Carlo baseline (default: stress; forest"
         " where a count of a search is given)",
     )
-    add(
-        "--budget",
-        type=_count,
-        metavar="N",
-        help="evaluations of stress (default: what some eight CPU seconds simulate)",
-    )
-    add("--trees", type=_count, metavar="N", help="independent searches (default: 200)")
-    add(
-        "--simulations",
-        type=_count,
-        metavar="N",
-        help="simulations per root (forest, default: 500) or per tree (the others, default: 9000)",
-    )
-    add("--prunes", type=_count, metavar="N", help="roots of a tree of the forest (default: 18)")
+    for name, text in [
+        ("--budget", "evaluations of stress (default: what some eight CPU seconds simulate)"),
+        ("--trees", "independent searches (default: 200)"),
+        (
+            "--simulations",
+            "simulations per root (forest, default: 500) or per tree (the others, default: 9000)",
+        ),
+        ("--prunes", "roots of a tree of the forest (default: 18)"),
+    ]:
+        add(name, type=_count, metavar="N", help=text)
     add("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add(
         "--output",
@@ -142,26 +141,24 @@ def _parser():
         help="folder for the archive and the pictures (default: jast-output)",
     )
     add(
-        "--paper",
-        action="store_true",
-        help="forest and mcts: the published widening in place of the better-tuned one",
-    )
-    add(
         "--heads",
         choices=["rollout", "value", "both"],
         help="forest: networks that learn from the trees before (default: none)",
     )
-    add(
-        "--no-cache",
-        action="store_true",
-        help="compile everything anew; else compiled programs are kept for the next call"
-        " (jast.cache)",
-    )
-    add("--quiet", action="store_true", help="no progress bars")
+    for name, text in [
+        ("--paper", "forest and mcts: the published widening in place of the better-tuned one"),
+        (
+            "--no-cache",
+            "compile everything anew; else compiled programs are kept for the next call"
+            " (jast.cache)",
+        ),
+        ("--quiet", "no progress bars"),
+    ]:
+        add(name, action="store_true", help=text)
     return parser
 
 
-def _kept():
+def _keep_programs():
     """Compiled programs stay for the next call, where there is a place for them."""
     try:
         cache()
@@ -175,13 +172,7 @@ def _count(text):
     return int(text)
 
 
-def _of_a_search(options):
-    """Whether an option was given that only a search has."""
-    given = options.trees, options.simulations, options.prunes, options.heads, options.paper
-    return any(given)
-
-
-def _loaded(parser, place):
+def _load(parser, place):
     """The simulator at FILE.py:NAME."""
     file, _, name = place.rpartition(":")
     if not Path(file).is_file():
@@ -218,7 +209,7 @@ def _stress(options, own):
     report.html(page, draw=draw, explanations=_explained(options, sim, report))
     print(f"saved {path}\nsaved {archive}\nsaved {page}")
     if best is not None:
-        _pictures(options, {"episode": lambda: _drawn(options, own, best, sim)})
+        _save_pictures(options, {"episode": lambda: _draw_episode(options, own, best, sim)})
     return 130 if "interrupted" in report.settings else 0
 
 
@@ -251,49 +242,35 @@ def _run(options):
         with contextlib.suppress(KeyboardInterrupt):
             results["monte-carlo"] = monte_carlo(keys[2], sim, episodes=found.episodes, **common)
         stopped = "monte-carlo" not in results or "interrupted" in results["monte-carlo"].settings
-    print(f"{table(results)}\n{_shares(results)}{_drawn_from(chosen)}\n")
+    print(f"{table(results)}\n{_shares(results)}{_box_note(chosen)}\n")
     print(f"{_episode(found.best)}\n\n{found.failures}\n")
 
     archive = options.output / "failures.npz"
     failures.save(archive, found.failures, found.settings | dict(simulator=options.simulator))
     print(f"saved {archive}")
-    _draw(options, sim, results)
+    draw = {
+        "episode": lambda: _draw_episode(options, None, found.best, sim),
+        "history": lambda: plot.history(results, total=True),
+    }
+    _save_pictures(options, draw)
     if stopped:
         print("interrupted: these are the results of what was done")
     return 130 if stopped else 0
 
 
 def _search(key, sim, options, common):
-    trees, each = (
-        options.trees or 200,
-        options.simulations or (500 if options.method == "forest" else 9000),
-    )
-    mode = "paper" if options.paper else "default"
-    if options.method == "forest":
-        return forest(
-            key,
-            sim,
-            trees=trees,
-            prunes=options.prunes or 18,
-            simulations=each,
-            mode=mode,
-            heads=options.heads,
-            **common,
-        )
-    if options.method == "mcts":
-        return mcts(key, sim, trees=trees, simulations=each, mode=mode, **common)
+    trees = options.trees or 200
+    each = options.simulations or (500 if options.method == "forest" else 9000)
     if options.method == "monte-carlo":
         return monte_carlo(key, sim, episodes=trees * each, **common)
-    samples = -(-each // ITERATIONS)
-    return cem(
-        key,
-        sim,
-        samples=samples,
-        elites=-(-samples // 10),
-        iterations=ITERATIONS,
-        trees=trees,
-        **common,
-    )
+    if options.method == "cem":
+        samples = -(-each // ITERATIONS)
+        counts = dict(samples=samples, elites=-(-samples // 10), iterations=ITERATIONS)
+        return cem(key, sim, trees=trees, **counts, **common)
+    common |= dict(trees=trees, simulations=each, mode="paper" if options.paper else "default")
+    if options.method == "mcts":
+        return mcts(key, sim, **common)
+    return forest(key, sim, prunes=options.prunes or 18, heads=options.heads, **common)
 
 
 def _shares(results):
@@ -302,11 +279,10 @@ def _shares(results):
     """
     lines = []
     for name, r in results.items():
-        k, n, what = (
-            (r.failures.seen, r.episodes, "episodes")
-            if name == "monte-carlo"
-            else (int(r.failing_per_tree.sum()), len(r.failing_per_tree), "trees")
-        )
+        if name == "monte-carlo":
+            what, k, n = "episodes", r.failures.seen, r.episodes
+        else:
+            what, k, n = "trees", int(r.failing_per_tree.sum()), len(r.failing_per_tree)
         low, high = clopper_pearson(k, n)
         interval = (
             "no interval: they share heads"
@@ -317,7 +293,7 @@ def _shares(results):
     return "\n".join(lines)
 
 
-def _drawn_from(chosen):
+def _box_note(chosen):
     """What the shares of failures are of, where they are not of the system's own disturbances."""
     if not isinstance(chosen, UniformBox):
         return ""
@@ -331,35 +307,17 @@ def _episode(episode):
     """The episode in numbers: what happened, and the disturbances that brought it about."""
     title = "likeliest failure" if episode.failure else "no failure was found; the best episode"
     numbers = dict(reward=episode.reward, log_p=episode.log_prob, distance=episode.distance)
-    lines = [
-        f"{title}: "
-        + ", ".join(f"{name.replace('_', ' ')} {float(v):.4f}" for name, v in numbers.items())
-        + f", {int(episode.length)} steps"
-    ]
-    parts = {
-        "x0": episode.x0,
-        "x": jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances),
-    }
-    for path, a in jax.tree_util.tree_leaves_with_path(parts):
-        text = np.array2string(
-            np.asarray(a),
-            precision=4,
-            max_line_width=120,
-            suppress_small=True,
-            threshold=300,
-            prefix="    ",
-        )
-        lines.append(f"  {path[0].key}{jax.tree_util.keystr(path[1:])}: {text}")
+    said = ", ".join(f"{k.replace('_', ' ')} {float(v):.4f}" for k, v in numbers.items())
+    lines = [f"{title}: {said}, {int(episode.length)} steps"]
+    x = jax.tree.map(lambda a: a[: int(episode.length)], episode.disturbances)
+    style = dict(precision=4, max_line_width=120, suppress_small=True, threshold=300, prefix="    ")
+    for path, a in jax.tree_util.tree_leaves_with_path({"x0": episode.x0, "x": x}):
+        name = f"{path[0].key}{jax.tree_util.keystr(path[1:])}"
+        lines.append(f"  {name}: {np.array2string(np.asarray(a), **style)}")
     return "\n".join(lines)
 
 
-def _draw(options, sim, results):
-    best = results[options.method].best
-    history = lambda: plot.history(results, total=True)
-    _pictures(options, {"episode": lambda: _drawn(options, None, best, sim), "history": history})
-
-
-def _drawn(options, own, best, sim):
+def _draw_episode(options, own, best, sim):
     """Axes with the episode ``best``: the system's own picture, or its disturbances."""
     if own is None and options.simulator in ("ferry", "ferry-b"):
         return plot.ferry(best, sim)
@@ -368,8 +326,8 @@ def _drawn(options, own, best, sim):
     return plot.disturbances(best)[0]
 
 
-def _pictures(options, draw):
-    """A file for each of ``draw``, name -> function that returns axes."""
+def _save_pictures(options, draw):
+    """A file for each of ``draw``: name -> function that returns axes."""
     try:
         import matplotlib
     except ImportError:

@@ -12,8 +12,10 @@ import numpy as np
 
 from jast._jax import is_traced
 
+__all__ = ["import_library", "number", "check_random_key", "real_number", "whole_number"]
 
-def library(function: str, module: str, extra: str) -> Any:
+
+def import_library(function: str, module: str, extra: str) -> Any:
     """The ``module`` of an ``extra`` of pyproject.toml; ImportError where that is not installed."""
     try:
         return importlib.import_module(module)
@@ -22,7 +24,7 @@ def library(function: str, module: str, extra: str) -> Any:
         raise ImportError(f"{function} needs {name}: pip install 'jast[{extra}]'") from error
 
 
-def random_key(function: str, key: Any) -> None:
+def check_random_key(function: str, key: Any) -> None:
     """ValueError unless ``key`` is one key of `jax.random`."""
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
@@ -35,7 +37,7 @@ def random_key(function: str, key: Any) -> None:
         )
 
 
-def whole(function, name, value, least=1):
+def whole_number(function, name, value, least=1):
     """``value`` as an int of at least ``least``."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)
@@ -52,11 +54,11 @@ def number(function, name, value, holds, expected):
     """``value`` as a Python float, the same whatever the precision that JAX is set to, of a number
     for which ``holds``.
     """
-    real(function, name, value, holds, expected)
+    real_number(function, name, value, holds, expected)
     return float(value)
 
 
-def real(function, name, value, holds, expected):
+def real_number(function, name, value, holds, expected):
     """``value`` as a float array []; one that is not traced must be a number for which
     ``holds``.
     """

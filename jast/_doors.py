@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+__all__ = ["door", "dir_function"]
+
 
 def door(
     package: str,
@@ -47,7 +49,7 @@ def door(
     return getattribute
 
 
-def listed(names: Iterable[str]) -> Callable[[], list[str]]:
+def dir_function(names: Iterable[str]) -> Callable[[], list[str]]:
     """The ``__dir__`` of a module that shows its public ``names`` only, for tab completion."""
     shown = sorted(names)
     return lambda: shown

@@ -249,8 +249,11 @@ def _unstopped(closed: Any) -> Any:
         return _unstopped(value) if isinstance(value, type(closed)) else value
 
     same, equations = {}, []
-    # literals, which have a value and no hash, stay
-    seen = lambda v: v if hasattr(v, "val") else same.get(v, v)
+
+    def seen(variable: Any) -> Any:
+        # literals, which have a value and no hash, stay
+        return variable if hasattr(variable, "val") else same.get(variable, variable)
+
     for equation in closed.jaxpr.eqns:
         given = [seen(v) for v in equation.invars]
         if equation.primitive.name == "stop_gradient":

@@ -11,6 +11,8 @@ import jax
 
 from jast._jax import briefly, is_brief
 
+__all__ = ["run_in_thread", "current_settings", "jax_settings"]
+
 SETTINGS = {
     "jax_enable_x64": jax.enable_x64,
     "jax_default_device": jax.default_device,
@@ -23,14 +25,14 @@ SETTINGS = {
 """What ``with`` statements set, which JAX, and Python, keep for each thread apart."""
 
 
-def settings() -> dict[str, Any]:
+def current_settings() -> dict[str, Any]:
     """`SETTINGS` as they are in this thread."""
     of_jax = {name: getattr(jax.config, name) for name in SETTINGS if name != "brief"}
     return of_jax | {"brief": is_brief()}
 
 
 @contextlib.contextmanager
-def under(values: dict[str, Any]) -> Iterator[None]:
+def jax_settings(values: dict[str, Any]) -> Iterator[None]:
     """A context in which the settings have these ``values``."""
     with contextlib.ExitStack() as stack:
         for name, value in values.items():
@@ -38,14 +40,14 @@ def under(values: dict[str, Any]) -> Iterator[None]:
         yield
 
 
-def apart(function, *args):
+def run_in_thread(function, *args):
     """``function(*args)`` in another thread. A KeyboardInterrupt meets this one, which waits for
     it: not a callback in the middle of a program of XLA's.
     """
-    now = settings()
+    now = current_settings()
 
     def run():
-        with under(now):
+        with jax_settings(now):
             return function(*args)
 
     with concurrent.futures.ThreadPoolExecutor(1) as pool:

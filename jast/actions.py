@@ -4,6 +4,7 @@ disturbances are stored.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -33,9 +34,36 @@ __all__ = [
 ]
 
 
+class _OfTheModel:
+    """What choices of actions share that draw from the model, or from a proposal in its place."""
+
+    places_start = False
+    focus = 1.0  # draws of the model are near its mode already
+
+    def of(self, dist: DistributionLike) -> DistributionLike:
+        """The distribution whose quantiles they are: the model."""
+        return dist
+
+    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
+        """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
+        return D.cdf(self.of(dist), x)
+
+    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
+        """Log density of `draw` at ``x``."""
+        return self.of(dist).log_prob(x)
+
+    def near(
+        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
+    ) -> chex.ArrayTree:
+        """``x`` drawn towards the mode of the distribution, by ``scale`` in (0, 1]; integers
+        stay.
+        """
+        return _towards_mode(x, dist if start else self.of(dist), scale)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Samples:
+class Samples(_OfTheModel):
     """See `samples`.
 
     Example:
@@ -45,9 +73,6 @@ class Samples:
         2.0
     """
 
-    places_start = False
-    focus = 1.0  # draws of the model are near its mode already
-
     def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
@@ -56,28 +81,14 @@ class Samples:
 
     draw_start = draw
 
-    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
-        """Log density of `draw` at ``x``."""
-        return dist.log_prob(x)
-
-    def near(
-        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
-    ) -> chex.ArrayTree:
-        """``x`` drawn towards the mode of ``dist``, by ``scale`` in (0, 1]; integers stay."""
-        return _towards_mode(x, dist, scale)
-
     def at(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The disturbance at the point ``u`` of [0, 1)^d; uniform points are draws of ``dist``."""
         return D.quantile(dist, u)
 
-    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
-        """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `at`."""
-        return D.cdf(dist, x)
-
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Quantiles:
+class Quantiles(_OfTheModel):
     """See `quantiles`.
 
     Example:
@@ -91,7 +102,6 @@ class Quantiles:
     """The leaves of the proposal."""
     kind: Any = field(default=None, metadata=dict(static=True))
     """Its structure, or None without one."""
-    focus = 1.0
 
     @property
     def places_start(self) -> bool:
@@ -103,30 +113,16 @@ class Quantiles:
         return dist if self.kind is None else self.kind.unflatten(self.numbers)
 
     def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
-        return self.place(_uniform_like(key, dist), dist)
+        return self.place(_like(jax.random.uniform, key, dist), dist)
 
     def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
-        return D.quantile(dist, _uniform_like(key, dist))
+        return D.quantile(dist, _like(jax.random.uniform, key, dist))
 
     def place(self, u: Any, dist: DistributionLike) -> chex.ArrayTree:
         """The action at the point ``u`` in [0, 1)^d."""
         return D.quantile(self.of(dist), u)
 
     at = place
-
-    def locate(self, x: Any, dist: DistributionLike) -> chex.ArrayTree:
-        """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `place`."""
-        return D.cdf(self.of(dist), x)
-
-    def log_prob(self, x: Any, dist: DistributionLike) -> chex.Array:
-        """Log density of `draw` at ``x``."""
-        return self.of(dist).log_prob(x)
-
-    def near(
-        self, x: Any, dist: DistributionLike, scale: chex.Numeric, start: bool = False
-    ) -> chex.ArrayTree:
-        """``x`` drawn towards the mode of the distribution, by ``scale``; integers stay."""
-        return _towards_mode(x, dist if start else self.of(dist), scale)
 
 
 @jax.tree_util.register_dataclass
@@ -148,7 +144,7 @@ class UniformBox:
     focus = 0.2  # a box knows nothing of the model
 
     def draw(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
-        return self.place(_uniform_like(key, dist), dist)
+        return self.place(_like(jax.random.uniform, key, dist), dist)
 
     def draw_start(self, key: chex.PRNGKey, dist: DistributionLike) -> chex.ArrayTree:
         """The box is one of steps: a random start is drawn from its own distribution."""
@@ -232,7 +228,7 @@ class UniformBox:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Wide:
+class Wide(_OfTheModel):
     """See `wide`.
 
     Example:
@@ -244,20 +240,16 @@ class Wide:
 
     width: Any = None
     places_start = True
-    focus = 0.3
+    focus = 0.3  # wide noise is far from the mode, and less so than a box
 
-    def _of(self, dtype: Any) -> jax.Array:
+    def _width(self, dtype: Any) -> jax.Array:
         return jnp.asarray(1 if self.width is None else self.width, dtype)
-
-    def of(self, dist: Any) -> Any:
-        """The distribution whose quantiles a search fits: the model."""
-        return dist
 
     def draw(self, key: chex.PRNGKey, dist: Any) -> Any:
         """One disturbance by this choice of actions, where ``dist`` is the disturbance model at the
         state.
         """
-        return self.of_normal(_normal_like(key, dist), dist)
+        return self.of_normal(_like(jax.random.normal, key, dist), dist)
 
     def draw_start(self, key: chex.PRNGKey, dist: Any) -> Any:
         """Likewise x0; drawn from its own distribution where that has no quantile function."""
@@ -265,7 +257,7 @@ class Wide:
 
     def of_normal(self, z: Any, dist: Any) -> Any:
         """The disturbance at the normal numbers ``width * z``."""
-        return D.from_normal(dist, jax.tree.map(lambda z: self._of(z.dtype) * z, z))
+        return D.from_normal(dist, jax.tree.map(lambda z: self._width(z.dtype) * z, z))
 
     def place(self, u: Any, dist: Any) -> Any:
         """The action at the point ``u`` in [0, 1)^d."""
@@ -275,13 +267,13 @@ class Wide:
 
     def locate(self, x: Any, dist: Any) -> Any:
         """The point of [0, 1]^d at which ``x`` is, a pytree like ``x``: the inverse of `place`."""
-        return jax.tree.map(lambda z: D.phi(z / self._of(z.dtype)), D.to_normal(dist, x))
+        return jax.tree.map(lambda z: D.phi(z / self._width(z.dtype)), D.to_normal(dist, x))
 
     def log_prob(self, x: Any, dist: Any) -> jax.Array:
         """Log density of `draw` at ``x``."""
 
         def ratio(z: jax.Array) -> jax.Array:
-            width = self._of(z.dtype)
+            width = self._width(z.dtype)
             e = z / width
             return jnp.sum(0.5 * (z - e) * (z + e) - jnp.log(width))
 
@@ -406,41 +398,20 @@ def _as(dtype, *values):
     return (jnp.asarray(v).astype(dtype) for v in values)
 
 
-def _uniform_like(key, dist):
-    """Uniform numbers in [0, 1) in the shape of a value of ``dist``, one independent stream a
-    leaf.
-    """
-    event = D.event_like(dist)
-    leaves, treedef = jax.tree.flatten(event)
-    keys = [key] if len(leaves) == 1 else [jax.random.fold_in(key, i) for i in range(len(leaves))]
-    return treedef.unflatten(
-        [
-            jax.random.uniform(k, s.shape, D.float_dtype(s.dtype))
-            for k, s in zip(keys, leaves, strict=True)
-        ]
-    )
-
-
-def _normal_like(key: jax.Array, dist: Any) -> Any:
-    """Standard normal numbers in the shape of a value of ``dist``, one independent stream a
-    leaf.
+def _like(draw: Callable[..., jax.Array], key: chex.PRNGKey, dist: DistributionLike) -> Any:
+    """Numbers by ``draw`` of `jax.random` in the shape of a value of ``dist``, one independent
+    stream a leaf.
     """
     leaves, treedef = jax.tree.flatten(D.event_like(dist))
     keys = [key] if len(leaves) == 1 else [jax.random.fold_in(key, i) for i in range(len(leaves))]
-    return treedef.unflatten(
-        [
-            jax.random.normal(k, s.shape, D.float_dtype(s.dtype))
-            for k, s in zip(keys, leaves, strict=True)
-        ]
-    )
+    draws = [draw(k, s.shape, D.float_dtype(s.dtype)) for k, s in zip(keys, leaves, strict=True)]
+    return treedef.unflatten(draws)
 
 
 def _towards_mode(x, dist, scale):
     def shrink(x, m):
-        return (
-            m + jnp.asarray(scale, x.dtype) * (x - m)
-            if jnp.issubdtype(x.dtype, jnp.floating)
-            else x
-        )
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return m + jnp.asarray(scale, x.dtype) * (x - m)
 
     return jax.tree.map(shrink, x, D.mode(dist))

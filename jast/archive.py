@@ -5,23 +5,51 @@ What all of jast's files have in common. All arrays are NumPy's: they keep their
 precision that JAX is set to.
 """
 
+from __future__ import annotations
+
 import hashlib
 import io
 import json
 import os
 import zipfile
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["write"]
+if TYPE_CHECKING:
+    from jast.typing import PathLike
+
+__all__ = [
+    "arrays_of",
+    "check_array",
+    "check_part",
+    "check_structure",
+    "children_of",
+    "describe",
+    "named",
+    "pack",
+    "read",
+    "unpack",
+    "write",
+]
+
+Header = dict[str, Any]
+Arrays = dict[str, np.ndarray]
 
 
-def write(path, format, version, header, arrays, *, quick=False):
-    """Write ``arrays``, a dict of NumPy arrays, and ``header``, a dict that JSON can hold, to the
-    file ``path``.
+def write(
+    path: PathLike,
+    format: str,
+    version: int,
+    header: Header,
+    arrays: Arrays,
+    *,
+    quick: bool = False,
+) -> None:
+    """Write ``arrays`` and ``header``, a dict that JSON can hold, to the file ``path``.
 
     The write is atomic: an existing file is replaced only once the new one is complete. A ``quick``
     write is not compressed and does not wait for the disk, so it survives the end of the process
@@ -42,31 +70,29 @@ def write(path, format, version, header, arrays, *, quick=False):
             os.unlink(part)
 
 
-def packed(format, version, header, arrays):
+def pack(format: str, version: int, header: Header, arrays: Arrays) -> bytes:
     """The bytes of a file of `write`."""
     file = io.BytesIO()
     np.savez(file, **_entries(format, version, header, arrays))
     return file.getvalue()
 
 
-def read(path, format, version, kind):
+def read(path: PathLike, formats: Mapping[str, int], kind: str) -> tuple[Header, Arrays]:
     """Read a file of `write`: ``(header, arrays)``, with ``package``, the jast that wrote it, in
     the header.
 
-    ValueError says why a file is refused: not ``kind`` (which is of this ``format``), a version
-    other than ``version``, or damaged.
+    ValueError says why a file is refused: not ``kind``, which is of one of these ``formats``;
+    another version than that of its format; or damaged.
     """
-    with _opened(path, kind) as file:
-        return unpacked(file.read(), path, format, version, kind)
-
-
-def _opened(path, kind):
     if os.path.isdir(path):
         raise ValueError(f"load: {path} is not {kind} but a folder, such as checkpoint= makes")
-    return open(path, "rb")
+    with open(path, "rb") as file:
+        return unpack(file.read(), path, formats, kind)
 
 
-def unpacked(data, path, format, version, kind):
+def unpack(
+    data: bytes, path: PathLike, formats: Mapping[str, int], kind: str
+) -> tuple[Header, Arrays]:
     """`read` of the bytes of a file; ``path``: what errors call it."""
     if data[:2] != b"PK":
         raise ValueError(f"load: {path} is not {kind}")
@@ -83,12 +109,13 @@ def unpacked(data, path, format, version, kind):
         raise ValueError(
             f"load: {path} is damaged or truncated ({type(error).__name__}: {error})"
         ) from None
-    if not isinstance(header, dict) or header.get("format") != format:
-        raise ValueError(f"load: {path} is not {kind}")
-    if header.get("version") != version:
+    format = header.get("format") if isinstance(header, dict) else None
+    if format not in formats:
+        raise ValueError(f"load: {path} is not {kind}: its format is {format!r}")
+    if header.get("version") != formats[format]:
         raise ValueError(
             f"load: {path} has version {header.get('version')!r}, and this jast reads version"
-            f" {version}: use the jast that wrote the file, {header.get('package')}"
+            f" {formats[format]}: use the jast that wrote the file, {header.get('package')}"
         )
     dtypes = header.get("dtypes", {})
     if set(dtypes) != set(arrays):
@@ -96,36 +123,15 @@ def unpacked(data, path, format, version, kind):
             f"load: {path} is damaged: its list of arrays and the arrays themselves differ in"
             f" {sorted(set(dtypes) ^ set(arrays))}"
         )
-    arrays = {
-        name: (
-            arrays[name].view(jnp.dtype(dtype))
-            if arrays[name].dtype.name != dtype
-            else arrays[name]
-        )
-        for name, dtype in dtypes.items()
-    }
+    for name, dtype in dtypes.items():
+        if arrays[name].dtype.name != dtype:
+            arrays[name] = arrays[name].view(jnp.dtype(dtype))
     if header.pop("sha256", None) != _checksum(header, arrays):
         raise ValueError(f"load: {path} is damaged: its checksum does not match")
     return header, arrays
 
 
-def format_of(path: str | os.PathLike) -> Any:
-    """The format of a file of `write`; ValueError where it is none or damaged."""
-    with _opened(path, "a file of jast.save") as file:
-        if file.read(2) != b"PK":
-            raise ValueError(f"load: {path} is not a file of jast.save")
-    try:
-        with zipfile.ZipFile(path) as pack:
-            array = np.lib.format.read_array(io.BytesIO(pack.read("header.npy")))
-            return json.loads(array.tobytes())["format"]
-    except Exception as error:  # a damaged zip fails in many ways
-        raise ValueError(
-            f"load: {path} is damaged, truncated or not a file of jast.save"
-            f" ({type(error).__name__}: {error})"
-        ) from None
-
-
-def named(parts):
+def named(parts: Mapping[str, Any]) -> Arrays:
     """The arrays of a dict of pytrees, by the names "part.0", "part.1" ..."""
     return {
         f"{name}.{i}": np.asarray(leaf)
@@ -134,36 +140,35 @@ def named(parts):
     }
 
 
-def arrays_of(arrays, name):
-    """A list: the arrays of the part ``name`` of `named`."""
+def arrays_of(arrays: Arrays, name: str) -> list[np.ndarray]:
+    """The arrays of the part ``name`` of `named`."""
     return [arrays[f"{name}.{i}"] for i in range(sum(key.startswith(f"{name}.") for key in arrays))]
 
 
-def describe(tree):
+def children_of(node: Any) -> tuple[list[str], list | None]:
+    """Names and children of a node of a pytree; None in place of the children of a leaf."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda child: child is not node)
+    if len(pairs) == 1 and pairs[0][1] is node:
+        return [], None
+    return [jax.tree_util.keystr(path) for path, _ in pairs], [child for _, child in pairs]
+
+
+def describe(tree: Any) -> Any:
     """A pytree's structure in JSON: its nodes as [kind, names, children], an array as "array"."""
     if tree is None:
         return ["None", [], []]
-    below, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda node: node is not tree)
-    if len(below) == 1 and below[0][1] is tree:
+    names, children = children_of(tree)
+    if children is None:
         return "array"
-    plain = type(tree) in (tuple, list) or (
-        type(tree) is dict and all(isinstance(key, str) for key in tree)
-    )
-    names = (
-        sorted(tree)
-        if plain and isinstance(tree, dict)
-        else []
-        if plain
-        else [jax.tree_util.keystr(path) for path, _ in below]
-    )
-    return [
-        type(tree).__name__ if plain else f"the class {type(tree).__name__}",
-        names,
-        [describe(child) for _, child in below],
-    ]
+    kind = f"the class {type(tree).__name__}"
+    if type(tree) is dict and all(isinstance(key, str) for key in tree):
+        kind, names = "dict", sorted(tree)
+    elif type(tree) in (tuple, list):
+        kind, names = type(tree).__name__, []
+    return [kind, names, [describe(child) for child in children]]
 
 
-def check_structure(path, other, name, structure, like):
+def check_structure(path: PathLike, other: str, name: str, structure: Any, like: Any) -> None:
     """ValueError unless ``structure``, of `describe`, is that of the pytree ``like``. ``other`` is
     the argument that must fit, ``name`` a part of the file.
     """
@@ -175,23 +180,14 @@ def check_structure(path, other, name, structure, like):
         )
 
 
-def check_array(path, other, name, a, like, axes=0):
+def check_array(
+    path: PathLike, other: str, name: str, a: np.ndarray, like: Any, axes: int = 0
+) -> None:
     """ValueError unless ``a``, without its first ``axes``, has the shape and the kind of number of
     ``like``; the precision may differ.
     """
-    kinds = [
-        next(
-            (
-                k
-                for k in (jnp.floating, jnp.signedinteger, jnp.unsignedinteger)
-                if jnp.issubdtype(d, k)
-            ),
-            d,
-        )
-        for d in (a.dtype, like.dtype)
-    ]
     shape = a.shape[axes:]
-    if shape != like.shape or kinds[0] != kinds[1]:
+    if shape != like.shape or _kind_of_number(a.dtype) != _kind_of_number(like.dtype):
         raise ValueError(
             f"load: {path} does not fit {other}: {name} has {a.dtype.name}{list(shape)}, expected"
             f" {like.dtype.name}{list(like.shape)}"
@@ -199,7 +195,7 @@ def check_array(path, other, name, a, like, axes=0):
 
 
 def check_part(
-    path: str | os.PathLike,
+    path: PathLike,
     name: str,
     structure: Any,
     arrays: list[np.ndarray],
@@ -215,7 +211,12 @@ def check_part(
         check_array(path, "sim", name, a, jax.ShapeDtypeStruct((*rows, *s.shape), s.dtype), axes)
 
 
-def _entries(format, version, header, arrays):
+def _kind_of_number(dtype: Any) -> Any:
+    kinds = jnp.floating, jnp.signedinteger, jnp.unsignedinteger
+    return next((kind for kind in kinds if jnp.issubdtype(dtype, kind)), dtype)
+
+
+def _entries(format: str, version: int, header: Header, arrays: Arrays) -> Arrays:
     """What `numpy.savez` is to write."""
     from jast import __version__  # not at import: the package imports this module
 
@@ -230,11 +231,10 @@ def _entries(format, version, header, arrays):
     return dict(header=np.frombuffer(json.dumps(header).encode(), np.uint8), **bits)
 
 
-def _checksum(header, arrays):
+def _checksum(header: Header, arrays: Arrays) -> str:
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
-        digest.update(
-            f"{name} {arrays[name].dtype.name} {arrays[name].shape}".encode()
-            + np.ascontiguousarray(arrays[name]).tobytes()
-        )
+        a = arrays[name]
+        digest.update(f"{name} {a.dtype.name} {a.shape}".encode())
+        digest.update(np.ascontiguousarray(a).tobytes())
     return digest.hexdigest()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from jast import distributions as D
 from jast._jax import jit
-from jast.episode import played
+from jast.episode import play_chosen
 from jast.limit_state import outcome, policy_of
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
@@ -63,7 +63,7 @@ def differentiable(sim, z):
     """
     policy = policy_of(sim, z)
     choose = lambda state, t, _: D.mode(policy.disturbance(state, t))
-    return played(sim, log_likelihood, D.mode(policy.start()), choose, (), sim.horizon)
+    return play_chosen(sim, log_likelihood, D.mode(policy.start()), choose, (), sim.horizon)
 
 
 def _one(sim, start):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import jax
 
-from jast._checks import whole
+from jast._checks import whole_number
 from jast._jax import reset_cache
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def cache(folder: PathLike | None = None, *, limit: int = LIMIT) -> Path:
         >>> jast.cache(tempfile.mkdtemp()).is_dir()
         True
     """
-    limit = whole("cache", "limit", limit, 0)
+    limit = whole_number("cache", "limit", limit, 0)
     try:
         path = Path(folder or jax.config.jax_compilation_cache_dir or _of_user()).expanduser()
         path.mkdir(parents=True, exist_ok=True)

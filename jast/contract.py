@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,21 +20,25 @@ from jax import lax
 from jast import distributions as D
 from jast._jax import is_traced, is_tracing, quick
 from jast.actions import Quantiles, Samples, UniformBox, Wide
-from jast.incidents import incidents, since, sources
+from jast.incidents import incidents, new_incidents, sources
 from jast.memory import release
 from jast.outline import outline
+from jast.pytrees import select
 from jast.simulator import Simulator, require_simulator
 from jast.traps import traps
 
 if TYPE_CHECKING:
+    import chex
+
     from jast.typing import Actions
 
-__all__ = ["check", "contract"]
+__all__ = ["ACTIONS", "OBSERVED", "check", "contract"]
 
-OBSERVED = 64
-"""The most numbers that ``observe`` may return to what looks at them."""
+OBSERVED = 64  # numbers that ``observe`` may return at most to what looks at them, as networks do
 ARRAYS = (jax.Array, np.ndarray, np.generic, bool, int, float)
-LANES, STEPS, DRAWS = 32, 8, 64
+LANES = 32  # nominal episodes that `check` runs: a handful, as a step may be slow
+STEPS = 8  # of each, where the system is not episodic
+DRAWS = 64  # of the actions at the start
 HINTS = {
     "TracerBoolConversionError": (
         " An if, and, or, not, min or max on a value of the state or the disturbance does not work:"
@@ -101,22 +105,23 @@ def check(sim: Simulator, actions: Actions | None = None) -> Simulator:
         raise ValueError(
             f"check: while the first steps ran, a function of the simulator raised {_first_line(e)}"
         ) from e
-    _densities(found)
-    _numbers(found, since(before, incidents(sim)))
-    _repeats(sim, found["x0"], found["x"], found["judged"])
+    _check_densities(found)
+    _check_numbers(found, new_incidents(before, incidents(sim)))
+    _check_twice("init", sim.init, found.x0)
+    _check_twice("evaluate", sim.evaluate, found.judged)
+    _check_twice("step", lambda x0, x: sim.step(sim.init(x0), x), found.x0, found.x)
     for words in traps(sim):
         warnings.warn(f"check: {words}", UserWarning, stacklevel=2)
     for source in sources(sim, "compare"):  # a black box that is judged at the end only
         source.compare(sim)
-    if actions is not None and (share := found["actions"]) > 0.5:
-        box = (
-            f" on the box [{_show(actions.low)}, {_show(actions.high)}]"
-            if isinstance(actions, UniformBox)
-            else ""
-        )
+    if actions is not None and found.impossible > 0.5:
+        box = ""
+        if isinstance(actions, UniformBox):
+            box = f" on the box [{_show(actions.low)}, {_show(actions.high)}]"
         raise ValueError(
             f"{_name(actions)}: expected disturbances inside the support of p(x | s), received log"
-            f" densities that are not finite in {share:.0%} of {DRAWS} draws at the start{box}"
+            f" densities that are not finite in {found.impossible:.0%} of {DRAWS} draws at the"
+            f" start{box}"
         )
     return sim
 
@@ -143,7 +148,7 @@ def _trace(function, sim, actions, observed):
     start = _call("start", sim.start)
     x0 = _draw("start", start)
     state = _arrays("init", _call("init", sim.init, x0))
-    hint = _whole(state)
+    hint = _hint_of_integers(state)
     dist = _call("disturbance", sim.disturbance, state)
     x = _draw("disturbance", dist)
     pair = _call("evaluate", sim.evaluate, state)
@@ -159,11 +164,8 @@ def _trace(function, sim, actions, observed):
     _scalar("is_terminal", _call("is_terminal", sim.is_terminal, state), bool)
     if observed:
         seen = _call("observe", sim.observe, state)
-        if (
-            not isinstance(seen, ARRAYS)
-            or jnp.ndim(seen) != 1
-            or not jnp.issubdtype(jnp.result_type(seen), jnp.floating)
-        ):
+        vector = isinstance(seen, ARRAYS) and jnp.ndim(seen) == 1
+        if not (vector and jnp.issubdtype(jnp.result_type(seen), jnp.floating)):
             raise ValueError(f"observe: returns {_kind(seen)}, expected a float vector")
         if jnp.size(seen) > observed:
             raise ValueError(
@@ -198,13 +200,13 @@ def _call(name, function, *args):
 def _draw(name, dist):
     """One traced value of ``dist``, which must be a distribution with a scalar log density."""
     if not (callable(getattr(dist, "sample", None)) and callable(getattr(dist, "log_prob", None))):
+        hint = "; combine several independent ones with jast.distributions.Joint"
         raise ValueError(
             f"{name}: expected a distribution (with sample and log_prob), received"
-            f" {_kind(dist)}{_several(dist)}"
+            f" {_kind(dist)}{hint if isinstance(dist, dict | list | tuple) else ''}"
         )
-    x = _arrays(
-        f"{name}: sample", _call(f"{name}: sample", lambda: D.sample(dist, jax.random.key(0)))
-    )
+    of_sample = f"{name}: sample"
+    x = _arrays(of_sample, _call(of_sample, lambda: D.sample(dist, jax.random.key(0))))
     log_p = _call(f"{name}: log_prob", dist.log_prob, x)
     if isinstance(log_p, ARRAYS) and jnp.shape(log_p):
         shape = jnp.shape(log_p)
@@ -215,13 +217,6 @@ def _draw(name, dist):
         )
     _scalar(f"{name}: log_prob", log_p, float)
     return x
-
-
-def _several(dist):
-    """What to do where a distribution should be and several are."""
-    if not isinstance(dist, dict | list | tuple):
-        return ""
-    return "; combine several independent ones with jast.distributions.Joint"
 
 
 def _arrays(name, tree):
@@ -252,8 +247,8 @@ def _scalar(what, value, kind, hint=""):
         )
 
 
-def _whole(state):
-    """A hint where a state of `init` holds whole numbers: often these are floats, written as 0."""
+def _hint_of_integers(state):
+    """What to say where a state of `init` holds whole numbers: often these are meant as floats."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if jnp.issubdtype(jnp.result_type(leaf), jnp.integer):
             at = f" in leaf {_path(path)}" if path else ""
@@ -267,25 +262,19 @@ def _same(what, new, old, hint=""):
         raise ValueError(
             f"{what} has structure {jax.tree.structure(new)}, expected {jax.tree.structure(old)}"
         )
-    for (path, a), b in zip(
-        jax.tree_util.tree_leaves_with_path(new), jax.tree.leaves(old), strict=True
-    ):
-        for part, x, y in (
-            ("shape", jnp.shape(a), jnp.shape(b)),
-            ("dtype", jnp.result_type(a), jnp.result_type(b)),
-        ):
-            if x != y:
-                raise ValueError(
-                    f"{what} leaf {_path(path)} has {part} {x}, expected {y}"
-                    f"{hint if part == 'dtype' else ''}"
-                )
+    leaves = jax.tree_util.tree_leaves_with_path(new)
+    for (path, a), b in zip(leaves, jax.tree.leaves(old), strict=True):
+        name = f"{what} leaf {_path(path)}"
+        if jnp.shape(a) != jnp.shape(b):
+            raise ValueError(f"{name} has shape {jnp.shape(a)}, expected {jnp.shape(b)}")
+        if (dtype := jnp.result_type(a)) != jnp.result_type(b):
+            raise ValueError(f"{name} has dtype {dtype}, expected {jnp.result_type(b)}{hint}")
 
 
 def _box(box, x):
     for side, end in zip(("low", "high"), box.ends(x), strict=True):
-        for leaf, shape in zip(
-            jax.tree.leaves(x), map(jnp.shape, jax.tree.leaves(end)), strict=True
-        ):
+        shapes = map(jnp.shape, jax.tree.leaves(end))
+        for leaf, shape in zip(jax.tree.leaves(x), shapes, strict=True):
             try:
                 fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
             except ValueError:
@@ -297,101 +286,104 @@ def _box(box, x):
                 )
 
 
+class _Probe(NamedTuple):
+    """The numbers that `check` judges, of L episodes, the last one undisturbed, at T states."""
+
+    has_mode: bool
+    """Whether there is an undisturbed episode."""
+    density: chex.Array
+    """bool [L, T]: the log density of the disturbance that led there is not finite."""
+    state: chex.ArrayTree
+    """bool [L, T]: a leaf of the state holds NaN."""
+    distance: chex.Array
+    """bool [L, T]: the miss distance is not finite."""
+    x0: chex.ArrayTree
+    """Of the first episode."""
+    x: chex.ArrayTree
+    """Its first disturbance."""
+    judged: chex.ArrayTree
+    """A state of it that is evaluated."""
+    impossible: chex.Array | None
+    """Share of the actions' draws at the start whose log density is not finite."""
+
+
 @quick
 def _probe(sim, actions):
-    """The numbers that `check` judges: LANES nominal episodes and the undisturbed one, STEPS steps
-    of each (all, of an episodic system).
+    """LANES nominal episodes and the undisturbed one, STEPS steps of each (all, of an episodic
+    system).
     """
     about = outline(sim)
     has_mode = about.start.mode and about.disturbance.mode
 
     def episode(key, undisturbed):
-        def choose(dist, key):
-            drawn = D.sample(dist, key)
+        def choose(dist, t):
+            drawn = D.sample(dist, jax.random.fold_in(key, t))
             if not has_mode:
                 return drawn
             return jax.tree.map(
-                lambda a, b: jnp.where(undisturbed, jnp.asarray(a, b.dtype), b), D.mode(dist), drawn
+                lambda mode, x: jnp.where(undisturbed, jnp.asarray(mode, x.dtype), x),
+                D.mode(dist),
+                drawn,
             )
 
-        def seen(state):
-            if sim.episodic:  # judged at its end, below
-                return jnp.asarray(sim.is_terminal(state)), (
-                    jax.tree.map(_any_nan, state),
-                    jnp.zeros((), bool),
-                )
-            event, distance, *_ = sim.evaluate(state)
-            return jnp.asarray(event) | jnp.asarray(sim.is_terminal(state)), (
-                jax.tree.map(_any_nan, state),
-                ~jnp.isfinite(distance),
-            )
+        def look(state):
+            """Whether the episode ends, which leaves are NaN, whether the distance is wrong."""
+            event = wrong = jnp.zeros((), bool)
+            if not sim.episodic:  # such a system is judged at its end, below
+                event, distance, *_ = sim.evaluate(state)
+                wrong = ~jnp.isfinite(distance)
+            ends = jnp.asarray(event) | jnp.asarray(sim.is_terminal(state))
+            return ends, (jax.tree.map(_any_nan, state), wrong)
 
         def step(carry, t):
             state, done = carry
             dist = sim.disturbance(state)
-            x = choose(dist, jax.random.fold_in(key, t))
+            x = choose(dist, t)
             after = _arrays("step", sim.step(state, x))
-            ends, flags = seen(after)
+            ends, flags = look(after)
             flags = (~jnp.isfinite(dist.log_prob(x)), *flags)
             flags = jax.tree.map(lambda f: f & ~done, flags)
-            state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, after)
-            return (state, done | ends), (flags, x)
+            return (select(done, state, after), done | ends), (flags, x)
 
         start = sim.start()
-        x0 = choose(start, jax.random.fold_in(key, 0))
+        x0 = choose(start, 0)
         first = _arrays("init", sim.init(x0))
-        done, flags = seen(first)
+        done, flags = look(first)
         steps = sim.horizon if sim.episodic else min(sim.horizon, STEPS)
         (last, _), (later, xs) = lax.scan(
             step, (first, jnp.zeros((), bool)), jnp.arange(1, steps + 1, dtype=jnp.int32)
         )
-        density, state, distance = jax.tree.map(
-            lambda a, b: jnp.concatenate([a[None], b]),
-            (~jnp.isfinite(start.log_prob(x0)), *flags),
-            later,
+        flags = (~jnp.isfinite(start.log_prob(x0)), *flags)
+        density, nan, distance = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[None], b]), flags, later
         )
         if sim.episodic:
             distance = distance.at[-1].set(~jnp.isfinite(sim.evaluate(last)[1]))
-        return (
-            (density, state, distance),
-            x0,
-            jax.tree.map(lambda a: a[0], xs),
-            last if sim.episodic else first,
-        )
+        x = jax.tree.map(lambda a: a[0], xs)
+        return (density, nan, distance), (x0, x, last if sim.episodic else first)
 
     keys = jax.random.split(jax.random.key(0), LANES + 1)
-    flags, *of = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
-    here, x, judged = jax.tree.map(lambda a: a[0], of)
-    density, state, distance = flags
+    flags, values = jax.vmap(episode)(keys, jnp.arange(LANES + 1) == LANES)
+    x0, x, judged = jax.tree.map(lambda a: a[0], values)
     share = None
     if actions is not None:
 
         def impossible(key):
-            dist = sim.disturbance(_arrays("init", sim.init(here)))
+            dist = sim.disturbance(_arrays("init", sim.init(x0)))
             return ~jnp.isfinite(dist.log_prob(actions.draw(key, dist)))
 
-        share = jnp.mean(
-            jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS)), dtype=jnp.float32
-        )
-    return dict(
-        has_mode=has_mode,
-        density=density,
-        state=state,
-        distance=distance,
-        x0=here,
-        x=x,
-        judged=judged,
-        actions=share,
-    )
+        drawn = jax.vmap(impossible)(jax.random.split(jax.random.key(1), DRAWS))
+        share = jnp.mean(drawn, dtype=jnp.float32)
+    return _Probe(has_mode, *flags, x0=x0, x=x, judged=judged, impossible=share)
 
 
 def _any_nan(a):
     return jnp.any(jnp.isnan(a)) if jnp.issubdtype(a.dtype, jnp.inexact) else jnp.zeros((), bool)
 
 
-def _densities(found):
+def _check_densities(found):
     # the undisturbed lane is at the modes, where a density may be infinite
-    density = found["density"][:LANES]
+    density = found.density[:LANES]
     for t in np.flatnonzero(density.any(axis=0))[:1]:
         name, where = ("start", "") if t == 0 else ("disturbance", f" at step {t}")
         raise ValueError(
@@ -400,44 +392,26 @@ def _densities(found):
         )
 
 
-def _numbers(found, went_wrong):
-    def bad(flags):  # [LANES + 1, STEPS + 1] -> the first step at which it is wrong, or None
-        steps = np.flatnonzero(
-            (flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found["has_mode"]))
-        )
-        return steps[0] if steps.size else None
+def _check_numbers(found, went_wrong):
+    def first_wrong(flags):  # [LANES + 1, STEPS + 1] -> a step, or None
+        wrong = (flags[:LANES].mean(axis=0) > 0.5) | (flags[LANES] & bool(found.has_mode))
+        return int(np.argmax(wrong)) if wrong.any() else None
 
-    wrong = [
-        (t, path)
-        for path, flags in jax.tree_util.tree_leaves_with_path(found["state"])
-        if (t := bad(flags)) is not None
-    ]
-    for t, path in sorted(wrong, key=lambda p: p[0])[:1]:
+    leaves = jax.tree_util.tree_leaves_with_path(found.state)
+    steps = [(first_wrong(flags), path) for path, flags in leaves]
+    for t, path in sorted([s for s in steps if s[0] is not None], key=lambda s: s[0])[:1]:
         raise ValueError(
             f"{'init' if t == 0 else 'step'}: state leaf {_path(path)} is NaN"
             f" {f'after {t} steps' if t else 'at the start'}, expected a number"
         )
-    if (t := bad(found["distance"])) is not None:
-        raise ValueError(
-            "\n  ".join(
-                [
-                    f"evaluate: distance is not finite after {t} steps, expected a number",
-                    *map(str, went_wrong),
-                ]
-            )
-        )
+    if (t := first_wrong(found.distance)) is not None:
+        said = f"evaluate: distance is not finite after {t} steps, expected a number"
+        raise ValueError("\n  ".join([said, *map(str, went_wrong)]))
 
 
-def _repeats(sim, x0, x, judged):
-    """ValueError unless init, evaluate (at ``judged``) and step agree to the bit in two runs."""
-    _twice("init", sim.init, x0)
-    _twice("evaluate", sim.evaluate, judged)
-    _twice("step", lambda x0, x: sim.step(sim.init(x0), x), x0, x)
-
-
-def _twice(name, function, *args):
-    """Two traces that read alike are one program, which is quicker to see than to run. Others run
-    outside of jit, as do those that call the host.
+def _check_twice(name, function, *args):
+    """ValueError unless two runs agree to the bit. Two traces that read alike are one program,
+    which is quicker to see than to run. Others run outside of jit, as do those that call the host.
     """
     texts = [_text(name, function, args) for _ in range(2)]
     if texts[0] == texts[1] and "callback" not in texts[0]:
@@ -473,11 +447,9 @@ def _path(path):
 
 
 def _kind(value):
-    return (
-        f"{jnp.result_type(value)}{list(jnp.shape(value))}"
-        if isinstance(value, ARRAYS)
-        else f"{type(value).__name__} {value!r}"[:120]
-    )
+    if isinstance(value, ARRAYS):
+        return f"{jnp.result_type(value)}{list(jnp.shape(value))}"
+    return f"{type(value).__name__} {value!r}"[:120]
 
 
 def _show(value):

@@ -8,6 +8,7 @@ populations and plain draws use it, and its statistics are tested; other estimat
 own key.
 """
 
+import math
 from functools import partial
 
 import jax
@@ -17,7 +18,7 @@ from jax import lax
 
 from jast._jax import define_prng_impl
 
-__all__ = ["COUNTER", "counter_key", "generator", "tree_keys"]
+__all__ = ["COUNTER", "coin", "counter_key", "numpy_generator", "tree_keys"]
 
 
 def _mix(h):
@@ -46,24 +47,18 @@ def _fold_in(key, data):
 
 
 def _split(key, shape):
-    numbers = lax.iota(jnp.uint32, max(1, _size(shape)))[: _size(shape)]
+    size = math.prod(shape)
+    numbers = lax.iota(jnp.uint32, max(1, size))[:size]
     return jax.vmap(lambda i: _fold_in(key, ~i))(numbers).reshape(*shape, 2)
 
 
 def _random_bits(key, bit_width, shape):
-    words = _size(shape) * (2 if bit_width == 64 else 1)
+    words = math.prod(shape) * (2 if bit_width == 64 else 1)
     bits = _word(key, lax.iota(jnp.uint32, words))
     if bit_width == 64:
         high, low = bits[0::2].astype(jnp.uint64), bits[1::2].astype(jnp.uint64)
         return ((high << 32) | low).reshape(shape)
     return bits.astype({8: jnp.uint8, 16: jnp.uint16, 32: jnp.uint32}[bit_width]).reshape(shape)
-
-
-def _size(shape):
-    size = 1
-    for n in shape:
-        size *= n
-    return size
 
 
 COUNTER = define_prng_impl(
@@ -93,7 +88,7 @@ def tree_keys(key, n):
     return jax.random.wrap_key_data(words, impl=COUNTER)
 
 
-def generator(key, *numbers):
+def numpy_generator(key, *numbers):
     """A NumPy generator from a JAX key of any kind, for work on the host; another one for each
     ``numbers``, whole and not all 0. A generator is returned as it is.
     """
@@ -104,8 +99,6 @@ def generator(key, *numbers):
 
 
 def counter_key(key: jax.Array, *numbers: int) -> jax.Array:
-    """A counter key from a user's key, another one for each ``numbers``: normal
-    numbers of Threefry would take most of the time of a cheap system.
-    """
-    words = generator(key, *numbers).integers(0, 2**32, 2, np.uint32)
+    """A counter key from a user's key, another one for each ``numbers``."""
+    words = numpy_generator(key, *numbers).integers(0, 2**32, 2, np.uint32)
     return jax.random.wrap_key_data(jnp.asarray(words), impl=COUNTER)

@@ -16,18 +16,18 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards, units
-from jast._checks import random_key
+from jast._checks import check_random_key
 from jast._jax import jit, quick
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.episode import Episode, rollout
-from jast.incidents import incidents, merged, since
+from jast.incidents import incidents, merge_incidents, new_incidents
 from jast.intervals import clopper_pearson
 from jast.outline import outline
-from jast.places import Post, Task
+from jast.places import Task, UnitContext
 from jast.policy import undisturbed
 from jast.progress import Progress, advance, begin, conclude
-from jast.pytrees import clear
+from jast.pytrees import zero_where
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -36,20 +36,19 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["BRIEF", "nominal", "outcome"]
+__all__ = ["BRIEF", "Nominal", "nominal", "outcome"]
 
 BRIEF = 4096
 """Episodes up to which the program is compiled quickly, as it runs briefly: on the ferry and three
 closed loops that takes .4 CPU seconds in place of 2.8, and the episodes .08 to .9 in place of .02
 to .2.
 """
-LANES = 1024
-"""Episodes of a chunk."""
-UNITS, CHUNKS = 64, 64
-"""Units of a call, about, and chunks of a unit at most."""
+LANES = 1024  # episodes of a chunk, which run side by side
+UNITS = 64  # of a call, about: enough for the cores of a machine, few enough to be kept one by one
+CHUNKS = 64  # of a unit at most: the size of what it returns
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 class Nominal(NamedTuple):
     """What `nominal` found: Python numbers and one `Episode`."""
 
@@ -153,26 +152,26 @@ def nominal(
         >>> found.episodes, 0.0 < found.rate < 0.2
         (1000, True)
     """
-    random_key("nominal", key)
+    check_random_key("nominal", key)
     if isinstance(episodes, bool) or int(episodes) != episodes or not 1 <= episodes < 2**31:
         raise ValueError(
             f"nominal: episodes must be a whole number from 1 to 2^31 - 1, received {episodes!r}"
         )
     contract("nominal", sim)
-    ways = units.ways("nominal", executor, devices)
+    ways = units.placement("nominal", executor, devices)
     asked, before = int(episodes), incidents(sim)
     about = outline(sim)
     calm = about.start.mode and about.disturbance.mode
     quiet = rollout(key, sim, undisturbed(sim)) if calm else None  # draws nothing
     with (
-        stored("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
+        open_checkpoint("nominal", checkpoint, key, sim=sim, episodes=asked) as store,
         Watch("nominal", asked, "episode", progress, callback) as watch,
     ):
-        ran = _played(key, sim, asked, watch, ways._replace(store=store))
+        ran = _play(key, sim, asked, watch, ways._replace(store=store))
     episodes, failures, invalid, mean, first = ran.state
-    before = since(before, incidents(sim)), ran.incidents
-    settings = results.asked("nominal", key, episodes=asked)
-    if short := units.note("episodes", ran, episodes, asked):
+    before = new_incidents(before, incidents(sim)), ran.incidents
+    settings = results.call_settings("nominal", key, episodes=asked)
+    if short := units.describe_missing("episodes", ran, episodes, asked):
         settings["interrupted"] = short
     if quiet is not None and bool(quiet.failure):
         warnings.warn(
@@ -185,25 +184,25 @@ def nominal(
             f"{invalid} of {episodes} nominal episodes are invalid: the simulator returned a number"
             " that is not finite; they count as not failing"
         )
-        warnings.warn("\n  ".join([said, *map(str, merged(*before))]), stacklevel=2)
+        warnings.warn("\n  ".join([said, *map(str, merge_incidents(*before))]), stacklevel=2)
     return Nominal(
-        quiet,
-        failures,
-        episodes,
-        failures / episodes,
-        clopper_pearson(failures, episodes),
-        float(mean) if invalid < episodes else math.nan,
-        invalid,
-        first,
-        settings,
+        undisturbed=quiet,
+        failing=failures,
+        episodes=episodes,
+        rate=failures / episodes,
+        interval=clopper_pearson(failures, episodes),
+        mean_distance=float(mean) if invalid < episodes else math.nan,
+        invalid=invalid,
+        first=first,
+        settings=settings,
     )
 
 
 class Job(NamedTuple):
     """What all units of a call have in common."""
 
-    key: Any
-    sim: Any
+    key: chex.PRNGKey
+    sim: Simulator
     episodes: int
     chunks: int
     """Of a unit."""
@@ -212,12 +211,12 @@ class Job(NamedTuple):
 class Counts(NamedTuple):
     """Of the chunks of a unit, [CHUNKS]; zeros where it has fewer."""
 
-    failures: Any
-    invalid: Any
-    valid: Any
-    distance: Any
+    failures: chex.Array
+    invalid: chex.Array
+    valid: chex.Array
+    distance: chex.Array
     """Sum over the valid ones."""
-    first: Any
+    first: chex.Array
     """Number of the first failure; that of all episodes where there is none."""
 
 
@@ -227,29 +226,35 @@ class Seen(NamedTuple):
     episodes: int
     failures: int
     invalid: int
-    mean: Any
+    mean: np.ndarray
     """Miss distance of the valid ones."""
     first: int | None
 
 
-def _played(key: Any, sim: Any, episodes: int, watch: Watch, ways: units.Ways) -> units.Ran:
-    """`jast.units.Ran` with `Seen` of all episodes, unless interrupted."""
+def _play(
+    key: chex.PRNGKey, sim: Simulator, episodes: int, watch: Watch, where: units.Placement
+) -> units.UnitsRun:
+    """`jast.units.UnitsRun` with `Seen` of all episodes, unless interrupted."""
     chunks = -(-episodes // LANES)
     job = Job(key, sim, episodes, min(-(-chunks // UNITS), CHUNKS))
     seen = Seen(0, 0, 0, np.zeros((), outline(sim).dtype), None)
-    played = lambda done: min(done * job.chunks * LANES, episodes)
-    task, n = Task(_unit, job, lambda: Counts(*Counts._fields)), -(-chunks // job.chunks)
-    return units.run(task, n, _with, seen, watch, ways, size=played)
+    task = Task(_unit, job, lambda: Counts(*Counts._fields))
+
+    def episodes_of(done: int) -> int:
+        return min(done * job.chunks * LANES, episodes)
+
+    n = -(-chunks // job.chunks)
+    return units.run(task, n, _add, seen, watch, where, size=episodes_of)
 
 
-def _unit(job: Job, number: int, post: Post) -> Counts:
+def _unit(job: Job, number: int, post: UnitContext) -> Counts:
     end = min((number + 1) * job.chunks, -(-job.episodes // LANES))
     bounds = job.episodes, number * job.chunks, end
     count = _count_quickly if job.episodes <= BRIEF else _count
     return count(job.key, job.sim, *(np.int32(n) for n in bounds))
 
 
-def _with(seen: Seen, number: int, counts: Counts) -> Seen:
+def _add(seen: Seen, number: int, counts: Counts) -> Seen:
     """``seen`` with the chunks of a unit as well."""
     mean, valid = seen.mean, seen.episodes - seen.invalid
     for count, total in zip(counts.valid, counts.distance, strict=True):
@@ -277,8 +282,10 @@ def _counts(key, sim, episodes, begin, end):
     def chunk(i, counts):
         index = i * LANES + jnp.arange(LANES, dtype=jnp.int32)
         live = (index < episodes) & (index >= 0)
-        reward = rewards.standard()
-        play = lambda k, on: outcome(jax.random.fold_in(key, k), sim, on, reward)[0]
+
+        def play(number, live):
+            return outcome(jax.random.fold_in(key, number), sim, live, rewards.STANDARD)[0]
+
         last = jax.vmap(play)(index, live)
         valid, failing = live & ~last.invalid, live & last.failure
         new = Counts(
@@ -313,6 +320,6 @@ def outcome(key: Any, sim: Any, live: Any, reward: Callable) -> tuple[Progress, 
 
     live = jnp.asarray(live)
     # of a state of zeros no black box is asked, whatever the lanes beside it go on with
-    first = first._replace(done=first.done | ~live, state=clear(~live, first.state))
+    first = first._replace(done=first.done | ~live, state=zero_where(~live, first.state))
     last, steps = lax.while_loop(lambda c: ~c[0].done, step, (first, jnp.zeros((), jnp.int32)))
     return conclude(sim, reward, last, live), steps

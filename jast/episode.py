@@ -14,12 +14,12 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards
-from jast._checks import random_key
+from jast._checks import check_random_key
 from jast._jax import is_traced, quick
 from jast.outline import outline
 from jast.policy import Policy, nominal_policy
 from jast.progress import advance, begin, conclude
-from jast.pytrees import clear, fitted, padded, select
+from jast.pytrees import conform, pad_rows, select, zero_where
 from jast.simulator import Simulator, require_simulator
 
 if TYPE_CHECKING:
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from jast.typing import Reward
 
 
-__all__ = ["Episode", "play_back", "replay", "rollout"]
+__all__ = ["Episode", "play_back", "play_chosen", "replay", "rollout"]
 
 
-@results.shown()
+@results.printable()
 class Episode(NamedTuple):
     """One episode, or many along leading axes. Rows from ``length`` on are zero and mean nothing.
 
@@ -114,7 +114,7 @@ def rollout(
         >>> episode.disturbances.shape, bool(episode.failure)
         ((30,), False)
     """
-    random_key("rollout", key)
+    check_random_key("rollout", key)
     require_simulator("rollout", sim)
     reward = rewards.as_pytree(reward)
     episode = _rollout(key, sim, policy, reward)
@@ -131,7 +131,7 @@ def _rollout(key: jax.Array, sim: Simulator, policy: Policy | None, reward: Call
     keys = jax.random.split(key, sim.horizon + 1)
     x0 = D.sample(policy.start(), keys[0])
 
-    return played(
+    return play_chosen(
         sim,
         reward,
         x0,
@@ -178,20 +178,20 @@ def replay(
         disturbances = episode
     like = outline(sim)
     x0 = like.x0 if x0 is None and not like.random_start else x0
-    x0 = fitted("replay: x0", x0, like.x0)
+    x0 = conform("replay: x0", x0, like.x0)
     rows = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else -1 for leaf in jax.tree.leaves(disturbances)}
     if len(rows) != 1 or not 0 <= (steps := rows.pop()) <= sim.horizon:
         raise ValueError(
             f"replay: disturbances must have between 0 and {sim.horizon} rows (the horizon),"
             f" received {jax.tree.map(jnp.shape, disturbances)}"
         )
-    disturbances = fitted(
+    disturbances = conform(
         "replay: disturbances",
         disturbances,
         jax.tree.map(lambda s: jax.ShapeDtypeStruct((steps, *s.shape), s.dtype), like.x),
     )
     steps = jnp.asarray(steps if length is None else length, jnp.int32)
-    return play_back(sim, rewards.as_pytree(reward), x0, padded(disturbances, sim.horizon), steps)
+    return play_back(sim, rewards.as_pytree(reward), x0, pad_rows(disturbances, sim.horizon), steps)
 
 
 @quick
@@ -201,10 +201,10 @@ def play_back(
     """`replay` without its checks: ``disturbances`` [horizon, ...], of which at most ``steps`` rows
     are played; may be vmapped.
     """
-    return played(sim, reward, x0, lambda state, t, x: x, disturbances, steps)
+    return play_chosen(sim, reward, x0, lambda state, t, x: x, disturbances, steps)
 
 
-def played(
+def play_chosen(
     sim: Simulator, reward: Callable, x0: Any, choose: Callable, rows: Any, steps: Any
 ) -> Episode:
     """The episode of at most ``steps`` steps in which ``choose(state, t, rows[t])`` gives the
@@ -219,7 +219,11 @@ def played(
         x = choose(safe.state, t, row)
         after = advance(sim, reward, safe, x, t + 1 >= steps)
         kept = select(before.done, before, after)
-        return kept, (clear(before.done, x), clear(before.done, after.state), ~before.done)
+        return kept, (
+            zero_where(before.done, x),
+            zero_where(before.done, after.state),
+            ~before.done,
+        )
 
     last, (disturbances, states, live) = lax.scan(
         body, first, (jnp.arange(sim.horizon, dtype=jnp.int32), rows)

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from jast import files, results
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.archive import arrays_of, check_part, describe, named
 from jast.episode import Episode, replay
 from jast.frames import dataframe
@@ -33,12 +33,13 @@ if TYPE_CHECKING:
     from jast.typing import PathLike, Reward
 
 __all__ = ["Failures", "collect", "from_json", "load", "merge", "save", "to_csv", "to_numpy"]
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)
 
-SCALARS = ("log_prob", "distance", "failure", "length", "reward")
+SCALARS = ("log_prob", "distance", "failure", "length", "reward")  # of an episode, in a file
+ROWS = ("counts", "tree", "simulation")  # of an archive, in a file
 
 
-@results.shown("seen")
+@results.printable("seen")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Failures:
@@ -82,8 +83,11 @@ class Failures:
 
     def take(self, rows: slice | np.ndarray) -> Failures:
         """The archive of these ``rows``, a slice or rising numbers."""
-        taken = _take((self.episodes, self.counts, self.tree, self.simulation), rows)
-        return Failures(*taken, self.seen, self.dropped)
+        return Failures(*_take(self.rows(), rows), seen=self.seen, dropped=self.dropped)
+
+    def rows(self) -> tuple[Any, ...]:
+        """What has a row for each episode."""
+        return self.episodes, self.counts, self.tree, self.simulation
 
     def __iter__(self) -> Iterator[Episode]:
         return (self.episode(i) for i in range(len(self)))
@@ -111,10 +115,11 @@ class Failures:
         """
         if steps:
             return dataframe(by_step(self).items(), ["failure", "step"])
-        e, rows = self.episodes, [("failure", np.arange(1, len(self) + 1))]
-        rows += [(name, getattr(e, name)) for name in ("reward", "log_prob", "distance", "length")]
-        rows += [(name, getattr(self, name)) for name in ("counts", "tree", "simulation")]
-        return dataframe(rows, ["failure"])
+        columns = [("failure", np.arange(1, len(self) + 1))]
+        for name in ("reward", "log_prob", "distance", "length"):
+            columns.append((name, getattr(self.episodes, name)))
+        columns += [(name, getattr(self, name)) for name in ROWS]
+        return dataframe(columns, ["failure"])
 
     @property
     def size(self) -> int:
@@ -172,9 +177,16 @@ def empty(sim):
     x0 = jax.tree.map(lambda s: np.zeros((0, *s.shape), s.dtype), like.x0)
     x = jax.tree.map(lambda s: np.zeros((0, sim.horizon, *s.shape), s.dtype), like.x)
     none = np.zeros(0, np.int32)
-    return Failures(
-        Episode(x0, x, zero, zero, np.zeros(0, bool), none, zero), none, none, none, 0, 0
+    episodes = Episode(
+        x0=x0,
+        disturbances=x,
+        log_prob=zero,
+        distance=zero,
+        failure=np.zeros(0, bool),
+        length=none,
+        reward=zero,
     )
+    return Failures(episodes, counts=none, tree=none, simulation=none, seen=0, dropped=0)
 
 
 def collect(
@@ -227,36 +239,30 @@ def collect(
         )
     tree = _numbers("tree", np.zeros(m, np.int32) if tree is None else tree, m)
     simulation = _numbers("simulation", np.arange(m) if simulation is None else simulation, m)
-    failing = np.flatnonzero(episodes.failure)
 
-    # known: bytes of a candidate -> its row, None where it was dropped
-    rows, dropped, known = [], 0, {}
-    for i in failing:
+    # a replay is None where it does not fail
+    replays, found = {}, []
+    for i in np.flatnonzero(episodes.failure):
         candidate = _take(episodes, i)
         name = identity(candidate)
-        if name not in known:
-            replayed = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
-            known[name] = len(rows) if replayed.failure else None
-            if replayed.failure:
-                rows.append((jax.tree.map(np.asarray, replayed), []))
-        if known[name] is None:
-            dropped += 1
-        else:
-            rows[known[name]][1].append(i)
+        if name not in replays:
+            again = jax.device_get(replay(sim, candidate, reward=reward)._replace(states=None))
+            replays[name] = jax.tree.map(np.asarray, again) if again.failure else None
+        found.append((i, replays[name]))
+    rows = [i for i, again in found if again is not None]
     archive = empty(sim)
     if rows:
-        kept = jax.tree.map(lambda *leaves: np.stack(leaves), *(row for row, _ in rows))
-        first = np.array([min(found, key=lambda i: (simulation[i], tree[i])) for _, found in rows])
+        kept = [again for _, again in found if again is not None]
         archive = Failures(
-            kept,
-            np.array([len(found) for _, found in rows], np.int32),
-            tree[first],
-            simulation[first],
-            0,
-            0,
+            episodes=jax.tree.map(lambda *leaves: np.stack(leaves), *kept),
+            counts=np.ones(len(rows), np.int32),
+            tree=tree[rows],
+            simulation=simulation[rows],
+            seen=0,
+            dropped=0,
         )
-    return _best("collect", archive, top)._replace(
-        seen=len(failing) if seen is None else int(seen), dropped=dropped
+    return _best("collect", archive, top).replace(
+        seen=len(found) if seen is None else int(seen), dropped=len(found) - len(rows)
     )
 
 
@@ -280,21 +286,15 @@ def merge(a: Failures, b: Failures, top: int = 64) -> Failures:
         >>> int(both.seen) == int(a.seen + b.seen)
         True
     """
-    outline = [
-        (
-            jax.tree.structure(f.episodes),
-            [np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)],
-        )
-        for f in (a, b)
-    ]
-    if outline[0] != outline[1]:
+    trees = [jax.tree.structure(f.episodes) for f in (a, b)]
+    shapes = [[np.shape(leaf)[1:] for leaf in jax.tree.leaves(f.episodes)] for f in (a, b)]
+    if trees[0] != trees[1] or shapes[0] != shapes[1]:
         raise ValueError(
             "merge: both archives must be of one simulator, received episodes of shapes"
-            f" {outline[0][1]} and {outline[1][1]}"
+            f" {shapes[0]} and {shapes[1]}"
         )
-    rows = lambda f: (f.episodes, f.counts, f.tree, f.simulation)
-    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), rows(a), rows(b))
-    return _best("merge", Failures(*arrays, 0, 0), top)._replace(
+    arrays = jax.tree.map(lambda u, v: np.concatenate([u, v]), a.rows(), b.rows())
+    return _best("merge", Failures(*arrays, seen=0, dropped=0), top).replace(
         seen=a.seen + b.seen, dropped=a.dropped + b.dropped
     )
 
@@ -353,10 +353,8 @@ def load(path: PathLike, sim: Simulator | None = None) -> tuple[Failures, dict[s
 def parts(failures: Failures) -> tuple[dict, dict[str, np.ndarray]]:
     """Header and arrays of an archive's file."""
     e = failures.episodes
-    arrays = {"x0": e.x0, "disturbances": e.disturbances} | {
-        name: getattr(e, name) for name in SCALARS
-    }
-    arrays |= {name: getattr(failures, name) for name in ("counts", "tree", "simulation")}
+    arrays = {name: getattr(e, name) for name in ("x0", "disturbances", *SCALARS)}
+    arrays |= {name: getattr(failures, name) for name in ROWS}
     header = dict(settings={}, seen=int(failures.seen), dropped=int(failures.dropped))
     header["structure"] = {name: describe(getattr(e, name)) for name in ("x0", "disturbances")}
     return header, named(arrays)
@@ -378,11 +376,9 @@ def whole(
             _rebuild(path, structure["x0"], iter(x0)),
             _rebuild(path, structure["disturbances"], iter(x)),
         )
-    scalars, places = (
-        [arrays[f"{name}.0"] for name in names]
-        for names in (SCALARS, ("counts", "tree", "simulation"))
-    )
-    return Failures(Episode(x0, x, *scalars), *places, header["seen"], header["dropped"])
+    episodes = Episode(x0, x, **{name: arrays[f"{name}.0"] for name in SCALARS})
+    rows = {name: arrays[f"{name}.0"] for name in ROWS}
+    return Failures(episodes, **rows, seen=header["seen"], dropped=header["dropped"])
 
 
 def _take(episodes, i):
@@ -420,19 +416,17 @@ def _best(caller, failures, top):
     for i in order:
         groups.setdefault(identity(_take(failures.episodes, i)), []).append(i)
     groups = list(groups.values())[:top]
-    kept = np.array([found[0] for found in groups], np.int64)
+    best = np.array([group[0] for group in groups], np.int64)
     first = np.array(
-        [min(found, key=lambda i: (failures.simulation[i], failures.tree[i])) for found in groups],
+        [min(group, key=lambda i: (failures.simulation[i], failures.tree[i])) for group in groups],
         np.int64,
     )
-    counts = np.array([failures.counts[found].sum() for found in groups], np.int32)
-    return Failures(
-        _take(failures.episodes, kept),
-        counts,
-        failures.tree[first],
-        failures.simulation[first],
-        0,
-        0,
+    return failures.take(best).replace(
+        counts=np.array([failures.counts[group].sum() for group in groups], np.int32),
+        tree=failures.tree[first],
+        simulation=failures.simulation[first],
+        seen=0,
+        dropped=0,
     )
 
 
@@ -453,9 +447,8 @@ def _rebuild(path, structure, leaves):
             " sim)"
         )
     below = [_rebuild(path, child, leaves) for child in below]
-    return {
-        "None": lambda: None,
-        "tuple": lambda: tuple(below),
-        "list": lambda: below,
-        "dict": lambda: dict(zip(names, below, strict=True)),
-    }[kind]()
+    if kind == "None":
+        return None
+    if kind == "dict":
+        return dict(zip(names, below, strict=True))
+    return tuple(below) if kind == "tuple" else below

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax.tree_util import SequenceKey
 
-__all__ = ["Field", "called", "entries", "fields", "place"]
+__all__ = ["Field", "leaf_name", "entry_places", "named_fields", "path_name"]
 
 
 class Field(NamedTuple):
@@ -20,26 +20,26 @@ class Field(NamedTuple):
     """[..., k] float64"""
 
 
-def called(path: tuple, root: str) -> str:
+def leaf_name(path: tuple, root: str) -> str:
     """The name of the leaf at ``path`` of a pytree that is called ``root``: "car.speed" in named
     tuples and dicts, "x.0" in plain tuples, ``root`` itself where it is the whole.
     """
-    name = place(path)
+    name = path_name(path)
     numbered = bool(path) and isinstance(path[0], SequenceKey)
     return f"{root}.{name}" if numbered else name or root
 
 
-def place(path: tuple) -> str:
+def path_name(path: tuple) -> str:
     """``path`` in words: "car.speed", "0"; "" for the whole."""
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
-def entries(shape: tuple) -> list[str]:
+def entry_places(shape: tuple) -> list[str]:
     """The place of each number in an array of ``shape``, row by row."""
     return [str(list(at)) if at else "" for at in np.ndindex(*shape)]
 
 
-def fields(tree: Any, root: str, lead: int = 1) -> list[Field]:
+def named_fields(tree: Any, root: str, lead: int = 1) -> list[Field]:
     """The `Field` of each array of numbers in ``tree`` [..., ...], whose first ``lead`` axes are of
     steps or episodes. What holds no numbers (random keys, arrays of size 0) is left out.
     """
@@ -52,5 +52,5 @@ def fields(tree: Any, root: str, lead: int = 1) -> list[Field]:
         if not a.size or not number:
             continue
         flat = a.reshape(*a.shape[:lead], -1).astype(float)
-        found.append(Field(called(path, root), entries(a.shape[lead:]), flat))
+        found.append(Field(leaf_name(path, root), entry_places(a.shape[lead:]), flat))
     return found

@@ -21,7 +21,7 @@ from jast.records import decode, encode, place_of
 if TYPE_CHECKING:
     from jast.typing import PathLike
 
-__all__ = ["load", "save"]
+__all__ = ["from_bytes", "load", "parts", "restore", "save", "store", "to_bytes"]
 
 
 class Kind(NamedTuple):
@@ -53,6 +53,7 @@ KINDS = {
     ),
     "jast result": Kind(1, "a result of jast", "", "jast.files"),
 }
+RESULT = "jast result"
 FORMATS = {kind.place: format for format, kind in KINDS.items() if kind.place}
 FUNCTIONS = (
     "jast.policy:Policy",
@@ -85,7 +86,7 @@ def save(path: PathLike, result: Any) -> None:
         ...     bool(jast.load(path).distance == episode.distance)
         True
     """
-    store(path, FORMATS.get(place_of(result), "jast result"), result)
+    store(path, FORMATS.get(place_of(result), RESULT), result)
 
 
 def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
@@ -111,10 +112,10 @@ def load(path: PathLike, sim: Any = None, *, heads: Any = None) -> Any:
         ...     jast.load(path).episodes
         100
     """
-    format = archive.format_of(path)
-    if format not in KINDS:
-        raise ValueError(f"load: {path} is not a file of jast.save: its format is {format!r}")
-    return restore(path, format, sim, heads)[0]
+    header, arrays = archive.read(
+        path, {format: kind.version for format, kind in KINDS.items()}, "a file of jast.save"
+    )
+    return _whole(path, header["format"], header, arrays, sim, heads)
 
 
 def store(path: Any, format: str, value: Any, **more: Any) -> None:
@@ -126,20 +127,20 @@ def store(path: Any, format: str, value: Any, **more: Any) -> None:
 def restore(path: Any, format: str, sim: Any = None, heads: Any = None) -> tuple[Any, dict]:
     """``(value, header)`` of a file of this format."""
     kind = KINDS[format]
-    header, arrays = archive.read(path, format, kind.version, kind.words)
+    header, arrays = archive.read(path, {format: kind.version}, kind.words)
     return _whole(path, format, header, arrays, sim, heads), header
 
 
-def packed(result: Any) -> bytes:
+def to_bytes(result: Any) -> bytes:
     """What `save` writes, as bytes, of a result of any kind."""
-    return archive.packed("jast result", KINDS["jast result"].version, *parts(result))
+    return archive.pack(RESULT, KINDS[RESULT].version, *parts(result))
 
 
-def unpacked(data: bytes, path: str, sim: Any = None) -> Any:
-    """What `packed` was given, as `load` gives it; ``path``: what errors call it."""
-    kind = KINDS["jast result"]
-    header, arrays = archive.unpacked(data, path, "jast result", kind.version, kind.words)
-    return _whole(path, "jast result", header, arrays, sim, None)
+def from_bytes(data: bytes, path: str, sim: Any = None) -> Any:
+    """What `to_bytes` was given, as `load` gives it; ``path``: what errors call it."""
+    kind = KINDS[RESULT]
+    header, arrays = archive.unpack(data, path, {RESULT: kind.version}, kind.words)
+    return _result(path, header, arrays, sim, None)
 
 
 def parts(value: Any) -> tuple[dict, dict[str, np.ndarray]]:
@@ -161,7 +162,7 @@ def parts(value: Any) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def _whole(path: Any, format: str, header: dict, arrays: dict, sim: Any, heads: Any) -> Any:
-    if format == "jast result":
+    if format == RESULT:
         return _result(path, header, arrays, sim, heads)
     given = heads if format == "jast heads" else sim
     return _module(format).whole(path, header, arrays, given)
@@ -205,11 +206,12 @@ def _check(path: Any, result: Any, sim: Any) -> None:
 
     like = outline(sim)
     parts = ("x0", like.x0, ()), ("disturbances", like.x, (sim.horizon,))
-    episodes = [result, *(result if isinstance(result, tuple) else ())]
-    for e in (e for e in episodes if isinstance(e, Episode)):
+    for e in [result, *(result if isinstance(result, tuple) else ())]:
+        if not isinstance(e, Episode):
+            continue
         for name, own, rows in parts:
-            value = getattr(e, name)
-            leaves, axes = jax.tree.leaves(value), np.ndim(e.length)
+            value, axes = getattr(e, name), np.ndim(e.length)
+            leaves = jax.tree.leaves(value)
             archive.check_part(path, name, archive.describe(value), leaves, own, rows, axes)
 
 

@@ -7,17 +7,16 @@ import hashlib
 import inspect
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-__all__ = ["differences", "fingerprint"]
+__all__ = ["describe_differences", "fingerprint", "versions"]
 
-TOLD = 3
-"""Differences that a message names."""
+NAMED = 3  # differences that a message names: more would hide the first
 
 
 def fingerprint(**parts: Any) -> dict[str, str]:
@@ -27,20 +26,26 @@ def fingerprint(**parts: Any) -> dict[str, str]:
     Arrays enter by their type, shape and a hash of their values, functions by their name and code
     and what they close over, other objects by their class alone.
     """
-    return dict(_versions()) | {
-        name: words for part, value in parts.items() for name, words in _words(part, value, ())
+    found = versions() | {
+        "python": "{}.{}".format(*sys.version_info),
+        "jax_enable_x64": str(jax.config.jax_enable_x64),
     }
+    for part, value in parts.items():
+        found.update(_describe(part, value, ()))
+    return found
 
 
-def differences(there: dict[str, str], here: dict[str, str]) -> str:
+def describe_differences(there: dict[str, str], here: dict[str, str]) -> str:
     """In words, where two fingerprints differ; "" where they do not."""
     names = [*here, *(n for n in there if n not in here)]
     unlike = [n for n in names if there.get(n) != here.get(n)]
     said = [
-        f"{n} is {there.get(n, 'nothing')} there, {here.get(n, 'nothing')} here" for n in unlike
+        f"{n} is {there.get(n, 'nothing')} there, {here.get(n, 'nothing')} here"
+        for n in unlike[:NAMED]
     ]
-    more = [f"and {len(said) - TOLD} more differences"] if len(said) > TOLD else []
-    return "; ".join(said[:TOLD] + more)
+    if len(unlike) > NAMED:
+        said.append(f"and {len(unlike) - NAMED} more differences")
+    return "; ".join(said)
 
 
 def versions() -> dict[str, str]:
@@ -55,17 +60,13 @@ def versions() -> dict[str, str]:
     }
 
 
-def _versions() -> Iterator[tuple[str, str]]:
-    yield from versions().items()
-    yield "python", "{}.{}".format(*sys.version_info)
-    yield "jax_enable_x64", str(jax.config.jax_enable_x64)
-
-
-def _words(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
+def _describe(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
     """(name, words) of ``value`` and what is in it; ``above``: functions that it is part of."""
-    inside = lambda pairs: (
-        pair for key, part in pairs for pair in _words(f"{name}.{key}", part, above)
-    )
+
+    def inside(pairs: Iterable[tuple[Any, Any]]) -> Iterator[tuple[str, str]]:
+        for key, part in pairs:
+            yield from _describe(f"{name}.{key}", part, above)
+
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         yield name, repr(value)
     elif isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
@@ -73,7 +74,7 @@ def _words(name: str, value: Any, above: tuple) -> Iterator[tuple[str, str]]:
     elif isinstance(value, np.ndarray | np.generic | jax.Array):
         yield name, _of_array(np.asarray(value))
     elif isinstance(value, partial):  # also jax.tree_util.Partial
-        yield from _words(name, value.func, above)
+        yield from _describe(name, value.func, above)
         yield from inside([*enumerate(value.args), *value.keywords.items()])
     elif isinstance(value, dict):
         yield from inside(value.items())
@@ -114,7 +115,7 @@ def _of_function(name: str, function: Any, above: tuple) -> Iterator[tuple[str, 
                 held = cell.cell_contents
             except ValueError:  # not yet assigned
                 continue
-            yield from _words(f"{name}.{variable}", held, (*above, function))
+            yield from _describe(f"{name}.{variable}", held, (*above, function))
 
 
 def _of_code(code: types.CodeType) -> Any:

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jast._checks import library
-from jast.fields import fields
+from jast._checks import import_library
+from jast.fields import named_fields
 
 __all__ = ["dataframe", "dataset"]
 
@@ -24,7 +24,7 @@ def dataframe(columns: Iterable[tuple[str, Any]], index: Sequence[str]) -> Any:
         index: names of the first columns, which are the index.
     """
     names, values = zip(*columns, strict=True)
-    table = library("to_dataframe", "pandas", "tables").DataFrame(dict(enumerate(values)))
+    table = import_library("to_dataframe", "pandas", "tables").DataFrame(dict(enumerate(values)))
     table = table.set_index(list(range(len(index)))) if index else table
     table.index.names = list(index) or [None]
     table.columns = list(names[len(index) :])
@@ -33,7 +33,7 @@ def dataframe(columns: Iterable[tuple[str, Any]], index: Sequence[str]) -> Any:
 
 def dataset(e: Any, **attributes: Any) -> Any:
     """The xarray Dataset of `jast.Episode.to_xarray`, with ``attributes``."""
-    xarray = library("to_xarray", "xarray", "tables")
+    xarray = import_library("to_xarray", "xarray", "tables")
     shape = np.shape(e.length)
     if len(shape) > 1:
         raise ValueError(
@@ -47,9 +47,10 @@ def dataset(e: Any, **attributes: Any) -> Any:
     found = {name: (("chain", "draw"), np.asarray(getattr(e, name))[None]) for name in OF_EPISODE}
     places = {"step": steps}
     for root, tree, late in (("x0", e.x0, None), ("x", e.disturbances, 1), ("state", e.states, 0)):
-        for f in fields(tree, root, lead=1 if late is None else 2):
+        for f in named_fields(tree, root, lead=1 if late is None else 2):
             own = f.name == root or f.name.startswith(f"{root}.")
-            name, values, dims = f.name if own else f"{root}.{f.name}", f.values, ("chain", "draw")
+            name = f.name if own else f"{root}.{f.name}"
+            values, dims = f.values, ("chain", "draw")
             if late is not None:
                 values = np.pad(values, ((0, 0), (late, 0), (0, 0)), constant_values=np.nan)
                 values, dims = np.where(blank, np.nan, values), (*dims, "step")

@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 from jax.tree_util import Partial
 
-from jast._doors import listed
+from jast._doors import dir_function
 
 if TYPE_CHECKING:
     from jast.simulator import Simulator
 
 __all__ = ["KINDS", "Incident", "incidents"]
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)
 
-GROUPS = 100
-"""The most different messages that a `Log` keeps apart."""
+GROUPS = 100  # different messages that a `Log` keeps apart at most: each has an example
 KINDS = {
     "raised": "run the system on the example's disturbances to see it again",
     "timed out": (
@@ -64,11 +63,11 @@ class Incident(NamedTuple):
     """
 
     kind: str
-    """One of `KINDS`"""
+    """One of `KINDS`."""
     message: str
     """E.g. "raised ZeroDivisionError: division by zero (system.py:12)" """
     count: int
-    """How often, the example included"""
+    """How often, the example included."""
     x0: Any
     """Initial disturbance of the example, ``()`` where the start is fixed; None where there is no
     example
@@ -77,9 +76,8 @@ class Incident(NamedTuple):
     """[t, ...]: the disturbances of the example up to there, a pytree where a disturbance is one"""
 
     def __str__(self) -> str:
-        said = (
-            self.message if self.message.startswith(self.kind) else f"{self.kind}: {self.message}"
-        )
+        named = self.message.startswith(self.kind)
+        said = self.message if named else f"{self.kind}: {self.message}"
         return f"{self.count} x {said}; {KINDS[self.kind]}"
 
 
@@ -94,21 +92,15 @@ class Log:
         only.
         """
         with self._lock:
-            group = (kind, message)
+            group = kind, message
             if group not in self._groups and len(self._groups) >= GROUPS:
-                group = (
-                    "other",
-                    f"more than {GROUPS} different messages; the latest: {kind}: {message}"[:200],
-                )
-                old = next((g for g in self._groups if g[0] == "other"), None)
-                if old is not None:
-                    group = old
-            known = self._groups.get(group)
-            self._groups[group] = (
-                Incident(*group, 1, *example())
-                if known is None
-                else known._replace(count=known.count + 1)
-            )
+                latest = f"more than {GROUPS} different messages; the latest: {kind}: {message}"
+                other = "other", latest[:200]
+                group = next((g for g in self._groups if g[0] == "other"), other)
+            if group not in self._groups:
+                self._groups[group] = Incident(*group, 0, *example())
+            incident = self._groups[group]
+            self._groups[group] = incident._replace(count=incident.count + 1)
 
     def all(self):
         """tuple of `Incident`, in the order of their first examples."""
@@ -130,7 +122,7 @@ def sources(sim, name) -> Iterator[Any]:
                     yield part.func
 
 
-def hosted(sim):
+def runs_on_host(sim):
     """Whether the simulator runs on the host: a black box, slow and without gradients."""
     return any(True for _ in sources(sim, "incidents"))
 
@@ -152,20 +144,17 @@ def incidents(sim: Simulator) -> tuple[Incident, ...]:
     return tuple(i for source in sources(sim, "incidents") for i in source.incidents())
 
 
-def merged(some, more):
-    """``some`` incidents and ``more`` as one tuple: those of one kind and message are counted
-    together.
-    """
-    groups = {(i.kind, i.message): i for i in some}
-    for i in more:
-        known = groups.get((i.kind, i.message))
-        groups[i.kind, i.message] = (
-            i if known is None else known._replace(count=known.count + i.count)
-        )
+def merge_incidents(first, second):
+    """All incidents as one tuple, in which those of one kind and message are counted together."""
+    groups = {(i.kind, i.message): i for i in first}
+    for i in second:
+        group = i.kind, i.message
+        count = groups[group].count if group in groups else 0
+        groups[group] = groups.get(group, i)._replace(count=count + i.count)
     return tuple(groups.values())
 
 
-def since(before, after):
+def new_incidents(before, after):
     """What is new in ``after`` (tuples of `Incident`): with the counts since ``before``."""
     known = {(i.kind, i.message): i.count for i in before}
     new = (i._replace(count=i.count - known.get((i.kind, i.message), 0)) for i in after)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from jast._checks import real
+from jast._checks import real_number
 
 __all__ = ["chernoff", "clopper_pearson", "delta_bound", "jeffreys", "log_normal", "normal"]
 
@@ -71,7 +71,7 @@ def _exact(k, n, level):
 
 def checked_level(function, level):
     """``level`` as a float. ValueError unless it is a number between 0 and 1."""
-    real(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
+    real_number(function, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     return float(level)
 
 
@@ -197,8 +197,10 @@ def normal(mean: float, standard_error: float, level: float = 0.95) -> tuple[flo
     """
     from statistics import NormalDist  # here: slow to import
 
-    real("normal", "mean", mean, math.isfinite, "that is finite")
-    real("normal", "standard_error", standard_error, lambda v: 0 <= v < math.inf, "of at least 0")
+    real_number("normal", "mean", mean, math.isfinite, "that is finite")
+    real_number(
+        "normal", "standard_error", standard_error, lambda v: 0 <= v < math.inf, "of at least 0"
+    )
     half = NormalDist().inv_cdf((1 + checked_level("normal", level)) / 2) * float(standard_error)
     return float(mean) - half, float(mean) + half
 

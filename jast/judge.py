@@ -11,8 +11,8 @@ from jax import lax
 
 from jast import limit_state as latent
 from jast._jax import jit
-from jast.incidents import hosted
-from jast.journal import answered
+from jast.checkpoints import answer_once
+from jast.incidents import runs_on_host
 from jast.simulator import Simulator
 
 __all__ = ["Judge", "judged", "lanes_of"]
@@ -37,8 +37,8 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
     """`Outcomes` of the points ``z`` [n, D], on the host. One program serves every ``n``; a black
     box runs once a point, in batches of ``n``.
     """
-    if hosted(sim):
-        return answered(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
+    if runs_on_host(sim):
+        return answer_once(lambda z: latent.outcomes(sim, jnp.asarray(z)), z)
     n, d = z.shape
     lanes, out = lanes_of(d), []
     for i in range(0, n, lanes):
@@ -46,7 +46,7 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
         padded = np.zeros((lanes, d), z.dtype)
         padded[: len(part)] = part
         run = lambda part, all=padded: _in_blocks(sim, all, np.int32(len(part)))
-        out.append(answered(run, part, rows=len(part)))
+        out.append(answer_once(run, part, rows=len(part)))
     return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
 
 

@@ -23,12 +23,12 @@ from jast.contract import contract
 from jast.cross_entropy.sequences import latent_policy
 from jast.distributions.numbers import unflat
 from jast.episode import Episode, replay, rollout
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.policy import Policy
 from jast.products import product, rows_of
 from jast.progress import Progress, advance, begin, conclude
-from jast.pytrees import count, in_lanes
+from jast.pytrees import count_numbers, map_in_lanes
 from jast.rewards import likelihood
 from jast.simulator import Simulator
 
@@ -97,7 +97,7 @@ def check(function: str, sim: Simulator) -> None:
 def dimension(sim: Simulator) -> int:
     """D."""
     about = outline(sim)
-    return count(about.x0) + sim.horizon * count(about.x)
+    return count_numbers(about.x0) + sim.horizon * count_numbers(about.x)
 
 
 def normal_numbers(sim: Simulator) -> Any:
@@ -157,7 +157,7 @@ def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes
 def _used(sim, steps):
     """How many numbers the start and so many ``steps`` take."""
     about = outline(sim)
-    return count(about.x0) + steps * count(about.x)
+    return count_numbers(about.x0) + steps * count_numbers(about.x)
 
 
 @jit
@@ -228,7 +228,7 @@ def _live(q):
 
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:
     like = outline(sim)
-    size0 = count(like.x0)
+    size0 = count_numbers(like.x0)
     return latent_policy(
         sim,
         choices.quantiles(),
@@ -243,11 +243,11 @@ def played(sim: Simulator, z: np.ndarray) -> Episode:
 
 
 def side_by_side(sim: Simulator, function: Callable, *rows: Any, lanes: int = LANES) -> Any:
-    """``function`` of ``rows`` [n, ...], ``lanes`` at a time (`in_lanes`); a black box plays none
-    twice.
+    """``function`` of ``rows`` [n, ...], ``lanes`` at a time (`map_in_lanes`); a black box plays
+    none twice.
     """
-    size = len(jax.tree.leaves(rows)[0]) if hosted(sim) else lanes
-    return in_lanes(size, function, *rows)
+    size = len(jax.tree.leaves(rows)[0]) if runs_on_host(sim) else lanes
+    return map_in_lanes(size, function, *rows)
 
 
 def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:

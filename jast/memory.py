@@ -18,11 +18,13 @@ from jast.simulator import Simulator
 __all__ = ["available", "readable", "release", "require", "require_episodes", "size"]
 
 MAPS = 16_000
-"""Mappings of memory from which programs are let go, some 2 GB: a process of Linux may have 65,530
-by default (vm.max_map_count), beyond which the compiler dies. A system that `jast.stress` meets
-takes some 2300.
+"""Mappings of memory from which programs are released, some 2 GB: a process of Linux may have
+65,530 by default (vm.max_map_count), beyond which the compiler dies. A system that `jast.stress`
+runs takes some 2300.
 """
-_MAPS, _FREE = Path("/proc/self/maps"), Path("/proc/meminfo")
+USABLE = 0.8  # of what is free: the rest is for what a call does not count
+_MAPS = Path("/proc/self/maps")
+_FREE = Path("/proc/meminfo")
 _GROUP = Path("/sys/fs/cgroup")
 
 
@@ -33,11 +35,10 @@ def available() -> int | None:
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
-        return (
-            stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
-        )
-    known = [n for n in (_of_the_machine(), _of_the_container()) if n is not None]
-    return min(known, default=None)
+        limit = stats.get("bytes_limit")
+        return None if limit is None else limit - stats.get("bytes_in_use", 0)
+    told = [n for n in (_free_in_machine(), _free_in_container()) if n is not None]
+    return min(told, default=None)
 
 
 def require(function: str, needed: int, what: str, advice: str) -> None:
@@ -51,7 +52,7 @@ def require(function: str, needed: int, what: str, advice: str) -> None:
         advice: what to do, as in "use fewer episodes".
     """
     free = available()
-    if free is not None and needed > 0.8 * free:
+    if free is not None and needed > USABLE * free:
         raise ValueError(
             f"{function}: {what} need at least {readable(needed)}, and {readable(free)} are free;"
             f" {advice}"
@@ -89,7 +90,7 @@ def release() -> None:
         jax.clear_caches()
 
 
-def _of_the_machine() -> int | None:
+def _free_in_machine() -> int | None:
     try:
         for line in _FREE.read_text().splitlines():
             if line.startswith("MemAvailable"):
@@ -102,14 +103,14 @@ def _of_the_machine() -> int | None:
         return None
 
 
-def _of_the_container() -> int | None:
+def _free_in_container() -> int | None:
     """What the limit of a control group (version 2) leaves, as seen from inside of it; None where
     there is none. What it holds for files alone can be taken.
     """
     try:
-        most = int((_GROUP / "memory.max").read_text())
-        now = int((_GROUP / "memory.current").read_text())
-        rows = (line.split() for line in (_GROUP / "memory.stat").read_text().splitlines())
-        return max(0, most - now + next(int(n) for name, n in rows if name == "inactive_file"))
-    except (OSError, ValueError, StopIteration):
+        limit = int((_GROUP / "memory.max").read_text())
+        used = int((_GROUP / "memory.current").read_text())
+        rows = dict(line.split() for line in (_GROUP / "memory.stat").read_text().splitlines())
+        return max(0, limit - used + int(rows["inactive_file"]))
+    except (OSError, ValueError, KeyError):
         return None

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from jast import distributions as D
-from jast.pytrees import strong
+from jast.pytrees import with_strong_types
 from jast.simulator import Simulator
 
-__all__ = ["Offer", "ask", "asked", "outline"]
+__all__ = ["Offer", "Outline", "ask", "per_simulator", "outline"]
 
 _static = dict(metadata=dict(static=True))
 
@@ -38,7 +38,7 @@ class Offer:
     @property
     def mode_is_median(self) -> bool:
         """It is known to be: the mode is the normal number 0, whatever the parameters."""
-        return self.families <= MEDIANS
+        return self.families <= MEDIAN_MODES
 
     @property
     def closed(self) -> bool:
@@ -109,20 +109,20 @@ def ask(sim: Simulator, question: Callable[[Any, Any, Any], Any]) -> Any:
     found = []
 
     def traced() -> None:
-        start, _, state, dist = _opened(sim)
+        start, _, state, dist = _first_state(sim)
         found.append(question(start, state, dist))
 
     jax.eval_shape(traced)
     return found[0]
 
 
-def asked(question: Callable[..., Any]) -> Callable[[Simulator], Any]:
+def per_simulator(question: Callable[..., Any]) -> Callable[[Simulator], Any]:
     """``question(sim, p(x0), state, p(x | state))``, a function of a module whose answer has a
     hash, as a function of a simulator. It is traced once for each kind of simulator, as `outline`.
     """
 
     def traced(sim: Simulator) -> _Answer:
-        start, _, state, dist = _opened(sim)
+        start, _, state, dist = _first_state(sim)
         return _Answer(question(sim, start, state, dist))
 
     return functools.wraps(question)(lambda sim: jax.eval_shape(traced, sim).value)
@@ -134,22 +134,22 @@ class _Answer:
     value: Any = field(**_static)
 
 
-def _opened(sim: Simulator) -> tuple[Any, Any, Any, Any]:
+def _first_state(sim: Simulator) -> tuple[Any, Any, Any, Any]:
     start = sim.start()
     x0 = D.sample(start, jax.random.key(0))
-    state = strong(sim.init(x0))
+    state = with_strong_types(sim.init(x0))
     return start, x0, state, sim.disturbance(state)
 
 
 def _outlined(sim: Simulator) -> Outline:
     # traced: what is static travels in the structure of the result, so that it is kept with it
-    start, x0, state, dist = _opened(sim)
+    start, x0, state, dist = _first_state(sim)
     x = D.sample(dist, jax.random.key(0))
     numbers = dist.log_prob(x), sim.evaluate(state)[1]
     return Outline(
-        x0,
-        x,
-        state,
+        x0=x0,
+        x=x,
+        state=state,
         dtype=jnp.result_type(*(jnp.asarray(a).dtype for a in numbers)),
         start=_offer(start),
         disturbance=_offer(dist),
@@ -159,12 +159,13 @@ def _outlined(sim: Simulator) -> Outline:
 
 def _offer(dist: Any) -> Offer:
     lacking = "" if _can(D.has_quantile, dist) else _without_quantile(dist)
-    return Offer(type(dist).__name__, _can(D.has_mode, dist), lacking, _families(dist))
+    mode = _can(D.has_mode, dist)
+    return Offer(type(dist).__name__, mode=mode, lacking=lacking, families=_families(dist))
 
 
-MEDIANS = {"Laplace", "Logistic", "MultivariateNormalDiag", "MultivariateNormalTri", "Normal"}
+MEDIAN_MODES = {"Laplace", "Logistic", "MultivariateNormalDiag", "MultivariateNormalTri", "Normal"}
 """Families, of jast and distrax, whose mode is their median."""
-CLOSED = (MEDIANS - {"Logistic"}) | {
+CLOSED = (MEDIAN_MODES - {"Logistic"}) | {
     "Bernoulli",
     "Categorical",
     "Exponential",
@@ -180,10 +181,14 @@ CLOSED = (MEDIANS - {"Logistic"}) | {
 JAX's keys, in episodes of 50 steps; those of the others take 2 to 20 times more."""
 
 
+def _parts(dist: Any) -> list[Any]:
+    """Of a joint distribution."""
+    return jax.tree.leaves(getattr(dist, "distributions", []), is_leaf=D.is_distribution)
+
+
 def _families(dist: Any) -> frozenset[str]:
     if hasattr(dist, "distributions"):
-        parts = jax.tree.leaves(dist.distributions, is_leaf=D.is_distribution)
-        return frozenset().union(*map(_families, parts))
+        return frozenset().union(*map(_families, _parts(dist)))
     if isinstance(dist, D.Independent):
         return _families(dist.distribution)
     kind = type(dist)
@@ -199,10 +204,9 @@ def _can(question: Callable[[Any], bool], dist: Any) -> bool:
 
 
 def _without_quantile(dist: Any) -> str:
-    if hasattr(dist, "distributions"):
-        parts = jax.tree.leaves(dist.distributions, is_leaf=D.is_distribution)
-        lacking = [_without_quantile(d) for d in parts if not _can(D.has_quantile, d)]
-        return lacking[0] if lacking else type(dist).__name__
+    for part in _parts(dist):
+        if not _can(D.has_quantile, part):
+            return _without_quantile(part)
     if hasattr(dist, "distribution"):
         return _without_quantile(dist.distribution)
     return type(dist).__name__

@@ -1,11 +1,10 @@
 """Where units of work run: threads of this process, devices, or the processes of an executor. Each
-place puts its answers into one queue.
+backend puts its results into one queue.
 """
 
 import contextlib
 import functools
 import importlib.util
-import itertools
 import pickle
 import queue
 import threading
@@ -15,20 +14,28 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jast._threads import settings, under
-from jast.fingerprint import differences, versions
-from jast.incidents import incidents, since
+from jast._threads import current_settings, jax_settings
+from jast.fingerprint import describe_differences, versions
+from jast.incidents import Incident, incidents, new_incidents
 
-__all__ = ["Answer", "Gone", "Place", "Post", "Task", "devices_of", "executor_of", "opened"]
+__all__ = [
+    "Backend",
+    "ExecutorClosed",
+    "Task",
+    "UnitContext",
+    "UnitResult",
+    "VersionMismatch",
+    "check_devices",
+    "check_executor",
+    "open_backend",
+]
 
-AHEAD, FAR = 2, 256
-"""Units under way or waiting to be merged: for each thread of this process, and for an executor,
-which does not say how many processes it has.
-"""
+THREAD_AHEAD = 2  # units under way or waiting to be merged, for each thread of this process
+EXECUTOR_AHEAD = 256  # likewise of an executor, which does not say how many processes it has
 
 
-class Post:
-    """What a unit may tell and ask while it runs; this one is of another process."""
+class UnitContext:
+    """What a unit may report and ask while it runs; this one, of another process, does nothing."""
 
     def more(self, n: int) -> None:
         """``n`` more of what the bar counts are done."""
@@ -41,56 +48,59 @@ class Post:
 class Task(NamedTuple):
     """What all units have in common."""
 
-    function: Callable[[Any, int, Post], Any]
-    """(shared, number of the unit, `Post`) -> pytree of arrays; a function of a module"""
+    function: Callable[[Any, int, UnitContext], Any]
+    """(shared, number of the unit, `UnitContext`) -> pytree of arrays; a function of a module."""
     shared: Any
-    """A pytree of arrays and of whatever else is known before"""
+    """A pytree of arrays and of whatever else is known before."""
     like: Callable[[], Any]
-    """() -> a pytree of the structure of what ``function`` returns"""
+    """() -> a pytree of the structure of what ``function`` returns."""
 
 
-class Answer(NamedTuple):
+class UnitResult(NamedTuple):
     """What came of a unit."""
 
     number: int
     result: Any = None
-    """Pytree of NumPy arrays; their list where it comes from another process"""
+    """Pytree of NumPy arrays; their list where it comes from another process."""
     error: BaseException | None = None
-    incidents: tuple = ()
+    incidents: tuple[Incident, ...] = ()
 
 
-class Place(NamedTuple):
-    """Where units run."""
+class Backend(NamedTuple):
+    """What runs units."""
 
     submit: Callable[[int], None]
-    """Has the unit of a number run; its `Answer` comes into ``news``. `Gone` where it cannot."""
+    """Has the unit of a number run; its `UnitResult` comes into ``news``. `ExecutorClosed` where
+    it cannot.
+    """
     stop: Callable[[], None]
-    """Lets units that have not begun be, and waits for those of this process."""
+    """Drops units that have not begun, and waits for those of this process."""
     news: queue.SimpleQueue
-    """Of `Answer`, and of the numbers that units tell by `Post.more`"""
+    """Of `UnitResult`, and of the numbers that units tell by `UnitContext.more`."""
     ahead: int
+    """Units that may be under way or waiting to be merged."""
     elsewhere: bool
+    """Whether units run in other processes."""
 
 
-class Gone(Exception):
+class ExecutorClosed(Exception):
     """An executor takes no more work."""
 
 
-class Differs(Exception):
+class VersionMismatch(Exception):
     """A process of the executor has other versions."""
 
 
-def executor_of(function: str, executor: Any) -> Any:
-    """``executor`` as the argument of a call. ValueError unless it has ``submit``."""
+def check_executor(function: str, executor: Any) -> None:
+    """ValueError unless ``executor``, the argument of a call, is None or has ``submit``."""
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise ValueError(
             f"{function}: executor must have submit(function, *args), as those of"
             f" concurrent.futures have, received {executor!r}"
         )
-    return executor
 
 
-def devices_of(function: str, devices: Any, executor: Any) -> tuple[jax.Device, ...] | None:
+def check_devices(function: str, devices: Any, executor: Any) -> tuple[jax.Device, ...] | None:
     """``devices`` as the argument of a call. ValueError unless they are some of `jax.devices`."""
     if devices is None:
         return None
@@ -103,25 +113,26 @@ def devices_of(function: str, devices: Any, executor: Any) -> tuple[jax.Device, 
 
 
 @contextlib.contextmanager
-def opened(
+def open_backend(
     function: str, task: Task, executor: Any, devices: Sequence[jax.Device] | None, threads: int
-) -> Iterator[Place]:
-    """A context with the `Place` of a call's units, which is stopped at its end."""
+) -> Iterator[Backend]:
+    """A context with the `Backend` of a call's units, which is stopped at its end."""
     if executor is not None:
-        place = _elsewhere(function, task, executor)
+        backend = _executor_backend(function, task, executor)
     else:
-        place = _here(task, devices, threads)
+        backend = _thread_backend(task, devices, threads)
     try:
-        yield place
+        yield backend
     finally:
-        place.stop()
+        backend.stop()
 
 
-def _here(task: Task, devices: Sequence[jax.Device] | None, threads: int) -> Place:
+def _thread_backend(task: Task, devices: Sequence[jax.Device] | None, threads: int) -> Backend:
     """``threads`` of this process, or one a device, by turns."""
-    news, end, now = queue.SimpleQueue(), threading.Event(), settings()
-    post = Post()
-    post.more, post.stopped = news.put, end.is_set
+    news, end = queue.SimpleQueue(), threading.Event()
+    now = current_settings()
+    context = UnitContext()
+    context.more, context.stopped = news.put, end.is_set
     if devices is None:
         pools = [(ThreadPoolExecutor(threads), now, task.shared)]
     else:
@@ -134,11 +145,11 @@ def _here(task: Task, devices: Sequence[jax.Device] | None, threads: int) -> Pla
         if end.is_set():
             return
         try:
-            with under(values):  # not once a thread: whoever frees it last would leave it
-                answer = Answer(number, jax.device_get(task.function(shared, number, post)))
+            with jax_settings(values):  # once a task: what a thread sets would outlast its thread
+                result = jax.device_get(task.function(shared, number, context))
+            news.put(UnitResult(number, result))
         except BaseException as error:  # also a KeyboardInterrupt that met a system
-            answer = Answer(number, error=error)
-        news.put(answer)
+            news.put(UnitResult(number, error=error))
 
     def submit(number):
         pool, *given = pools[number % len(pools)]
@@ -150,46 +161,45 @@ def _here(task: Task, devices: Sequence[jax.Device] | None, threads: int) -> Pla
             pool.shutdown(cancel_futures=True)
 
     count = threads if devices is None else len(devices)
-    return Place(submit, stop, news, AHEAD * count, False)
+    return Backend(submit, stop, news, ahead=THREAD_AHEAD * count, elsewhere=False)
 
 
 def _put(shared: Any, device: jax.Device) -> Any:
-    arrays = lambda a: jax.device_put(a, device) if isinstance(a, jax.Array) else a
-    return jax.tree.map(arrays, shared)
+    return jax.tree.map(
+        lambda a: jax.device_put(a, device) if isinstance(a, jax.Array) else a, shared
+    )
 
 
-def _elsewhere(function: str, task: Task, executor: Any) -> Place:
+def _executor_backend(function: str, task: Task, executor: Any) -> Backend:
     """The processes of ``executor``."""
-    news, flying, tickets = queue.SimpleQueue(), {}, itertools.count()
-    parcel = _packed(function, task)
-    surroundings = {k: v for k, v in settings().items() if k != "jax_default_device"}
+    news, futures = queue.SimpleQueue(), set()
+    pickled = _pickle(function, task)
+    surroundings = {k: v for k, v in current_settings().items() if k != "jax_default_device"}
     ours = versions()
 
-    def ended(number, ticket, future):
-        flying.pop(ticket, None)
+    def end(number, future):
+        futures.discard(future)
         try:
-            answer = Answer(number, *future.result())
+            news.put(UnitResult(number, *future.result()))
         except BaseException as error:  # a CancelledError, too
-            answer = Answer(number, error=error)
-        news.put(answer)
+            news.put(UnitResult(number, error=error))
 
     def submit(number):
-        ticket = next(tickets)
         try:
-            future = executor.submit(_unit, parcel, surroundings, ours, number)
+            future = executor.submit(_run_unit, pickled, surroundings, ours, number)
         except Exception as error:
-            raise Gone(f"{type(error).__name__}: {error}") from error
-        flying[ticket] = future
-        future.add_done_callback(functools.partial(ended, number, ticket))
+            raise ExecutorClosed(f"{type(error).__name__}: {error}") from error
+        futures.add(future)
+        future.add_done_callback(functools.partial(end, number))
 
     def stop():
-        for future in list(flying.values()):
+        for future in list(futures):
             future.cancel()
 
-    return Place(submit, stop, news, FAR, True)
+    return Backend(submit, stop, news, ahead=EXECUTOR_AHEAD, elsewhere=True)
 
 
-def _packed(function: str, task: Task) -> bytes:
+def _pickle(function: str, task: Task) -> bytes:
     """What a process needs of ``task``. ValueError where it cannot be sent."""
     by_value = importlib.util.find_spec("cloudpickle") is not None
     if by_value:  # also of functions that are in no module
@@ -207,20 +217,20 @@ def _packed(function: str, task: Task) -> bytes:
         ) from error
 
 
-def _unit(parcel: bytes, surroundings: dict, wanted: dict, number: int) -> tuple:
+def _run_unit(pickled: bytes, surroundings: dict, wanted: dict, number: int) -> tuple:
     """In a process of an executor: the arrays of a unit, None, and new incidents. An error comes
     back as text, so that it can always be sent.
     """
-    if unlike := differences(versions(), wanted):
-        return None, Differs(unlike), ()
-    function, shared = _unpacked(parcel)
-    with under(surroundings):
+    if unlike := describe_differences(versions(), wanted):
+        return None, VersionMismatch(unlike), ()
+    function, shared = _unpickle(pickled)
+    with jax_settings(surroundings):
         before = incidents(shared)
-        arrays = jax.tree.leaves(jax.device_get(function(shared, number, Post())))
-        return arrays, None, since(before, incidents(shared))
+        arrays = jax.tree.leaves(jax.device_get(function(shared, number, UnitContext())))
+        return arrays, None, new_incidents(before, incidents(shared))
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(parcel: bytes) -> tuple:
+def _unpickle(pickled: bytes) -> tuple[Callable, Any]:
     """Once a process, so that its compiled programs serve all units."""
-    return pickle.loads(parcel)
+    return pickle.loads(pickled)

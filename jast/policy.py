@@ -1,6 +1,4 @@
-"""Policies: who chooses the disturbances. One protocol for the nominal model, a box, a recording
-and a learned failure policy.
-"""
+"""Policies: who chooses the disturbances."""
 
 from __future__ import annotations
 
@@ -9,16 +7,15 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast import results
 
-__all__ = ["Policy", "nominal_policy", "recorded", "undisturbed"]
+__all__ = ["Policy", "nominal_policy", "undisturbed"]
 
 
-@results.shown()
+@results.printable()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:
@@ -54,17 +51,6 @@ def undisturbed(sim):
     return Policy(Partial(_mode_start, sim.start), Partial(_mode_step, sim.disturbance))
 
 
-def recorded(disturbances, x0=()):
-    """Plays back ``disturbances`` [T, ...] from the start ``x0``; the last row is repeated beyond
-    T.
-    """
-    disturbances, x0 = jax.tree.map(jnp.asarray, (disturbances, x0))
-    return Policy(
-        Partial(D.Deterministic, x0) if jax.tree.leaves(x0) else D.Fixed,
-        Partial(_row, disturbances),
-    )
-
-
 def _nominal(disturbance, state, t):
     return disturbance(state)
 
@@ -75,7 +61,3 @@ def _mode_start(start):
 
 def _mode_step(disturbance, state, t):
     return D.Deterministic(D.mode(disturbance(state)))
-
-
-def _row(disturbances, state, t):
-    return D.Deterministic(jax.tree.map(lambda a: a[jnp.minimum(t, a.shape[0] - 1)], disturbances))

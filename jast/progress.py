@@ -2,8 +2,10 @@
 `begin`, `advance` and `conclude`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +13,19 @@ import jax.numpy as jnp
 from jast import distributions as D
 from jast import rewards
 from jast.outline import outline
-from jast.pytrees import strong
+from jast.pytrees import with_strong_types
 from jast.simulator import Simulator
 
-__all__ = ["Progress", "begin"]
+if TYPE_CHECKING:
+    import chex
+
+__all__ = ["Progress", "advance", "begin", "blank", "conclude"]
 
 
 class Progress(NamedTuple):
     """An episode so far, at a state."""
 
-    state: Any
+    state: chex.ArrayTree
     log_prob: jax.Array
     reward: jax.Array
     distance: jax.Array
@@ -30,7 +35,7 @@ class Progress(NamedTuple):
     """The simulator, the density or the reward returned NaN, or an infinity that has no meaning:
     the episode ended there.
     """
-    owed: Any = ()
+    owed: jax.Array | tuple[()] = ()
     """Of an episodic system: the log p of the arrival at its end, which the reward has not seen
     before `conclude`; 0 before the end. Else ``()``.
     """
@@ -39,43 +44,58 @@ class Progress(NamedTuple):
 def blank(sim: Simulator, state: Any) -> Progress:
     """The `Progress` at ``state``, with nothing behind it."""
     zero, no = jnp.zeros((), outline(sim).dtype), jnp.zeros((), bool)
-    return Progress(state, zero, zero, zero + jnp.inf, no, no, no, zero if sim.episodic else ())
+    return Progress(
+        state=state,
+        log_prob=zero,
+        reward=zero,
+        distance=zero + jnp.inf,
+        failure=no,
+        done=no,
+        invalid=no,
+        owed=zero if sim.episodic else (),
+    )
 
 
 def begin(sim: Simulator, reward: Callable, x0: Any, last: Any = False) -> Progress:
     """The `Progress` at s0, which x0 leads to; a failure there is an episode of length 0. ``last``:
     the episode is to end here.
     """
-    return _begun(sim, rewards.as_pytree(reward), x0, last)
+    return _begin(sim, rewards.as_pytree(reward), x0, last)
 
 
 @jax.jit  # programs with the system in them trace it once for all of them
-def _begun(sim: Simulator, reward: Callable, x0: Any, last: Any) -> Progress:
+def _begin(sim: Simulator, reward: Callable, x0: Any, last: Any) -> Progress:
     """`begin`, of a ``reward`` that is a pytree."""
     start = sim.start()
-    state = strong(sim.init(x0))
-    log_p = (D.log_density(start, x0, density) for density in ("raw", rewards.density_of(reward)))
-    return _arrive(
-        sim, reward, blank(sim, state), state, log_p, jnp.asarray(last), lambda d: jnp.zeros_like(d)
-    )
+    state = with_strong_types(sim.init(x0))
+    before, last = blank(sim, state), jnp.asarray(last)
+    log_p = _log_densities(start, x0, reward)
+    return _arrive(sim, reward, before, state, log_p, last, jnp.zeros_like)
 
 
 def advance(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: Any) -> Progress:
     """The `Progress` one step on, by disturbance ``x``; ``last``: the horizon is reached by it.
     Meaningless once ``progress.done``.
     """
-    return _advanced(sim, rewards.as_pytree(reward), progress, x, last)
+    return _advance(sim, rewards.as_pytree(reward), progress, x, last)
 
 
-@jax.jit  # as `_begun`
-def _advanced(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: Any) -> Progress:
+@jax.jit  # as `_begin`
+def _advance(sim: Simulator, reward: Callable, progress: Progress, x: Any, last: Any) -> Progress:
     """`advance`, of a ``reward`` that is a pytree."""
     dist = sim.disturbance(progress.state)
-    log_p = (D.log_density(dist, x, density) for density in ("raw", rewards.density_of(reward)))
-    state = strong(sim.step(progress.state, x))
-    return _arrive(
-        sim, reward, progress, state, log_p, last, lambda d: sim.evaluate(progress.state)[1] - d
-    )
+    state = with_strong_types(sim.step(progress.state, x))
+    log_p = _log_densities(dist, x, reward)
+
+    def approach(distance: jax.Array) -> jax.Array:
+        return sim.evaluate(progress.state)[1] - distance
+
+    return _arrive(sim, reward, progress, state, log_p, last, approach)
+
+
+def _log_densities(dist: Any, x: Any, reward: Callable) -> list[Any]:
+    """That of ``x``, raw and as the reward counts it."""
+    return [D.log_density(dist, x, density) for density in ("raw", rewards.density_of(reward))]
 
 
 def conclude(sim: Simulator, reward: Callable, progress: Progress, live: Any = True) -> Progress:
@@ -94,7 +114,7 @@ def conclude(sim: Simulator, reward: Callable, progress: Progress, live: Any = T
     event, own = jnp.asarray(event), jnp.asarray(own).astype(progress.reward.dtype)
     told = sum(jnp.asarray(p).astype(own.dtype) for p in told)
     owed, log_prob = progress.owed + told, progress.log_prob + told
-    total = _paid(reward, progress.reward, owed, event, own, jnp.ones((), bool), -own)
+    total = _pay(reward, progress.reward, owed, event, own, jnp.ones((), bool), -own)
     invalid = ~jnp.isfinite(own) | _wrong(log_prob) | _wrong(total)
     new = dict(owed=jnp.zeros_like(progress.owed), log_prob=log_prob) | _outcome(
         total, own, event, jnp.ones((), bool), invalid
@@ -121,23 +141,20 @@ def _arrive(
     ends = jnp.asarray(sim.is_terminal(state)) | last
     if sim.episodic:  # evaluated at its end, by `conclude`
         none = jnp.zeros((), dtype)
-        total, owed = (
-            jnp.where(
-                ends, before.reward, _paid(reward, before.reward, counted, False, none, False, none)
-            ),
-            jnp.where(ends, counted, 0),
-        )
-        event, distance, done = jnp.zeros((), bool), before.distance, ends
+        paid = _pay(reward, before.reward, counted, False, none, False, none)
+        total, owed = jnp.where(ends, before.reward, paid), jnp.where(ends, counted, 0)
+        event, done = jnp.zeros((), bool), ends
+        distance = before.distance
     else:
         event, own, *told = sim.evaluate(state)
         event, own = jnp.asarray(event), jnp.asarray(own).astype(dtype)
         for p in told:
             log_prob, counted = (a + jnp.asarray(p).astype(dtype) for a in (log_prob, counted))
         # the order at a state: failure, then is_terminal, then the horizon
-        done, distance, owed = event | ends, jnp.minimum(before.distance, own), ()
-        total = _paid(
-            reward, before.reward, counted, event, distance, done, approach(own).astype(dtype)
-        )
+        done, owed = event | ends, ()
+        distance = jnp.minimum(before.distance, own)
+        nearer = approach(own).astype(dtype)
+        total = _pay(reward, before.reward, counted, event, distance, done, nearer)
     invalid = _wrong(log_prob) | _wrong(total)
     if not sim.episodic:
         invalid |= ~jnp.isfinite(own)
@@ -154,7 +171,7 @@ def _wrong(number: jax.Array) -> jax.Array:
     return jnp.isnan(number) | (number == jnp.inf)
 
 
-def _paid(
+def _pay(
     reward: Callable,
     total: jax.Array,
     log_p: jax.Array,
@@ -164,17 +181,11 @@ def _paid(
     approach: jax.Array,
 ) -> jax.Array:
     """The episode's reward, ``total`` before, after one more arrival."""
+    once = rewards.once(reward)  # it is paid for the whole episode, at its end
+    log_p = total + log_p if once else log_p
     event, terminal = jnp.asarray(event), jnp.asarray(terminal)
-    if rewards.once(reward):  # it is paid for the whole episode, at its end
-        total = total + log_p
-        return jnp.where(
-            terminal,
-            jnp.asarray(reward(total, event, distance, terminal, approach)).astype(total.dtype),
-            total,
-        )
-    return total + jnp.asarray(reward(log_p, event, distance, terminal, approach)).astype(
-        total.dtype
-    )
+    paid = jnp.asarray(reward(log_p, event, distance, terminal, approach)).astype(total.dtype)
+    return jnp.where(terminal, paid, log_p) if once else total + paid
 
 
 def _outcome(

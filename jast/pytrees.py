@@ -11,7 +11,20 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-__all__ = ["count"]
+__all__ = [
+    "Key",
+    "as_partial",
+    "zero_where",
+    "count_numbers",
+    "conform",
+    "map_in_lanes",
+    "map_in_parts",
+    "pad_rows",
+    "select",
+    "shapes_text",
+    "with_strong_types",
+    "traceable",
+]
 
 
 class Key(NamedTuple):
@@ -20,12 +33,12 @@ class Key(NamedTuple):
     data: Any
 
 
-def strong(tree: Any) -> Any:
+def with_strong_types(tree: Any) -> Any:
     """Arrays of explicit dtype: a weak type would change on its way through a step."""
     return jax.tree.map(lambda a: lax.convert_element_type(a, jnp.result_type(a)), tree)
 
 
-def bound(function: Callable) -> Partial:
+def as_partial(function: Callable) -> Partial:
     """``function`` as a pytree of the arguments that it binds."""
     return function if isinstance(function, Partial) else Partial(function)
 
@@ -37,22 +50,26 @@ def traceable(function: Partial) -> Partial:
     given = function.args, function.keywords
     if not any(map(callable, jax.tree.leaves(given))):
         return function
-    kept = lambda which: jax.tree.map(lambda a: a if callable(a) == which else None, given)
-    return Partial(_Beside(function.func, kept(True)), *kept(False))
+    functions = jax.tree.map(lambda a: a if callable(a) else None, given)
+    others = jax.tree.map(lambda a: None if callable(a) else a, given)
+    return Partial(_WithFunctions(function.func, functions), *others)
 
 
 @dataclass(frozen=True, eq=False)
-class _Beside:
+class _WithFunctions:
     """A function, and the functions among the leaves of its arguments; equal where these are."""
 
     function: Callable
     static: Any
-    """(args, keywords) with None where JAX traces"""
+    """(args, keywords) with None where JAX traces."""
 
     def __call__(self, args: tuple, keywords: dict, *more: Any) -> Any:
-        whole = lambda a, b: b if a is None else a
-        given, absent = (args, keywords), lambda a: a is None
-        args, keywords = jax.tree.map(whole, given, self.static, is_leaf=absent)
+        args, keywords = jax.tree.map(
+            lambda a, b: b if a is None else a,
+            (args, keywords),
+            self.static,
+            is_leaf=lambda a: a is None,
+        )
         return self.function(*args, *more, **keywords)
 
     def _parts(self) -> tuple:
@@ -60,7 +77,7 @@ class _Beside:
         return self.function, *leaves, tree
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Beside) and self._parts() == other._parts()
+        return isinstance(other, _WithFunctions) and self._parts() == other._parts()
 
     def __hash__(self) -> int:
         return hash(self._parts())
@@ -71,12 +88,12 @@ def select(pred: Any, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y), a, b)
 
 
-def clear(pred: Any, tree: Any) -> Any:
+def zero_where(pred: Any, tree: Any) -> Any:
     """Zeros where the scalar ``pred`` holds, else ``tree``."""
     return jax.tree.map(lambda a: jnp.where(pred, jnp.zeros((), a.dtype), a), tree)
 
 
-def padded(rows: Any, length: int) -> Any:
+def pad_rows(rows: Any, length: int) -> Any:
     """``rows`` [T, ...] with zeros behind them, [length, ...]; those of that length as they are."""
 
     def longer(a: Any) -> Any:
@@ -87,7 +104,7 @@ def padded(rows: Any, length: int) -> Any:
     return jax.tree.map(longer, rows)
 
 
-def in_parts(size: int, function: Callable, *trees: Any) -> Any:
+def map_in_parts(size: int, function: Callable, *trees: Any) -> Any:
     """``function`` of arrays [n, ...], which goes on them row by row, ``size`` rows at a time; n is
     a multiple of that. On the host.
     """
@@ -99,22 +116,22 @@ def in_parts(size: int, function: Callable, *trees: Any) -> Any:
     return jax.tree.map(lambda *a: np.concatenate(a), *jax.device_get(parts))
 
 
-def in_lanes(size: int, function: Callable, *trees: Any) -> Any:
-    """`in_parts` for any number n of rows from 1 on: the last part is filled up with rows that are
-    played twice. So one program serves every n.
+def map_in_lanes(size: int, function: Callable, *trees: Any) -> Any:
+    """`map_in_parts` for any number n of rows from 1 on: the last part is filled up with rows
+    again, so one program serves every n.
     """
     n = len(jax.tree.leaves(trees)[0])
     rows = np.arange(-(-n // size) * size) % n
-    found = in_parts(size, function, *jax.tree.map(lambda a: np.asarray(a)[rows], trees))
+    found = map_in_parts(size, function, *jax.tree.map(lambda a: np.asarray(a)[rows], trees))
     return jax.tree.map(lambda a: a[:n], found)
 
 
-def count(like: Any) -> int:
+def count_numbers(like: Any) -> int:
     """How many numbers ``like``, arrays or their shapes, holds."""
     return sum(math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like))
 
 
-def fitted(name: str, value: Any, like: Any) -> Any:
+def conform(name: str, value: Any, like: Any) -> Any:
     """``value`` as arrays of the shapes and dtypes of ``like``.
 
     Raises ValueError, which calls it ``name``, for another structure or shape, and for floats where
@@ -122,7 +139,7 @@ def fitted(name: str, value: Any, like: Any) -> Any:
     """
 
     def refusal() -> ValueError:
-        return ValueError(f"{name} must be {_text(like)}, received {_text(value)}")
+        return ValueError(f"{name} must be {shapes_text(like)}, received {shapes_text(value)}")
 
     def fit(v: Any, s: Any) -> jax.Array:
         v = jnp.asarray(v)
@@ -136,5 +153,6 @@ def fitted(name: str, value: Any, like: Any) -> Any:
     return jax.tree.map(fit, value, like)
 
 
-def _text(tree: Any) -> str:
+def shapes_text(tree: Any) -> str:
+    """Dtypes and shapes of the arrays of ``tree``, for messages."""
     return str(jax.tree.map(lambda a: f"{jnp.result_type(a)}{list(jnp.shape(a))}", tree))

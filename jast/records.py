@@ -13,6 +13,9 @@ import jax
 import numpy as np
 
 from jast._jax import is_traced
+from jast.archive import children_of
+
+__all__ = ["decode", "encode", "place_of"]
 
 RECORDS = {
     "Episode": "jast.episode:Episode",
@@ -73,7 +76,10 @@ def encode(value: Any, arrays: dict[str, np.ndarray], special: Special, at: str 
     Raises:
         ValueError: that names the place of what cannot be kept.
     """
-    below = lambda child, name: encode(child, arrays, special, f"{at}.{name}")
+
+    def below(child: Any, name: Any) -> Any:
+        return encode(child, arrays, special, f"{at}.{name}")
+
     if value is None or type(value) in (bool, int, float, str):  # no NumPy number, which stays one
         return value
     if (found := special(value)) is not None:
@@ -87,7 +93,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray], special: Special, at: str 
         return {kind: [below(v, i) for i, v in enumerate(value)]}
     if type(value) is dict and all(isinstance(k, str) for k in value):
         return {"dict": {k: below(v, k) for k, v in value.items()}}
-    names, children = _below(value)
+    names, children = children_of(value)
     if children is None:
         raise ValueError(f"save: {at} must be an array, a number or a text, received {value!r}")
     parts = [below(v, i) for i, v in enumerate(children)]
@@ -107,7 +113,10 @@ def decode(node: Any, path: str, arrays: dict[str, np.ndarray], special: Special
     Raises:
         ValueError: for classes that only a simulator can restore, where there is none or another.
     """
-    below = lambda child: decode(child, path, arrays, special, sim)
+
+    def below(child: Any) -> Any:
+        return decode(child, path, arrays, special, sim)
+
     if not isinstance(node, dict):
         return node
     ((kind, about),) = node.items()
@@ -168,7 +177,7 @@ def _own(path: str, sim: Any, name: str, names: list[str]) -> Any:
     left = [known.x0, known.x, known.state]
     while left:
         node = left.pop()
-        own, children = _below(node)
+        own, children = children_of(node)
         if children is None:
             continue
         if type(node).__name__ == name and own == names:
@@ -178,11 +187,3 @@ def _own(path: str, sim: Any, name: str, names: list[str]) -> Any:
         f"load: {path} does not fit sim: it holds values of the class {name}, which sim does not"
         " have"
     )
-
-
-def _below(node: Any) -> tuple[list[str], list | None]:
-    """Names and children of a node of a pytree; no children of a leaf."""
-    pairs, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda child: child is not node)
-    if len(pairs) == 1 and pairs[0][1] is node:
-        return [], None
-    return [jax.tree_util.keystr(path) for path, _ in pairs], [child for _, child in pairs]

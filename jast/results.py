@@ -19,7 +19,16 @@ from jax.tree_util import Partial
 
 from jast._jax import is_traced
 
-__all__ = ["VOCABULARY", "html_table"]
+__all__ = [
+    "VOCABULARY",
+    "Former",
+    "call_settings",
+    "batch_shape",
+    "html_table",
+    "renamed",
+    "result_class",
+    "printable",
+]
 
 VOCABULARY = {
     "episodes": "runs of the system, each counted once",
@@ -31,13 +40,13 @@ VOCABULARY = {
     "history": "how it went",
     "settings": "what was asked for, as JSON can hold it",
 }
-LINES, COLUMNS = 10, 100
-"""Of a repr, the most."""
+LINES = 10  # of a repr at most
+COLUMNS = 100  # likewise
 
 C = TypeVar("C", bound=type)
 
 
-def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
+def printable(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
     """A class decorator: objects print, and a repr is short whatever they hold.
 
     Where the class has a ``__str__`` of its own, the repr is its first lines; else it names the
@@ -85,8 +94,8 @@ def shown(scalar: str | None = None, batches: bool = False) -> Callable[[C], C]:
     return decorate
 
 
-def result(scalar: str, batches: bool = False) -> Callable[[C], C]:
-    """A class decorator of results: `shown`, and every name of `VOCABULARY` that the class lacks is
+def result_class(scalar: str, batches: bool = False) -> Callable[[C], C]:
+    """A class decorator of results: `printable`, and a name of `VOCABULARY` that the class lacks is
     None.
     """
 
@@ -95,12 +104,12 @@ def result(scalar: str, batches: bool = False) -> Callable[[C], C]:
             if not hasattr(cls, name):
                 missing = property(lambda self: None, doc=f"None here; elsewhere {meaning}.")
                 setattr(cls, name, missing)
-        return shown(scalar, batches)(cls)
+        return printable(scalar, batches)(cls)
 
     return decorate
 
 
-def asked(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
+def call_settings(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
     """The ``settings`` of a result, as JSON can hold them.
 
     Args:
@@ -111,10 +120,13 @@ def asked(method: str, key: jax.Array, **given: Any) -> dict[str, Any]:
     Returns:
         ``method``, these, and ``seed``, the words of the key.
     """
-    plain = lambda v: v if isinstance(v, str | int) else np.asarray(v).tolist()
+
+    def plain(value: Any) -> Any:
+        return value if isinstance(value, str | int) else np.asarray(value).tolist()
+
     typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
-    words = jax.random.key_data(key) if typed else key
-    return dict(method=method, **jax.tree.map(plain, given), seed=np.asarray(words).tolist())
+    seed = jax.random.key_data(key) if typed else key
+    return dict(method=method, **jax.tree.map(plain, given), seed=plain(seed))
 
 
 class Former(property):
@@ -141,9 +153,9 @@ def _prints(value: Any, batches: bool) -> bool:
 
 
 def _of_many(value: Any) -> str:
-    shape, traced = batch_shape(value), is_traced(value)
-    words = ["traced"] * traced + [f"a batch of shape {shape}"] * bool(shape)
-    return ", ".join(words)
+    shape = batch_shape(value)
+    words = ["traced" if is_traced(value) else "", f"a batch of shape {shape}" if shape else ""]
+    return ", ".join(filter(None, words))
 
 
 def _number(value: Any) -> bool:
@@ -201,15 +213,14 @@ def _words(value: Any) -> str:
 
 def _container(value: tuple | list | dict) -> str:
     if isinstance(value, dict):
-        text = "{" + ", ".join(f"{k!r}: {_words(v)}" for k, v in list(value.items())[:3])
-        text, end = text + ", ..." * (len(value) > 3), "}"
+        begin, end = "{}"
+        words = [f"{k!r}: {_words(v)}" for k, v in list(value.items())[:3]]
     else:
-        text = "(["[isinstance(value, list)] + ", ".join(_words(v) for v in value[:3])
-        text += ", ..." * (len(value) > 3) + "," * (len(value) == 1 and isinstance(value, tuple))
-        end = ")]"[isinstance(value, list)]
-    if len(text) > 70:
-        return f"{type(value).__name__} of {len(value)}"
-    return text + end
+        begin, end = "[]" if isinstance(value, list) else "()"
+        words = [_words(v) for v in value[:3]]
+    text = begin + ", ".join(words) + ", ..." * (len(value) > 3)
+    text += "," * (len(value) == 1 and isinstance(value, tuple))
+    return f"{type(value).__name__} of {len(value)}" if len(text) > 70 else text + end
 
 
 def _is_record(value: Any) -> bool:

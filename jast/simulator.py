@@ -13,12 +13,12 @@ from jax.tree_util import Partial
 from jast import results
 from jast.distributions import Fixed
 from jast.distributions.containers import accepted
-from jast.pytrees import bound, traceable
+from jast.pytrees import as_partial, traceable
 
 if TYPE_CHECKING:
     from jast.typing import Disturbance, Evaluate, Init, IsTerminal, Observe, Start, Step
 
-__all__ = ["Simulator", "require_simulator"]
+__all__ = ["Simulator", "fixed", "never", "ravel", "require_simulator", "translating"]
 
 
 def fixed():
@@ -57,11 +57,11 @@ class Translating:
 
 def translating(f):
     """The `Translating` function of ``f`` as a Partial with the arguments that ``f`` binds."""
-    f = bound(f)
+    f = as_partial(f)
     return Partial(Translating(f.func), *f.args, **f.keywords)
 
 
-@results.shown()
+@results.printable()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Simulator:
@@ -129,7 +129,7 @@ class Simulator:
             if f.metadata.get("static"):
                 continue
             if callable(value):
-                value = traceable(bound(value))
+                value = traceable(as_partial(value))
                 if f.name in ("disturbance", "start") and type(value.func) is not Translating:
                     value = translating(value)
                 object.__setattr__(self, f.name, value)

@@ -14,14 +14,14 @@ import jax
 import numpy as np
 
 from jast.episode import Episode, replay
-from jast.fields import place
+from jast.fields import path_name
 from jast.outline import outline
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
     from jast.typing import PathLike
 
-__all__ = ["from_json", "to_csv", "to_numpy"]
+__all__ = ["by_step", "from_json", "to_csv", "to_numpy"]
 
 OF_EPISODE = ("length", "log_prob", "distance", "reward")
 
@@ -49,7 +49,7 @@ def to_numpy(failures: Any) -> dict[str, np.ndarray]:
     out = {name: getattr(e, name) for name in OF_EPISODE}
     for root, part in (("x0", e.x0), ("x", e.disturbances)):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
-            name = place(path)
+            name = path_name(path)
             out[f"{root}.{name}" if name else root] = leaf
     return out
 
@@ -97,16 +97,14 @@ def to_csv(path: PathLike, failures: Any) -> None:
 def by_step(failures: Any) -> dict[str, list]:
     """The columns of `to_csv`: Python's numbers, None where a row has none."""
     arrays = to_numpy(failures)
-    of = lambda root: [(k, v) for k, v in arrays.items() if k == root or k.startswith(f"{root}.")]
-    first, last = 0 if of("x0") else 1, arrays["length"]
+    x0 = list(_columns(arrays, "x0", 1))
+    first, last = 0 if x0 else 1, arrays["length"]
     at = [(i, t) for i in range(len(last)) for t in range(first, int(last[i]) + 1)]
     columns: dict[str, list] = {"failure": [i + 1 for i, _ in at], "step": [t for _, t in at]}
-    for k, v in of("x0"):
-        for name, flat in _numbers(k, v, 1):
-            columns[name] = [None if t else flat[i].item() for i, t in at]
-    for k, v in of("x"):
-        for name, flat in _numbers(k, v, 2):
-            columns[name] = [flat[i, t - 1].item() if t else None for i, t in at]
+    for name, values in x0:
+        columns[name] = [None if t else values[i].item() for i, t in at]
+    for name, values in _columns(arrays, "x", 2):
+        columns[name] = [values[i, t - 1].item() if t else None for i, t in at]
     return columns
 
 
@@ -142,21 +140,28 @@ def from_json(path: PathLike, sim: Simulator) -> Episode:
             f"from_json: path must be a file from the page of a report, received {str(path)!r},"
             f" which is not one: {wrong!r}"
         ) from None
-    about, wholes = outline(sim), []
-    for name, like, part in zip(("x0", "x"), (about.x0, about.x), parts, strict=True):
-        pairs, treedef = jax.tree_util.tree_flatten_with_path(like)
-        names = [place(at) for at, _ in pairs]
+    like, wholes = outline(sim), []
+    for name, part in zip(("x0", "x"), parts, strict=True):
+        pairs, treedef = jax.tree_util.tree_flatten_with_path(getattr(like, name))
+        names = [path_name(at) for at, _ in pairs]
         if set(names) != set(part):
             raise ValueError(
                 f"from_json: sim must be the simulator of the failure, whose {name} has the fields"
                 f" {sorted(part)}, received one with {sorted(names)}"
             )
-        arrays = (np.array(part[name]["values"], part[name]["dtype"]) for name in names)
-        wholes.append(treedef.unflatten(list(arrays)))
-    return replay(sim, wholes[1], wholes[0])
+        arrays = [np.array(part[name]["values"], part[name]["dtype"]) for name in names]
+        wholes.append(treedef.unflatten(arrays))
+    x0, x = wholes
+    return replay(sim, x, x0)
 
 
-def _numbers(name: str, values: np.ndarray, lead: int) -> Iterator[tuple[str, np.ndarray]]:
-    """What each number of an array is called, and its values [...] over the ``lead`` first axes."""
-    for at in np.ndindex(values.shape[lead:]):
-        yield f"{name}[{','.join(map(str, at))}]" if at else name, values[(..., *at)]
+def _columns(
+    arrays: dict[str, np.ndarray], root: str, lead: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """What each number of the arrays of ``root`` is called, and its values [...] over the ``lead``
+    first axes.
+    """
+    for name, values in arrays.items():
+        if name == root or name.startswith(f"{root}."):
+            for at in np.ndindex(values.shape[lead:]):
+                yield f"{name}[{','.join(map(str, at))}]" if at else name, values[(..., *at)]

@@ -11,10 +11,10 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Var
 
 from jast import distributions as D
-from jast.incidents import hosted
-from jast.outline import asked, outline
-from jast.pytrees import Key, strong
-from jast.rounding import Looked, looked, words
+from jast.incidents import runs_on_host
+from jast.outline import outline, per_simulator
+from jast.pytrees import Key, with_strong_types
+from jast.rounding import Probe, describe, probe
 from jast.simulator import Simulator
 
 __all__ = ["traps"]
@@ -33,12 +33,12 @@ def traps(sim: Simulator) -> list[str]:
     """What loses failures, or minutes, of a simulator that keeps its contract: a text each, which
     names the function at fault. None for a system on the host. Runs 80 episodes at most.
     """
-    if hosted(sim):
+    if runs_on_host(sim):
         return []
-    seen, about, (equations, level, keys) = looked(sim), outline(sim), _program(sim)
-    found = [f"step: {text}" for text in (words(seen), _jumps(seen)) if text is not None]
+    seen, about, (equations, level, keys) = probe(sim), outline(sim), _program(sim)
+    found = [f"step: {text}" for text in (describe(seen), _jumps(seen)) if text is not None]
     found += _fixed_keys(about.state, seen, keys)
-    if seen.felt and level:
+    if seen.distance_differs and level:
         found.append(
             "step: the miss distance depends on the disturbance, and its gradient is 0 everywhere:"
             " all ways from one to the other pass through jax.lax.stop_gradient, comparisons or"
@@ -54,13 +54,13 @@ def traps(sim: Simulator) -> list[str]:
     return found
 
 
-def _jumps(seen: Looked) -> str | None:
-    if not seen.back:
+def _jumps(seen: Probe) -> str | None:
+    if not seen.jump_back:
         return None
     return (
         f"the state jumps back to its start, as that of an environment which resets itself does, at"
-        f" step {seen.back} of one of 16 episodes: evaluate never sees the failure before; use the"
-        " step that does not reset (of gymnax step_env, of brax an environment without"
+        f" step {seen.jump_back} of one of 16 episodes: evaluate never sees the failure before; use"
+        " the step that does not reset (of gymnax step_env, of brax an environment without"
         " AutoResetWrapper)"
     )
 
@@ -70,10 +70,10 @@ def _is_ours(leaf: Any) -> bool:
     return isinstance(leaf, Key)
 
 
-def _fixed_keys(state: Any, seen: Looked, keys: tuple[bool, ...]) -> Iterator[str]:
+def _fixed_keys(state: Any, seen: Probe, keys: tuple[bool, ...]) -> Iterator[str]:
     """A text for each of the leaves that are ``keys`` and that no disturbance reaches."""
     leaves = jax.tree_util.tree_leaves_with_path(state, is_leaf=_is_ours)
-    for (path, leaf), key, still in zip(leaves, keys, seen.still, strict=True):
+    for (path, leaf), key, still in zip(leaves, keys, seen.unmoved, strict=True):
         if key and still and not _is_ours(leaf):
             yield (
                 f"init: state leaf {jax.tree_util.keystr(path) or '(the whole)'} looks like a"
@@ -83,7 +83,7 @@ def _fixed_keys(state: Any, seen: Looked, keys: tuple[bool, ...]) -> Iterator[st
             )
 
 
-@asked
+@per_simulator
 def _program(
     sim: Simulator, start: Any, state: Any, dist: Any
 ) -> tuple[int, bool, tuple[bool, ...]]:
@@ -164,9 +164,11 @@ def _level(sim: Simulator) -> bool:
         for i, number in zip(smooth, floats, strict=True):
             numbers[i] = number
         x = jax.tree.unflatten(tree, numbers)
-        state = strong(sim.init(D.sample(sim.start(), jax.random.key(0))))
+        state = with_strong_types(sim.init(D.sample(sim.start(), jax.random.key(0))))
         # a loop follows what needs several steps to reach the distance
-        state, _ = lax.scan(lambda s, _: (strong(sim.step(s, x)), None), state, length=sim.horizon)
+        state, _ = lax.scan(
+            lambda s, _: (with_strong_types(sim.step(s, x)), None), state, length=sim.horizon
+        )
         return heard(sim.evaluate(state)[1])
 
     floats = [leaves[i] for i in smooth]

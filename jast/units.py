@@ -15,33 +15,52 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 
 from jast._jax import was_interrupted
-from jast.checkpoints import Store
-from jast.incidents import Incident, merged
-from jast.places import Answer, Differs, Gone, Place, Task, devices_of, executor_of, opened
+from jast.checkpoints import Checkpoint
+from jast.incidents import Incident, merge_incidents
+from jast.places import (
+    Backend,
+    ExecutorClosed,
+    Task,
+    UnitResult,
+    VersionMismatch,
+    check_devices,
+    check_executor,
+    open_backend,
+)
+from jast.typing import Executor
 from jast.watch import Watch, terminable
 
-__all__ = ["Ran", "Ways", "joined", "not_traced", "note", "run", "ways"]
+__all__ = [
+    "HERE",
+    "Placement",
+    "UnitsRun",
+    "concatenate",
+    "describe_missing",
+    "placement",
+    "require_untraced",
+    "run",
+]
 
 State = TypeVar("State")
-TRIES = 3
+TRIES = 3  # of a unit in an executor: one process may die by chance, three hardly
 
 
-class Ways(NamedTuple):
-    """How the units of a call are run."""
+class Placement(NamedTuple):
+    """Where the units of a call run, and where finished ones are kept."""
 
-    executor: Any = None
+    executor: Executor | None = None
     devices: Sequence[jax.Device] | None = None
-    store: Store | None = None
+    store: Checkpoint | None = None
     name: str = "unit"
     """Of the parts in the store."""
     keeps: Callable[[Any], bool] = lambda result: True
     """Whether the store is to hold a result."""
 
 
-HERE = Ways()
+HERE = Placement()
 
 
-class Ran(NamedTuple):
+class UnitsRun(NamedTuple):
     """What came of the units."""
 
     state: Any
@@ -55,18 +74,22 @@ class Ran(NamedTuple):
     """What ended it early, "" for Ctrl-C; None where nothing did."""
 
 
-class _Kept(NamedTuple):
+class _Merged(NamedTuple):
     state: Any
     done: int = 0
-    merged: int = 0
+    count: int = 0
+    """Of units that are merged, and not left out."""
 
 
-def ways(function: str, executor: Any, devices: Any, store: Store | None = None) -> Ways:
-    """The `Ways` of a call by its arguments; ValueError where these cannot be."""
-    return Ways(executor_of(function, executor), devices_of(function, devices, executor), store)
+def placement(
+    function: str, executor: Any, devices: Any, store: Checkpoint | None = None
+) -> Placement:
+    """The `Placement` of a call by its arguments; ValueError where these cannot be."""
+    check_executor(function, executor)
+    return Placement(executor, check_devices(function, devices, executor), store)
 
 
-def not_traced(function: str, **given: Any) -> None:
+def require_untraced(function: str, **given: Any) -> None:
     """ValueError where one of these arguments is given inside of a transformation of JAX."""
     for name, value in given.items():
         if value is not None:
@@ -82,13 +105,13 @@ def run(
     fold: Callable[[State, int, Any], State],
     state: State,
     watch: Watch,
-    ways: Ways = HERE,
+    where: Placement = HERE,
     *,
     size: Callable[[int], int] = lambda done: done,
     words: Callable[[State], dict[str, Any]] = lambda state: {},
     threads: int = 1,
     cut: bool = False,
-) -> Ran:
+) -> UnitsRun:
     """Run the units 0 to n - 1 and merge what they return, in the order of their numbers.
 
     Args:
@@ -98,15 +121,15 @@ def run(
             interrupted.
         state: the first one.
         watch: is told after each merge.
-        ways: where units run, and where finished ones are kept.
+        where: units run, and finished ones are kept.
         size: of the first so many units, in units of ``watch``.
         words: of a state, for the bar.
         threads: that units run in, where there is neither an executor nor devices.
         cut: whether a unit that an interruption ends early counts with what it has.
 
     Returns:
-        `Ran`. Ctrl-C, SIGTERM and an executor that takes no more work end it with what is merged
-        by then.
+        `UnitsRun`. Ctrl-C, SIGTERM and an executor that takes no more work end it with what is
+        merged by then.
 
     Raises:
         KeyboardInterrupt: where it was interrupted before anything was merged.
@@ -114,49 +137,56 @@ def run(
         ValueError: where a unit cannot be sent to an executor, or its processes have other
             versions.
     """
-    with opened(watch.name, task, ways.executor, ways.devices, threads) as place:
-        desk = _Desk(task, place, ways, watch)
-        kept, sent, ended = _Kept(state), 0, None
+    with open_backend(watch.name, task, where.executor, where.devices, threads) as backend:
+        scheduler = _Scheduler(task, backend, where, watch)
+        merged = _Merged(state)
+        sent, ended = 0, None
         try:
             with terminable():
-                while kept.done < n:
-                    while sent < min(n, kept.done + place.ahead):
-                        desk.begin(sent)
+                while merged.done < n:
+                    while sent < min(n, merged.done + backend.ahead):
+                        scheduler.begin(sent)
                         sent += 1
-                    if kept.done not in desk.ready:
-                        if desk.interruption is not None:
-                            raise desk.interruption
-                        desk.listen()
+                    if merged.done not in scheduler.ready:
+                        if scheduler.interruption is not None:
+                            raise scheduler.interruption
+                        scheduler.listen()
                         continue
                     # at once: an interruption finds all of a unit or nothing
-                    kept = _merged(kept, fold, kept.done, desk.ready[kept.done])
-                    del desk.ready[kept.done - 1]
-                    watch.reach(max(watch.done, size(kept.done)), **words(kept.state))
+                    merged = _merge(merged, fold, merged.done, scheduler.ready[merged.done])
+                    del scheduler.ready[merged.done - 1]
+                    watch.reach(max(watch.done, size(merged.done)), **words(merged.state))
                     watch.tell()
         except BaseException as error:
-            if not was_interrupted(error) and not isinstance(error, Gone):
+            closed = isinstance(error, ExecutorClosed)
+            if not (closed or was_interrupted(error)):
                 raise
-            place.stop()
-            ended = f": the executor takes no more work ({error})" * isinstance(error, Gone)
+            backend.stop()
+            ended = f": the executor takes no more work ({error})" if closed else ""
             if cut:
-                for number, result in desk.rest(kept.done):
-                    kept = _merged(kept, fold, number, result)
-            if not kept.merged:
-                cause = RuntimeError(f"{watch.name}{ended}") if ended else KeyboardInterrupt()
+                for number, result in scheduler.rest(merged.done):
+                    merged = _merge(merged, fold, number, result)
+            if not merged.count:
+                cause = RuntimeError(f"{watch.name}{ended}") if closed else KeyboardInterrupt()
                 raise cause from error
-        if n and not kept.merged:
-            desk.give_up()
-        return Ran(kept.state, kept.done, tuple(sorted(desk.lost)), desk.incidents, ended)
+        if n and not merged.count:
+            scheduler.give_up()
+        left_out = tuple(sorted(scheduler.left_out))
+        return UnitsRun(merged.state, merged.done, left_out, scheduler.incidents, ended)
 
 
-def joined(some: Ran, more: Ran) -> Ran:
-    """Two `Ran` in a row, whose states are tuples."""
-    left_out = (*some.left_out, *(some.done + i for i in more.left_out))
-    incidents = merged(some.incidents, more.incidents)
-    return Ran(some.state + more.state, some.done + more.done, left_out, incidents, more.ended)
+def concatenate(first: UnitsRun, second: UnitsRun) -> UnitsRun:
+    """Two `UnitsRun` in a row, whose states are tuples."""
+    return UnitsRun(
+        state=first.state + second.state,
+        done=first.done + second.done,
+        left_out=(*first.left_out, *(first.done + i for i in second.left_out)),
+        incidents=merge_incidents(first.incidents, second.incidents),
+        ended=second.ended,
+    )
 
 
-def note(what: str, ran: Ran, done: int, total: int) -> str | None:
+def describe_missing(what: str, ran: UnitsRun, done: int, total: int) -> str | None:
     """In words, that ``ran`` has only ``done`` of ``total`` ``what``; None where it has all."""
     said = "" if ran.ended is None else f"after {done} of {total} {what}{ran.ended}"
     if ran.left_out:
@@ -166,50 +196,57 @@ def note(what: str, ran: Ran, done: int, total: int) -> str | None:
     return said or None
 
 
-def _merged(kept: _Kept, fold: Callable, number: int, result: Any) -> _Kept:
+def _merge(merged: _Merged, fold: Callable, number: int, result: Any) -> _Merged:
     if result is None:  # left out
-        return kept._replace(done=kept.done + 1)
-    return _Kept(fold(kept.state, number, result), kept.done + 1, kept.merged + 1)
+        return merged._replace(done=merged.done + 1)
+    return _Merged(fold(merged.state, number, result), merged.done + 1, merged.count + 1)
 
 
-class _Desk:
-    """Sends units off and takes their answers: ``ready`` has results by number, None for a unit
+class _Scheduler:
+    """Sends units off and takes their results: ``ready`` has results by number, None for a unit
     that is left out.
     """
 
-    def __init__(self, task: Task, place: Place, ways: Ways, watch: Watch):
-        self._place, self._ways, self._store, self._watch = place, ways, ways.store, watch
+    def __init__(self, task: Task, backend: Backend, where: Placement, watch: Watch):
+        self._backend, self._where, self._watch = backend, where, watch
         self._structure = functools.cache(lambda: jax.tree.structure(task.like()))
-        self._tries, self._error, self._any = Counter(), None, False
-        self.ready, self.lost, self.incidents, self.interruption = {}, [], (), None
+        self._tries = Counter()
+        self._error: BaseException | None = None
+        self._any_result = False
+        self.ready: dict[int, Any] = {}
+        self.left_out: list[int] = []
+        self.incidents: tuple[Incident, ...] = ()
+        self.interruption: BaseException | None = None
 
     def begin(self, number: int) -> None:
         """Have a unit run, or take what a checkpoint holds of it."""
-        arrays = None if self._store is None else self._store.get(number, self._ways.name)
+        store = self._where.store
+        arrays = None if store is None else store.get(number, self._where.name)
         if arrays is None:
-            self._place.submit(number)
+            self._backend.submit(number)
         else:
             self.ready[number] = self._structure().unflatten(arrays)
 
     def listen(self) -> None:
         """Wait for news, and take all that there are by then."""
-        more = 0
+        reported = 0
         while True:
-            item = self._place.news.get()
-            if isinstance(item, Answer):
+            item = self._backend.news.get()
+            if isinstance(item, UnitResult):
                 self._take(item)
             else:
-                more += item
-            if self._place.news.empty():
+                reported += item
+            if self._backend.news.empty():
                 break
-        if more:
-            self._watch.more(more)
+        if reported:
+            self._watch.more(reported)
 
     def rest(self, done: int) -> list[tuple[int, Any]]:
-        """What units that were stopped still answered, in order."""
-        while not self._place.news.empty():
-            item = self._place.news.get()
-            if isinstance(item, Answer) and item.error is None and not self._place.elsewhere:
+        """What units that were stopped still returned, in order."""
+        while not self._backend.news.empty():
+            item = self._backend.news.get()
+            good = isinstance(item, UnitResult) and item.error is None
+            if good and not self._backend.elsewhere:
                 self.ready[item.number] = item.result
         return sorted((i, r) for i, r in self.ready.items() if i >= done and r is not None)
 
@@ -220,9 +257,9 @@ class _Desk:
             f" the last error: {_words(self._error)}"
         ) from self._error
 
-    def _take(self, answer: Answer) -> None:
-        number, result, error, incidents = answer
-        if isinstance(error, Differs):
+    def _take(self, item: UnitResult) -> None:
+        error, result = item.error, item.result
+        if isinstance(error, VersionMismatch):
             raise ValueError(
                 f"{self._watch.name}: a process of the executor runs other versions, so its"
                 f" results would differ: {error}"
@@ -231,27 +268,27 @@ class _Desk:
             if was_interrupted(error):  # what came before it is merged first
                 self.interruption = error
                 return
-            if not self._place.elsewhere:
+            if not self._backend.elsewhere:
                 raise error
-            return self._again(number, error)
-        if self._place.elsewhere:
+            return self._try_again(item.number, error)
+        if self._backend.elsewhere:
             result = self._structure().unflatten(result)
-        if self._store is not None and self._ways.keeps(result):
-            self._store.put(number, jax.tree.leaves(result), self._ways.name)
-        self._any = True
-        self.incidents = merged(self.incidents, incidents)
-        self.ready[number] = result
+        if self._where.store is not None and self._where.keeps(result):
+            self._where.store.put(item.number, jax.tree.leaves(result), self._where.name)
+        self._any_result = True
+        self.incidents = merge_incidents(self.incidents, item.incidents)
+        self.ready[item.number] = result
 
-    def _again(self, number: int, error: BaseException) -> None:
+    def _try_again(self, number: int, error: BaseException) -> None:
         self._tries[number] += 1
         self._error = error
         if self._tries[number] < TRIES:
-            return self._place.submit(number)
+            return self._backend.submit(number)
         self.ready[number] = None
-        self.lost.append(number)
+        self.left_out.append(number)
         lost = Incident("unit left out", f"unit left out: {_words(error)}", 1, None, None)
-        self.incidents = merged(self.incidents, (lost,))
-        if len(self.lost) == TRIES and not self._any:
+        self.incidents = merge_incidents(self.incidents, (lost,))
+        if len(self.left_out) == TRIES and not self._any_result:
             self.give_up()
 
 

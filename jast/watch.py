@@ -1,9 +1,6 @@
-"""Long work: piece by piece, so that it can be watched and interrupted; one bar, one callback, one
-signature of it.
-"""
+"""Long work piece by piece, so that it can be watched and interrupted: its bar and its callback."""
 
 import contextlib
-import inspect
 import signal
 import threading
 import warnings
@@ -12,18 +9,12 @@ from typing import Any, TypeVar
 
 __all__ = ["Watch", "in_pieces", "terminable"]
 
-Callback = Callable[[int, int, Any], Any]
 State = TypeVar("State")
-FIRST = "compiling"
-"""What a bar says before anything is done: most of that time goes there."""
+COMPILING = "compiling"  # what a bar says before anything is done: most of that time goes there
 
 
 class Watch:
-    """A bar of tqdm and the user's callback; a context manager, which closes the bar.
-
-    The callback is called as ``callback(done, total, result)``, with the result so far or None. One
-    of two arguments, as in earlier versions, still works, and warns once (DeprecationWarning).
-    """
+    """A bar of tqdm and the user's callback; a context manager, which closes the bar."""
 
     def __init__(
         self,
@@ -31,10 +22,9 @@ class Watch:
         total: int,
         unit: str,
         progress: bool,
-        callback: Callable[..., Any] | None,
+        callback: Callable[[int, int, Any], Any] | None,
         *,
         done: int = 0,
-        former: Callable[[int, int, Any], tuple] | None = None,
     ):
         """
         Args:
@@ -42,15 +32,22 @@ class Watch:
             total: units of all the work.
             unit: their name.
             progress: whether there is a bar.
-            callback: the user's, or None.
+            callback: the user's, called as ``callback(done, total, result)`` with the result so
+                far or None.
             done: units that are done already.
-            former: the two arguments of earlier versions, from the three; default: the first two.
 
         Raises:
             ValueError: for a callback that cannot be called.
         """
-        self.name, self.done, self.total = name, done, total
-        self._callback = None if callback is None else _of_three(name, callback, former)
+        if callback is not None and not callable(callback):
+            raise ValueError(
+                f"{name}: callback must be callable, (done, total, result so far or None),"
+                f" received {callback!r}"
+            )
+        self.name = name
+        self.done = done
+        self.total = total
+        self._callback = callback
         self._bar = None
         if progress:
             self._bar = _bar_of_tqdm()(
@@ -58,14 +55,14 @@ class Watch:
                 initial=done,
                 unit=unit,
                 unit_scale=total >= 1000,
-                desc=f"{name}: {FIRST}",
+                desc=f"{name}: {COMPILING}",
             )
 
     def reach(self, done: int, **words: Any) -> None:
         """``done`` units are done; ``words``: numbers beside the bar."""
         self.done = done
         if self._bar is not None:
-            if self._bar.desc.startswith(f"{self.name}: {FIRST}"):
+            if self._bar.desc.startswith(f"{self.name}: {COMPILING}"):
                 self._bar.set_description(self.name, refresh=False)
             if words:
                 self._bar.set_postfix(**words, refresh=False)
@@ -164,32 +161,3 @@ def _bar_of_tqdm() -> Any:
         warnings.simplefilter("ignore", TqdmWarning)  # of a notebook without ipywidgets
         from tqdm.auto import tqdm
     return tqdm
-
-
-def _of_three(name: str, callback: Any, former: Callable[..., tuple] | None) -> Callback:
-    """``callback`` as a function of (done, total, result)."""
-    if not callable(callback):
-        raise ValueError(
-            f"{name}: callback must be callable, (done, total, result so far or None), received"
-            f" {callback!r}"
-        )
-    if _takes(callback, 3) or not _takes(callback, 2):
-        return callback
-    warnings.warn(
-        f"{name}: callback takes (done, total, result so far or None) now; one of two arguments"
-        " goes with the next version",
-        DeprecationWarning,
-        stacklevel=4,
-    )
-    two = (lambda done, total, result: (done, total)) if former is None else former
-    return lambda *three: callback(*two(*three))
-
-
-def _takes(callback: Callable[..., Any], n: int) -> bool:
-    try:
-        inspect.signature(callback).bind(*range(n))
-    except TypeError:
-        return False
-    except ValueError:  # a builtin that does not say
-        return True
-    return True

@@ -19,7 +19,7 @@ from jast import blackbox
 from jast.blackbox import worker
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
 from jast.estimate.recorded_tilts import recorded
-from jast.incidents import GROUPS, Log, incidents, since
+from jast.incidents import GROUPS, Log, incidents, new_incidents
 
 NORMAL = Normal(0.0, 1.0)
 
@@ -216,7 +216,7 @@ def test_what_goes_wrong_is_counted_with_an_example():
     )
     before = incidents(sim)
     ends(sim, [[1, 2]])
-    assert [(i.kind, i.count) for i in since(before, incidents(sim))] == [("raised", 1)]
+    assert [(i.kind, i.count) for i in new_incidents(before, incidents(sim))] == [("raised", 1)]
 
 
 def test_a_search_goes_on_without_the_invalid_episodes(key):

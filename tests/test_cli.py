@@ -209,7 +209,7 @@ def test_help(capsys):
         ),
         (
             ["--method", "cem", "--paper"],
-            "argument --paper: only with --method forest or mcts, not with cem",
+            "argument --paper: only of --method forest or mcts, not of cem",
         ),
         (["--output", __file__], "argument --output: "),
         (

@@ -115,7 +115,7 @@ def test_what_is_free(monkeypatch, tmp_path):
         (tmp_path / f"memory.{name}").write_text(text)
     assert memory.available() == 1_000_000
     (tmp_path / "memory.max").write_text("max\n")  # no limit
-    assert memory._of_the_container() is None
+    assert memory._free_in_container() is None
 
 
 def test_what_is_not_known_hinders_nothing(monkeypatch):

@@ -14,7 +14,7 @@ import jast
 from jast import distributions as D
 from jast.outline import Offer, ask, outline
 from jast.progress import begin
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 
 NAMES = ("start", "init", "step", "disturbance", "evaluate", "is_terminal", "observe")
 
@@ -63,7 +63,7 @@ def test_of_a_tree_of_disturbances_and_a_random_start():
             lambda a: (a.shape, a.dtype), value
         )
     assert about.dtype == episode.log_prob.dtype
-    assert (count(about.x0), count(about.x), about.observation) == (2, 3, (5,))
+    assert (count_numbers(about.x0), count_numbers(about.x), about.observation) == (2, 3, (5,))
     assert about.start == about.disturbance
     assert about.start == Offer("Joint", True, "", frozenset({"Categorical", "Normal"}))
 

@@ -10,7 +10,7 @@ from systems import ring, walk
 import jast
 from jast import plot
 from jast.distributions import Joint, Normal
-from jast.fields import fields
+from jast.fields import named_fields
 from jast.search.failure_modes import owners
 
 FERRY = jast.simulators.ferry()
@@ -38,17 +38,17 @@ def test_names_of_any_pytree():
         jax.random.split(jax.random.key(0), 2),
         np.zeros((2, 0)),
     )
-    found = fields(tree, "s")
+    found = named_fields(tree, "s")
     assert [(f.name, f.entries) for f in found] == [
         ("s.0.a", ["[0]", "[1]", "[2]"]),
         ("s.1", ["[0, 0]", "[0, 1]"]),
     ]
     assert found[0].values.shape == (2, 3)
-    [whole] = fields(np.array([True, False]), "state")
+    [whole] = named_fields(np.array([True, False]), "state")
     assert whole.name == "state"
     assert whole.entries == [""]
     assert whole.values.tolist() == [[1], [0]]
-    assert fields({"deep": {"speed": np.zeros(1)}}, "s")[0].name == "deep.speed"
+    assert named_fields({"deep": {"speed": np.zeros(1)}}, "s")[0].name == "deep.speed"
 
 
 def test_traces_of_a_nested_state_against_nominal_bands():

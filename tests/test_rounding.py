@@ -9,7 +9,7 @@ import pytest
 import jast
 from jast import distributions as D
 from jast.estimate import failure_probability
-from jast.rounding import rounded
+from jast.rounding import rounding_problem
 
 
 def walk(offset, idle=0.0):
@@ -32,20 +32,20 @@ def _walk(offset, idle):
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])
 def test_floats_that_are_fine_enough_are_not_mentioned(offset):
-    assert rounded(walk(offset)) is None
+    assert rounding_problem(walk(offset)) is None
 
 
 def test_an_offset_is_too_coarse():
     """4.6e6 in float32 has units of a half."""
-    assert "state is too coarse: a disturbance changes one" in rounded(walk(4.6e6))
+    assert "state is too coarse: a disturbance changes one" in rounding_problem(walk(4.6e6))
 
 
 def test_what_decides_nothing_may_be_coarse():
-    assert rounded(walk(0.0, 4.6e6)) is None
+    assert rounding_problem(walk(0.0, 4.6e6)) is None
 
 
 def test_float64_is_fine(x64):
-    assert rounded(walk(4.6e6)) is None
+    assert rounding_problem(walk(4.6e6)) is None
 
 
 def test_check_and_the_estimate_say_so(key):
@@ -65,4 +65,4 @@ def test_a_random_start_and_an_episodic_system():
         init=lambda x0: jnp.stack([x0, x0]),
         episodic=True,
     )
-    assert "state is too coarse" in rounded(sim)
+    assert "state is too coarse" in rounding_problem(sim)

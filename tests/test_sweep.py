@@ -22,7 +22,7 @@ from jast.estimate.markov_tilts import Tilts
 from jast.estimate.tilt_fit import as_tilts, of_tilts
 from jast.intervals import clopper_pearson
 from jast.sweeping import Sweep
-from jast.sweeping.batch import batch, kinds
+from jast.sweeping.batch import count_kinds, make_simulators
 
 LIMITS = (0.5, 1.0, 1.5, 2.0)
 
@@ -87,15 +87,18 @@ def of_words(limit):
     ],
 )
 def test_what_cannot_be_traced_compiles_apart(of, limits, n):
-    made = batch(of, [{"limit": v} for v in limits])
-    assert kinds(made) == n
+    made = make_simulators(of, [{"limit": v} for v in limits])
+    assert count_kinds(made) == n
 
 
 def test_simulators_of_one_kind_are_taken_as_they_are():
     sims = [jast.simulators.walk1d(threshold=v) for v in (3.0, 4.0)]
-    assert all(a is b for a, b in zip(batch(sims, [{}, {}]), sims)) and kinds(sims) == 1
+    assert (
+        all(a is b for a, b in zip(make_simulators(sims, [{}, {}]), sims))
+        and count_kinds(sims) == 1
+    )
     shared = lambda limit: jast.simulators.walk1d(threshold=limit)
-    made = batch(shared, [{"limit": 3.0}, {"limit": 4.0}])
+    made = make_simulators(shared, [{"limit": 3.0}, {"limit": 4.0}])
     assert made[0].evaluate.func is sims[0].evaluate.func
 
 
@@ -315,7 +318,7 @@ def test_the_picture(key):
 
 def test_partials_of_make_are_equal_in_other_sweeps_and_processes():
     rows = [{"limit": v} for v in LIMITS]
-    a, b = batch(make, rows), batch(make, rows[:2])
+    a, b = make_simulators(make, rows), make_simulators(make, rows[:2])
     assert jax.tree.structure(a[0]) == jax.tree.structure(b[1])
     assert isinstance(a[0].step, Partial)
     sent = pickle.loads(pickle.dumps(a[0]))  # as to another process

@@ -13,7 +13,7 @@ from systems import line
 import jast
 from jast.estimate import Estimate
 from jast.estimate.sample import Sample, counted
-from jast.sweeping.join import joined
+from jast.sweeping.join import join_rows
 
 LIMITS = np.linspace(3.0, 3.7, 8)
 PHI = NormalDist()
@@ -29,7 +29,7 @@ def log_truth(limits, horizon=1):
     return np.log([2 * PHI.cdf(-v / math.sqrt(horizon)) for v in limits])
 
 
-MADE = jast.sweeping.batch.batch(walk, [{"limit": v} for v in LIMITS])
+MADE = jast.sweeping.batch.make_simulators(walk, [{"limit": v} for v in LIMITS])
 BLANK = dict.fromkeys(Estimate._fields)
 
 
@@ -75,7 +75,7 @@ def test_intervals_hold_the_truth_and_ratios_are_sharper(copies):
     curves, ratios, errors, alone = [], [], [], []
     for _ in range(120):
         found = [row(rng, i, 300, copies) for i in range(len(LIMITS))]
-        j = joined(keys(8), MADE, found)
+        j = join_rows(keys(8), MADE, found)
         low, high = np.log(j.curve[:, 1:].T)
         curves.append(np.mean((low < truth) & (truth < high)))
         (low, high), step = np.log(j.ratios[:, 1:].T), np.diff(truth)
@@ -95,21 +95,21 @@ def test_a_row_that_is_flagged_takes_no_part():
     rng = np.random.default_rng(0)
     found = [row(rng, i, 300) for i in range(4)]
     found[1] = found[1]._replace(reliable=False)
-    j = joined(keys(4), MADE[:4], found)
+    j = join_rows(keys(4), MADE[:4], found)
     assert np.isnan(j.curve[1]).all() and np.isfinite(np.delete(j.curve, 1, 0)).all()
     assert np.isnan(j.ratios[:2]).all() and np.isfinite(j.ratios[2]).all()
     for none in (None, 3, found[0]._replace(draws=None), found[1]):
-        assert joined(keys(2), MADE[:2], [found[0], none]) is None
-    assert joined(keys(1), MADE[:1], found[:1]) is None
+        assert join_rows(keys(2), MADE[:2], [found[0], none]) is None
+    assert join_rows(keys(1), MADE[:1], found[:1]) is None
     dear = found[0]._replace(settings=dict(budget=10_000))
-    assert joined(keys(2), MADE[:2], [dear, dear]) is None
+    assert join_rows(keys(2), MADE[:2], [dear, dear]) is None
 
 
 def test_rows_without_common_failures_stand_alone():
     rng = np.random.default_rng(0)
     a, b = row(rng, 0, 300, sides=(1,)), row(rng, 1, 300, sides=(-1,))
     apart = [walk(3.0), walk(9.0)]
-    j = joined(keys(2), apart, [a, b])
+    j = join_rows(keys(2), apart, [a, b])
     assert np.isnan(j.curve).all() and j.ratios[0, 0] == pytest.approx(b.mean / a.mean)
 
 
@@ -119,9 +119,9 @@ def test_a_row_that_misses_a_failure_mode_is_named():
     found = [row(rng, i, 2000, error=0.02) for i in range(5)]
     lost = row(rng, 2, 2000, error=0.02, sides=(1,))
     found[2] = lost._replace(log_mean=lost.log_mean - math.log(2))
-    j = joined(keys(5), MADE[:5], found)
+    j = join_rows(keys(5), MADE[:5], found)
     assert j.apart == (1, 2)
-    assert joined(keys(5), MADE[:5], [row(rng, i, 2000) for i in range(5)]).apart == ()
+    assert join_rows(keys(5), MADE[:5], [row(rng, i, 2000) for i in range(5)]).apart == ()
     none, said = (None,) * 5, dict(judged=1, apart=[1, 2])
     table = jast.sweeping.Sweep({"limit": tuple(LIMITS[:5])}, (1,) * 5, none, none, said, *j[:2])
     assert str(table).splitlines()[-2:] == [

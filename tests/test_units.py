@@ -23,7 +23,7 @@ from systems import line
 
 import jast
 from jast import places, units
-from jast.checkpoints import PARTS, Store, stored
+from jast.checkpoints import PARTS, Checkpoint, RecordFile, open_checkpoint, read_records
 from jast.estimate import (
     Estimate,
     failure_probability,
@@ -33,8 +33,7 @@ from jast.estimate import (
     policy_proposal,
     subset_simulation,
 )
-from jast.fingerprint import differences, fingerprint
-from jast.ledger import Ledger, records
+from jast.fingerprint import describe_differences, fingerprint
 from jast.places import Task
 from jast.policies import sac
 from jast.policy import nominal_policy
@@ -91,7 +90,7 @@ class Full:
 
 def parts(folder):
     """The records of a checkpoint; none where it is not there yet."""
-    return list(records(folder / PARTS)) if (folder / PARTS).exists() else []
+    return list(read_records(folder / PARTS)) if (folder / PARTS).exists() else []
 
 
 @pytest.fixture
@@ -152,7 +151,7 @@ class Closing:
 
 def squares(n=5, function=square, executor=None, **how):
     watch = Watch("squares", n, "unit", False, how.pop("callback", None))
-    ways = units.ways("squares", executor, how.pop("devices", None))
+    ways = units.placement("squares", executor, how.pop("devices", None))
     like = lambda: 0
     fold = lambda state, number, result: (*state, int(result))
     return units.run(Task(function, None, like), n, fold, (), watch, ways, **how)
@@ -312,11 +311,11 @@ def test_a_system_is_not_asked_again(name, key, same, tmp_path, monkeypatch):
     answers = [r for r in parts(folder) if r.header["name"].startswith("answer")]
     assert len(answers) > 3
     os.truncate(folder / PARTS, answers[len(answers) // 2].end)
-    with Ledger(folder / PARTS) as ledger:
+    with RecordFile(folder / PARTS) as ledger:
         ledger.put("answer-1", *ledger.get("answer-0"))
     same(call(key, checkpoint=folder), alone)
     assert {r.header["name"] for r in parts(folder)} >= {r.header["name"] for r in answers}
-    monkeypatch.setattr(Store, "put", lambda *_: pytest.fail("asked again"))
+    monkeypatch.setattr(Checkpoint, "put", lambda *_: pytest.fail("asked again"))
     same(call(key, checkpoint=folder), alone)
 
 
@@ -340,7 +339,7 @@ def test_a_unit_that_goes_on_failing_is_left_out_and_told():
     assert ran.done == 5
     (incident,) = ran.incidents
     assert "ZeroDivisionError: one" in str(incident) and "make the same call again" in str(incident)
-    assert "units 1 are left out" in units.note("units", ran, 4, 5)
+    assert "units 1 are left out" in units.describe_missing("units", ran, 4, 5)
 
 
 def test_where_all_units_fail_the_call_says_why():
@@ -353,7 +352,7 @@ def test_where_all_units_fail_the_call_says_why():
 def test_an_executor_that_is_shut_down_leaves_what_is_done():
     ran = squares(n=600, executor=Closing(after=300))
     assert 0 < len(ran.state) < 600 and list(ran.state) == [i**2 for i in range(len(ran.state))]
-    assert "cannot schedule new futures" in units.note("units", ran, ran.done, 600)
+    assert "cannot schedule new futures" in units.describe_missing("units", ran, ran.done, 600)
     with pytest.raises(RuntimeError, match="squares: the executor takes no more work"):
         squares(executor=Closing(after=1))
 
@@ -421,9 +420,9 @@ def test_a_full_disk_is_told(key, tmp_path, monkeypatch, same):
         self._file = Full(self._file)
         real(self, *args)
 
-    real = Ledger.put
+    real = RecordFile.put
     with monkeypatch.context() as patch:
-        patch.setattr(Ledger, "put", full)
+        patch.setattr(RecordFile, "put", full)
         match = "nominal: checkpoint .* cannot be written: No space left"
         with pytest.raises(OSError, match=match):
             CALLS["nominal"](key, checkpoint=tmp_path)
@@ -436,13 +435,13 @@ def test_a_state_that_cannot_be_written_leaves_the_last_one(key, tmp_path, monke
         file.write(b"a half")
         raise OSError(28, "No space left on device")
 
-    with stored("sac", tmp_path, key) as store:
+    with open_checkpoint("sac", tmp_path, key) as store:
         store.replace({"at": 1}, {"a": np.arange(3)})
         with monkeypatch.context() as patch:
             patch.setattr(np, "savez", full)
             with pytest.raises(OSError, match="sac: checkpoint .* No space left"):
                 store.replace({"at": 2}, {"a": np.arange(4)})
-    with stored("sac", tmp_path, key) as store:
+    with open_checkpoint("sac", tmp_path, key) as store:
         header, arrays = store.state()
         assert header["at"] == 1 and arrays["a"].tolist() == [0, 1, 2]
         (tmp_path / "state.jast").write_bytes(b"PK damaged")
@@ -471,12 +470,14 @@ def test_a_fingerprint_tells_functions_and_numbers_apart():
         return lambda x: gain * x
 
     same = fingerprint(sim=walk1d(), f=made(2.0)), fingerprint(sim=walk1d(), f=made(2.0))
-    assert differences(*same) == ""
-    assert "f.gain is 2.0 there, 3.0 here" == differences(
+    assert describe_differences(*same) == ""
+    assert "f.gain is 2.0 there, 3.0 here" == describe_differences(
         same[0], fingerprint(sim=walk1d(), f=made(3.0))
     )
-    assert "code" in differences(fingerprint(f=lambda x: x + 1), fingerprint(f=lambda x: x - 1))
-    assert "sim" in differences(fingerprint(sim=walk1d()), fingerprint(sim=ferry()))
+    assert "code" in describe_differences(
+        fingerprint(f=lambda x: x + 1), fingerprint(f=lambda x: x - 1)
+    )
+    assert "sim" in describe_differences(fingerprint(sim=walk1d()), fingerprint(sim=ferry()))
 
 
 # --- long: processes, devices, many kills

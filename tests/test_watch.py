@@ -1,15 +1,14 @@
 """Long work that is watched."""
 
 import re
-import warnings
 
 import pytest
 
 from jast.watch import Watch, in_pieces
 
 
-def watched(callback, **named):
-    with Watch("search", 1000, "sim", False, callback, **named) as watch:
+def watched(callback):
+    with Watch("search", 1000, "sim", False, callback) as watch:
         watch.more(10)
         watch.reach(30, best=1)
         watch.tell(lambda: "so far")
@@ -19,19 +18,6 @@ def test_the_callback_takes_three():
     seen = []
     watched(lambda *three: seen.append(three))
     assert seen == [(10, 1000, None), (30, 1000, "so far")]
-
-
-def test_one_of_two_arguments_warns_once_and_gets_what_it_got():
-    seen = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        watched(lambda done, total: seen.append((done, total)))
-        watched(lambda a, b: seen.append((a, b)), former=lambda done, total, r: (r, done))
-    assert [w.category for w in caught] == [DeprecationWarning] * 2
-    assert "search: callback takes (done, total, result so far or None) now" in str(
-        caught[0].message
-    )
-    assert seen == [(10, 1000), (30, 1000), (None, 10), ("so far", 30)]
 
 
 def test_defaults_and_methods_are_callbacks():

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from jast import archive, weakness
-from jast.checkpoints import Store
-from jast.counter import generator
+from jast.checkpoints import Checkpoint
+from jast.counter import numpy_generator
 from jast.weakness import Selector, Step, validate
 
 KEY = jax.random.key(0)
@@ -72,7 +72,7 @@ def in_turn(size=7, sets=2):
         for _ in range(sets):
             now = ask(np.arange(at, min(at + size, data.size)))
             at += size
-        noise = generator(key).random(data.size, np.float32)
+        noise = numpy_generator(key).random(data.size, np.float32)
         return Step(
             {"at": np.asarray(at), "failed": np.asarray(now.failed.sum())},
             noise,
@@ -214,7 +214,7 @@ def test_a_checkpoint_holds_every_answer(tmp_path):
     system = Flaky(answers, 38, SystemExit())  # what nothing catches
     with pytest.raises(SystemExit):
         validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path)
-    _, state = archive.read(path / "state.jast", "jast checkpoint state", 1, "a state")
+    _, state = archive.read(path / "state.jast", {"jast checkpoint state": 1}, "a state")
     assert len(state["order"]) == 35
     same(validate(KEY, system, inputs, labels, selector=in_turn(), checkpoint=path), whole)
     assert len(system.asked) == 60
@@ -367,9 +367,9 @@ def test_nothing_is_lost_where_something_else_raises(where, tmp_path, monkeypatc
     if where in ("selector", "scores"):
         selector = selector._replace(step=step)
     if where == "checkpoint":
-        calls, real = [], Store.replace
+        calls, real = [], Checkpoint.replace
         monkeypatch.setattr(
-            Store,
+            Checkpoint,
             "replace",
             lambda *a: boom() if len(calls) == 5 else calls.append(1) or real(*a),
         )

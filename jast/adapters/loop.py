@@ -21,7 +21,7 @@ from jast import distributions as D
 from jast.adapters.kept import as_numbers, in_dtypes_of, with_keys
 from jast.adapters.noise import Random, disturbed, model_of, random, replaced
 from jast.contract import OBSERVED
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 from jast.simulator import Simulator, fixed, ravel
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def simulator(
             f" received {seed!r}"
         )
     number = np.uint32(0 if drawn or seed is None else seed)
-    functions = {k: v if v is None else bound(v) for k, v in functions.items()}
+    functions = {k: v if v is None else as_partial(v) for k, v in functions.items()}
     loop = _Loop(
         system=system,
         noise=noise,

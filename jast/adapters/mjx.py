@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jast._checks import whole
+from jast._checks import whole_number
 from jast.adapters import loop
 from jast.adapters.kept import refuse_warp
 from jast.adapters.loop import Instant
 from jast.adapters.noise import add
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 from jast.simulator import Simulator
 
 __all__ = ["mjx"]
@@ -151,9 +151,9 @@ def mjx(
     physics = _Physics(
         subject=model,
         data=data,
-        sense=bound(functions["sense"]),
+        sense=as_partial(functions["sense"]),
         advance=step,
-        substeps=whole("mjx", "substeps", substeps),
+        substeps=whole_number("mjx", "substeps", substeps),
     )
     return loop.simulator(
         "mjx",
@@ -164,7 +164,7 @@ def mjx(
         action=action,
         force=force,
         parameters=parameters,
-        failure=Partial(_reached, bound(distance)) if failure is None else failure,
+        failure=Partial(_reached, as_partial(distance)) if failure is None else failure,
         distance=distance,
         observe=observe,
     )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 
 __all__ = ["Random", "add", "disturbed", "model_of", "random", "replaced"]
 
@@ -44,8 +44,8 @@ def random(
             + f"{PAIR}, received {value!r}"
         )
     # a distribution of jast is a pytree, whose numbers are traced
-    model = model if isinstance(model, D.Distribution) else bound(model)
-    return Random(model, None if apply is None else bound(apply))
+    model = model if isinstance(model, D.Distribution) else as_partial(model)
+    return Random(model, None if apply is None else as_partial(apply))
 
 
 def disturbed(argument: str, random: Random, subject: Any, draw: Any) -> Any:

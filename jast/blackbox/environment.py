@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jast._checks import whole_number
+
 __all__ = ["Moment", "gymnasium_system"]
 
 
@@ -24,24 +26,24 @@ class Moment(NamedTuple):
 
     observation: Any
     reward: float
-    """Of the last step; 0 after a reset"""
+    """Of the last step; 0 after a reset."""
     total: float
-    """The sum of the rewards so far"""
+    """The sum of the rewards so far."""
     terminated: bool
     truncated: bool
     info: dict[str, Any]
     env: Any
-    """The environment itself, for what it does not return"""
+    """The environment itself, for what it does not return."""
 
 
 class _System(NamedTuple):
     """Makes the objects of one environment."""
 
-    make: Any
-    agent: Any
-    apply: Any
-    event: Any
-    distance: Any
+    make: Callable[[], Any]
+    agent: Callable[[Any], Any] | None
+    apply: Callable[[Any, Any], Any] | None
+    event: Callable[[Moment], bool]
+    distance: Callable[[Moment], float]
     seed: int
 
     def __call__(self):
@@ -67,18 +69,18 @@ class _Environment:
     def transition(self, x):
         if self.is_terminal():
             return
-        s, now = self.system, self.now
-        action = s.agent(now.observation) if s.agent is not None else None
-        action = s.apply(action, x) if s.apply is not None else x
+        agent, apply = self.system.agent, self.system.apply
+        action = None if agent is None else agent(self.now.observation)
+        action = x if apply is None else apply(action, x)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.now = Moment(
-            observation,
-            float(reward),
-            now.total + float(reward),
-            bool(terminated),
-            bool(truncated),
-            info,
-            self.env,
+            observation=observation,
+            reward=float(reward),
+            total=self.now.total + float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            info=info,
+            env=self.env,
         )
 
     def is_event(self):
@@ -142,25 +144,21 @@ def gymnasium_system(
         >>> jast.rollout(jax.random.key(0), sim).disturbances.shape
         (5, 1)
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(
-            f"gymnasium_system: seed must be a whole number of at least 0, received {seed!r}"
-        )
-    for name, value, optional in (
-        ("make", make, False),
-        ("distance", distance, False),
-        ("event", event, True),
-        ("agent", agent, True),
-        ("apply", apply, True),
-    ):
-        if not (callable(value) or optional and value is None):
+    seed = whole_number("gymnasium_system", "seed", seed, 0)
+    needed, optional = (
+        dict(make=make, distance=distance),
+        dict(event=event, agent=agent, apply=apply),
+    )
+    for name, value in (needed | optional).items():
+        if not (callable(value) or name in optional and value is None):
             raise ValueError(f"gymnasium_system: {name} must be a function, received {value!r}")
     if agent is not None and apply is None:
         raise ValueError(
             "gymnasium_system: an agent needs apply=, a function (action, disturbance) -> action;"
             " without it no disturbance reaches the environment"
         )
-    return _System(make, agent, apply, _terminated if event is None else event, distance, int(seed))
+    event = _terminated if event is None else event
+    return _System(make=make, agent=agent, apply=apply, event=event, distance=distance, seed=seed)
 
 
 def _terminated(moment):

@@ -4,20 +4,19 @@ memory of past outcomes. NumPy only, never JAX.
 
 from __future__ import annotations
 
-import functools
 import threading
 import time
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from jast.blackbox.worker import fill
+from jast.blackbox.worker import fill, history
 from jast.incidents import Log
 
-__all__ = ["Calls"]
+__all__ = ["Calls", "Host"]
 
-REMEMBERED = 1 << 16
-"""Outcomes that are kept to be compared with, of failures and of the others each."""
+REMEMBERED = 1 << 16  # outcomes kept to be compared with, of failures and of others each: some MB
 
 
 class Calls(NamedTuple):
@@ -58,12 +57,13 @@ class Host:
 
     def __init__(self, runner, spec, x, starts):
         """``x``: the structure of a disturbance; ``starts``: how many leaves x0 has."""
-        self.runner, self.spec, self.x, self.starts, self.log = runner, spec, x, starts, Log()
+        self.runner, self.spec, self.x, self.starts = runner, spec, x, starts
+        self.log = Log()
         self.done = Calls(0, 0, 0, 0, 0.0)
         self.failing, self.others = {}, {}
         self.lock = threading.Lock()
         # one callable for each kind of answer, as it is part of what a compiled program is known by
-        self.callback = functools.cache(lambda dtype, size: functools.partial(self, dtype, size))
+        self.callback = cache(lambda dtype, size: partial(self, dtype, size))
 
     def __reduce__(self):  # another process counts for itself
         return Host, (self.runner, self.spec, self.x, self.starts)
@@ -83,7 +83,10 @@ class Host:
         """
         n = live.ndim
         batch = np.broadcast_shapes(live.shape, t.shape, *(a.shape[:n] for a in leaves))
-        flat = lambda a: np.broadcast_to(a, (*batch, *a.shape[n:])).reshape((-1, *a.shape[n:]))
+
+        def flat(a):
+            return np.broadcast_to(a, (*batch, *a.shape[n:])).reshape((-1, *a.shape[n:]))
+
         live = flat(live)
         rows = np.flatnonzero(live)
         out = (
@@ -128,55 +131,44 @@ class Host:
             episodes=count.episodes + reply.episodes,
             transitions=count.transitions + reply.transitions,
         )
-        example = lambda i: (
-            lambda: (
+
+        def example(i):
+            return (
                 fill(self.spec.x0, [a[i] for a in x0]),
                 fill(self.x, [a[i, : t[i]] for a in xs]),
             )
-        )
+
         wrong = np.zeros(len(t), bool)
         for i, kind, message in reply.problems:
             wrong[i] = True
-            self.log.add(kind, message, example(i))
+            self.log.add(kind, message, partial(example, i))
         with np.errstate(over="ignore"):
-            distance, log_p, seen = (
-                a.astype(dtype) for a in (reply.distance, reply.log_p, reply.seen)
-            )
+            distance = reply.distance.astype(dtype)
+            log_p = reply.log_p.astype(dtype)
+            seen = reply.seen.astype(dtype)
         for i in np.flatnonzero(~np.isfinite(distance) & ~wrong):
             wrong[i] = True
-            self.log.add(
-                "NaN",
-                f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}",
-                example(i),
-            )
+            said = f"distance is {reply.distance[i]:g}, too large for {np.dtype(dtype).name}"
+            self.log.add("NaN", said, partial(example, i))
         event, terminal = reply.event & ~wrong, reply.terminal | wrong
         distance[wrong], log_p[wrong] = np.nan, 0
         for i in np.flatnonzero(~wrong):
-            self._compare(
-                hash(
-                    (
-                        int(t[i]),
-                        *(a[i].tobytes() for a in x0),
-                        *(a[i, : t[i]].tobytes() for a in xs),
-                    )
-                ),
-                event[i],
-                reply.distance[i],
-                reply.log_p[i],
-                example(i),
-            )
+            key = hash(history([a[i] for a in x0], [a[i] for a in xs], int(t[i])))
+            outcome = bool(event[i]), float(reply.distance[i]), float(reply.log_p[i])
+            self._compare(key, outcome, partial(example, i))
         return event, distance, terminal, log_p, seen
 
-    def _compare(self, key, event, distance, log_p, example):
-        """Remember an outcome; an incident where the same input had another one before."""
-        now = bool(event), float(distance), float(log_p)
+    def _compare(self, key, outcome, example):
+        """Remember an outcome (event, distance, log p); an incident where the same input had
+        another one before.
+        """
         before = self.failing.get(key) or self.others.get(key)
         if before is None:
-            known = self.failing if event else self.others
-            if len(known) >= REMEMBERED:
-                del known[next(iter(known))]
-            known[key] = now
-        elif before != now:
+            outcomes = self.failing if outcome[0] else self.others
+            if len(outcomes) >= REMEMBERED:
+                del outcomes[next(iter(outcomes))]
+            outcomes[key] = outcome
+        elif before != outcome:
             names = "a failure and no failure", "two distances", "two values of log p"
-            what = next(name for name, a, b in zip(names, before, now) if a != b)
+            what = next(name for name, a, b in zip(names, before, outcome) if a != b)
             self.log.add("not deterministic", f"the same disturbances gave {what}", example)

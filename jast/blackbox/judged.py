@@ -10,12 +10,13 @@ from jax import lax
 
 from jast import distributions as D
 from jast.blackbox.host import Host
+from jast.pytrees import select
 from jast.simulator import Simulator
 
-EPISODES = 16
-"""Half of them drawn from the model, half from its tails, where failures are."""
-TAIL = 0.02
-"""The probability of both tails together."""
+__all__ = ["compare"]
+
+EPISODES = 16  # half of them drawn from the model, half from its tails, where failures are
+TAIL = 0.02  # the probability of both tails together
 
 
 def compare(host: Host, sim: Simulator) -> None:
@@ -24,7 +25,7 @@ def compare(host: Host, sim: Simulator) -> None:
     Runs `EPISODES` more episodes, looked at after every disturbance. An ``is_event`` that raises
     before the end is not compared.
     """
-    drawn = jax.device_get(_drawn(jax.random.key(2), sim))
+    drawn = jax.device_get(_draw(jax.random.key(2), sim))
     lost = host.lost(*map(jax.tree.leaves, drawn))
     if lost:
         warnings.warn(
@@ -37,7 +38,7 @@ def compare(host: Host, sim: Simulator) -> None:
 
 
 @jax.jit
-def _drawn(key, sim):
+def _draw(key, sim):
     """x0 [EPISODES, ...] and disturbances [EPISODES, horizon, ...]."""
 
     def episode(key, wild):
@@ -45,9 +46,11 @@ def _drawn(key, sim):
             drawn = D.sample(dist, key)
             if not D.has_quantile(dist):
                 return drawn
-            pick = lambda s: _outer(jax.random.uniform(key, s.shape, D.float_dtype(s.dtype)))
-            far = D.quantile(dist, jax.tree.map(pick, D.event_like(dist)))
-            return jax.tree.map(lambda a, b: jnp.where(wild, a, b), far, drawn)
+            u = jax.tree.map(
+                lambda s: _in_tails(jax.random.uniform(key, s.shape, D.float_dtype(s.dtype))),
+                D.event_like(dist),
+            )
+            return select(wild, D.quantile(dist, u), drawn)
 
         def step(state, t):
             x = choose(jax.random.fold_in(key, t), sim.disturbance(state))
@@ -59,6 +62,6 @@ def _drawn(key, sim):
     return jax.vmap(episode)(jax.random.split(key, EPISODES), jnp.arange(EPISODES) >= EPISODES // 2)
 
 
-def _outer(u):
+def _in_tails(u):
     """``u`` in [0, 1) moved into the tails: below TAIL / 2 or above 1 - TAIL / 2."""
     return jnp.where(u < 0.5, TAIL * u, 1 - TAIL * (1 - u))

@@ -9,21 +9,19 @@ import time
 import weakref
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, wait
+from typing import NamedTuple
 
 import numpy as np
 
-from jast._checks import library
+from jast._checks import import_library
 from jast.blackbox import environment, programs, worker
 
-__all__ = ["Pool"]
+__all__ = ["Pool", "pack"]
 
 NEEDS = "jast.blackbox with workers >= 1"
-GRACE = 1.0
-"""Seconds that a worker has beyond the time limits of its rows before it is killed."""
-START = 60.0
-"""Seconds that a worker may take to start, and to load the system."""
-PIECE = 0.01
-"""Seconds of work in a piece, at least, where that leaves no worker idle."""
+GRACE = 1.0  # seconds that a worker has beyond the time limits of its rows before it is killed
+START = 60.0  # seconds that a worker may take to start, and to load the system
+PIECE = 0.01  # seconds of work in a piece, at least, where that leaves no worker idle
 
 
 class Unloadable(RuntimeError):
@@ -56,16 +54,13 @@ class _Install:
 SERVE, PROBE, CONFIGURE, JUDGE = map(_Remote, ("serve", "probe", "configure", "judge"))
 
 
-def packed(system, spec):
+def pack(system, spec):
     """The system as bytes; this package's part of them by value, so that a worker need not import
     it. Raises ValueError for one that cannot be sent.
     """
-    cloudpickle = library(NEEDS, "cloudpickle", "blackbox")
-    own = [
-        m
-        for m in (worker, programs, environment)
-        if m.__name__ not in cloudpickle.list_registry_pickle_by_value()
-    ]
+    cloudpickle = import_library(NEEDS, "cloudpickle", "blackbox")
+    registered = cloudpickle.list_registry_pickle_by_value()
+    own = [m for m in (worker, programs, environment) if m.__name__ not in registered]
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
@@ -90,7 +85,7 @@ class Worker:
     def start(self):
         """A future that is done when the process has the system."""
         if self.executor is None:
-            self.executor = library(NEEDS, "loky", "blackbox").ProcessPoolExecutor(
+            self.executor = import_library(NEEDS, "loky", "blackbox").ProcessPoolExecutor(
                 max_workers=1, timeout=None
             )
             return self.executor.submit(pickle.loads, self.payload)
@@ -109,11 +104,22 @@ def _close(workers):
         each.kill()
 
 
-def _configured(payload, workers, spec, x, size):
+def _configure_pool(payload, workers, spec, x, size):
     """A `Pool`."""
     made = Pool(payload, workers, spec)
     made.configure(x, size)
     return made
+
+
+class _Piece(NamedTuple):
+    """Rows that a worker runs."""
+
+    worker: Worker
+    queue: deque
+    """Where the rows come from."""
+    rows: np.ndarray
+    deadline: float
+    """When they must be done, by `time.monotonic`."""
 
 
 class Pool:
@@ -129,11 +135,12 @@ class Pool:
     def __init__(self, payload, workers, spec):
         self.payload, self.spec = payload, spec
         self.workers = [Worker(payload) for _ in range(workers)]
-        self.x, self.size, self.pace = 0, 0, None
+        self.x, self.size = 0, 0
+        self.pace: float | None = None  # seconds a row
         weakref.finalize(self, _close, self.workers)
 
     def __reduce__(self):  # another process has workers of its own
-        return _configured, (self.payload, len(self.workers), self.spec, self.x, self.size)
+        return _configure_pool, (self.payload, len(self.workers), self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """As `worker.Runner.configure`, for all workers."""
@@ -169,7 +176,9 @@ class Pool:
         batch, which a search keeps from step to step.
         """
         n = len(t)
-        reply = worker.Reply(*worker.blank(n, self.size), [], 0, 0, 0.0)
+        reply = worker.Reply(
+            *worker.blank(n, self.size), problems=[], episodes=0, transitions=0, seconds=0.0
+        )
         queues = self._pieces(lanes)
         free, busy = set(self.workers), {}
         try:
@@ -181,50 +190,33 @@ class Pool:
                 ]
                 self._start([w for w, _, _ in given])
                 for w, queue, rows in given:
-                    task = w.submit(
-                        SERVE,
-                        t[rows],
-                        [a[rows] for a in x0],
-                        [a[rows, : t[rows].max()] for a in xs],
-                    )
-                    busy[task] = w, queue, rows, self._deadline(t[rows])
+                    longest = t[rows].max()
+                    leaves = [a[rows] for a in x0], [a[rows, :longest] for a in xs]
+                    task = w.submit(SERVE, t[rows], *leaves)
+                    busy[task] = _Piece(w, queue, rows, self._deadline(t[rows]))
                     free.remove(w)
-                done = wait(
-                    busy,
-                    (
-                        max(0.0, min(b[3] for b in busy.values()) - time.monotonic())
-                        if self.spec.limit
-                        else None
-                    ),
-                    FIRST_COMPLETED,
-                ).done
-                late = [
-                    task
-                    for task in busy
-                    if task not in done and self.spec.limit and time.monotonic() > busy[task][3]
-                ]
+                first = min(piece.deadline for piece in busy.values())
+                patience = None if first == np.inf else max(0.0, first - time.monotonic())
+                done = wait(busy, patience, FIRST_COMPLETED).done
+                now = time.monotonic()
+                late = [task for task in set(busy) - done if now > busy[task].deadline]
                 for task in [*done, *late]:
-                    w, queue, rows, _ = busy.pop(task)
-                    free.add(w)
-                    problem = (
-                        "timed out",
-                        (
-                            f"no answer within {self.spec.limit or 0:g} s, and could not be"
-                            " interrupted"
-                        ),
-                    )
+                    piece = busy.pop(task)
+                    free.add(piece.worker)
+                    limit = f"{self.spec.limit or 0:g} s"
+                    problem = "timed out", f"no answer within {limit}, and could not be interrupted"
                     if task in done:
                         try:
-                            reply = _merged(reply, rows, worker.Reply(*task.result()))
+                            reply = _merge(reply, piece.rows, worker.Reply(*task.result()))
                             continue
                         except Exception as error:
                             problem = "died", _cause(error)
-                    w.kill()
-                    if len(rows) > 1:
-                        queue.extendleft(rows[i : i + 1] for i in reversed(range(len(rows))))
+                    piece.worker.kill()
+                    if len(piece.rows) > 1:  # one by one, which finds the culprit
+                        piece.queue.extendleft(piece.rows[::-1, None])
                     else:
-                        reply.terminal[rows[0]] = True
-                        reply.problems.append((int(rows[0]), *problem))
+                        reply.terminal[piece.rows] = True
+                        reply.problems.append((int(piece.rows[0]), *problem))
         except BaseException:  # an interruption: what still runs must not answer the next call
             _close(self.workers)
             raise
@@ -248,9 +240,10 @@ class Pool:
         """When these rows must be done: each has its limit, and each transition of a history that
         may have to be repeated.
         """
-        if self.spec.limit:
-            parts = len(t) if self.spec.episodic else np.sum(t + 2)
-            return time.monotonic() + float(parts) * self.spec.limit + GRACE
+        if not self.spec.limit:
+            return np.inf
+        parts = len(t) if self.spec.episodic else np.sum(t + 2)
+        return time.monotonic() + float(parts) * self.spec.limit + GRACE
 
     def _start(self, workers):
         starting = [(w, task) for w in workers if (task := w.start()) is not None]
@@ -265,7 +258,7 @@ class Pool:
             ) from error
 
 
-def _merged(all, rows, part):
+def _merge(all, rows, part):
     for name in ("event", "distance", "terminal", "log_p", "seen"):
         getattr(all, name)[rows] = getattr(part, name)
     all.problems.extend((int(rows[i]), kind, message) for i, kind, message in part.problems)

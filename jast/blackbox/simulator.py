@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import distributions as D
-from jast._checks import real, whole
+from jast._checks import number, whole_number
 from jast._jax import host_call
 from jast.blackbox.host import Calls, Host
 from jast.blackbox.judged import compare
-from jast.blackbox.pool import Pool, packed
+from jast.blackbox.pool import Pool, pack
 from jast.blackbox.worker import METHODS, Runner, Spec, takes
 from jast.contract import OBSERVED
 from jast.distributions.containers import accepted
 from jast.distributions.kinds import Seeds
 from jast.incidents import sources
+from jast.pytrees import select, shapes_text
 from jast.simulator import Simulator, fixed, translating
 
 if TYPE_CHECKING:
@@ -49,13 +50,13 @@ class Record(NamedTuple):
         (1, [2.0, 0.0])
     """
 
-    begun: Any
-    """bool: True in every state of an episode; the system is not run on a state of zeros"""
-    t: Any
-    """int32: disturbances so far"""
-    x0: Any
-    disturbances: Any
-    """[horizon, ...]: the first t rows; zeros after them"""
+    begun: chex.Array
+    """bool: True in every state of an episode; the system is not run on a state of zeros."""
+    t: chex.Array
+    """int32: disturbances so far."""
+    x0: chex.ArrayTree
+    disturbances: chex.ArrayTree
+    """[horizon, ...]: the first t rows; zeros after them."""
 
 
 class Standing(NamedTuple):
@@ -81,20 +82,20 @@ class Standing(NamedTuple):
         3.0
     """
 
-    begun: Any
-    t: Any
-    x0: Any
-    disturbances: Any
-    event: Any
-    """bool"""
-    distance: Any
-    """float: miss distance; NaN where something went wrong"""
-    terminal: Any
-    """bool: ended without a failure, or by an incident"""
-    log_p: Any
-    """float: log p of the last disturbance as the object says it; 0 where it says nothing"""
-    seen: Any
-    """[k] float: what the object's ``observe`` returned; empty where it has none"""
+    begun: chex.Array
+    t: chex.Array
+    x0: chex.ArrayTree
+    disturbances: chex.ArrayTree
+    event: chex.Array
+    """bool."""
+    distance: chex.Array
+    """float: miss distance; NaN where something went wrong."""
+    terminal: chex.Array
+    """bool: ended without a failure, or by an incident."""
+    log_p: chex.Array
+    """float: log p of the last disturbance as the object says it; 0 where it says nothing."""
+    seen: chex.Array
+    """[k] float: what the object's ``observe`` returned; empty where it has none."""
 
 
 def from_python(
@@ -196,19 +197,15 @@ def from_python(
         >>> int(jast.rollout(jax.random.key(0), sim).length) <= 10
         True
     """
-    horizon, workers = whole(NAME, "horizon", horizon), whole(NAME, "workers", workers, 0)
+    horizon, workers = (
+        whole_number(NAME, "horizon", horizon),
+        whole_number(NAME, "workers", workers, 0),
+    )
     if episodic is not None and not isinstance(episodic, bool):
         raise ValueError(f"{NAME}: episodic must be True, False or None, received {episodic!r}")
     if time_limit is not None:
-        time_limit = float(
-            real(
-                NAME,
-                "time_limit",
-                time_limit,
-                lambda s: 0 < s < np.inf,
-                "of seconds above 0, or None",
-            )
-        )
+        expected = "of seconds above 0, or None"
+        time_limit = number(NAME, "time_limit", time_limit, lambda s: 0 < s < np.inf, expected)
         if not workers:
             raise ValueError(
                 f"{NAME}: time_limit needs workers of at least 1, received workers=0: a run in this"
@@ -223,13 +220,13 @@ def from_python(
     start = _start(start)
     like0 = jax.eval_shape(lambda: D.sample(start(), jax.random.key(0)))
     random = bool(jax.tree.leaves(like0))
-    run = _is_run(system, random, episodic)
+    run = _is_function(system, random, episodic)
     episodic = run if episodic is None else episodic
     disturbance = D.seeds() if disturbance is None else accepted(disturbance)
     tells = likelihood or ("maybe" if isinstance(disturbance, Seeds) and not run else None)
     spec = Spec(run, episodic, horizon, _structure("x0", like0), random, time_limit, tells)
-    runner = Pool(packed(system, spec), workers, spec) if workers else Runner(system, spec)
-    size = 0 if run else _probed(runner, start, limited=observe is None)
+    runner = Pool(pack(system, spec), workers, spec) if workers else Runner(system, spec)
+    size = 0 if run else _observed_numbers(runner, start, limited=observe is None)
 
     constant = D.is_distribution(disturbance)
     if not (constant or callable(disturbance)):
@@ -242,7 +239,10 @@ def from_python(
     x = _structure("disturbance", like)
     runner.configure(x, size)
     host = Host(runner, spec, x, len(jax.tree.leaves(like0)))
-    begin = lambda x0: blank(like)._replace(begun=jnp.ones((), bool), x0=x0)
+
+    def begin(x0):
+        return blank(like)._replace(begun=jnp.ones((), bool), x0=x0)
+
     fields = dict(
         disturbance=(lambda state: disturbance) if constant else disturbance,
         horizon=horizon,
@@ -251,13 +251,12 @@ def from_python(
         observe=_observe if observe is None else observe,
     )
     if episodic:
-        judge = _ended if tells is None else _ended_telling
-        return Simulator(begin, _extended, evaluate=_Asking(host, judge), **fields)
-    init = lambda x0: _found(host, begin(x0))
+        judge = _judge if tells is None else _judge_with_log_p
+        return Simulator(begin, _extend, evaluate=_Asking(host, judge), **fields)
     return Simulator(
-        init,
-        _Asking(host, _moved),
-        evaluate=_stands if tells is None else _stands_telling,
+        lambda x0: _with_outcome(host, begin(x0)),
+        _Asking(host, _transition),
+        evaluate=_outcome if tells is None else _outcome_and_log_p,
         is_terminal=lambda state: state.terminal,
         **fields,
     )
@@ -306,47 +305,44 @@ class _Asking:
         return self.function(self.host, *args)
 
 
-def _ended(host, state):
+def _judge(host, state):
     """Event and distance of an episode; NaN before its end. A state of zeros is not asked for."""
-    return _ended_telling(host, state)[:2]
+    return _judge_with_log_p(host, state)[:2]
 
 
-def _ended_telling(host, state):
-    """`_ended`, and log p as the system says it."""
+def _judge_with_log_p(host, state):
+    """`_judge`, and log p as the system says it."""
     live = state.begun & (state.t == host.spec.horizon)
-    event, distance, _, log_p, _ = _asked(host, 0, live, state.t, state.x0, state.disturbances)
+    event, distance, _, log_p, _ = _ask(host, 0, live, state.t, state.x0, state.disturbances)
     return event, jnp.where(live | ~state.begun, distance, jnp.nan), log_p
 
 
-def _extended(state, x):
+def _extend(state, x):
     rows = jax.tree.map(
         lambda a, v: a.at[state.t].set(jnp.asarray(v, a.dtype)), state.disturbances, x
     )
     return state._replace(t=state.t + 1, disturbances=rows)
 
 
-def _moved(host, state, x):
+def _transition(host, state, x):
     """An ended state, and one of zeros, stays as it is and is not asked for."""
     over = ~state.begun | state.event | state.terminal | (state.t >= host.spec.horizon)
-    after = _found(host, _extended(state, x), ~over)
-    return jax.tree.map(lambda a, b: jnp.where(over, a, b), state, after)
+    after = _with_outcome(host, _extend(state, x), ~over)
+    return select(over, state, after)
 
 
-def _found(host, state, live=True):
+def _with_outcome(host, state, live=True):
     """``state`` with its outcome."""
-    found = _asked(
-        host, state.seen.shape[0], state.begun & live, state.t, state.x0, state.disturbances
-    )
-    return state._replace(
-        **dict(zip(("event", "distance", "terminal", "log_p", "seen"), found, strict=True))
-    )
+    size, live = state.seen.shape[0], state.begun & live
+    found = _ask(host, size, live, state.t, state.x0, state.disturbances)
+    return Standing(*state[: -len(found)], *found)
 
 
-def _stands(state):
+def _outcome(state):
     return state.event, state.distance
 
 
-def _stands_telling(state):
+def _outcome_and_log_p(state):
     return state.event, state.distance, state.log_p
 
 
@@ -355,18 +351,19 @@ def _observe(state):
         return state.seen
     rows = jax.tree.leaves(state.disturbances)
     dtype = jnp.zeros(()).dtype
-    last = [jnp.ravel(a[jnp.maximum(state.t - 1, 0)]) for a in rows]
-    # a seed is an unsigned number of any size
-    last = [
-        a.astype(dtype)
-        / (float(jnp.iinfo(a.dtype).max) if jnp.issubdtype(a.dtype, jnp.unsignedinteger) else 1.0)
-        for a in last
-    ]
+
+    def numbers(a):
+        a = jnp.ravel(a[jnp.maximum(state.t - 1, 0)])
+        # a seed is an unsigned number of any size
+        seed = jnp.issubdtype(a.dtype, jnp.unsignedinteger)
+        return a.astype(dtype) / (float(jnp.iinfo(a.dtype).max) if seed else 1.0)
+
+    last = map(numbers, rows)
     return jnp.concatenate([(state.t / rows[0].shape[0]).astype(dtype)[None], *last])[:OBSERVED]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _asked(host, size, live, t, x0, disturbances):
+def _ask(host, size, live, t, x0, disturbances):
     """Event, distance, terminal, log p and [size] observed numbers from the host, where ``live``;
     one call for a batch, under any number of `jax.vmap`.
     """
@@ -377,47 +374,40 @@ def _asked(host, size, live, t, x0, disturbances):
     )
 
 
-@_asked.defjvp
+@_ask.defjvp
 def _(host, size, primals, tangents):
     """No gradient: NaN, whatever the direction."""
-    event, distance, terminal, log_p, seen = _asked(host, size, *primals)
-    moved = [
-        jnp.sum(a).astype(distance.dtype)
-        for a in jax.tree.leaves(tangents)
-        if a.dtype != jax.dtypes.float0
-    ]
+    event, distance, terminal, log_p, seen = _ask(host, size, *primals)
+    floats = [a for a in jax.tree.leaves(tangents) if a.dtype != jax.dtypes.float0]
+    moved = [jnp.sum(a).astype(distance.dtype) for a in floats]
     unknown = sum(moved, jnp.zeros_like(distance)) * jnp.nan
     none = np.zeros((), jax.dtypes.float0)
-    return (event, distance, terminal, log_p, seen), (
-        none,
-        unknown,
-        none,
-        unknown,
-        jnp.broadcast_to(unknown, seen.shape),
-    )
+    slopes = none, unknown, none, unknown, jnp.broadcast_to(unknown, seen.shape)
+    return (event, distance, terminal, log_p, seen), slopes
 
 
 def _blank(episodic, horizon, like0, size, like):
     """A state of zeros; ``like0``, ``like``: shapes and dtypes of x0 and x."""
-    zeros = lambda tree, lead: jax.tree.map(lambda s: jnp.zeros((*lead, *s.shape), s.dtype), tree)
-    no = jnp.zeros((), bool)
-    record = Record(no, jnp.zeros((), jnp.int32), zeros(like0, ()), zeros(like, (horizon,)))
-    return (
-        record
-        if episodic
-        else Standing(*record, no, jnp.zeros(()), no, jnp.zeros(()), jnp.zeros((size,)))
+    no, zero = jnp.zeros((), bool), jnp.zeros(())
+    record = Record(
+        begun=no,
+        t=jnp.zeros((), jnp.int32),
+        x0=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like0),
+        disturbances=jax.tree.map(lambda s: jnp.zeros((horizon, *s.shape), s.dtype), like),
     )
+    if episodic:
+        return record
+    seen = jnp.zeros((size,))
+    return Standing(*record, event=no, distance=zero, terminal=no, log_p=zero, seen=seen)
 
 
 def _shape(disturbance, blank, like):
     """Shapes and dtypes of a value of ``disturbance``, whose state holds such values: found by
     trying until it returns what it was given.
     """
-    given = like is not None
-    like = (
-        jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), like)
-        if given
-        else jax.ShapeDtypeStruct((), jnp.zeros(()).dtype)
+    hint = "" if like is not None else "; give like=, an example of a disturbance"
+    like = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), 0.0 if hint else like
     )
 
     def value():
@@ -430,8 +420,7 @@ def _shape(disturbance, blank, like):
         try:
             found = jax.eval_shape(value)
         except Exception as error:
-            hint = "" if given else "; give like=, an example of a disturbance"
-            tried = f"on a state with disturbances {_text(blank(like).disturbances)}{hint}"
+            tried = f"on a state with disturbances {shapes_text(blank(like).disturbances)}{hint}"
             raise ValueError(
                 f"{NAME}: disturbance: {type(error).__name__}: {error} ({tried})"
             ) from error
@@ -440,12 +429,8 @@ def _shape(disturbance, blank, like):
         like = found
     raise ValueError(
         f"{NAME}: the shape of what disturbance returns changes with the shape of the state's"
-        f" disturbances, the last was {_text(like)}; give like=, an example of a disturbance"
+        f" disturbances, the last was {shapes_text(like)}; give like=, an example of a disturbance"
     )
-
-
-def _text(tree):
-    return str(jax.tree.map(lambda a: f"{a.dtype}{list(a.shape)}", tree))
 
 
 def _structure(name, like):
@@ -453,11 +438,9 @@ def _structure(name, like):
     leaves, tree = jax.tree.flatten(like)
 
     def plain(s):
-        if isinstance(s, dict):
-            return all(map(plain, s.values()))
-        return (
-            s is None or isinstance(s, int) or (isinstance(s, tuple | list) and all(map(plain, s)))
-        )
+        if isinstance(s, dict | tuple | list):
+            return all(map(plain, s.values() if isinstance(s, dict) else s))
+        return s is None or isinstance(s, int)
 
     structure = tree.unflatten(range(len(leaves)))
     if not plain(structure):
@@ -478,7 +461,7 @@ def _start(start):
     return translating(start)
 
 
-def _is_run(system, random, episodic):
+def _is_function(system, random, episodic):
     """Whether ``system`` is a function of whole episodes; else it makes objects. ValueError where
     it is neither.
     """
@@ -491,11 +474,8 @@ def _is_run(system, random, episodic):
             )
         return False
     if not callable(system):
-        hint = (
-            "; give its class, or a function that makes it"
-            if any(hasattr(system, m) for m in METHODS)
-            else ""
-        )
+        an_object = any(hasattr(system, m) for m in METHODS)
+        hint = "; give its class, or a function that makes it" if an_object else ""
         raise ValueError(
             f"{NAME}: system must be a function of the disturbances, or a class, received"
             f" {system!r}{hint}"
@@ -504,17 +484,12 @@ def _is_run(system, random, episodic):
         parameters = inspect.signature(system).parameters.values()
     except (TypeError, ValueError):  # one that Python knows nothing of
         parameters = None
-    if parameters is not None and not any(
-        p.kind == p.VAR_POSITIONAL or (p.default is p.empty and p.kind != p.VAR_KEYWORD)
-        for p in parameters
-    ):
+    if parameters is not None and not any(map(_is_needed, parameters)):
         return False
     if not takes(system, 1 + random):
-        expected = (
-            "(disturbances, x0), since start is random"
-            if random
-            else "(disturbances), since no start distribution was given"
-        )
+        expected = "(disturbances), since no start distribution was given"
+        if random:
+            expected = "(disturbances, x0), since start is random"
         raise ValueError(
             f"{NAME}: system must be a function of {expected}, received"
             f" {_name(system)}{inspect.signature(system)}"
@@ -527,11 +502,15 @@ def _is_run(system, random, episodic):
     return True
 
 
+def _is_needed(p):
+    return p.kind == p.VAR_POSITIONAL or (p.default is p.empty and p.kind != p.VAR_KEYWORD)
+
+
 def _name(system):
     return getattr(system, "__name__", type(system).__name__)
 
 
-def _probed(runner, start, limited):
+def _observed_numbers(runner, start, limited):
     """The length of an observation, by a first object where all others will be. ValueError where it
     does not work, and where it is ``limited`` and too long.
     """

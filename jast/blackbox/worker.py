@@ -18,13 +18,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Runner", "Spec", "line_of"]
+__all__ = [
+    "METHODS",
+    "NAME",
+    "Reply",
+    "Runner",
+    "Spec",
+    "WrongAnswer",
+    "blank",
+    "fill",
+    "history",
+    "install",
+    "line_of",
+    "takes",
+]
 
 METHODS = ("initialize", "transition", "miss_distance", "is_event")
-KEPT = 8192
-"""The most objects that are kept for the next transitions of their episodes."""
-NAME = "jast_blackbox_worker"
-"""The module that a worker process keeps its system in."""
+KEPT = 8192  # objects that are kept at most for the next transitions of their episodes
+NAME = "jast_blackbox_worker"  # the module that a worker process keeps its system in
 
 
 class WrongAnswer(Exception):
@@ -104,9 +115,8 @@ def takes(function, count):
     return True
 
 
-def _configured(kind, system, spec, x, size):
-    """A `Runner`."""
-    made = kind(system, spec)
+def _configure_runner(system, spec, x, size):
+    made = Runner(system, spec)
     made.configure(x, size)
     return made
 
@@ -116,13 +126,15 @@ class Runner:
 
     def __init__(self, system, spec):
         self.system, self.spec = system, spec
-        self.kept, self.count, self.spare = {}, 0, []
+        self.kept: dict[tuple, list] = {}  # history -> objects that have it
+        self.count = 0  # of these
+        self.spare: list = []  # objects for new episodes
         self.x, self.size = 0, 0
         self.episodes = self.transitions = 0
         self.alarm = Alarm(spec.limit)
 
     def __reduce__(self):  # another process makes objects of its own
-        return _configured, (Runner, self.system, self.spec, self.x, self.size)
+        return _configure_runner, (self.system, self.spec, self.x, self.size)
 
     def configure(self, x, size):
         """``x``: the structure of a disturbance, like ``x0`` of `Spec`; ``size``: how many numbers
@@ -166,8 +178,9 @@ class Runner:
         """
         n = len(t)
         event, distance, terminal, log_p, seen = blank(n, self.size)
-        problems, self.episodes, self.transitions, begin = [], 0, 0, time.perf_counter()
-        one = self._episode if self.spec.episodic else self._standing
+        problems, begin = [], time.perf_counter()
+        self.episodes = self.transitions = 0
+        one = self._episode if self.spec.episodic else self._step
         for i in range(n):
             try:
                 event[i], distance[i], terminal[i], log_p[i], observed = one(
@@ -181,15 +194,15 @@ class Runner:
                 terminal[i] = True
                 problems.append((i, *_said(error)))
         return Reply(
-            event,
-            distance,
-            terminal,
-            log_p,
-            seen,
-            problems,
-            self.episodes,
-            self.transitions,
-            time.perf_counter() - begin,
+            event=event,
+            distance=distance,
+            terminal=terminal,
+            log_p=log_p,
+            seen=seen,
+            problems=problems,
+            episodes=self.episodes,
+            transitions=self.transitions,
+            seconds=time.perf_counter() - begin,
         )
 
     def judge(self, x0, xs):
@@ -238,12 +251,12 @@ class Runner:
         self.spare.append(thing)
         return *outcome, False, log_p, None
 
-    def _standing(self, t, x0, xs):
+    def _step(self, t, x0, xs):
         """Event, distance, terminal and observation of the object with this history, which is moved
         on from the last one where it is kept.
         """
         log_p, answer = 0.0, None
-        thing, at = self._taken(_history(x0, xs, t - 1)) if t else None, t - 1
+        thing, at = self._take(history(x0, xs, t - 1)) if t else None, t - 1
         if thing is None:
             thing, at = self._fresh(), 0
             self.episodes += 1
@@ -260,10 +273,10 @@ class Runner:
         if outcome[0] or ended or t >= self.spec.horizon:
             self.spare.append(thing)
         else:
-            self.kept.setdefault(_history(x0, xs, t), []).append(thing)
+            self.kept.setdefault(history(x0, xs, t), []).append(thing)
             self.count += 1
             if self.count > KEPT:
-                self.spare.append(self._taken(next(iter(self.kept))))
+                self.spare.append(self._take(next(iter(self.kept))))
         return *outcome, ended, log_p, observed
 
     def _initialize(self, thing, x0):
@@ -304,7 +317,7 @@ class Runner:
     def _fresh(self):
         return self.spare.pop() if self.spare else self.system()
 
-    def _taken(self, history):
+    def _take(self, history):
         things = self.kept.get(history)
         if things is None:
             return None
@@ -343,19 +356,15 @@ class Alarm(contextlib.AbstractContextManager):
             raise TimedOut
 
 
-def _history(x0, xs, t):
+def history(x0, xs, t):
+    """What tells episodes of ``t`` disturbances apart."""
     return t, *(a.tobytes() for a in x0), *(a[:t].tobytes() for a in xs)
 
 
 def blank(n, size):
     """Event, distance, terminal, log p and observation of n rows that have no answer yet."""
-    return (
-        np.zeros(n, bool),
-        np.full(n, np.nan),
-        np.zeros(n, bool),
-        np.zeros(n),
-        np.zeros((n, size)),
-    )
+    no = np.zeros(n, bool)
+    return no, np.full(n, np.nan), no.copy(), np.zeros(n), np.zeros((n, size))
 
 
 def _evaluate(thing):

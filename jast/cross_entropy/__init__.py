@@ -2,7 +2,7 @@
 surrogates and mixtures.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.cross_entropy import schedules
 from jast.cross_entropy.gaussian import Gaussian, normal
 from jast.cross_entropy.methods import (
@@ -45,4 +45,4 @@ __all__ = [
     "tell",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 
-@results.shown()
+@results.printable()
 class Gaussian(NamedTuple):
     """N(mean, covariance), floats; the covariance is positive definite.
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import random_key
+from jast._checks import check_random_key
 from jast.cross_entropy import loop
 from jast.cross_entropy.settle import MODES, check_objective, make_plan
 
@@ -232,7 +232,7 @@ def ce_mixture(
 
 
 def _run(method: str, *, key: chex.PRNGKey, objective: Objective, **given: Any) -> CEResult:
-    random_key(method, key)
+    check_random_key(method, key)
     plan, settings, proposal = make_plan(method, **given)
     mean = jax.tree.leaves(proposal)[-2]
     objective = check_objective(method, objective, mean.shape[-1], mean.dtype)
@@ -303,7 +303,7 @@ def start(
     """
     if method not in list(MODES):
         raise ValueError(f"start: method must be one of {list(MODES)}, received {method!r}")
-    random_key("start", key)
+    check_random_key("start", key)
     plan, real, proposal = make_plan(
         method,
         proposal,

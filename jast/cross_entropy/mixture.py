@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 
-@results.shown()
+@results.printable()
 class Mixture(NamedTuple):
     """The sum of weights[i] N(means[i], covariances[i]); the weights sum to 1, each covariance is
     positive definite.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["CEResult", "History", "Scores", "scores"]
 
 
-@results.shown()
+@results.printable()
 class History(NamedTuple):
     """How it went. K iterations with ``n`` true evaluations in all; those of iteration k stand
     together, in order.
@@ -45,7 +45,7 @@ class History(NamedTuple):
     """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
 
-@results.result("best_value", batches=True)
+@results.result_class("best_value", batches=True)
 class CEResult(NamedTuple):
     """The outcome. With a leading axis everywhere after `jax.vmap`.
 
@@ -111,7 +111,7 @@ def _point(x):
     return f"({shown}{', ...' if x.size > 6 else ''})"
 
 
-@results.shown()
+@results.printable()
 class Scores(NamedTuple):
     """Of several runs, the means over them; distances are Euclidean, from the best point to the
     optimum.

@@ -12,7 +12,7 @@ import operator
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
-from jast._checks import whole
+from jast._checks import whole_number
 
 if TYPE_CHECKING:
     from jast.typing import Schedule
@@ -127,8 +127,8 @@ def counts(schedule: Schedule, samples: int, iterations: int) -> tuple[int, ...]
     if not callable(schedule) and not isinstance(schedule, str) and schedule is not None:
         return _whole(schedule)
     samples, iterations = (
-        whole("schedule", "samples", samples),
-        whole("schedule", "iterations", iterations),
+        whole_number("schedule", "samples", samples),
+        whole_number("schedule", "iterations", iterations),
     )
     if schedule is None or (isinstance(schedule, str) and schedule == "uniform"):
         return (samples,) * iterations

@@ -6,7 +6,7 @@ from numbers import Real
 import jax
 import jax.numpy as jnp
 
-from jast._checks import real, whole
+from jast._checks import real_number, whole_number
 from jast._jax import is_traced
 from jast.cross_entropy.gaussian import as_gaussian
 from jast.cross_entropy.loop import Plan, Settings
@@ -83,7 +83,7 @@ def make_plan(
     sizes = counts(schedule, samples, iterations)
     mean_size = max(1, round(sum(sizes) / len(sizes)))
     sizes = tuple(n for n in sizes if n)  # an iteration without evaluations teaches nothing
-    elites = whole(method, "elites", elites, 1)
+    elites = whole_number(method, "elites", elites, 1)
     if elites > max(sizes):
         raise ValueError(
             f"{method}: elites must be at most the number of samples in an iteration,"
@@ -115,7 +115,7 @@ def make_plan(
         (lambda v: 0 <= v < math.inf, "of at least 0"),
     )
     numbers = [
-        real(method, name, chosen.pop(name, default), *check)
+        real_number(method, name, chosen.pop(name, default), *check)
         for name, default, check in (
             ("alpha", 1.0, positive),
             ("optimism", 0.0, other),
@@ -159,8 +159,8 @@ def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
     fewest, elites = min(2 * d, judged), max(10, 2 * d)
     return dict(
         evaluated=min(math.ceil(round(float(share) * most, 9)), max(kept), most // 2),
-        memory=whole(method, "memory", chosen["memory"], 1),
-        best=whole(method, "best", chosen["best"], 0),
+        memory=whole_number(method, "memory", chosen["memory"], 1),
+        best=whole_number(method, "best", chosen["best"], 0),
         optimistic=is_traced(optimism) or bool(optimism != 0),
         judged=judged,
         sub=(10 * elites, elites, 2),
@@ -170,7 +170,7 @@ def _surrogate_plan(method, chosen, optimism, most, each, kept, d):
         ),
         detail={
             "gaussian process": chosen["kernel"],
-            "polynomial": whole(method, "degree", chosen["degree"], 1),
+            "polynomial": whole_number(method, "degree", chosen["degree"], 1),
             "radial basis": chosen["basis"],
         }.get(chosen["surrogate"]),
     )
@@ -231,7 +231,7 @@ def _first_mixture(method, proposal, elites, components, asked):
     else:
         g = as_gaussian(proposal)
         k = (
-            whole(method, "components", asked, 1)
+            whole_number(method, "components", asked, 1)
             if asked is not None
             else min(components or elites, elites)
         )

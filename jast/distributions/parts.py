@@ -12,7 +12,7 @@ from jast.distributions.base import is_distribution
 from jast.distributions.kinds import Where
 from jast.distributions.numbers import split
 from jast.distributions.verbs import event_like, from_normal, to_normal
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 
 __all__ = ["Parts", "parts"]
 
@@ -53,7 +53,7 @@ def parts(d: Any) -> Parts:
 
 def _numbers(d: Any) -> Parts:
     like = event_like(d)
-    n = count(like)
+    n = count_numbers(like)
     return Parts(
         normals=n,
         choices=(),
@@ -133,7 +133,7 @@ def _mixture(d: Any) -> Parts:
     like, components = event_like(d), d.components_distribution
     log_w = jax.nn.log_softmax(d.mixture_distribution.logits, axis=-1)
     lead = (None,) * (len(components.batch_shape) - log_w.ndim)
-    log_p = jnp.broadcast_to(log_w[lead], components.batch_shape).reshape(count(like), -1)
+    log_p = jnp.broadcast_to(log_w[lead], components.batch_shape).reshape(count_numbers(like), -1)
 
     def value(z: jax.Array, i: tuple[jax.Array, ...]) -> Any:
         own = jnp.broadcast_to(z.reshape(*like.shape, 1), components.batch_shape)
@@ -149,9 +149,9 @@ def _mixture(d: Any) -> Parts:
         return jnp.ravel(z), (jnp.ravel(k),)
 
     return Parts(
-        normals=count(like),
+        normals=count_numbers(like),
         choices=(log_p,),
         value=value,
         inverse=inverse,
-        owners=tuple(range(count(like))),
+        owners=tuple(range(count_numbers(like))),
     )

@@ -2,7 +2,7 @@
 estimators that find their own proposal.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.estimate.adaptive import adaptive_cross_entropy, failure_probability
 from jast.estimate.answers import (
     Exceedance,
@@ -63,4 +63,4 @@ __all__ = [
     "trace_proposal",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

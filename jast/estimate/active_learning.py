@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.checkpoints import answer_once
+from jast.counter import numpy_generator
 from jast.estimate.gaussians import Gaussians
 from jast.estimate.surrogate import Surrogate, covariance, fit, normal_cdf, predict
 from jast.estimate.surrogate_failures import DOUBT, Pool, expected, pool
-from jast.journal import answered
 from jast.watch import Watch
 
 __all__ = ["CANDIDATES", "Learner", "learn"]
@@ -33,7 +33,7 @@ class Learner:
     """What is known so far: the calls, the surrogate of them, and the proposal."""
 
     def __init__(self, key: Any, sim: Any, budget: int, watch: Watch):
-        self.sim, self.budget, self.watch, self.rng = sim, budget, watch, generator(key)
+        self.sim, self.budget, self.watch, self.rng = sim, budget, watch, numpy_generator(key)
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
@@ -50,7 +50,7 @@ class Learner:
         for i in range(0, len(z), self.batch):
             rows = np.asarray(z[i : i + self.batch], self.dtype)
             run = lambda rows: latent.outcomes(self.sim, jnp.asarray(rows))
-            out.append(answered(run, rows))
+            out.append(answer_once(run, rows))
             o = out[-1]
             self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
             self.learn(rows, o.distance, o.failure, o.invalid)

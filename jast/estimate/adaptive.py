@@ -11,9 +11,9 @@ import jax
 
 from jast import limit_state as latent
 from jast import units
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast._jax import briefly
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.estimate import budgets, few_calls
 from jast.estimate.by_proposal import Asked, by_proposal
 from jast.estimate.estimate import Estimate, or_rough
@@ -23,8 +23,7 @@ from jast.estimate.population import by_populations
 from jast.estimate.redrawn import fits
 from jast.estimate.sample import Sample
 from jast.intervals import checked_level
-from jast.journal import kept
-from jast.results import asked
+from jast.results import call_settings
 
 if TYPE_CHECKING:
     import chex
@@ -144,10 +143,10 @@ def failure_probability(
         True
     """
     name = NAME
-    random_key(name, key)
+    check_random_key(name, key)
     budgets.given(name, budget, seconds)
     if budget is not None:
-        budget = whole(name, "budget", budget, few_calls.LEAST)
+        budget = whole_number(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
     if near is not None and not isinstance(near, Estimate):
@@ -159,12 +158,16 @@ def failure_probability(
         guided = not alone and seconds is None
         of_time = lambda: budgets.budget_of(name, key, sim, seconds, few_calls.LEAST)
         budget = budgets.DEAR if guided else of_time()
-    settings = asked(name, key, budget=budget, gradients=bool(gradients), level=level)
+    settings = call_settings(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
     few = not budgets.cheap(sim, budget)
-    with stored(name, checkpoint, key, **about) as store, kept(store), briefly(few):
+    with (
+        open_checkpoint(name, checkpoint, key, **about) as store,
+        keep_answers(store),
+        briefly(few),
+    ):
         if alone and not few:
             ways, watched = ways._replace(store=store), (progress, callback)
             found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
@@ -207,10 +210,10 @@ def adaptive_cross_entropy(
         5000
     """
     name = "adaptive_cross_entropy"
-    random_key(name, key)
-    budget = whole(name, "budget", budget, LEAST)
+    check_random_key(name, key)
+    budget = whole_number(name, "budget", budget, LEAST)
     level = checked_level(name, level)
-    settings = asked(name, key, budget=budget, level=level)
+    settings = call_settings(name, key, budget=budget, level=level)
     for_search, key = jax.random.split(key)
     found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
     result = importance(key, sim, found.policy, budget - int(found.episodes), level=level)

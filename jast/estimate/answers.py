@@ -25,7 +25,7 @@ __all__ = ["Exceedance", "FailureTimes", "distance_quantile", "exceedance", "fai
 POINTS = 64
 
 
-@results.shown()
+@results.printable()
 class Exceedance(NamedTuple):
     """The probability that an episode comes as near to a failure as a threshold of the miss
     distance, [k] each, NumPy. NaN where it is not known.
@@ -56,7 +56,7 @@ class Exceedance(NamedTuple):
     """That of the estimate"""
 
 
-@results.shown()
+@results.printable()
 class FailureTimes(NamedTuple):
     """When failures happen, in steps, [T + 1] each, NumPy: from 0, at the start, to the last step
     at which one was seen.

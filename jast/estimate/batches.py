@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import counter_key, generator
+from jast.counter import counter_key, numpy_generator
 from jast.estimate.gaussians import log_sum
 from jast.judge import judged, lanes_of
 
@@ -39,20 +39,20 @@ def drawn(sim, q, u, e):
 
 def numbers(key, n, d, dtype):
     """Uniform [n] and normal [n, d] numbers for `drawn`; ``key``: of JAX, or a NumPy generator."""
-    rng = generator(key)
+    rng = numpy_generator(key)
     return rng.random(n).astype(dtype), rng.standard_normal((n, d)).astype(dtype)
 
 
 def of_chunk(key, i, n, q):
     """The `numbers` of the first ``n`` draws of chunk ``i`` of an estimate by ``q``."""
     d, dtype = q.means.shape[1], q.means.dtype
-    e = generator(key, 3, i).standard_normal((n, d)).astype(dtype)
+    e = numpy_generator(key, 3, i).standard_normal((n, d)).astype(dtype)
     return picks(key, i, n, dtype), e
 
 
 def picks(key, i, n, dtype):
     """The uniform numbers that choose the components of the first ``n`` draws of chunk ``i``."""
-    return generator(key, 2, i).random(n).astype(dtype)
+    return numpy_generator(key, 2, i).random(n).astype(dtype)
 
 
 def plain_chunk(key, i, n, sim):

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate.population import episodes_a_second
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.judge import judged
 from jast.simulator import Simulator
 
@@ -31,7 +31,7 @@ DEAR = 100_000
 
 def cheap(sim: Simulator, budget: int) -> bool:
     """Whether so many evaluations of a system are spent by populations."""
-    return budget >= CHEAP and not hosted(sim)
+    return budget >= CHEAP and not runs_on_host(sim)
 
 
 def budget_of(
@@ -46,14 +46,14 @@ def budget_of(
         ValueError: for ``seconds`` that are not a number above 0.
     """
     if seconds is None:
-        if hosted(sim):
+        if runs_on_host(sim):
             return dear
         budget = min(_rounded(SECONDS * episodes_a_second(key, sim)), MOST)
         return budget if budget >= CHEAP else dear
     real = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if not real or not 0 < float(seconds) < math.inf:
         raise ValueError(f"{name}: seconds must be a number above 0, received {seconds!r}")
-    rate = _rate_on_host(key, sim) if hosted(sim) else episodes_a_second(key, sim)
+    rate = _rate_on_host(key, sim) if runs_on_host(sim) else episodes_a_second(key, sim)
     return max(_rounded(float(seconds) * rate), least)
 
 
@@ -72,7 +72,7 @@ def _rounded(evaluations: float) -> int:
 
 def _rate_on_host(key: jax.Array, sim: Simulator) -> float:
     """Episodes a second of a system that is not in JAX, by as many as take a fifth of one."""
-    n, rng = 1, generator(key, 6)
+    n, rng = 1, numpy_generator(key, 6)
     while True:
         z = rng.standard_normal((n, latent.dimension(sim))).astype(latent.normal_numbers(sim))
         begun = time.perf_counter()

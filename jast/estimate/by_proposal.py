@@ -31,10 +31,10 @@ from jast.estimate.subset import by_levels
 from jast.estimate.tilt_family import TiltFamily
 from jast.estimate.tilt_start import cooled, given, led_down, with_given
 from jast.failures import Failures
-from jast.incidents import hosted
-from jast.rounding import rounded
+from jast.incidents import runs_on_host
+from jast.rounding import rounding_problem
 from jast.simulator import Simulator
-from jast.units import HERE, Ways
+from jast.units import HERE, Placement
 from jast.watch import Watch
 
 __all__ = ["by_proposal"]
@@ -58,7 +58,7 @@ class Asked(NamedTuple):
     level: float = 0.95
     watched: tuple[bool, Any] = (False, None)
     """progress and callback"""
-    ways: Ways = HERE
+    ways: Placement = HERE
     settings: SearchSettings = SETTINGS
 
 
@@ -82,7 +82,7 @@ class Search(NamedTuple):
 
 def by_proposal(asked: Asked) -> Estimate:
     """The `Estimate` of a call."""
-    chance, coarse = begun(asked.key), rounded(asked.sim)
+    chance, coarse = begun(asked.key), rounding_problem(asked.sim)
     against = [] if coarse is None else [coarse]
     try:
         return _drawn(asked, _sought(asked, chance), against)
@@ -140,7 +140,7 @@ def _gaussians(asked, chance, state):
         if serves(near := _from_near(f, start), asked.settings.near_fitted):
             return Search(f, near)
         state = near._replace(q=None, anchors=None)
-    state = explored(f, state, asked.known, asked.gradients and not hosted(asked.sim))
+    state = explored(f, state, asked.known, asked.gradients and not runs_on_host(asked.sim))
     if state.q is not None:
         end = max(end, state.spent + 2 * f.batch)  # what was found is drawn, however dear it was
         state = adapted(f, state, asked.settings.refits, end)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast.counter import counter_key, generator
+from jast.counter import counter_key, numpy_generator
 from jast.estimate.batches import resampled
 from jast.estimate.particles import (
     AFTER,
@@ -107,7 +107,7 @@ class _Population:
 
     def __init__(self, key, sim, n, moves, capacity, settings=SETTINGS):
         self.sim, self.n, self.moves, self.settings = sim, n, moves, settings
-        self.rng, self.key, self.calls = generator(key, 1), key, 0
+        self.rng, self.key, self.calls = numpy_generator(key, 1), key, 0
         self.particles, self.steering = blank(sim, capacity), begun()
         self.evaluations, self.invalid = 0, 0
         self.log_mean, self.family = 0.0, np.arange(n)
@@ -315,7 +315,7 @@ def cooled(
     probability it has. Else those of high density replace the others at each width, as in every
     population, and moves are spent where failures are likeliest.
     """
-    m, rng, rows, steering = len(points), generator(key, 6), np.arange(len(points)), begun()
+    m, rng, rows, steering = len(points), numpy_generator(key, 6), np.arange(len(points)), begun()
     particles = blank(sim, size(sim, settings.particles, settings))
     z = np.zeros(particles.z.shape, particles.z.dtype)
     z[:m] = points

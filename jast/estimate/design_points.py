@@ -12,8 +12,8 @@ from jax import lax
 
 from jast._jax import quick
 from jast.boundary import EPISODES, STEPS, descents
-from jast.counter import generator
-from jast.journal import answered
+from jast.checkpoints import answer_once
+from jast.counter import numpy_generator
 from jast.limit_state import dimension, normal_numbers, unit
 from jast.products import product
 
@@ -42,7 +42,7 @@ def design_points(key, sim, starts=MOST, limit=16):
     """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
     where the miss distance has no useful gradient.
     """
-    z = generator(key).standard_normal((starts, dimension(sim)))
+    z = numpy_generator(key).standard_normal((starts, dimension(sim)))
     found = descended(sim, z)
     return found._replace(points=distinct(found.points, limit))
 
@@ -52,7 +52,7 @@ def descended(sim, starts):
     n = len(starts)
     z = np.zeros((MOST, dimension(sim)), normal_numbers(sim))
     z[:n] = starts
-    points, failing = (a[:n] for a in answered(partial(_in_blocks, sim), z, np.int32(n)))
+    points, failing = (a[:n] for a in answer_once(partial(_in_blocks, sim), z, np.int32(n)))
     points = points[failing & np.isfinite(points).all(axis=1)].astype(np.float64)
     return DesignPoints(points, n * (STEPS * GRADIENT + EPISODES))
 

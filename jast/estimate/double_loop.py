@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast.contract import contract
 from jast.estimate.estimate import estimate
 from jast.estimate.importance_sampling import Traces, chunks, one_trace
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
-from jast.results import asked
+from jast.results import call_settings
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -81,9 +81,9 @@ def double_loop(
         >>> int(counted.evaluations)
         500
     """
-    random_key("double_loop", key)
-    starts = whole("double_loop", "starts", starts, 2)
-    samples = whole("double_loop", "samples", samples)
+    check_random_key("double_loop", key)
+    starts = whole_number("double_loop", "starts", starts, 2)
+    samples = whole_number("double_loop", "samples", samples)
     if samples > LANES:
         raise ValueError(f"double_loop: samples must be at most {LANES}, received {samples!r}")
     level = checked_level("double_loop", level)
@@ -94,7 +94,7 @@ def double_loop(
             "double_loop: proposal must have one component, since its traces share their start,"
             f" received {len(proposal.log_weights)}"
         )
-    settings = asked("double_loop", key, starts=starts, samples=samples, level=level)
+    settings = call_settings("double_loop", key, starts=starts, samples=samples, level=level)
     lanes = max(1, min(starts, LANES // samples))
     watch = Watch("double_loop", starts, "start", progress, callback)
     total, notes, lost = chunks(_chunk, (key, sim, proposal, lanes, samples), lanes, watch)

@@ -19,7 +19,7 @@ KEPT = 2**17
 """Failing draws that are kept at most, and so many that did not fail."""
 
 
-@results.shown()
+@results.printable()
 class Draws(NamedTuple):
     """The failing episodes among the draws of an estimate, and the others that came nearest to a
     failure: [m] each, NumPy. Of more failures than fit, one in ``every`` is kept, and counts

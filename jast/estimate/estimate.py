@@ -18,7 +18,7 @@ INVALID, COUNTED = 0.01, 10
 """Part of an estimate that invalid episodes may add; failures from which a count is believed."""
 
 
-@results.result("samples")
+@results.result_class("samples")
 class Estimate(NamedTuple):
     """A failure probability. Python numbers and NumPy arrays; where it must not be believed,
     ``print`` says UNRELIABLE and why before any number, and then first what plain draws guarantee.

@@ -17,7 +17,7 @@ from jax import lax
 
 from jast import distributions as D
 from jast import results, rewards
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast.episode import play_back
 from jast.estimate import diagnostics
 from jast.estimate.answers import asked
@@ -28,7 +28,7 @@ from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, points
 from jast.intervals import clopper_pearson, log_normal
 from jast.limit_state import dimension, policy_of
-from jast.pytrees import clear, select, strong
+from jast.pytrees import select, with_strong_types, zero_where
 
 if TYPE_CHECKING:
     import chex
@@ -44,7 +44,7 @@ BLOCK = 1024
 OF = ("state", "start", "episode")
 
 
-@results.shown()
+@results.printable()
 class Event(NamedTuple):
     """An event among the failures. Python numbers.
 
@@ -76,7 +76,7 @@ class Event(NamedTuple):
     level: float
 
 
-@results.shown()
+@results.printable()
 class GivenStart(NamedTuple):
     """A failure given where the episode starts. Python numbers.
 
@@ -186,11 +186,11 @@ def given_start(
         ['tilted']
     """
     name = "given_start"
-    random_key(name, key)
+    check_random_key(name, key)
     kept, level = asked(name, estimate, level)
     functions = _functions(name, named)
     happened = _happened(name, sim, estimate, kept, functions, "start", proposal)
-    n, log_w = whole(name, "draws", draws), kept.log_weight[kept.failure]
+    n, log_w = whole_number(name, "draws", draws), kept.log_weight[kept.failure]
     count, done = dict.fromkeys(functions, 0), 0
     for i in range(-(-n // 2**16)):
         rows = min(2**16, n - done)
@@ -306,12 +306,12 @@ def _judged(sim, functions, proposal, made, length, of):
             own, for_start, for_steps = component(made, proposal)
             x0 = D.sample(own.start(), for_start)
             choose = lambda s, t: D.sample(own.disturbance(s, t), jax.random.fold_in(for_steps, t))
-        first = strong(sim.init(x0))
+        first = with_strong_types(sim.init(x0))
 
         def step(state, t):
             x = choose(state, t)
-            after = select(t < length, strong(sim.step(state, x)), state)
-            return after, clear(t >= length, x)
+            after = select(t < length, with_strong_types(sim.step(state, x)), state)
+            return after, zero_where(t >= length, x)
 
         last, xs = lax.scan(step, first, jnp.arange(sim.horizon, dtype=jnp.int32))
         if of == "episode":
@@ -326,7 +326,7 @@ def _judged(sim, functions, proposal, made, length, of):
 @partial(jax.jit, static_argnums=3)
 def _starts(key, sim, functions, n):
     def one(key):
-        first = strong(sim.init(D.sample(sim.start(), key)))
+        first = with_strong_types(sim.init(D.sample(sim.start(), key)))
         return {k: jnp.asarray(f(first)) for k, f in functions.items()}
 
     return jax.vmap(one)(jax.random.split(key, n))

@@ -12,8 +12,8 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast import results
-from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast._checks import check_random_key, whole_number
+from jast.checkpoints import answer_once, keep_answers, open_checkpoint
 from jast.episode import Episode
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
@@ -25,7 +25,6 @@ from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import numbers_of, redrawn
 from jast.estimate.sample import Sample
 from jast.frames import dataset
-from jast.journal import answered, kept
 from jast.memory import require_episodes
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ __all__ = ["FailureSamples", "failure_samples"]
 PER_SAMPLE = 10
 
 
-@results.result("ess")
+@results.result_class("ess")
 class FailureSamples(NamedTuple):
     """Failures drawn from p(x | failure).
 
@@ -133,8 +132,8 @@ def failure_samples(
         True
     """
     name = "failure_samples"
-    random_key(name, key)
-    samples, moves = whole(name, "samples", samples), whole(name, "moves", moves, 0)
+    check_random_key(name, key)
+    samples, moves = whole_number(name, "samples", samples), whole_number(name, "moves", moves, 0)
     latent.check(name, sim)
     q = source.proposal if isinstance(source, Estimate) else source
     if q is None and isinstance(source, Estimate):
@@ -144,7 +143,7 @@ def failure_samples(
         )
     require_episodes(name, sim, PER_SAMPLE * samples)
     about = dict(sim=sim, source=q, samples=samples, moves=moves)
-    with stored(name, checkpoint, key, **about) as store, kept(store):
+    with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
         return _sampled(name, key, sim, q, samples, moves)
 
 
@@ -172,7 +171,7 @@ def _sampled(name, key, sim, q, samples, moves):
         failure = o.failure
     else:
         q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
-        e, log_w = answered(lambda _: played(for_draws, sim, q, n), key_data)
+        e, log_w = answer_once(lambda _: played(for_draws, sim, q, n), key_data)
         z, failure = latent.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
@@ -182,7 +181,7 @@ def _sampled(name, key, sim, q, samples, moves):
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
     people, chain = settled(key, sim, z[rows], moves)
-    episodes = answered(partial(latent.episodes, sim), people.z)
+    episodes = answer_once(partial(latent.episodes, sim), people.z)
     # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
     # side in another program
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate import batches, diagnostics, markov_tilts
 from jast.estimate.batches import of_chunk, picks
 from jast.estimate.draws import drawn_by
@@ -17,7 +17,7 @@ from jast.estimate.estimate import Estimate, estimate
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts
 from jast.simulator import Simulator
-from jast.units import Ways
+from jast.units import Placement
 from jast.watch import Watch
 
 __all__ = ["estimated"]
@@ -32,7 +32,7 @@ def estimated(
     q: latent.Latent | Tilts,
     lanes: int,
     watch: Watch,
-    ways: Ways,
+    ways: Placement,
     *,
     spent: int,
     reasons: Sequence[str],
@@ -145,7 +145,7 @@ def _of_gaussians(key, sim, q, i, n, lanes):
 def _of_tilts(key, sim, q, i, n, lanes):
     """The same of tilts."""
     about, dtype = markov_tilts.shape(sim), latent.normal_numbers(sim)
-    drawn = markov_tilts.numbers(generator(key, 2, i), lanes, about, sim.horizon, dtype)
+    drawn = markov_tilts.numbers(numpy_generator(key, 2, i), lanes, about, sim.horizon, dtype)
     u, first, noise = drawn
     some = u[:n], tuple(a[:n] for a in first), tuple(a[:, :n] for a in noise)
     o, ratio, _ = markov_tilts.played(sim, q, *some)

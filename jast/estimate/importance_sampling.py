@@ -20,9 +20,9 @@ from jax.scipy.special import logsumexp
 
 from jast import distributions as D
 from jast import results, units
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast._jax import jit
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
@@ -35,7 +35,7 @@ from jast.outline import outline
 from jast.places import Task
 from jast.policy import nominal_policy
 from jast.progress import advance, begin, conclude
-from jast.results import asked
+from jast.results import call_settings
 from jast.rewards import log_likelihood
 from jast.watch import Watch
 
@@ -54,7 +54,7 @@ LANES = 16384
 PROBES = 256
 
 
-@results.shown()
+@results.printable()
 class Traces(NamedTuple):
     """Simulated episodes of a proposal, one a row of the leading axis [n].
 
@@ -116,11 +116,11 @@ def log_weights(
         >>> bool(jnp.allclose(traces.log_weight, 0.0, atol=1e-4))
         True
     """
-    random_key("log_weights", key)
+    check_random_key("log_weights", key)
     if mode not in ("default", "paper"):
         raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
     q = as_proposal("log_weights", sim, proposal)
-    samples = whole("log_weights", "samples", samples)
+    samples = whole_number("log_weights", "samples", samples)
     require_episodes("log_weights", sim, samples)
     return traces(key, sim, q, samples, mode == "paper")
 
@@ -177,21 +177,21 @@ def importance(
         >>> bool(found.failing > 100)
         True
     """
-    random_key("importance", key)
-    samples = whole("importance", "samples", samples, 2)
+    check_random_key("importance", key)
+    samples = whole_number("importance", "samples", samples, 2)
     if mode not in ("default", "paper"):
         raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
     level = checked_level("importance", level)
     contract("importance", sim)
     proposal = as_proposal("importance", sim, proposal)
-    settings = asked("importance", key, samples=samples, mode=mode, level=level)
+    settings = call_settings("importance", key, samples=samples, mode=mode, level=level)
     whole_key = key
     key, for_probes = jax.random.split(key)
-    ways = units.ways("importance", executor, devices)
+    ways = units.placement("importance", executor, devices)
     about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
     lanes = even(samples)
-    with stored("importance", checkpoint, whole_key, **about) as store:
+    with open_checkpoint("importance", checkpoint, whole_key, **about) as store:
         shared = key, sim, proposal, lanes, mode == "paper"
         watch = Watch("importance", samples, "episode", progress, callback)
         total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
@@ -226,7 +226,7 @@ def chunks(simulate, shared, lanes, watch, ways=units.HERE, plain=None):
     with watch:
         ran = units.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
     total, done = ran.state
-    short = units.note("episodes", ran, done, samples)
+    short = units.describe_missing("episodes", ran, done, samples)
     if ran.left_out:
         return total, (), (short, *map(str, ran.incidents))
     return total, () if short is None else (f"interrupted {short}",), ()

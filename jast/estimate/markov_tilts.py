@@ -18,15 +18,15 @@ from jax import lax
 from jax.scipy.special import logsumexp, ndtr
 
 from jast._jax import jit
-from jast.counter import generator
+from jast.checkpoints import answer_once
+from jast.counter import numpy_generator
 from jast.distributions.parts import Parts, parts
 from jast.estimate.gaussians import log_sum
-from jast.incidents import hosted
-from jast.journal import answered
+from jast.incidents import runs_on_host
 from jast.limit_state import Outcomes, normal_numbers
-from jast.outline import asked, outline
+from jast.outline import outline, per_simulator
 from jast.progress import advance, begin, conclude
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.rewards import likelihood
 
 __all__ = ["Frame", "Tilts", "features", "of_the_model", "played", "shape"]
@@ -121,7 +121,7 @@ class Trace(NamedTuple):
     """[T, n, B, C] of all categories"""
 
 
-@asked
+@per_simulator
 def shape(sim: Any, start: Any, state: Any, dist: Any) -> Shape:
     """The `Shape` of a simulator."""
     a, b = parts(start), parts(dist)
@@ -317,10 +317,10 @@ def _in_lanes(sim, n, run, given):
     time, so that one program serves every n; of a black box, which no row may run in vain, all at
     once.
     """
-    lanes, out = n if hosted(sim) else LANES, []
+    lanes, out = n if runs_on_host(sim) else LANES, []
     for i in range(0, n, lanes):
         m = min(lanes, n - i)
-        o, x, trace = answered(
+        o, x, trace = answer_once(
             lambda rows, _: run(rows), np.minimum(np.arange(i, i + lanes), n - 1), given
         )
         of_steps = (a[:, :m] for a in trace[3:])
@@ -380,7 +380,7 @@ def _played(sim, q, u, first, noise):
     )
     end = jax.vmap(lambda p: conclude(sim, density, p))(progress)
     about = outline(sim)
-    used = count(about.x0) + length * count(about.x)
+    used = count_numbers(about.x0) + length * count_numbers(about.x)
     outcome = Outcomes(end.failure, end.distance, used, length, end.invalid, end.reward)
     return outcome, ratio, Trace(z0, i0, log_p0, *rows)
 
@@ -389,7 +389,7 @@ def numbers(key, n, about, horizon, dtype):
     """What `played` needs of chance for ``n`` episodes: (u, first, noise); ``key``: of JAX, or a
     NumPy generator.
     """
-    rng = generator(key)
+    rng = numpy_generator(key)
 
     # uniform numbers of 64 bits: fine near 0, where rare categories lie
     def of(a, b, *size):

@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 from jast import actions as choices
 from jast import distributions as D
 from jast import results
-from jast._checks import random_key, real, whole
+from jast._checks import check_random_key, real_number, whole_number
 from jast._jax import jit
 from jast.contract import contract
 from jast.cross_entropy import sequences
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["FailureProposal", "failure_proposal"]
 
 
-@results.result("episodes", batches=True)
+@results.result_class("episodes", batches=True)
 class FailureProposal(NamedTuple):
     """A proposal and how it was found. K iterations; with a leading axis everywhere after
     `jax.vmap`.
@@ -155,15 +155,19 @@ def failure_proposal(
         >>> bool(found.reached)
         True
     """
-    random_key("failure_proposal", key)
+    check_random_key("failure_proposal", key)
     samples, iterations = (
-        whole("failure_proposal", "samples", samples, 2),
-        whole("failure_proposal", "iterations", iterations),
+        whole_number("failure_proposal", "samples", samples, 2),
+        whole_number("failure_proposal", "iterations", iterations),
     )
     settings = Settings(
-        real("failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"),
-        real("failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"),
-        real("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
+        real_number(
+            "failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"
+        ),
+        real_number(
+            "failure_proposal", "smoothing", smoothing, lambda v: 0 <= v < 1, "from 0 to below 1"
+        ),
+        real_number("failure_proposal", "floor", floor, lambda v: 0 < v < np.inf, "above 0"),
     )
     contract("failure_proposal", sim)
     require_episodes("failure_proposal", sim, samples)

@@ -12,20 +12,20 @@ import numpy as np
 from jax import lax
 
 from jast import units
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast._jax import jit
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.crude import outcome
 from jast.estimate.batches import plain_chunk, rows_of
 from jast.estimate.draws import drawn_by
 from jast.estimate.estimate import Estimate, of_counts
 from jast.estimate.importance_sampling import Traces, chunks
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.intervals import checked_level
 from jast.judge import judged
 from jast.outline import outline
-from jast.results import asked
+from jast.results import call_settings
 from jast.rewards import log_likelihood
 from jast.watch import Watch
 
@@ -90,19 +90,19 @@ def monte_carlo(
         True
     """
     name = "monte_carlo"
-    random_key(name, key)
-    samples = whole(name, "samples", samples)
+    check_random_key(name, key)
+    samples = whole_number(name, "samples", samples)
     level = checked_level(name, level)
     contract(name, sim)
     by_points = outline(sim).closed
     simulate = of_points if by_points else _of_keys
     lanes = lanes_of_points(sim) if by_points else LANES
-    ways = units.ways(name, executor, devices)
-    with stored(name, checkpoint, key, sim=sim, samples=samples) as store:
+    ways = units.placement(name, executor, devices)
+    with open_checkpoint(name, checkpoint, key, sim=sim, samples=samples) as store:
         watch = Watch(name, samples, "episode", progress, callback)
         shared = key, sim, lanes, samples
         total, notes, lost = chunks(simulate, shared, lanes, watch, ways._replace(store=store))
-    settings = asked(name, key, samples=samples, level=level)
+    settings = call_settings(name, key, samples=samples, level=level)
     found = of_counts(name, total, level=level, notes=notes, reasons=lost)
     draws = drawn_by(found.draws, key, lanes, "model" if by_points else "keys")
     return found._replace(settings=settings, draws=draws)
@@ -130,7 +130,7 @@ def _of_keys(shared, i, post):
     """As `of_points`, by draws of distributions without a quantile function in closed form."""
     key, sim, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
-    size = n if hosted(sim) else BLOCK  # of a system on the host no episode is run in vain
+    size = n if runs_on_host(sim) else BLOCK  # of a system on the host no episode is run in vain
     out = jax.device_get(_played(jax.random.fold_in(key, i), sim, np.int32(n), size))
     failure, invalid, length, distance = (a[:n] for a in out)
     none = np.zeros(n)

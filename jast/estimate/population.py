@@ -13,8 +13,8 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast import units
-from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast._checks import check_random_key, whole_number
+from jast.checkpoints import open_checkpoint
 from jast.counter import counter_key
 from jast.estimate.descents import SETTINGS, Settings, size
 from jast.estimate.estimate import Estimate
@@ -24,7 +24,7 @@ from jast.estimate.population_search import Search
 from jast.estimate.population_weights import weighted
 from jast.intervals import checked_level
 from jast.memory import require
-from jast.results import asked
+from jast.results import call_settings
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -111,14 +111,14 @@ def population(
         True
     """
     name = "population"
-    random_key(name, key)
-    budget = whole(name, "budget", budget, LEAST)
-    particles = whole(name, "particles", particles, 128)
+    check_random_key(name, key)
+    budget = whole_number(name, "budget", budget, LEAST)
+    particles = whole_number(name, "particles", particles, 128)
     level = checked_level(name, level)
     latent.check(name, sim)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     about = dict(sim=sim, budget=budget, particles=particles)
-    with stored(name, checkpoint, key, **about) as store:
+    with open_checkpoint(name, checkpoint, key, **about) as store:
         found = by_populations(
             name,
             key,
@@ -129,7 +129,7 @@ def population(
             watched=(progress, callback),
             ways=ways._replace(store=store),
         )
-    return found._replace(settings=asked(name, key, budget=budget, level=level))
+    return found._replace(settings=call_settings(name, key, budget=budget, level=level))
 
 
 def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
@@ -161,7 +161,7 @@ def by_populations(
     particles: int = SETTINGS.particles,
     level: float = 0.95,
     watched: tuple = (False, None),
-    ways: units.Ways = units.HERE,
+    ways: units.Placement = units.HERE,
     settings: Settings = SETTINGS,
 ) -> Estimate:
     """The `Estimate` of `population`, for the function of this ``name``."""

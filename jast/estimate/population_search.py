@@ -12,7 +12,7 @@ from jast.estimate.agreement import APART, BLUNT, Answer, Kind, answer_of, poole
 from jast.estimate.descents import WAYS, Descent
 from jast.estimate.particles import LANES
 from jast.places import Task
-from jast.rounding import rounded
+from jast.rounding import rounding_problem
 
 __all__ = ["Search"]
 
@@ -36,7 +36,7 @@ class Search:
         self.spent = self.invalid = 0
         self.plain = np.zeros(3, np.int64)
         self.interrupted = ""
-        self.reasons = [] if (coarse := rounded(sim)) is None else [coarse]
+        self.reasons = [] if (coarse := rounding_problem(sim)) is None else [coarse]
         self.history = []
 
     def kind(self, way):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate.agreement import Answer, Kind
 from jast.estimate.batches import log_ratio
 from jast.estimate.estimate import Estimate
@@ -100,7 +100,7 @@ def _promise(s, samples, log_mean, left, components):
     """
     points, log_w = samples[0].points.astype(np.float64), samples[0].log_weight
     weights = np.exp(log_w - np.logaddexp.reduce(log_w))
-    g = fit(generator(s.key, 7), points, weights, len(points), limit=components)
+    g = fit(numpy_generator(s.key, 7), points, weights, len(points), limit=components)
     q = as_latent(defended(g, 0.0, True), normal_numbers(s.sim))
     log_w = [a.log_weight - log_ratio(q, a.points, a.used) for a in samples]
     log_moment = max(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate import markov_tilts
 from jast.estimate.batches import log_ratio
 from jast.estimate.design_points import explained
@@ -66,7 +66,7 @@ class Chain:
     """
 
     def __init__(self, key, sim, size, covered=None):
-        self.rng, self.sim, self.size, self.covered = generator(key), sim, size, covered
+        self.rng, self.sim, self.size, self.covered = numpy_generator(key), sim, size, covered
         self.scale, self.accepted, self.evaluations, self.invalid = 0.7, math.nan, 0, 0
         self.dtype, self.dimension = normal_numbers(sim), dimension(sim)
         if covered is not None and isinstance(covered[0], Tilts):

@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast import results
-from jast._checks import real
+from jast._checks import real_number
 from jast._jax import is_traced
 from jast.contract import contract
 from jast.distributions.mixtures import blend
@@ -26,7 +26,7 @@ from jast.episode import Episode
 from jast.limit_state import latents
 from jast.outline import ask, outline
 from jast.policy import Policy
-from jast.pytrees import fitted
+from jast.pytrees import conform
 
 if TYPE_CHECKING:
     from jast.simulator import Simulator
@@ -36,7 +36,7 @@ __all__ = ["Proposal", "policy_proposal", "trace_proposal"]
 MIXING = ("step", "trace")
 
 
-@results.shown()
+@results.printable()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Proposal:
@@ -238,7 +238,7 @@ def as_proposal(function, sim, proposal):
 def _epsilon(function, epsilon, mixing):
     if mixing not in MIXING:
         raise ValueError(f'{function}: mixing must be "step" or "trace", received {mixing!r}')
-    return real(function, "epsilon", epsilon, lambda v: 0 < v <= 1, "above 0 and at most 1")
+    return real_number(function, "epsilon", epsilon, lambda v: 0 < v <= 1, "above 0 and at most 1")
 
 
 def _stacked(sim, episodes):
@@ -268,7 +268,7 @@ def _stacked(sim, episodes):
     for x0, x, _ in batched:
         one = jax.tree.map(lambda a: a[0], (x0, x))
         try:
-            fitted("x0", one[0], like.x0), fitted("disturbances", one[1], full)
+            conform("x0", one[0], like.x0), conform("disturbances", one[1], full)
         except ValueError as error:
             raise ValueError(
                 f"trace_proposal: episodes do not fit the simulator: {error}"

@@ -8,7 +8,7 @@ import numpy as np
 from jast import distributions as D
 from jast import limit_state as latent
 from jast._jax import jit
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.distributions.parts import parts
 from jast.episode import rollout
 from jast.estimate import markov_tilts as tilts
@@ -18,7 +18,7 @@ from jast.estimate.sample import Sample
 from jast.limit_state import Outcomes
 from jast.outline import outline
 from jast.policy import Policy
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 
 __all__ = ["failing", "fits", "numbers_of", "points", "redrawn"]
 
@@ -32,8 +32,8 @@ def redrawn(key: Any, sim: Any, q: Any, n: int) -> tuple[np.ndarray, Any, np.nda
     `Sample` its own failures come back, chosen by weight, and nothing is run.
     """
     if isinstance(q, Sample):
-        rows = resampled(q.log_weight, n, generator(key).random())
-        steps = (q.used - count(outline(sim).x0)) // max(count(outline(sim).x), 1)
+        rows = resampled(q.log_weight, n, numpy_generator(key).random())
+        steps = (q.used - count_numbers(outline(sim).x0)) // max(count_numbers(outline(sim).x), 1)
         some = Outcomes(np.ones(n, bool), *(a[rows] for a in (q.distance, q.used, steps)), None)
         return q.points[rows], some._replace(invalid=np.zeros(n, bool)), np.zeros(n)
     if isinstance(q, latent.Latent):
@@ -78,7 +78,7 @@ def points(key: Any, i: int, sim: Any, q: Any, n: int, lanes: int) -> np.ndarray
     if isinstance(q, Sample):
         return q.points[i * lanes : i * lanes + n]
     if isinstance(q, tilts.Tilts):
-        return redrawn(generator(key, 2, i), sim, q, lanes)[0]
+        return redrawn(numpy_generator(key, 2, i), sim, q, lanes)[0]
     return latent.place(q, *of_chunk(key, i, n, q))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jast.estimate.batches import resampled
 from jast.estimate.draws import Draws, drawn_by
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 
 if TYPE_CHECKING:
     from jast.estimate.descents import Descent
@@ -74,7 +74,7 @@ def independent(key: Any, sim: Simulator, sample: Sample, log_mean: float, worth
 def counted(key: Any, sim: Simulator, sample: Sample, samples: int) -> Draws:
     """`Draws` of the model, so many, whose failures are the ``sample``."""
     about, m = outline(sim), len(sample.points)
-    steps = (sample.used - count(about.x0)) // max(count(about.x), 1)
+    steps = (sample.used - count_numbers(about.x0)) // max(count_numbers(about.x), 1)
     found = Draws(
         log_weight=np.zeros(m),
         distance=sample.distance,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate.search_settings import SearchSettings
 from jast.simulator import Simulator
 
@@ -123,8 +123,8 @@ class Chance(NamedTuple):
 
 def begun(key: jax.Array) -> Chance:
     """The `Chance` of a call."""
-    root = generator(key, 1)
-    return Chance(root, generator(Chance(root, root, []).next_key()), [])
+    root = numpy_generator(key, 1)
+    return Chance(root, numpy_generator(Chance(root, root, []).next_key()), [])
 
 
 class Family(Protocol):

@@ -11,14 +11,14 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast import units
-from jast._checks import random_key, whole
-from jast.checkpoints import stored
+from jast._checks import check_random_key, whole_number
+from jast.checkpoints import open_checkpoint
 from jast.estimate.estimate import Estimate
 from jast.estimate.populations import LAST, QUANTILE, Explored, explore
 from jast.intervals import checked_level, log_normal
 from jast.memory import require_episodes
 from jast.places import Task
-from jast.results import asked
+from jast.results import call_settings
 from jast.simulator import Simulator
 from jast.watch import Watch
 
@@ -83,28 +83,28 @@ def subset_simulation(
         True
     """
     name = "subset_simulation"
-    random_key(name, key)
+    check_random_key(name, key)
     samples, replicates = (
-        whole(name, "samples", samples, 100),
-        whole(name, "replicates", replicates, FEWEST),
+        whole_number(name, "samples", samples, 100),
+        whole_number(name, "replicates", replicates, FEWEST),
     )
     level = checked_level(name, level)
     latent.check(name, sim)
     require_episodes(name, sim, samples)
-    ways = units.ways(name, executor, devices)
+    ways = units.placement(name, executor, devices)
     about = dict(sim=sim, samples=samples, replicates=replicates)
     with (
-        stored(name, checkpoint, key, **about) as store,
+        open_checkpoint(name, checkpoint, key, **about) as store,
         Watch(name, replicates, "population", progress, callback) as watch,
     ):
         task = Task(_unit, (jax.random.split(key, replicates), sim, samples), lambda: (0,) * 7)
         add = lambda runs, number, parts: (*runs, _explored(*parts))
         ran = units.run(task, replicates, add, (), watch, ways._replace(store=store))
-    runs, short = ran.state, units.note("populations", ran, len(ran.state), replicates)
+    runs, short = ran.state, units.describe_missing("populations", ran, len(ran.state), replicates)
     if len(runs) < FEWEST:
         raise KeyboardInterrupt if ran.ended == "" else RuntimeError(f"{name}: {short}")
     reasons = [] if short is None else [short, *map(str, ran.incidents)]
-    settings = asked(name, key, samples=samples, replicates=replicates, level=level)
+    settings = call_settings(name, key, samples=samples, replicates=replicates, level=level)
     return of_populations(name, runs, samples, level, reasons)._replace(settings=settings)
 
 

@@ -1,6 +1,6 @@
 """Why did it fail? Pure calls of a simulator and an episode, for black boxes, too."""
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.explain.attribution import Attribution, attribution
 from jast.explain.cards import cards
 from jast.explain.criticality import Criticality, criticality
@@ -36,4 +36,4 @@ __all__ = [
     "rules",
     "sensitivity",
 ]
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

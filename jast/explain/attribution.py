@@ -11,7 +11,7 @@ import numpy as np
 
 from jast import _checks, results
 from jast.boundary import differentiable
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.episode import Episode
 from jast.explain.point import (
     EpisodePoint,
@@ -32,7 +32,7 @@ POINTS = 128  # on the way from the mode to the episode
 PRINTED = 10  # disturbances
 
 
-@results.shown()
+@results.printable()
 class Attribution(NamedTuple):
     """By how much each disturbance has lowered the miss distance.
 
@@ -120,9 +120,9 @@ def attribution(
     name = "attribution"
     if method not in METHODS:
         raise ValueError(f"{name}: method must be one of {sorted(METHODS)}, received {method!r}")
-    permutations = _checks.whole(name, "permutations", permutations, 2)
+    permutations = _checks.whole_number(name, "permutations", permutations, 2)
     key = jax.random.key(0) if key is None else key
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     g = failing_point(name, sim, episode)
     quiet = g.judge(np.zeros((1, len(g.v)))).distance[0]
     if not np.isfinite(quiet):
@@ -151,7 +151,7 @@ def attribution(
 
 def _shapley(g: EpisodePoint, quiet: float, key: jax.Array, permutations: int):
     """Means and standard errors [D], by pairs of orders."""
-    live, rng = np.flatnonzero(g.v), generator(key)
+    live, rng = np.flatnonzero(g.v), numpy_generator(key)
     d, pairs = len(live), -(-permutations // 2)
     seen = np.zeros((pairs, len(g.v)))
     if not d:

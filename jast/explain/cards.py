@@ -12,7 +12,7 @@ from jast.estimate.markov_tilts import Tilts
 from jast.explain.criticality import Criticality, criticality
 from jast.explain.eigenfailures import Eigenfailures, eigenfailures
 from jast.explain.minimal import Minimal, minimal
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
@@ -57,12 +57,12 @@ def cards(
         True
     """
     name = "cards"
-    _checks.random_key(name, key)
-    budget = _checks.whole(name, "budget", budget, 1)
+    _checks.check_random_key(name, key)
+    budget = _checks.whole_number(name, "budget", budget, 1)
     p: Any = getattr(modes, "probability", None)
     chosen: list[Any] = list(getattr(modes, "modes", modes))[:MODES]
     # tilts are told by playing their draws again
-    again = hosted(sim) and isinstance(getattr(p and p.draws, "source", None), Tilts)
+    again = runs_on_host(sim) and isinstance(getattr(p and p.draws, "source", None), Tilts)
     out: list[list[Minimal | Criticality | Eigenfailures]] = []
     for i, mode in enumerate(chosen):
         each = budget // len(chosen)

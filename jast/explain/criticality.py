@@ -10,9 +10,9 @@ import numpy as np
 
 from jast import _checks, results
 from jast import distributions as D
-from jast.episode import Episode, played, replay
+from jast.episode import Episode, play_chosen, replay
 from jast.intervals import checked_level, clopper_pearson
-from jast.pytrees import in_lanes, select
+from jast.pytrees import map_in_lanes, select
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator, require_simulator
 
@@ -25,7 +25,7 @@ LANES = 512  # episodes that are played at a time
 CERTAIN = 0.95  # a probability from which on a failure counts as certain
 
 
-@results.result("evaluations")
+@results.result_class("evaluations")
 class Criticality(NamedTuple):
     """The probability of failing from each state of an episode, [length + 1] rows.
 
@@ -107,8 +107,8 @@ def criticality(
         True
     """
     name = "criticality"
-    _checks.random_key(name, key)
-    draws, level = _checks.whole(name, "draws", draws, 1), checked_level(name, level)
+    _checks.check_random_key(name, key)
+    draws, level = _checks.whole_number(name, "draws", draws, 1), checked_level(name, level)
     require_simulator(name, sim)
     episode = replay(sim, episode)
     steps = int(episode.length)
@@ -120,7 +120,7 @@ def criticality(
         return _continued(keys, sim, *given, kept)
 
     at = np.arange(len(rows), dtype=np.int32)
-    ended, wrong = in_lanes(LANES, lanes, at, rows)
+    ended, wrong = map_in_lanes(LANES, lanes, at, rows)
     failing, invalid = np.bincount(rows[ended], minlength=steps + 1), int(wrong.sum())
     p = failing / draws
     interval = np.stack([clopper_pearson(int(k), draws, level) for k in failing])
@@ -149,7 +149,7 @@ def _continued(keys: Any, sim: Simulator, x0: Any, disturbances: Any, kept: Any)
             own = D.sample(sim.disturbance(state), jax.random.fold_in(key, t))
             return select(t < kept, x, own)
 
-        e = played(sim, log_likelihood, x0, choose, disturbances, sim.horizon)
+        e = play_chosen(sim, log_likelihood, x0, choose, disturbances, sim.horizon)
         return e.failure, ~jnp.isfinite(e.reward)
 
     return jax.vmap(one)(keys, kept)

@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 from jast import distributions as D
 from jast.outline import outline
-from jast.pytrees import select, strong
+from jast.pytrees import select, with_strong_types
 from jast.simulator import Simulator
 from jast.stress_testing.report import Report
 
@@ -131,7 +131,7 @@ def _arrived(sim, state, t):
 
 def _init(sim_a, sim_b, x0):
     t = jnp.zeros((), jnp.int32)
-    a, b = strong(sim_a.init(x0)), strong(sim_b.init(x0))
+    a, b = with_strong_types(sim_a.init(x0)), with_strong_types(sim_b.init(x0))
     failed_a, over_a, _ = _arrived(sim_a, a, t)
     failed_b, over_b, distance = _arrived(sim_b, b, t)
     return Both(
@@ -141,7 +141,7 @@ def _init(sim_a, sim_b, x0):
         failed_b=failed_b,
         over_a=over_a,
         over_b=over_b,
-        nearest=strong(distance),
+        nearest=with_strong_types(distance),
         t=t,
     )
 
@@ -149,8 +149,8 @@ def _init(sim_a, sim_b, x0):
 def _step(sim_a, sim_b, state, x):
     t = state.t + 1
     # one that is over stays where it is
-    a = select(state.over_a, state.a, strong(sim_a.step(state.a, x)))
-    b = select(state.over_b, state.b, strong(sim_b.step(state.b, x)))
+    a = select(state.over_a, state.a, with_strong_types(sim_a.step(state.a, x)))
+    b = select(state.over_b, state.b, with_strong_types(sim_b.step(state.b, x)))
     failed_a, over_a, _ = _arrived(sim_a, a, t)
     failed_b, over_b, distance = _arrived(sim_b, b, t)
     return Both(
@@ -182,7 +182,7 @@ def _evaluate(sim_b, state):
 
 def _quiet(sim):
     """The miss distance of the start at its mode."""
-    return jnp.abs(sim.evaluate(strong(sim.init(D.mode(sim.start()))))[1])
+    return jnp.abs(sim.evaluate(with_strong_types(sim.init(D.mode(sim.start()))))[1])
 
 
 def _observe(sim_a, sim_b, state):

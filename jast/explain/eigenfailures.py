@@ -10,7 +10,7 @@ import numpy as np
 
 from jast import _checks, results
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.episode import Episode
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
@@ -18,7 +18,7 @@ from jast.explain.drawn import UNRELIABLE, failing_draws, free_undecided, normal
 from jast.explain.gathered import gather_episodes
 from jast.explain.point import number_names, number_steps, used_numbers
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.search.failure_modes import pointing
 from jast.simulator import Simulator
 
@@ -37,7 +37,7 @@ BEYOND = 3.0
 PRINTED = 4  # numbers of a direction
 
 
-@results.shown()
+@results.printable()
 class Eigenfailures(NamedTuple):
     """K directions in the space of the N normal numbers, the one that differs most first.
 
@@ -147,9 +147,9 @@ def eigenfailures(
         True
     """
     name = "eigenfailures"
-    _checks.random_key(name, key)
-    mode = _checks.whole(name, "mode", mode, 0)
-    directions = _checks.whole(name, "directions", directions)
+    _checks.check_random_key(name, key)
+    mode = _checks.whole_number(name, "mode", mode, 0)
+    directions = _checks.whole_number(name, "directions", directions)
     latent.check(name, sim)
     z, log_w, length, good, spent = _points(name, sim, failures)
     ways = [] if isinstance(failures, Estimate) else getattr(failures, "modes", None) or []
@@ -164,7 +164,9 @@ def eigenfailures(
             f"{name}: failures must be at least {FAILURES} effective ones of the mode, received"
             f" {ess:.3g}"
         )
-    z = _align_ends(sim, free_undecided(sim, z, length, generator(key)).astype(np.float64), length)
+    z = _align_ends(
+        sim, free_undecided(sim, z, length, numpy_generator(key)).astype(np.float64), length
+    )
     mean, variances, vectors, chance = components(z, normalised(log_w), ess)
     shifts = vectors @ mean
     nats = (variances - 1 - np.log(np.maximum(variances, 1e-300)) + shifts**2) / 2
@@ -245,7 +247,7 @@ def _modes_of(sim: Simulator, z: np.ndarray, length: np.ndarray, ways: Any) -> n
 
 def _align_ends(sim: Simulator, z: np.ndarray, length: np.ndarray) -> np.ndarray:
     """The points ``z`` [m, D] as late as the last of them: what was behind the end comes first."""
-    first, (m, d), last = count(outline(sim).x0), z.shape, int(length.max())
+    first, (m, d), last = count_numbers(outline(sim).x0), z.shape, int(length.max())
     steps = z[:, first:].reshape(m, sim.horizon, -1)
     at = (np.arange(last) - (last - length[:, None])) % last
     moved = np.take_along_axis(steps[:, :last], at[..., None], axis=1)

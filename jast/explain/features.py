@@ -8,7 +8,7 @@ import numpy as np
 
 from jast.explain.gathered import FullEpisodes
 from jast.explain.point import names_of_leaves
-from jast.fields import fields
+from jast.fields import named_fields
 from jast.outline import outline
 from jast.simulator import Simulator
 
@@ -89,7 +89,7 @@ def _components(sim: Simulator, episodes: FullEpisodes) -> list[tuple[str, np.nd
 
 def _columns(tree: Any, root: str, lead: int) -> Iterator[tuple[str, np.ndarray]]:
     """(name, values) of each number of ``tree``, whose first ``lead`` axes stay."""
-    for part in fields(tree, root, lead):
+    for part in named_fields(tree, root, lead):
         for i, entry in enumerate(part.entries):
             yield part.name + entry, part.values[..., i]
 

@@ -18,7 +18,7 @@ from jast.episode import Episode, play_back, rollout
 from jast.failures import Failures, identity
 from jast.limit_state import side_by_side
 from jast.outline import outline
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 from jast.search.failure_modes import Mode
 from jast.simulator import Simulator
 
@@ -169,7 +169,7 @@ def _drawn(key: jax.Array, sim: Simulator, at: jax.Array) -> Episode:
 
 def observations(name: str, sim: Simulator, observe: Callable, e: Episode) -> np.ndarray:
     """[n, horizon + 1, d] of the states."""
-    watched, about = partial(_watched, sim, bound(observe)), (e.x0, e.disturbances, e.length)
+    watched, about = partial(_watched, sim, as_partial(observe)), (e.x0, e.disturbances, e.length)
     seen = side_by_side(sim, watched, *about, lanes=LANES)
     if not isinstance(seen, np.ndarray) or seen.ndim != 3:
         shapes = jax.tree.map(lambda a: np.shape(a)[2:], seen)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jast import _checks, results
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate.answers import asked
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
@@ -60,7 +60,7 @@ class Index(NamedTuple):
     """(low, high) at ``level``, of counts"""
 
 
-@results.shown()
+@results.printable()
 class Indices(NamedTuple):
     """Sensitivity of a failure to each number of the disturbances.
 
@@ -148,11 +148,11 @@ def indices(
         11
     """
     name = "indices"
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     kept, level = asked(name, estimate, level)
-    draws = _checks.whole(name, "draws", draws, 0)
+    draws = _checks.whole_number(name, "draws", draws, 0)
     latent.check(name, sim)
-    rng = generator(key)
+    rng = numpy_generator(key)
     z, log_w, length, spent = failing_draws(name, sim, estimate, KEPT)
     z = free_undecided(sim, z, length, rng)
     w = normalised(log_w)

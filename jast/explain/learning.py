@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jast._checks import library
+from jast._checks import import_library
 
 __all__ = ["DISTINCT", "hold_out", "sklearn_module"]
 
@@ -13,7 +13,7 @@ DISTINCT = 4  # episodes of a class, the least
 
 def sklearn_module(function: str, module: str) -> Any:
     """A module of scikit-learn; ImportError where it is not installed."""
-    return library(function, f"sklearn.{module}", "explain")
+    return import_library(function, f"sklearn.{module}", "explain")
 
 
 def hold_out(

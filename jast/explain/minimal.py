@@ -9,7 +9,7 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast import results
-from jast._checks import number, whole
+from jast._checks import number, whole_number
 from jast.episode import Episode, replay
 from jast.explain.point import (
     EpisodePoint,
@@ -27,7 +27,7 @@ SWEEPS = 3  # rounds of shrinking one number after the other
 PRINTED = 12  # needed disturbances, and runs of steps
 
 
-@results.shown()
+@results.printable()
 class Minimal(NamedTuple):
     """What a failure needs.
 
@@ -104,7 +104,10 @@ def minimal(
         1
     """
     name = "minimal"
-    orders, budget = whole(name, "orders", orders, 1), whole(name, "budget", budget, 1)
+    orders, budget = (
+        whole_number(name, "orders", orders, 1),
+        whole_number(name, "budget", budget, 1),
+    )
     slack = number(name, "slack", slack, lambda v: 0 <= v < np.inf, "0 or more")
     g = failing_point(name, sim, episode)
     if (farther := g._replace(v=(1 + slack) * g.v)).judge(farther.v[None]).failure[0]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jast import _checks, results
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.explain.cases import given_cases, simulate_cases
 from jast.explain.gathered import draw_ordinary, observations
 from jast.explain.learning import hold_out, sklearn_module
@@ -32,7 +32,7 @@ REPEATS = 400  # samples of the bootstrap
 FAILING, NEAR, ORDINARY = 1, 2, 0  # kinds of episodes
 
 
-@results.result("evaluations")
+@results.result_class("evaluations")
 class Monitor(NamedTuple):
     """A classifier of observations, and how it does on episodes that it has not seen.
 
@@ -176,9 +176,9 @@ def monitor(
     name = "monitor"
     sklearn_module(name, "ensemble")
     key = jax.random.key(0) if key is None else key
-    _checks.random_key(name, key)
-    within = _checks.whole(name, "within", within, 1)
-    episodes = _checks.whole(name, "episodes", episodes, 40)
+    _checks.check_random_key(name, key)
+    within = _checks.whole_number(name, "within", within, 1)
+    episodes = _checks.whole_number(name, "episodes", episodes, 40)
     rate = _checks.number(name, "false_alarms", false_alarms, lambda v: 0 <= v <= 1, "from 0 to 1")
     level = _checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     if model not in MODELS:
@@ -186,7 +186,7 @@ def monitor(
     first, second = jax.random.split(key)
     e, owner, group, spent = _episodes(name, first, sim, failures, others, episodes)
     seen = observations(name, sim, sim.observe if observe is None else observe, e)
-    rng = generator(second)
+    rng = numpy_generator(second)
     out = hold_out(rng, owner, group, HELD_OUT)
     aside = np.zeros(len(out), bool)
     calm = np.flatnonzero(~out & (owner == ORDINARY))
@@ -230,7 +230,7 @@ def monitor(
         level=level,
         maxima=maxima,
         evaluations=spent + len(e.length),
-        settings=results.asked(name, key, **settings),
+        settings=results.call_settings(name, key, **settings),
     )
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from jast import limit_state as latent
 from jast.distributions.numbers import unflat
 from jast.episode import Episode
-from jast.fields import called, entries
+from jast.fields import entry_places, leaf_name
 from jast.judge import Judge
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.search.centred import centred
 from jast.simulator import Simulator
 
@@ -76,7 +76,7 @@ def failing_point(name: str, sim: Simulator, episode: Episode) -> EpisodePoint:
 def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
     """The numbers ``row`` [D] in the shapes of x0 and of the disturbances [horizon, ...]."""
     about = outline(sim)
-    start = count(about.x0)
+    start = count_numbers(about.x0)
 
     def shaped(part: np.ndarray, like: Any) -> Any:
         return jax.tree.map(
@@ -90,14 +90,14 @@ def like_disturbances(sim: Simulator, row: np.ndarray) -> tuple[Any, Any]:
 def number_steps(sim: Simulator) -> np.ndarray:
     """[D]: the step that each number belongs to, from 1; 0 for those of the start."""
     about = outline(sim)
-    start, each = count(about.x0), count(about.x)
+    start, each = count_numbers(about.x0), count_numbers(about.x)
     return np.concatenate([np.zeros(start, int), 1 + np.arange(sim.horizon * each) // max(each, 1)])
 
 
 def used_numbers(sim: Simulator, length: np.ndarray) -> np.ndarray:
     """[n]: how many of the numbers decided something in episodes of ``length`` [n] steps."""
     about = outline(sim)
-    return count(about.x0) + length * count(about.x)
+    return count_numbers(about.x0) + length * count_numbers(about.x)
 
 
 def number_names(sim: Simulator) -> list[str]:
@@ -112,5 +112,5 @@ def names_of_leaves(like: Any, root: str) -> list[str]:
     """
     out = []
     for path, s in jax.tree_util.tree_flatten_with_path(like)[0]:
-        out += [called(path, root) + entry for entry in entries(s.shape)]
+        out += [leaf_name(path, root) + entry for entry in entry_places(s.shape)]
     return out

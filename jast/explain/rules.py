@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jast import _checks, results
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.episode import Episode
 from jast.explain.cases import given_cases, simulate_cases
 from jast.explain.features import Describer, feature_table, make_describer
@@ -28,7 +28,7 @@ HELD_OUT = 0.3  # the share of the episodes that tells how often the rules are r
 OF = "disturbances", "states", "both"
 
 
-@results.result("evaluations")
+@results.result_class("evaluations")
 class Rules(NamedTuple):
     """Rules for failures, and how they do on episodes that they were not made from.
 
@@ -93,7 +93,9 @@ class Rules(NamedTuple):
         e = gather_episodes("predict", "episodes", self.sim, episodes)
         key = jax.random.key(1)
         seen = play_to_horizon(self.sim, e, key, self.describer.of != "disturbances")
-        x = feature_table(self.sim, self.describer, seen, _ends(generator(key), e, self.ends))[1]
+        x = feature_table(
+            self.sim, self.describer, seen, _ends(numpy_generator(key), e, self.ends)
+        )[1]
         return np.asarray(self.classes)[self.tree.predict(x)]
 
 
@@ -165,22 +167,25 @@ def rules(
     name = "rules"
     trees = sklearn_module(name, "tree")
     key = jax.random.key(0) if key is None else key
-    _checks.random_key(name, key)
-    episodes = _checks.whole(name, "episodes", episodes, 20)
-    most, lead = _checks.whole(name, "most", most, 2), _checks.whole(name, "lead", lead, 0)
+    _checks.check_random_key(name, key)
+    episodes = _checks.whole_number(name, "episodes", episodes, 20)
+    most, lead = (
+        _checks.whole_number(name, "most", most, 2),
+        _checks.whole_number(name, "lead", lead, 0),
+    )
     level = _checks.number(name, "level", level, lambda v: 0 < v < 1, "between 0 and 1")
     if of not in OF:
         raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
     first, second, third = jax.random.split(key, 3)
     number = isinstance(others, int | np.integer) and not isinstance(others, bool)
     if others is None or number:
-        many = _checks.whole(name, "others", others, 1) if number else None
+        many = _checks.whole_number(name, "others", others, 1) if number else None
         cases = simulate_cases(name, first, sim, failures, labels, episodes, many)
     else:
         cases = given_cases(name, sim, failures, others, labels, DISTINCT)
     e, owner, group, names, spent = cases
     seen = play_to_horizon(sim, e, second, of != "disturbances")
-    rng = generator(third)
+    rng = numpy_generator(third)
     ends = e.length[owner > 0]
     d = make_describer(sim, seen, of, lead)
     features, x = feature_table(sim, d, seen, _ends(rng, e, ends))
@@ -207,7 +212,7 @@ def rules(
         ends=ends,
         sim=sim,
         evaluations=spent + seen.evaluations,
-        settings=results.asked(name, key, **settings),
+        settings=results.call_settings(name, key, **settings),
     )
 
 

@@ -30,7 +30,7 @@ LANES = 1024  # draws at a time
 RELIABLE = 100  # effective failures, below which the answer is UNRELIABLE
 
 
-@results.shown()
+@results.printable()
 class Sensitivity(NamedTuple):
     """Derivatives of the log probability of failure.
 
@@ -108,8 +108,11 @@ def sensitivity(
     """
     name = "sensitivity"
     key = jax.random.key(0) if key is None else key
-    _checks.random_key(name, key)
-    samples, level = _checks.whole(name, "samples", samples, LANES), checked_level(name, level)
+    _checks.check_random_key(name, key)
+    samples, level = (
+        _checks.whole_number(name, "samples", samples, LANES),
+        checked_level(name, level),
+    )
     latent.check(name, sim)
     q = getattr(estimate, "proposal", None)
     if not fits(sim, q):

@@ -15,7 +15,7 @@ __all__ = ["Rule", "grow_tree", "read_rules"]
 FOLDS = 3  # parts of the episodes by which the size of a tree is chosen
 
 
-@results.shown()
+@results.printable()
 class Rule(NamedTuple):
     """One way through the tree.
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.episode import Episode
 from jast.estimate.batches import resampled
 from jast.estimate.draws import Draws
@@ -17,7 +17,7 @@ from jast.explain.point import used_numbers
 from jast.judge import Judge
 from jast.markov import proposed
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.search.failure_modes import Modes, owners
 from jast.simulator import Simulator
 
@@ -165,7 +165,7 @@ def draw_variants(key: jax.Array, sim: Simulator, seeds: Seeds, n: int) -> Varia
     failures and near misses alike, and so is the time where it does not matter. All kinds of
     failures get the same number of chains.
     """
-    rng, judge = generator(key), Judge(sim)
+    rng, judge = numpy_generator(key), Judge(sim)
     kinds = np.unique(seeds.label)
     each = [_draw_seeds(rng, seeds, k, -(-n // len(kinds))) for k in kinds]
     seed = np.concatenate(each)
@@ -215,7 +215,7 @@ def _redraw(rng: np.random.Generator, z: np.ndarray, scale: float) -> np.ndarray
 def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> np.ndarray:
     """``z`` [n, D] with the disturbances some steps later, in a ring."""
     n, steps = len(z), sim.horizon
-    start = count(outline(sim).x0)
+    start = count_numbers(outline(sim).x0)
     at = (np.arange(steps) - rng.integers(0, steps, (n, 1))) % steps
     rows = z[:, start:].reshape(n, steps, -1)
     moved = np.take_along_axis(rows, at[:, :, None], axis=1)

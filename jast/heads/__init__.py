@@ -2,7 +2,7 @@
 trees.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.heads.heads import Heads, Moments
 from jast.heads.histogram import as_policy
 from jast.heads.networks import Head, make_head
@@ -24,4 +24,4 @@ __all__ = [
     "settings",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

@@ -14,7 +14,7 @@ import numpy as np
 
 from jast import results
 from jast.heads.networks import Head
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 
 if TYPE_CHECKING:
     import chex
@@ -85,7 +85,7 @@ def update_moments(before: Moments, x: np.ndarray) -> Moments:
     return Moments(*(np.asarray(a, np.float32) for a in updated))
 
 
-@results.shown()
+@results.printable()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Heads:
@@ -119,7 +119,7 @@ class Heads:
         for name in ("policy", "value"):
             head = getattr(self, name)
             if isinstance(head, tuple) and len(head) == 2 and callable(head[1]):
-                apply = bound(head[1])
+                apply = as_partial(head[1])
                 object.__setattr__(self, name, Head(head[0], apply))
 
 

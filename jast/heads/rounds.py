@@ -30,7 +30,7 @@ from jast.heads.samples import (
 )
 from jast.heads.training import HeadState, init_head, train_head
 from jast.outline import ask, outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.simulator import Simulator
 
 __all__ = ["HeadTraining", "init_heads", "train_heads", "with_moments"]
@@ -104,7 +104,7 @@ def count_inputs(sim: Simulator, actions: Any, heads: str | Heads) -> tuple[int,
     about = outline(sim)
     if about.observation is None:
         contract("forest", sim, observed=math.inf)  # raises: it says what is wrong with observe
-    return math.prod(about.observation), count(about.x)
+    return math.prod(about.observation), count_numbers(about.x)
 
 
 def with_moments(heads: Heads, n: int, d: int) -> Heads:
@@ -205,7 +205,7 @@ def train_heads(key, training, sim, actions, settings, batches):
 def _samples(heads, sim, actions, settings, batches):
     """What the policy head (None without one) and the value head learn from."""
     about = outline(sim)
-    n, first = heads.inputs.mean.shape[0] - count(about.x), int(about.random_start)
+    n, first = heads.inputs.mean.shape[0] - count_numbers(about.x), int(about.random_start)
     bins = None
     if heads.policy is not None:
         seen = jnp.zeros((n,), jnp.float32)

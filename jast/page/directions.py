@@ -5,7 +5,7 @@ import numpy as np
 
 from jast.episode import Episode
 from jast.explain import Eigenfailures
-from jast.fields import fields
+from jast.fields import named_fields
 from jast.page.traces import short
 
 __all__ = ["directions"]
@@ -41,6 +41,6 @@ def _columns(e: Episode, steps: np.ndarray) -> dict[str, list[float]]:
     """Name of a number -> its values at ``steps``, NaN behind the end."""
     return {
         f.name + entry: short(np.where(steps <= e.length, f.values[steps - 1, i], np.nan))
-        for f in fields(e.disturbances, "x")
+        for f in named_fields(e.disturbances, "x")
         for i, entry in enumerate(f.entries)
     }

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from jast.episode import Episode, replay
-from jast.fields import fields, place
-from jast.incidents import hosted
+from jast.fields import named_fields, path_name
+from jast.incidents import runs_on_host
 from jast.simulator import Simulator
 
 __all__ = ["exact", "far", "groups", "pictures", "short", "states_of", "trace"]
@@ -73,7 +73,7 @@ def distances(sim: Simulator, states: Any, steps: list[int]) -> list[float] | No
     """Miss distance at each of ``steps``; None where that says nothing, or where it would call
     a black box again.
     """
-    if sim.episodic or hosted(sim):
+    if sim.episodic or runs_on_host(sim):
         return None
     return short(np.asarray(far(sim, states), float)[steps])
 
@@ -91,7 +91,7 @@ def groups(tree: Any, steps: list[int], name: str, late: int = 0) -> list[dict]:
     ``late``: row 0 is of step 1, and step 0 has none.
     """
     found = []
-    for called, places, flat in fields(tree, name):
+    for called, places, flat in named_fields(tree, name):
         shown = min(flat.shape[1], ENTRIES)
         rows = [flat[t - late, :shown] if t >= late else np.full(shown, np.nan) for t in steps]
         found.append(
@@ -116,7 +116,7 @@ def exact(episode: Episode) -> dict:
     def arrays(tree: Any) -> list[dict]:
         return [
             {
-                "name": place(path),
+                "name": path_name(path),
                 "dtype": np.asarray(a).dtype.name,
                 "values": np.asarray(a).tolist(),
             }

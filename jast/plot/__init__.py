@@ -16,7 +16,7 @@ weakness recognition: `failures_found`, `roc`, `first_failures`, `contributions`
 adversary also `confusion`, `threshold_sweep`, `likely_failures`, `pixel_likelihood`.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.plot.adversary import confusion, likely_failures, pixel_likelihood, threshold_sweep
 from jast.plot.colav import colav, colav_animation, colav_story
 from jast.plot.colav_published import colav_published
@@ -82,4 +82,4 @@ __all__ = [
     "weights",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

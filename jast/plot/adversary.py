@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from jast._checks import number, whole
+from jast._checks import number, whole_number
 from jast.plot import style
 from jast.plot.weakness import checked_result, checked_truth
 from jast.weakness.encoded import Encoded
@@ -104,7 +104,7 @@ def threshold_sweep(
     caller = "threshold_sweep"
     scores = np.asarray(checked_result(caller, result).scores)
     failed = checked_truth(caller, failed, len(scores))
-    at = np.linspace(0, 1, whole(f"plot.{caller}", "thresholds", thresholds, 2))
+    at = np.linspace(0, 1, whole_number(f"plot.{caller}", "thresholds", thresholds, 2))
     precision, recall = np.array([precision_recall(scores >= t, failed) for t in at]).T
     with style.axes(ax, (5.4, 3.6)) as ax:
         ax.plot(at, precision, color=style.BLUE, marker="o", markersize=4, label="precision")
@@ -168,7 +168,7 @@ def likely_failures(
         kind, np.ones(n, bool)
     )
     order = np.argsort(networks.scores if kind == "false negatives" else -networks.scores)
-    chosen = order[there[order]][: whole(f"plot.{caller}", "count", count)]
+    chosen = order[there[order]][: whole_number(f"plot.{caller}", "count", count)]
     if not len(chosen):
         raise ValueError(f"plot.{caller}: there are no {kind} among the inputs")
     codes = networks.codes[chosen]

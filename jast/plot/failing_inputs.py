@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jast._checks import whole
+from jast._checks import whole_number
 from jast.plot import style
 from jast.plot.weakness import checked_result
 from jast.weakness.data import check_data
@@ -65,7 +65,7 @@ def first_failures(
     """
     caller = "first_failures"
     failures, n = np.asarray(checked_result(caller, result).failures), len(result.scores)
-    count = whole(f"plot.{caller}", "count", count)
+    count = whole_number(f"plot.{caller}", "count", count)
     inputs, labels, _ = check_data(f"plot.{caller}", inputs, labels)
     if len(inputs) != n:
         raise ValueError(

@@ -13,7 +13,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast.distributions.spread import spread
 from jast.episode import Episode, replay
-from jast.fields import fields
+from jast.fields import named_fields
 from jast.plot import style
 from jast.simulator import Simulator
 
@@ -116,9 +116,9 @@ def disturbances(
         first, steps = spreads(sim, episode)
     first = [
         (f if f.name.startswith("x0") else f._replace(name=f"x0 {f.name}"), 0)
-        for f in fields(first, "x0", lead=0)
+        for f in named_fields(first, "x0", lead=0)
     ]
-    arrays = [*first, *((f, 1) for f in fields(steps, "x"))]
+    arrays = [*first, *((f, 1) for f in named_fields(steps, "x"))]
     count = max(len(arrays), 1)
     size = (6.8, 1.4 + 2.0 * count)
     with style.panels("disturbances", axes, size, count, "array of x") as axes:

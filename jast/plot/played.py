@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jast._checks import whole
+from jast._checks import whole_number
 from jast.blackbox.simulator import Record, Standing
 from jast.episode import Episode, replay, rollout
 from jast.estimate import FailureSamples
 from jast.failures import Failures
-from jast.fields import fields
-from jast.incidents import hosted
+from jast.fields import named_fields
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.page.traces import far
 from jast.policy import undisturbed
@@ -74,7 +74,7 @@ def samples_of(caller: str, samples: Any, sim: Any, modes: Any, most: int) -> Sa
         modes: `Modes`, a number for each of the episodes, or None: those of a report, else none.
         most: at least 1.
     """
-    most = whole(f"plot.{caller}", "most", most)
+    most = whole_number(f"plot.{caller}", "most", most)
     source = samples
     if isinstance(samples, Report):
         sim = samples.sim if sim is None else sim
@@ -150,7 +150,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
     """
     like, states = outline(sim).state, episodes.states
     if states is None and not isinstance(like, Record):
-        states = (_states if hosted(sim) else _compiled_states)(sim, episodes)
+        states = (_states if runs_on_host(sim) else _compiled_states)(sim, episodes)
     length = np.asarray(episodes.length)
     there = np.arange(sim.horizon + 1) <= length[:, None]
     box = isinstance(like, Record | Standing)  # a record of the disturbances, then
@@ -173,7 +173,7 @@ def series_of(sim: Simulator, episodes: Episode) -> Series:
 
 def replays_without_calls(sim: Simulator) -> bool:
     """Whether `series_of` calls no black box."""
-    return not hosted(sim) or isinstance(outline(sim).state, Record)
+    return not runs_on_host(sim) or isinstance(outline(sim).state, Record)
 
 
 def _states(sim: Simulator, episodes: Episode) -> Any:
@@ -190,7 +190,7 @@ _compiled_states, _compiled_draws = jax.jit(_states), jax.jit(_drawn)
 def _columns(tree: Any, root: str, there: np.ndarray) -> dict[str, np.ndarray]:
     return {
         name + place: np.where(there, values[..., j], np.nan)
-        for name, places, values in fields(tree, root, lead=2)
+        for name, places, values in named_fields(tree, root, lead=2)
         for j, place in enumerate(places)
     }
 
@@ -221,7 +221,7 @@ def nominal_series(caller: str, sim: Simulator, nominal: Any) -> Series | None:
     """
     if isinstance(nominal, Episode):
         return series_of(sim, samples_of(caller, nominal, sim, None, DRAWS).episodes)
-    count = (0 if hosted(sim) else DRAWS) if nominal is None else nominal
+    count = (0 if runs_on_host(sim) else DRAWS) if nominal is None else nominal
     if isinstance(count, bool) or not isinstance(count, int) or count < 0:
         raise ValueError(
             f"plot.{caller}: nominal must be Episodes with one leading axis, or how many to draw,"
@@ -230,7 +230,7 @@ def nominal_series(caller: str, sim: Simulator, nominal: Any) -> Series | None:
     if not count:
         return None
     keys = jax.random.split(jax.random.key(0), count)
-    return series_of(sim, (_drawn if hosted(sim) else _compiled_draws)(sim, keys))
+    return series_of(sim, (_drawn if runs_on_host(sim) else _compiled_draws)(sim, keys))
 
 
 def undisturbed_series(sim: Simulator) -> Series | None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jast.fields import fields
-from jast.incidents import hosted
+from jast.fields import named_fields
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.plot import style
 from jast.plot.general import shade_deviations, spreads
@@ -129,7 +129,7 @@ def pictures(report: Report) -> list[bytes]:
     from matplotlib.figure import Figure  # one that pyplot does not keep
     from PIL import Image  # comes with matplotlib
 
-    sim = None if report.sim is None or hosted(report.sim) else report.sim
+    sim = None if report.sim is None or runs_on_host(report.sim) else report.sim
     shown, files = _shown_failures(report), []
     with style.styled():
         owned = _series_of_modes(report, sim, shown, None) if shown else None
@@ -310,8 +310,8 @@ def _draw_disturbances(ax: Any, sim: Any, failure: Any) -> None:
     about = None if sim is None else outline(sim)
     normal = about is not None and about.disturbance.quantile and about.start.quantile
     first, steps = spreads(sim, failure) if normal else ((), failure.disturbances)
-    found = [(f, 0, f.values[None]) for f in fields(first, "x0", lead=0)]
-    found += [(f, 1, f.values[:n]) for f in fields(steps, "x")]
+    found = [(f, 0, f.values[None]) for f in named_fields(first, "x0", lead=0)]
+    found += [(f, 1, f.values[:n]) for f in named_fields(steps, "x")]
     named = [
         (f.name + place, at, v[:, i]) for f, at, v in found for i, place in enumerate(f.entries)
     ]

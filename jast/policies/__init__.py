@@ -1,6 +1,6 @@
 """Learned failure policies: who is taught to make a system fail, in its likeliest ways."""
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.policies.failure_policy import FailurePolicy, History
 from jast.policies.proximal_policy import ppo
 from jast.policies.q_learning_policy import q_learning
@@ -9,4 +9,4 @@ from jast.policies.storage import load, save
 
 __all__ = ["FailurePolicy", "History", "load", "ppo", "q_learning", "sac", "save"]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

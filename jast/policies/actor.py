@@ -17,7 +17,7 @@ from jast import distributions as D
 from jast.heads.heads import Moments
 from jast.heads.networks import dense
 from jast.outline import ask, outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.simulator import Simulator
 
 __all__ = [
@@ -64,7 +64,9 @@ def count_latents(sim: Simulator, function: str) -> tuple[int, int]:
     start, step = ask(sim, lambda start, state, dist: (D.untiltable(start), D.untiltable(dist)))
     if step is not None:
         raise ValueError(f"{function}: disturbance: {step}")
-    return count(like.x), count(like.x0) if _floats(like.x0) and start is None else 0
+    return count_numbers(like.x), count_numbers(like.x0) if _floats(
+        like.x0
+    ) and start is None else 0
 
 
 def _floats(like: Any) -> bool:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast.archive import arrays_of, named
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.policies.exploring import Config, Totals, TrainingState, fit_normalisation, fit_start
 from jast.policies.failure_policy import (
     FailurePolicy,
@@ -88,7 +88,7 @@ def train_policy(
         learn=functools.partial(method.learn, for_steps),
     )
     about = dict(sim=sim, config=config, plan=plan, scale=scale, widen=widen) | about
-    with stored(method.function, checkpoint, key, **about) as store:
+    with open_checkpoint(method.function, checkpoint, key, **about) as store:
         kept = _resume(method, store) or _explore(method, plan, sim.horizon, scale, widen)
         training, rows = _learn(method, plan, kept, scale is None, progress, callback, store)
     tilt = ()

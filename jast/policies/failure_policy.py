@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["FailurePolicy", "History", "Learned", "append_row", "assemble", "history_of"]
 
 
-@results.shown()
+@results.printable()
 class History(NamedTuple):
     """The training, a row for each twentieth of it: [rows] each.
 
@@ -110,7 +110,7 @@ class Learned(NamedTuple):
     scale: jax.Array
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FailurePolicy(Policy):

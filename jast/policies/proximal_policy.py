@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import jax
 import jax.numpy as jnp
 
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
@@ -112,18 +112,18 @@ def ppo(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (30,)
     """
-    random_key("ppo", key)
+    check_random_key("ppo", key)
     contract("ppo", sim, observed=OBSERVED)
     if settings.is_auto(steps):
         steps = min(sim.horizon, MOST_STEPS)
     counts = dict(episodes=episodes, batch=batch, epochs=epochs, components=components, steps=steps)
     episodes, batch, epochs, components, steps = (
-        whole("ppo", name, value) for name, value in counts.items()
+        whole_number("ppo", name, value) for name, value in counts.items()
     )
     if settings.is_auto(lanes):
         lanes = episodes * sim.horizon // (steps * ITERATIONS)
         lanes = min(max(FEWEST_LANES, lanes), MOST_LANES)
-    lanes = whole("ppo", "lanes", lanes)
+    lanes = whole_number("ppo", "lanes", lanes)
     plan = settings.make_plan("ppo", episodes, sim.horizon, lanes, steps)
     hidden = settings.check_hidden("ppo", hidden)
     dense_reward = settings.check_shaping("ppo", shaping, sim)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast.contract import OBSERVED, contract
 from jast.memory import require
 from jast.outline import outline
@@ -111,11 +111,11 @@ def q_learning(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (10,)
     """
-    random_key("q_learning", key)
+    check_random_key("q_learning", key)
     contract("q_learning", sim, observed=OBSERVED)
     counts = dict(episodes=episodes, lanes=lanes)
-    episodes, lanes = (whole("q_learning", name, value) for name, value in counts.items())
-    values = whole("q_learning", "values", values, 2)
+    episodes, lanes = (whole_number("q_learning", name, value) for name, value in counts.items())
+    values = whole_number("q_learning", "values", values, 2)
     plan = settings.make_plan("q_learning", episodes, sim.horizon, lanes)
     number = functools.partial(settings.check_number, "q_learning")
     rates = tabular.Rates(
@@ -175,14 +175,16 @@ def _cells(
     """The function of a cell, and how many there are."""
     if cell is None:
         several = isinstance(cells, Sequence) and not isinstance(cells, str)
-        each = tuple(whole("q_learning", "cells", c) for c in (cells if several else [cells] * m))
+        each = tuple(
+            whole_number("q_learning", "cells", c) for c in (cells if several else [cells] * m)
+        )
         if len(each) != m:
             raise ValueError(
                 f"q_learning: cells must be a whole number or {m} of them, one for each number"
                 f" observed, received {cells!r}"
             )
         return tabular.grid_cell(each), horizon * math.prod(each)
-    cells = whole("q_learning", "cells", cells)
+    cells = whole_number("q_learning", "cells", cells)
     like = jax.eval_shape(cell, *(jax.ShapeDtypeStruct(*s) for s in (((m,), "f4"), ((), "i4"))))
     if not (getattr(like, "shape", None) == () and jnp.issubdtype(like.dtype, np.integer)):
         raise ValueError(

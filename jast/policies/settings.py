@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jast._checks import real, whole
+from jast._checks import real_number, whole_number
 from jast._jax import is_traced
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.simulator import Simulator
 
 __all__ = [
@@ -68,7 +68,7 @@ def check_number(
     function: str, name: str, value: Any, holds: Callable[[float], bool], expected: str
 ) -> float:
     """``value`` as a float for which ``holds``, and that is not traced."""
-    value = real(function, name, value, holds, expected)
+    value = real_number(function, name, value, holds, expected)
     if is_traced(value):
         raise ValueError(
             f"{function}: {name} must be a number {expected}, received a traced one: {function}"
@@ -100,7 +100,7 @@ def check_hidden(function: str, hidden: Any) -> tuple[int, ...]:
         raise ValueError(
             f"{function}: hidden must be the widths of one or more layers, received {hidden!r}"
         )
-    return tuple(whole(function, "hidden", width) for width in hidden)
+    return tuple(whole_number(function, "hidden", width) for width in hidden)
 
 
 def check_shaping(function: str, shaping: Any, sim: Simulator) -> bool:
@@ -110,5 +110,5 @@ def check_shaping(function: str, shaping: Any, sim: Simulator) -> bool:
             f'{function}: shaping must be "auto", "steps" or "end", received {shaping!r}'
         )
     if shaping == "auto":
-        return not (sim.episodic and hosted(sim))
+        return not (sim.episodic and runs_on_host(sim))
     return shaping == "steps"

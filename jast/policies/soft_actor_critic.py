@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import jax
 import jax.numpy as jnp
 
-from jast._checks import random_key, whole
+from jast._checks import check_random_key, whole_number
 from jast.contract import OBSERVED, contract
 from jast.memory import require, size
 from jast.outline import outline
@@ -128,11 +128,11 @@ def sac(
         >>> jast.rollout(jax.random.key(1), sim, policy).disturbances.shape
         (30,)
     """
-    random_key("sac", key)
+    check_random_key("sac", key)
     contract("sac", sim, observed=OBSERVED)
     counts = dict(episodes=episodes, lanes=lanes, batch=batch, buffer=buffer, components=components)
     episodes, lanes, batch, buffer, components = (
-        whole("sac", name, value) for name, value in counts.items()
+        whole_number("sac", name, value) for name, value in counts.items()
     )
     plan = settings.make_plan("sac", episodes, sim.horizon, lanes)
     hidden = settings.check_hidden("sac", hidden)
@@ -152,7 +152,7 @@ def sac(
     )
     if settings.is_auto(updates):
         updates = -(-UPDATES // plan.learning)
-    updates = whole("sac", "updates", updates)
+    updates = whole_number("sac", "updates", updates)
     n, n0 = count_latents(sim, "sac")
     (m,) = outline(sim).observation
     learning = dict(hidden=hidden, components=components, dense_reward=dense_reward, batch=batch)

@@ -1,6 +1,6 @@
 """Searches for failures; each returns a `SearchResult`."""
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.search.cem import cem
 from jast.search.chain import chain
 from jast.search.failure_modes import Mode, Modes, modes
@@ -32,4 +32,4 @@ __all__ = [
     "table",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

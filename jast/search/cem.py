@@ -19,12 +19,11 @@ from jax import lax
 from jast import _checks, units
 from jast import actions as choices
 from jast._jax import jit
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.counter import tree_keys
 from jast.cross_entropy import sequences
 from jast.episode import Episode
-from jast.incidents import hosted, incidents, since
-from jast.journal import kept
+from jast.incidents import incidents, new_incidents, runs_on_host
 from jast.memory import require_episodes
 from jast.outline import outline
 from jast.search import lockstep as E
@@ -167,7 +166,7 @@ def cem(
             f"cem: samples x iterations x trees must be below 2^31, received {samples} x"
             f" {iterations} x {trees}"
         )
-    share = lambda name, value: _checks.real(
+    share = lambda name, value: _checks.real_number(
         "cem", name, value, lambda v: 0 <= v <= 1, "from 0 to 1"
     )
     require_simulator("cem", sim)
@@ -188,7 +187,7 @@ def cem(
     width = actions.width if isinstance(actions, choices.Wide) else 1.0
     carry = _nothing(sim, plan, trees, max(elites, top), width, around)
     if settings is None:
-        units.not_traced("cem", checkpoint=checkpoint)
+        units.require_untraced("cem", checkpoint=checkpoint)
 
         def body(i, carry):
             inner, counted = carry
@@ -205,12 +204,12 @@ def cem(
         return carry, counted, best, jax.tree.map(jnp.transpose, rows) if record else None
 
     ends = [samples * (i + 1) for i in range(iterations)]
-    with stored("cem", checkpoint, key, **asked) as store, kept(store):
+    with open_checkpoint("cem", checkpoint, key, **asked) as store, keep_answers(store):
         (pool, _), log = E.drive(
             chunk,
             carry,
             ends,
-            host=hosted(sim),
+            host=runs_on_host(sim),
             trees=trees,
             progress=progress,
             callback=callback,
@@ -231,7 +230,7 @@ def cem(
         top,
     )
     found = ended(key, sim, reward, joined(sim, reward, pilot, found, top), top)
-    return found._replace(incidents=since(before, incidents(sim)))
+    return found._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 @partial(jit, static_argnums=5)

@@ -19,10 +19,10 @@ import numpy as np
 from jast import _checks
 from jast._jax import is_traced, is_tracing
 from jast.counter import tree_keys
-from jast.incidents import hosted, incidents, since
+from jast.incidents import incidents, new_incidents, runs_on_host
 from jast.limit_state import check, dimension, normal_numbers
 from jast.markov import WIDTHS
-from jast.results import asked
+from jast.results import call_settings
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.search import tempering as T
@@ -98,11 +98,11 @@ def chain(
     episodes, top = E.whole(name, episodes=episodes, top=top)
     expected = "above 0 and below 1"
     narrowest = _checks.number(name, "narrowest", narrowest, lambda v: 0 < v < 1, expected)
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
     check(name, sim)
-    settings = asked(name, key, episodes=episodes, narrowest=narrowest)
+    settings = call_settings(name, key, episodes=episodes, narrowest=narrowest)
     settings = planned(name, refine, sim, settings, SHARE)
     size = max(2 * LEVELS[0], min(LANES, 1 << max(0, (episodes // 16).bit_length())))
     steps = math.ceil(math.log(LOST / narrowest) * math.sqrt(dimension(sim)) / 2)
@@ -111,7 +111,7 @@ def chain(
     search = _Search(key, sim, shape, narrowest)
     lanes = shape[0] * shape[1]
     before = incidents(sim)
-    stretch = lanes if hosted(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
+    stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
     looks = [lanes * (i + 1) for i in range(len(WIDTHS))]
     ends = [*looks, *range(looks[-1] + stretch, episodes, stretch)]
     ends = [*(end for end in ends if end < episodes), episodes]
@@ -119,7 +119,7 @@ def chain(
         search.chunk,
         (K.none(sim, max(top, 64)), None, (), []),
         ends,
-        host=hosted(sim),
+        host=runs_on_host(sim),
         progress=progress,
         callback=callback,
         name=name,
@@ -131,7 +131,7 @@ def chain(
         )
     found = K.result(sim, search.reward, log, kept, settings, top)
     found = ended(key, sim, search.reward, found, top)
-    return found._replace(incidents=since(before, incidents(sim)))
+    return found._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 class _Search:

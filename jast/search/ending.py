@@ -6,10 +6,10 @@ import jax
 import numpy as np
 
 from jast import _checks
-from jast._threads import apart
+from jast._threads import run_in_thread
 from jast.episode import replay
 from jast.failures import collect, identity, merge
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.rewards import Lexicographic, likelihood
 from jast.search.refinement import refine as pull
@@ -92,7 +92,7 @@ def ended(
         return found
     work = lambda: _refined(jax.random.fold_in(key, ADDRESS), sim, reward, found, top, budget)
     try:
-        return apart(work) if hosted(sim) else work()
+        return run_in_thread(work) if runs_on_host(sim) else work()
     except KeyboardInterrupt:
         note = f"while refining, after all {found.episodes} episodes"
         return found._replace(settings=settings | dict(interrupted=note))
@@ -102,7 +102,7 @@ def _refined(
     key: jax.Array, sim: Simulator, reward: Any, found: SearchResult, top: int, budget: int
 ) -> SearchResult:
     archive = found.failures
-    first = archive[:FEW] if hosted(sim) else archive
+    first = archive[:FEW] if runs_on_host(sim) else archive
     given = collect(sim, likelihood(sim), first.episodes, top=len(first))
     # none where all are on a knife edge, or the density at the mode is infinite
     given = given[: int(np.isfinite(given.episodes.reward).sum())]

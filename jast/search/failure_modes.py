@@ -23,7 +23,7 @@ __all__ = ["Mode", "Modes", "modes"]
 UNKNOWN = (math.nan, math.nan)
 
 
-@results.shown()
+@results.printable()
 class Mode(NamedTuple):
     """One way to fail.
 

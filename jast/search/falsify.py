@@ -19,12 +19,12 @@ import numpy as np
 
 from jast import _checks
 from jast._jax import is_traced, is_tracing, jit
-from jast._threads import apart
-from jast.incidents import hosted, incidents, since
+from jast._threads import run_in_thread
+from jast.incidents import incidents, new_incidents, runs_on_host
 from jast.limit_state import check, normal_numbers, outcome, played
 from jast.outline import outline
-from jast.pytrees import count, in_lanes
-from jast.results import asked
+from jast.pytrees import count_numbers, map_in_lanes
+from jast.results import call_settings
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.search.result import History, SearchResult
@@ -121,18 +121,18 @@ def falsify(
     """
     name = "falsify"
     simulations, batch, top = E.whole(name, simulations=simulations, batch=batch, top=top)
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
     check(name, sim)
-    settings = asked(name, key, simulations=simulations, batch=batch, stop=int(stop))
+    settings = call_settings(name, key, simulations=simulations, batch=batch, stop=int(stop))
     work, before = _Work(sim, settings["seed"], batch, bool(stop)), incidents(sim)
     watch = Watch(name, simulations, "sim", progress, callback)
     found, done = in_pieces(work, work.nothing(), work.ends(simulations), watch)
     if done < simulations and not work.over:
         settings |= dict(interrupted=f"after {done} of {simulations} episodes")
     result = _result(sim, found, settings, top)
-    return result._replace(incidents=since(before, incidents(sim)))
+    return result._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 class _Work:
@@ -141,7 +141,11 @@ class _Work:
     def __init__(self, sim: Simulator, seed: Any, batch: int, stop: bool):
         about = outline(sim)
         self.sim, self.seed, self.batch, self.stop, self.over = sim, seed, batch, stop, False
-        self.k0, self.k, self.dtype = count(about.x0), count(about.x), normal_numbers(sim)
+        self.k0, self.k, self.dtype = (
+            count_numbers(about.x0),
+            count_numbers(about.x),
+            normal_numbers(sim),
+        )
 
     def nothing(self) -> _Found:
         rows, first = np.zeros((0, self.sim.horizon, self.k)), np.zeros((0, self.k0))
@@ -161,7 +165,7 @@ class _Work:
         u = np.concatenate([first, rows.reshape(n, -1)], axis=1)
         lanes = np.pad(u, ((0, self.batch - n), (0, 0)), mode="edge")
         ask = lambda: jax.device_get(_judged(self.sim, lanes.astype(self.dtype)))
-        o = jax.tree.map(lambda a: a[:n], apart(ask) if hosted(self.sim) else ask())
+        o = jax.tree.map(lambda a: a[:n], run_in_thread(ask) if runs_on_host(self.sim) else ask())
         score = np.where(o.invalid, np.inf, np.where(o.failure, -1, o.distance))
         new = score, rows, first, o.length
         every = (np.concatenate(p) for p in zip(pool, new, strict=True))
@@ -236,7 +240,7 @@ def _result(sim: Simulator, found: _Found, settings: dict, top: int) -> SearchRe
         np.concatenate([pool.first[0], pool.rows[0].ravel()])
     ]
     points = np.stack(points).astype(normal_numbers(sim))
-    e = played(sim, in_lanes(AT_ONCE, _normal, points))
+    e = played(sim, map_in_lanes(AT_ONCE, _normal, points))
     numbers = [i for i, _ in found.failing]
     failing = jax.tree.map(lambda a: a[: len(numbers)], e)
     ends, best, failures = zip(*found.moments, strict=True)

@@ -19,10 +19,10 @@ import numpy as np
 from jast import _checks, memory
 from jast._jax import is_traced, is_tracing
 from jast.contract import contract
-from jast.counter import generator, tree_keys
-from jast.incidents import hosted, incidents, since
+from jast.counter import numpy_generator, tree_keys
+from jast.incidents import incidents, new_incidents, runs_on_host
 from jast.outline import outline
-from jast.results import asked
+from jast.results import call_settings
 from jast.rewards import as_pytree
 from jast.search import cells as C
 from jast.search import kept as K
@@ -112,20 +112,22 @@ def go_explore(
     require_simulator(name, sim)
     episodes, top = E.whole(name, episodes=episodes, top=top)
     length = (
-        max(1, -(-sim.horizon // 8)) if length is None else _checks.whole(name, "length", length)
+        max(1, -(-sim.horizon // 8))
+        if length is None
+        else _checks.whole_number(name, "length", length)
     )
     expected = "from 0 to below 1"
     backward = _checks.number(name, "backward", backward, lambda v: 0 <= v < 1, expected)
     if cell is not None and not callable(cell):
         raise ValueError(f"{name}: cell must be a function of a state, received {cell!r}"[:200])
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
     contract(name, sim)
     cell = None if cell is None else _cell(name, sim, cell)
     numbers = dict(episodes=episodes, length=min(length, sim.horizon), backward=backward)
-    settings = planned(name, refine, sim, asked(name, key, **numbers), SHARE)
-    size = HOSTED if hosted(sim) else LANES
+    settings = planned(name, refine, sim, call_settings(name, key, **numbers), SHARE)
+    size = HOSTED if runs_on_host(sim) else LANES
     lanes = max(8, min(size, 1 << max(0, (episodes // 16).bit_length())))
     plan = P.Plan(lanes, min(length, sim.horizon), min(TRACES, lanes // 8))
     search = _Search(key, sim, cell, plan, episodes, int(episodes * (1 - backward)))
@@ -135,20 +137,20 @@ def go_explore(
     needed = 2 * memory.size(jax.eval_shape(partial(C.empty, sim, slots)))  # and those that enter
     memory.require(name, needed, f"{slots} states and the ways there", "use a smaller state")
     carry = C.empty(sim, slots), K.none(sim, max(top, 64), mark), None, 0
-    stretch = lanes if hosted(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
+    stretch = lanes if runs_on_host(sim) else lanes * max(1, episodes // (lanes * MOMENTS))
     ends = [*range(stretch, episodes, stretch), episodes]
     (_, kept, *_), log = E.drive(
         search.chunk,
         carry,
         ends,
-        host=hosted(sim),
+        host=runs_on_host(sim),
         progress=progress,
         callback=callback,
         name=name,
     )
     found = K.result(sim, search.reward, log, kept, settings, top)
     found = ended(key, sim, search.reward, found, top)
-    return found._replace(incidents=since(before, incidents(sim)))
+    return found._replace(incidents=new_incidents(before, incidents(sim)))
 
 
 def _cell(name, sim, cell):
@@ -167,7 +169,7 @@ class _Search:
     """What does not change while a search runs."""
 
     def __init__(self, key, sim, cell, plan, episodes, until):
-        self.key, self.rng = tree_keys(key, 1)[0], generator(jax.random.fold_in(key, 1))
+        self.key, self.rng = tree_keys(key, 1)[0], numpy_generator(jax.random.fold_in(key, 1))
         self.sim, self.cell, self.plan, self.reward = sim, cell, plan, K.likelihood(sim)
         self.episodes, self.until = episodes, until
 

@@ -14,9 +14,9 @@ from jast import _checks
 from jast import boundary as B
 from jast._jax import is_traced, is_tracing, jit
 from jast.episode import Episode, play_back
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.limit_state import check, dimension, normal_numbers, played, side_by_side
-from jast.results import asked
+from jast.results import call_settings
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.search.ending import ended, planned
@@ -86,17 +86,17 @@ def gradient(
     """
     name = "gradient"
     starts, top = E.whole(name, starts=starts, top=top)
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     if is_traced(key, sim) or is_tracing():
         raise ValueError(f"{name}: cannot be traced; call it outside of jax.jit and jax.vmap")
-    if hosted(sim):
+    if runs_on_host(sim):
         raise ValueError(
             f"{name}: sim runs on the host and has no gradients; jast.search.go_explore and"
             " jast.search.chain need none"
         )
     check(name, sim)
     search = _Search(key, sim, starts, top)
-    settings = planned(name, refine, sim, asked(name, key, starts=starts), SHARE)
+    settings = planned(name, refine, sim, call_settings(name, key, starts=starts), SHARE)
     cost = starts * (B.STEPS * GRADIENT + B.EPISODES)
     found, log = E.drive(
         search.chunk,

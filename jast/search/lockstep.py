@@ -15,9 +15,9 @@ import numpy as np
 from jax import lax
 
 from jast import failures as archive
-from jast._threads import apart
+from jast._threads import run_in_thread
+from jast.checkpoints import step_once
 from jast.episode import Episode, replay
-from jast.journal import stepped
 from jast.outline import outline
 from jast.progress import advance, begin, conclude
 from jast.search.result import History, SearchResult, Trials
@@ -263,8 +263,8 @@ def drive(chunk, carry, ends, *, host=False, trees=1, progress=False, callback=N
         carry, noted = kept
         make = lambda: chunk(carry, done, end)
         run = lambda: jax.block_until_ready(make())
-        step = (lambda: apart(run)) if host else run
-        carry, *news = stepped(step, carry, like=make)
+        step = (lambda: run_in_thread(run)) if host else run
+        carry, *news = step_once(step, carry, like=make)
         return carry, note(noted, end, *jax.device_get(news))
 
     whole = ends[-1] * trees

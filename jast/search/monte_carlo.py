@@ -16,9 +16,9 @@ from jax import lax
 from jast import actions as choices
 from jast import units
 from jast._jax import jit, quick
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.counter import tree_keys
-from jast.incidents import hosted, incidents, merged, since
+from jast.incidents import incidents, merge_incidents, new_incidents, runs_on_host
 from jast.memory import require
 from jast.outline import outline
 from jast.places import Task
@@ -131,10 +131,12 @@ def monte_carlo(
         "monte_carlo", key, sim, reward, actions, episodes=episodes
     )
     settings = planned("monte_carlo", refine, sim, settings, usual(sim, reward))
-    lanes = HOSTED if hosted(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
+    lanes = HOSTED if runs_on_host(sim) else min(LANES, max(128, 1 << (episodes - 1).bit_length()))
     own, key = key, tree_keys(key, 1)[0]
     if settings is None:
-        units.not_traced("monte_carlo", checkpoint=checkpoint, executor=executor, devices=devices)
+        units.require_untraced(
+            "monte_carlo", checkpoint=checkpoint, executor=executor, devices=devices
+        )
         if episodes * sim.horizon >= 2**31:
             raise ValueError(
                 "monte_carlo: episodes times the horizon must be below 2^31 inside a"
@@ -150,11 +152,13 @@ def monte_carlo(
         require("monte_carlo", 2 * episodes * row, records, "use fewer, or record=False")
 
     most = (2**31 - 1) // (lanes * sim.horizon)  # the steps of a chunk are counted in int32
-    blocks = 1 if record or hosted(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
+    blocks = (
+        1 if record or runs_on_host(sim) else max(1, min(-(-episodes // (lanes * MOMENTS)), most))
+    )
     stride = blocks * lanes
     job = Job(key, sim, reward, actions, _nothing(sim, top), episodes, stride, lanes, bool(record))
     with (
-        stored("monte_carlo", checkpoint, own, top=top, **asked) as store,
+        open_checkpoint("monte_carlo", checkpoint, own, top=top, **asked) as store,
         Watch("monte_carlo", episodes, "sim", progress, callback) as watch,
     ):
         ran = units.run(
@@ -163,12 +167,12 @@ def monte_carlo(
             partial(_with, job),
             (jax.device_get(job.nothing), E.NOTHING),
             watch,
-            units.ways("monte_carlo", executor, devices, store),
+            units.placement("monte_carlo", executor, devices, store),
             size=lambda done: min(done * stride, episodes),
             words=lambda kept: E.in_words(kept[1]),
         )
     found, noted = ran.state
-    log = E.logged(noted, units.note("episodes", ran, noted.tally.episodes, episodes))
+    log = E.logged(noted, units.describe_missing("episodes", ran, noted.tally.episodes, episodes))
     found = jax.device_get(found)
     numbers = np.concatenate([found.number[None], found.top_number])
     rebuilt = jax.device_get(_rebuild(key, sim, reward, actions, numbers))
@@ -190,8 +194,8 @@ def monte_carlo(
         top,
     )
     found = ended(own, sim, reward, found, top)
-    here = since(before, incidents(sim))
-    return found._replace(incidents=merged(here, ran.incidents))
+    here = new_incidents(before, incidents(sim))
+    return found._replace(incidents=merge_incidents(here, ran.incidents))
 
 
 class Job(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 from jast.judge import Judge
 from jast.limit_state import unit
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.simulator import Simulator
 
 __all__ = ["Paths", "assigned", "components", "moved_in_time", "nearest"]
@@ -243,7 +243,7 @@ def moved_in_time(sim: Simulator, v: np.ndarray, steps: np.ndarray) -> np.ndarra
     """The points ``v`` [n, D] with their disturbances so many ``steps`` [n] later, sooner where
     negative; what comes in is the mode. On the host.
     """
-    first, n = count(outline(sim).x0), len(v)
+    first, n = count_numbers(outline(sim).x0), len(v)
     rows, t = v[:, first:].reshape(n, sim.horizon, -1), np.arange(sim.horizon) - steps[:, None]
     inside = (t >= 0) & (t < sim.horizon)
     moved = np.take_along_axis(rows, np.clip(t, 0, sim.horizon - 1)[..., None], axis=1)

@@ -16,10 +16,10 @@ from jax import lax
 from jast import actions as choices
 from jast import failures as archive
 from jast._jax import is_tracing, jit
-from jast._threads import apart
+from jast._threads import run_in_thread
 from jast.counter import tree_keys
 from jast.episode import Episode, play_back
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.rewards import LogLikelihood
 from jast.search import lockstep as E
@@ -63,9 +63,11 @@ def fly(sim: Simulator, density: str, widen: str) -> Pilot:
             nothing else points to failures, as all plain episodes have one miss distance.
     """
     widths = 1 if widen == "never" else len(WIDTHS)
-    host = hosted(sim)
+    host = runs_on_host(sim)
     run = lambda: _fly(sim, density, widths, widen == "blind", HOSTED if host else EPISODES)
-    return apart(lambda: jax.block_until_ready(run())) if host and not is_tracing() else run()
+    return (
+        run_in_thread(lambda: jax.block_until_ready(run())) if host and not is_tracing() else run()
+    )
 
 
 @partial(jit, static_argnames=("density", "widths", "blind", "lanes"))

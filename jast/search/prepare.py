@@ -9,11 +9,11 @@ import jax
 
 from jast import actions as choices
 from jast import rewards
-from jast._checks import random_key
+from jast._checks import check_random_key
 from jast._jax import is_traced, is_tracing
 from jast.contract import ACTIONS, contract
 from jast.outline import outline
-from jast.results import asked
+from jast.results import call_settings
 from jast.search.pilot import Pilot, fly
 from jast.simulator import Simulator
 
@@ -53,7 +53,7 @@ def prepare(
     """The `Ready` of a search by the name ``function``, of its arguments and other ``settings``;
     ``widen`` of `jast.search.pilot.fly`. ValueError unless `contract` holds.
     """
-    random_key(function, key)
+    check_random_key(function, key)
     contract(function, sim, actions)
     reward = rewards.lexicographic() if reward is None else reward
     reward, actions, pilot = _scaled(sim, reward, actions, widen)
@@ -62,7 +62,7 @@ def prepare(
         return Ready(reward, actions, None, pilot)
     func = getattr(reward, "func", reward)
     name = getattr(func, "__name__", None) or f"rewards.{type(func).__name__.lower()}"
-    settings = asked(function, key, **settings) | dict(
+    settings = call_settings(function, key, **settings) | dict(
         reward=name,
         reward_settings=_settings(reward),
         actions=ACTIONS.get(type(actions), type(actions).__name__),

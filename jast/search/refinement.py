@@ -8,16 +8,15 @@ import jax
 import numpy as np
 
 from jast import _checks, results
-from jast.checkpoints import stored
-from jast.counter import generator
+from jast.checkpoints import keep_answers, open_checkpoint
+from jast.counter import numpy_generator
 from jast.episode import Episode, replay
 from jast.failures import Failures, collect, empty
-from jast.incidents import hosted
-from jast.journal import kept
+from jast.incidents import runs_on_host
 from jast.limit_state import check, normal_of, played, unit
 from jast.outline import outline
-from jast.pytrees import count
-from jast.results import asked
+from jast.pytrees import count_numbers
+from jast.results import call_settings
 from jast.rewards import likelihood
 from jast.search import moves as M
 from jast.search.centred import centred
@@ -47,7 +46,7 @@ on.
 LIFTS = 0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 class Refined(NamedTuple):
     """Failures, pulled to where they are likeliest.
 
@@ -132,11 +131,11 @@ def refine(
         True
     """
     name = "refine"
-    _checks.random_key(name, key)
-    budget = _checks.whole(name, "budget", budget, 100)
+    _checks.check_random_key(name, key)
+    budget = _checks.whole_number(name, "budget", budget, 100)
     check(name, sim)
-    gradients = bool(gradients) and not hosted(sim)
-    settings = asked(name, key, budget=budget, gradients=int(gradients))
+    gradients = bool(gradients) and not runs_on_host(sim)
+    settings = call_settings(name, key, budget=budget, gradients=int(gradients))
     given = failures.episodes if isinstance(failures, Failures) else failures
     if not isinstance(given, Episode):
         raise ValueError(
@@ -147,8 +146,8 @@ def refine(
         given = jax.tree.map(lambda a: np.asarray(a)[None], given)
     given = jax.device_get(given._replace(states=None))
     about = dict(sim=sim, failures=given, budget=budget, gradients=gradients)
-    with stored(name, checkpoint, key, **about) as store, kept(store):
-        work = _Work(generator(key), sim, given, gradients)
+    with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
+        work = _Work(numpy_generator(key), sim, given, gradients)
         work.run(budget)
         return work.result(settings)
 
@@ -174,7 +173,7 @@ class _Work:
 
     def __init__(self, rng, sim, given, gradients):
         self.rng, self.sim, self.given, self.gradients = rng, sim, given, gradients
-        self.centred, self.first = centred(sim), count(outline(sim).x0)
+        self.centred, self.first = centred(sim), count_numbers(outline(sim).x0)
         self.v = normal_of(self.centred, given)
         self.value = np.asarray(given.reward, np.float64)
         self.left = list(np.argsort(-self.value, kind="stable"))

@@ -18,7 +18,7 @@ from jast.search.refinement import Refined
 __all__ = ["History", "SearchResult", "Trials", "table"]
 
 
-@results.shown()
+@results.printable()
 class History(NamedTuple):
     """How the search went, at C moments of it.
 
@@ -43,7 +43,7 @@ class History(NamedTuple):
         return self.failing
 
 
-@results.shown()
+@results.printable()
 class Trials(NamedTuple):
     """Every simulated episode of a search, [n, trees]: n of each tree, in the order in which they
     were simulated.
@@ -83,7 +83,7 @@ class Trials(NamedTuple):
         return dataframe(columns, ["tree", "episode"])
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 class SearchResult(NamedTuple):
     """The outcome of a search; on the host, NumPy and Python numbers. Under `jax.jit` or `jax.vmap`
     all are traced arrays and ``failures`` is None.

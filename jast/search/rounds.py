@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jast._jax import quick
+from jast.checkpoints import step_once
 from jast.episode import rollout
-from jast.incidents import hosted
-from jast.journal import stepped
+from jast.incidents import runs_on_host
 from jast.judge import judged
 from jast.limit_state import Outcomes, policy_of
-from jast.pytrees import in_lanes
+from jast.pytrees import map_in_lanes
 from jast.rewards import likelihood
 from jast.search import moves as M
 from jast.simulator import Simulator
@@ -83,7 +83,7 @@ def _judged(sim: Simulator, v: np.ndarray) -> Outcomes:
     at a time: its programs then have few shapes.
     """
     n, k, d = v.shape
-    parts = v if hosted(sim) else v.reshape(1, n * k, d)
+    parts = v if runs_on_host(sim) else v.reshape(1, n * k, d)
     found = [judged(sim, part) for part in parts]
     return Outcomes(*(np.concatenate(a).reshape(n, k) for a in zip(*found, strict=True)))
 
@@ -100,8 +100,8 @@ def _gradients(sim, points):
     """
     v = (1 - np.minimum(points.gap, OUTSIDE))[:, None] * points.v
     v = np.where(v == 0, -ASIDE * np.sign(points.slope), v).astype(points.v.dtype)
-    run = lambda v: in_lanes(GROUP, lambda v: _slopes(sim, v), v)
-    found = stepped(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
+    run = lambda v: map_in_lanes(GROUP, lambda v: _slopes(sim, v), v)
+    found = step_once(lambda: run(v), v, like=lambda: jnp.zeros((len(v), 2, v.shape[1]), v.dtype))
     return found[:, 0], found[:, 1]
 
 

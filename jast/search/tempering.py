@@ -16,7 +16,7 @@ from jast.distributions.numbers import unflat
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import proposed
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 from jast.search import kept as K
 from jast.search import lockstep as E
 from jast.simulator import Simulator
@@ -144,7 +144,7 @@ def _exchanged(chains, widths, key, turn):
 def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> E.Played:
     """The episodes of the points ``z`` [n, D], with their disturbances."""
     like = outline(sim)
-    size = count(like.x0)
+    size = count_numbers(like.x0)
     z0 = jax.vmap(lambda row: unflat(row[:size], like.x0))(z)
     steps = jax.vmap(jax.vmap(lambda row: unflat(row, like.x)))(
         z[:, size:].reshape(len(z), sim.horizon, -1)
@@ -158,7 +158,7 @@ def play(sim: Simulator, reward: Any, z: jax.Array, live: jax.Array) -> E.Played
 def _state(sim, played, live):
     """Of played episodes: how many of the numbers decided them, whether they failed, distances."""
     like, e = outline(sim), played.episode
-    used = count(like.x0) + e.length * count(like.x)
+    used = count_numbers(like.x0) + e.length * count_numbers(like.x)
     distance = jnp.where(live & ~played.invalid, e.distance, jnp.inf)
     return used.astype(jnp.int32), e.failure & live, distance
 

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import real, whole
+from jast._checks import real_number, whole_number
 from jast.blackbox import from_python
 from jast.distributions import Independent, Normal
 
@@ -121,9 +121,9 @@ def bluesky(
         >>> horizon
         3
     """
-    waypoints = whole("bluesky", "waypoints", waypoints)
+    waypoints = whole_number("bluesky", "waypoints", waypoints)
     tolerance = float(
-        real("bluesky", "tolerance", tolerance, lambda v: 0 < v < np.inf, "of nmi above 0")
+        real_number("bluesky", "tolerance", tolerance, lambda v: 0 < v < np.inf, "of nmi above 0")
     )
     _installed()
     disturbance = Independent(Normal(jnp.asarray(MEANS), jnp.asarray(SIGMAS)), 1)

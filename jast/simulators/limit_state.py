@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast.distributions import MultivariateNormalDiag
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 from jast.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def limit_state(g: Callable[[Any], chex.Array], dimension: int) -> Simulator:
         )
     if not callable(g):
         raise ValueError(f"limit_state: g must be a function, received {g!r}")
-    g = bound(g)
+    g = as_partial(g)
     origin = jnp.zeros((dimension,))
     try:
         value = jax.eval_shape(lambda: g(origin))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
-from jast._checks import real, whole
+from jast._checks import real_number, whole_number
 from jast._jax import is_traced
 from jast.distributions import Categorical
 from jast.simulator import Simulator
@@ -47,7 +47,7 @@ def ruin(up: chex.Numeric = 0.4, start: int = 1, goal: int = 30, horizon: int = 
     """
     up = _probability("ruin", up)
     start, goal = (
-        v if is_traced(v) else whole("ruin", name, v)
+        v if is_traced(v) else whole_number("ruin", name, v)
         for name, v in (("start", start), ("goal", goal))
     )
     if not is_traced(start) and not is_traced(goal) and goal <= start:
@@ -105,7 +105,7 @@ def ruin_probability(
 
 
 def _probability(function, up):
-    up = real(function, "up", up, lambda p: 0 < p < 1, "between 0 and 1")
+    up = real_number(function, "up", up, lambda p: 0 < p < 1, "between 0 and 1")
     return up.astype(up.dtype)  # no longer weakly typed
 
 

@@ -2,7 +2,7 @@
 broke and when, and simulators whose failure is the violation.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.specs.formulas import Formula, always, eventually, implies, predicate, until
 from jast.specs.parts import Part, Parts, parts
 from jast.specs.robustness import robustness
@@ -24,4 +24,4 @@ __all__ = [
     "under",
     "until",
 ]
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 
 __all__ = [
     "Formula",
@@ -169,7 +169,7 @@ def predicate(fn: Callable[[Any], Any], name: str | None = None) -> Formula:
         name = own if own.isidentifier() else "predicate"
     if not isinstance(name, str) or not name:
         raise ValueError(f"predicate: name must be a text, received {name!r}")
-    return Predicate(bound(fn), name)
+    return Predicate(as_partial(fn), name)
 
 
 def always(f: Formula, a: float = 0.0, b: float | None = None) -> Formula:

@@ -42,7 +42,7 @@ class Part(NamedTuple):
     """[T] its robustness at each moment, windows clipped at the trace's end."""
 
 
-@results.shown()
+@results.printable()
 class Parts(NamedTuple):
     """What `parts` found: prints as a table, a long formula on several lines.
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jast._checks import real
+from jast._checks import real_number
 from jast._jax import is_traced
 from jast.specs import windows
 from jast.specs.formulas import (
@@ -89,7 +89,9 @@ def robustness(
     """
     dt, length = spacing("robustness", dt), _length("robustness", trace)
     if temperature is not None:
-        temperature = real("robustness", "temperature", temperature, lambda v: v > 0, "above 0")
+        temperature = real_number(
+            "robustness", "temperature", temperature, lambda v: v > 0, "above 0"
+        )
     if not goes_on:
         fits("robustness", formula, length, dt)
     found = _robustness(formula, trace, temperature, dt, goes_on)

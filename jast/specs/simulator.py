@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 from jast.contract import contract
 from jast.episode import Episode
 from jast.outline import outline
-from jast.pytrees import bound
+from jast.pytrees import as_partial
 from jast.simulator import Simulator
 from jast.specs import monitor
 from jast.specs.formulas import Formula, predicates
@@ -117,7 +117,7 @@ def under(
     if samples is not None and not callable(samples):
         raise ValueError(f"under: samples must be a function of the state, received {samples!r}")
     contract("under", sim)
-    samples = samples if samples is None else bound(samples)
+    samples = samples if samples is None else as_partial(samples)
     about, dt = outline(sim), spacing("under", dt)
     watch = _Watch(sim=sim, formula=formula, samples=samples, dt=dt, total=0)
     rows = jax.eval_shape(lambda: _samples_of(watch, _zeros(about.state)))

@@ -15,7 +15,7 @@ from jast.episode import Episode
 from jast.estimate.design_points import design_points
 from jast.estimate.populations import cool, explore
 from jast.failures import empty
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.outline import outline
 from jast.rewards import likelihood
 from jast.search.cem import cem
@@ -146,7 +146,7 @@ def explorers_of(sim: Simulator, budget: int) -> dict[str, int]:
     chosen, left = [], budget
     for name, least in LEAST.items():
         fits = (quantiles or name not in LATENT) and least <= left
-        if fits and (name != "gradients" or (floats and not hosted(sim))):
+        if fits and (name != "gradients" or (floats and not runs_on_host(sim))):
             chosen.append(name)
             left -= least
     return {name: LEAST[name] + left // len(chosen) for name in chosen}

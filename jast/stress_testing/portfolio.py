@@ -13,7 +13,7 @@ import numpy as np
 from jast import _checks, units
 from jast import limit_state as latent
 from jast._jax import briefly
-from jast.checkpoints import stored
+from jast.checkpoints import keep_answers, open_checkpoint
 from jast.contract import check
 from jast.crude import BRIEF, nominal
 from jast.episode import rollout
@@ -26,9 +26,8 @@ from jast.estimate.population import by_populations
 from jast.estimate.redrawn import redrawn
 from jast.estimate.sample import Sample
 from jast.failures import Failures, collect, empty, merge
-from jast.journal import kept
 from jast.outline import outline
-from jast.results import asked
+from jast.results import call_settings
 from jast.rewards import likelihood
 from jast.search.failure_modes import Mode, Modes, modes, spread
 from jast.search.refinement import refine
@@ -128,11 +127,11 @@ def stress(
         (True, True)
     """
     name = "stress"
-    _checks.random_key(name, key)
+    _checks.check_random_key(name, key)
     budgets.given(name, budget, seconds)
     if budget is not None:
-        budget = _checks.whole(name, "budget", budget, LEAST)
-    top = _checks.whole(name, "top", top, 1)
+        budget = _checks.whole_number(name, "budget", budget, LEAST)
+    top = _checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
     check(sim)
     about = outline(sim)
@@ -141,11 +140,11 @@ def stress(
         budget = PORTFOLIO
     if budget is None:
         budget = budgets.budget_of(name, key, sim, seconds, LEAST, PORTFOLIO)
-    settings = asked(name, key, budget=budget, top=top)
-    ways = units.ways(name, executor, devices)
+    settings = call_settings(name, key, budget=budget, top=top)
+    ways = units.placement(name, executor, devices)
     with (
-        stored(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
-        kept(store),
+        open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
+        keep_answers(store),
         briefly(not budgets.cheap(sim, budget)),
         Watch(name, budget, "sim", progress, callback) as watch,
     ):

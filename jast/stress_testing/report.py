@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Report", "Tried"]
 
 
-@results.shown()
+@results.printable()
 class Tried(NamedTuple):
     """One piece of the work.
 
@@ -40,7 +40,7 @@ class Tried(NamedTuple):
     """log p relative to the mode of the likeliest of them; -inf without one."""
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 class Report(NamedTuple):
     """The outcome of `jast.stress`.
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jast import limit_state as latent
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate.batches import resampled
 from jast.estimate.redrawn import redrawn
 from jast.estimate.sample import Sample
@@ -125,7 +125,7 @@ def _failures(key, sim, q, n):
     were, and evaluations.
     """
     if isinstance(q, Sample):  # which have been run
-        rows = resampled(q.log_weight, n // PART, generator(key).random())
+        rows = resampled(q.log_weight, n // PART, numpy_generator(key).random())
         return q.points[rows], q.group[rows], len(q.points), 0
     z, o, log_w = redrawn(key, sim, q, n)
     if not (failing := int(o.failure.sum())):

@@ -9,12 +9,13 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jast.contract import contract
-from jast.incidents import hosted
+from jast.incidents import runs_on_host
 from jast.simulator import Simulator
 
-__all__ = ["batch", "kinds"]
+__all__ = ["count_kinds", "make_simulators"]
 
 Made = list[Simulator | Exception]
+"""Simulators, or what their making raised."""
 
 
 class Part(NamedTuple):
@@ -29,7 +30,9 @@ class Part(NamedTuple):
         return getattr(self.make(**settings), self.name)(*args)
 
 
-def batch(make: Callable[..., Simulator] | Sequence, rows: Sequence[Mapping[str, Any]]) -> Made:
+def make_simulators(
+    make: Callable[..., Simulator] | Sequence, rows: Sequence[Mapping[str, Any]]
+) -> Made:
     """A `Simulator` for each of ``rows``, or what its making raised.
 
     Args:
@@ -40,19 +43,20 @@ def batch(make: Callable[..., Simulator] | Sequence, rows: Sequence[Mapping[str,
         They share one program where they are of one kind as ``make`` makes them, or where it can
         be traced: then it is called inside of the programs, with its settings as arguments.
     """
-    made = [_made(make, row, i) for i, row in enumerate(rows)]
-    if callable(make) and kinds(made) > 1 and not any(map(hosted, _good(made))):
+    made = [_make_one(make, row, i) for i, row in enumerate(rows)]
+    if callable(make) and count_kinds(made) > 1 and not any(map(runs_on_host, _simulators(made))):
         traced = [
-            s if isinstance(s, Exception) else _traced(make, s, r) for s, r in zip(made, rows)
+            s if isinstance(s, Exception) else _with_settings(make, s, r)
+            for s, r in zip(made, rows)
         ]
-        if kinds(traced) == 1 and _works(_good(traced)[0]):
+        if count_kinds(traced) == 1 and _can_be_traced(_simulators(traced)[0]):
             return traced
     return made
 
 
-def kinds(made: Made) -> int:
+def count_kinds(made: Made) -> int:
     """How many kinds of simulators there are, each of which compiles its own programs."""
-    return len({_kind(s) for s in _good(made)})
+    return len({_kind(s) for s in _simulators(made)})
 
 
 def _kind(sim):
@@ -60,11 +64,11 @@ def _kind(sim):
     return structure, tuple((np.shape(a), getattr(a, "dtype", type(a))) for a in leaves)
 
 
-def _good(made: Made) -> list[Simulator]:
+def _simulators(made: Made) -> list[Simulator]:
     return [s for s in made if not isinstance(s, Exception)]
 
 
-def _made(make, row, i):
+def _make_one(make, row, i):
     try:
         sim = make(**row) if callable(make) else make[i]
         if isinstance(sim, Simulator):
@@ -74,7 +78,7 @@ def _made(make, row, i):
         return error
 
 
-def _traced(make, sim, row):
+def _with_settings(make, sim, row):
     """``sim`` with its settings as arguments of its functions."""
     static = {f.name for f in fields(sim) if f.metadata.get("static")}
     functions = {
@@ -83,7 +87,7 @@ def _traced(make, sim, row):
     return Simulator(**functions, **{name: getattr(sim, name) for name in static})
 
 
-def _works(sim):
+def _can_be_traced(sim):
     """Whether the functions of ``sim`` can be traced with its settings as arguments."""
 
     def trace(sim):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from jast.counter import generator
+from jast.counter import numpy_generator
 from jast.estimate import Estimate
 from jast.estimate.agreement import APART, BLUNT
 from jast.estimate.budgets import cheap
@@ -28,51 +28,51 @@ from jast.intervals import log_normal
 from jast.judge import judged
 from jast.limit_state import Latent, dimension
 from jast.outline import outline
-from jast.pytrees import count
+from jast.pytrees import count_numbers
 
 if TYPE_CHECKING:
     from jast.simulator import Simulator
 
-__all__ = ["Joined", "joined"]
+__all__ = ["Curve", "join_rows"]
 
 
-class Joined(NamedTuple):
+class Curve(NamedTuple):
     """The rows of a sweep as one curve. NaN where a row takes no part."""
 
     curve: np.ndarray
-    """[N, 3] probability, and the ends of its interval"""
+    """[N, 3] probability, and the ends of its interval."""
     ratios: np.ndarray
-    """[N - 1, 3] likewise of the probability of the next row over that of a row"""
+    """[N - 1, 3] likewise of the probability of the next row over that of a row."""
     apart: tuple[int, ...]
-    """Rows that contradict the ratio to the next one"""
+    """Rows that contradict the ratio to the next one."""
     episodes: int
-    """Simulated for the ratios"""
+    """Simulated for the ratios."""
 
 
 class Row(NamedTuple):
     """The failures of a row."""
 
     error: float
-    """Standard error of its log probability"""
+    """Standard error of its log probability."""
     points: np.ndarray
-    """[m, D]"""
+    """[m, D]."""
     share: np.ndarray
-    """[m] weights, of sum 1"""
+    """[m] weights, of sum 1."""
     family: np.ndarray
-    """[m] from 0 on; members of one are not independent"""
+    """[m] from 0 on; members of one are not independent."""
 
-    def carried(self) -> np.ndarray:
+    def family_shares(self) -> np.ndarray:
         """[G] shares of the families."""
         return np.bincount(self.family, self.share)
 
-    def own(self) -> np.ndarray:
+    def moves(self) -> np.ndarray:
         """[G] by what each family moves the log probability. They may be a part of all draws, or
         one of two ways that were pooled, whose weight is then that of its inverse variance.
         """
-        share = self.carried()
+        share = self.family_shares()
         return min(self.error**2 / (share @ share), 1.0) * share
 
-    def seen_by(self, sim: Simulator) -> tuple[float, np.ndarray]:
+    def share_failing_in(self, sim: Simulator) -> tuple[float, np.ndarray]:
         """The log of the share that fails in ``sim`` too, and by what each family moves it [G]; NaN
         where that is too much.
         """
@@ -82,10 +82,10 @@ class Row(NamedTuple):
         return (math.log(share) if moves @ moves < BLUNT**2 else math.nan), moves
 
 
-def joined(
+def join_rows(
     keys: Sequence[jax.Array], made: Sequence[Simulator], found: Sequence[Any]
-) -> Joined | None:
-    """The `Joined` of the results ``found`` of `jast.estimate.failure_probability` with ``keys`` on
+) -> Curve | None:
+    """The `Curve` of the results ``found`` of `jast.estimate.failure_probability` with ``keys`` on
     systems of one kind; None where no two of them can be joined.
     """
     places = np.array([i for i, each in enumerate(zip(made, found)) if _takes_part(*each)], int)
@@ -93,7 +93,7 @@ def joined(
     m, n = len(chain), len(found)
     if m < 2:
         return None
-    said, covariance, episodes = _said(chain)
+    said, covariance, episodes = _measure(chain)
     steps = np.diff(np.eye(m), axis=0)
     against = np.concatenate([steps, -np.eye(m - 1)], axis=1)
     spread = np.sqrt(np.diagonal(against @ covariance @ against.T))
@@ -101,9 +101,9 @@ def joined(
     used = np.isfinite(said)
     used[m:] &= ~apart
     of_curve = np.concatenate([np.eye(m), steps])[used]
-    weighed = np.linalg.solve(covariance[np.ix_(used, used)], of_curve)
-    covariance = np.linalg.inv(of_curve.T @ weighed)
-    logs = covariance @ weighed.T @ said[used]
+    weighted = np.linalg.solve(covariance[np.ix_(used, used)], of_curve)
+    covariance = np.linalg.inv(of_curve.T @ weighted)
+    logs = covariance @ weighted.T @ said[used]
     errors, level = np.sqrt(np.diagonal(covariance)), chain[0][2].level
     curve, ratios = np.full((n, 3), np.nan), np.full((n - 1, 3), np.nan)
     for k in np.flatnonzero(np.append(used[m:], False) | np.append(False, used[m:])):
@@ -113,10 +113,10 @@ def joined(
     errors = np.sqrt(np.diagonal(steps @ covariance @ steps.T))
     for k in np.flatnonzero(np.diff(places) == 1):
         ratios[places[k]] = np.exp(steps[k] @ logs + half * errors[k])
-    return Joined(curve, ratios, tuple(places[:-1][apart].tolist()), episodes)
+    return Curve(curve, ratios, tuple(places[:-1][apart].tolist()), episodes)
 
 
-def _said(chain):
+def _measure(chain):
     """What m rows (key, simulator, `Estimate`) say, log probabilities [m] and then log ratios
     [m - 1], NaN where these are not known; the covariance of both; and the episodes that it took.
     """
@@ -124,16 +124,16 @@ def _said(chain):
     said = np.array([float(r.log_mean) for _, _, r in chain] + [0.0] * (m - 1))
     covariance = np.zeros((2 * m - 1, 2 * m - 1))
     for k, each in enumerate(chain):
-        row = _row(*each)  # of one at a time, as points may be many
-        moves = {k: row.own()}
+        row = _row_of(*each)  # of one at a time, as points may be many
+        moves = {k: row.moves()}
         for j, sign in ((k - 1, -1), (k + 1, 1)):
             if 0 <= j < m:
                 at = m + min(j, k)
-                log_share, of_share = row.seen_by(chain[j][1])
+                log_share, of_share = row.share_failing_in(chain[j][1])
                 said[at] += sign * log_share
                 moves[at] = sign * of_share
                 # a share of 1 is known to one effective failure
-                covariance[at, at] += np.sum(row.carried() ** 2) ** 2
+                covariance[at, at] += np.sum(row.family_shares() ** 2) ** 2
                 episodes += len(row.points)
         which, columns = list(moves), np.stack(list(moves.values()))
         covariance[np.ix_(which, which)] += columns @ columns.T
@@ -147,7 +147,7 @@ def _takes_part(sim, r):
     return good and r.draws is not None and isinstance(r.draws.source, Sample | Latent)
 
 
-def _row(key, sim, r):
+def _row_of(key, sim, r):
     """The `Row` of a result that takes part."""
     if isinstance(r.proposal, Sample) and isinstance(r.draws.source, Sample):
         sample = r.proposal
@@ -156,9 +156,9 @@ def _row(key, sim, r):
         most = SETTINGS.numbers // dimension(sim)
         points, log_w, length, _ = failing(sim, r.draws, most)
         about, family = outline(sim), np.arange(len(points))
-        used = count(about.x0) + length * count(about.x)
+        used = count_numbers(about.x0) + length * count_numbers(about.x)
     # what its own episode did not use may decide a neighbour's, so it is drawn from the model
-    new = generator(key, 8).standard_normal(points.shape).astype(points.dtype)
+    new = numpy_generator(key, 8).standard_normal(points.shape).astype(points.dtype)
     points = np.where(np.arange(points.shape[1]) < used[:, None], points, new)
     share = np.exp(log_w - np.logaddexp.reduce(log_w))
     return Row(r.relative_error, points, share, family)

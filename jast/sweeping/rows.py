@@ -12,30 +12,30 @@ import numpy as np
 
 from jast import files, units
 from jast._jax import was_interrupted
-from jast.places import Post, Task
+from jast.places import Task, UnitContext
 
 if TYPE_CHECKING:
-    from jast.checkpoints import Store
+    from jast.checkpoints import Checkpoint
     from jast.simulator import Simulator
     from jast.typing import Executor
     from jast.watch import Watch
 
-__all__ = ["Rows", "elsewhere", "here", "options_of"]
+__all__ = ["Rows", "options_of", "run_here", "run_in_executor"]
 
 ROW = "row"
 Outcome = tuple[Any, Exception | None]
-"""What the function returned, or what was raised"""
+"""What the function returned, or what was raised."""
 
 
 class Rows(NamedTuple):
-    """What is to be done."""
+    """What is to be done, row by row."""
 
     function: Callable[..., Any]
     keys: Sequence[jax.Array]
     made: Sequence[Simulator | Exception]
     options: Sequence[Mapping[str, Any]]
     keeps: bool
-    """Whether results are to be kept, and so made into bytes"""
+    """Whether results are to be kept, and so made into bytes."""
 
 
 class Found(NamedTuple):
@@ -43,7 +43,7 @@ class Found(NamedTuple):
 
     outcomes: list[Outcome]
     ended: str = ""
-    """Words of what ended them early, where it was no interruption"""
+    """Words of what ended them early, where it was no interruption."""
 
 
 def options_of(
@@ -57,7 +57,7 @@ def options_of(
     return [{**options, "checkpoint": Path(folder) / f"row-{i}"} for i in range(n)]
 
 
-def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
+def run_here(rows: Rows, follow: bool, store: Checkpoint | None, watch: Watch) -> Found:
     """One row after the other in this thread; ``follow``: each is given the result before it.
     KeyboardInterrupt where one meets the first row.
     """
@@ -65,10 +65,10 @@ def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
     try:
         for i, sim in enumerate(rows.made):
             kept = None if store is None else store.get(i, ROW)
-            outcome = _unit(rows, i, Post(), near) if kept is None else kept[0]
+            outcome = _run_row(rows, i, UnitContext(), near) if kept is None else kept[0]
             if kept is None and store is not None and _is_kept(outcome):
                 store.put(i, [outcome], ROW)
-            result, error = _opened(outcome, sim)
+            result, error = _unpack(outcome, sim)
             found.append((result, error))
             if follow and error is None:
                 near = {"near": result}
@@ -81,21 +81,26 @@ def here(rows: Rows, follow: bool, store: Store | None, watch: Watch) -> Found:
     return Found(found)
 
 
-def elsewhere(rows: Rows, executor: Executor, store: Store | None, watch: Watch) -> Found:
+def run_in_executor(
+    rows: Rows, executor: Executor, store: Checkpoint | None, watch: Watch
+) -> Found:
     """Each row a unit of `jast.units` in the processes of ``executor``: one whose process dies is
     tried again twice, and then has an error.
     """
-    fold = lambda done, i, outcome: {**done, i: _opened(outcome, rows.made[i])}
-    ways = units.Ways(executor, None, store, ROW, _is_kept)
-    ran = units.run(Task(_unit, rows, lambda: 0), len(rows.made), fold, {}, watch, ways)
+
+    def fold(done, i, outcome):
+        return {**done, i: _unpack(outcome, rows.made[i])}
+
+    where = units.Placement(executor, None, store, ROW, _is_kept)
+    ran = units.run(Task(_run_row, rows, lambda: 0), len(rows.made), fold, {}, watch, where)
     lost = "left out, since its process failed in every attempt"
     found = [ran.state.get(i, (None, RuntimeError(lost))) for i in range(ran.done)]
     cut = next((i for i, (result, _) in enumerate(found, 1) if _ended_early(result)), len(found))
     return Found(found[:cut], ran.ended or "")
 
 
-def _unit(
-    rows: Rows, i: int, post: Post, near: Mapping[str, Any] | None = None
+def _run_row(
+    rows: Rows, i: int, context: UnitContext, near: Mapping[str, Any] | None = None
 ) -> np.ndarray[Any, Any]:
     """Row ``i``: the bytes of its result where that is to be kept, else an array [] that holds its
     `Outcome`.
@@ -105,7 +110,7 @@ def _unit(
             raise rows.made[i]
         result = rows.function(rows.keys[i], rows.made[i], **rows.options[i], **(near or {}))
         if rows.keeps and not _ended_early(result):
-            return np.frombuffer(files.packed(result), np.uint8)
+            return np.frombuffer(files.to_bytes(result), np.uint8)
         outcome = result, None
     except Exception as error:
         if was_interrupted(error):
@@ -123,9 +128,9 @@ def _is_kept(outcome: np.ndarray[Any, Any]) -> bool:
     return outcome.dtype == np.uint8
 
 
-def _opened(outcome: np.ndarray[Any, Any], sim: Any) -> Outcome:
+def _unpack(outcome: np.ndarray[Any, Any], sim: Any) -> Outcome:
     if _is_kept(outcome):
-        return files.unpacked(outcome.tobytes(), "sweep: a row of the checkpoint", sim), None
+        return files.from_bytes(outcome.tobytes(), "sweep: a row of the checkpoint", sim), None
     return outcome[()]
 
 

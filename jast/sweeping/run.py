@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jast._checks import random_key
-from jast.checkpoints import stored
+from jast._checks import check_random_key
+from jast.checkpoints import open_checkpoint
 from jast.estimate import failure_probability
-from jast.places import executor_of
-from jast.results import asked
+from jast.places import check_executor
+from jast.results import call_settings
 from jast.simulator import Simulator
-from jast.sweeping.batch import batch, kinds
-from jast.sweeping.join import joined
-from jast.sweeping.rows import Rows, elsewhere, here, options_of
+from jast.sweeping.batch import count_kinds, make_simulators
+from jast.sweeping.join import join_rows
+from jast.sweeping.rows import Rows, options_of, run_here, run_in_executor
 from jast.sweeping.table import Sweep
 from jast.watch import Watch, terminable
 
@@ -107,11 +107,11 @@ def sweep(
         >>> table.results[0].failing > table.results[1].failing
         True
     """
-    random_key("sweep", key)
+    check_random_key("sweep", key)
     columns, settings_of = _rows(values)
     if not callable(function):
         raise ValueError(f"sweep: function must be callable, received {function!r}")
-    executor_of("sweep", executor)
+    check_executor("sweep", executor)
     if follow is None:
         follow = function is failure_probability and executor is None
     if follow and executor is not None:
@@ -120,49 +120,50 @@ def sweep(
             " other"
         )
     n = len(settings_of)
-    made = batch(_checked(simulators, n), settings_of)
+    made = make_simulators(_checked(simulators, n), settings_of)
     keys = [jax.random.fold_in(key, i) for i in range(n)]
     about = dict(row=function, follow=bool(follow), values=columns, simulators=made)
     with (
-        stored("sweep", checkpoint, key, **about, options=options) as store,
+        open_checkpoint("sweep", checkpoint, key, **about, options=options) as store,
         Watch("sweep", n, "value", progress, callback) as watch,
         terminable(),
     ):
         own = options_of(function, options, None if executor else checkpoint, n)
         rows = Rows(function, keys, made, own, store is not None)
         if executor is None:
-            found, ended = here(rows, follow, store, watch)
+            found, ended = run_here(rows, follow, store, watch)
         else:
-            found, ended = elsewhere(rows, executor, store, watch)
-        curve = _joined(function, rows, found)
+            found, ended = run_in_executor(rows, executor, store, watch)
+        curve = _join(function, rows, found)
     outcomes, errors = zip(*found, strict=True)
     if all(e is not None for e in errors) and len(found) == n:
         raise errors[0]
-    settings = asked(
-        "sweep", key, function=_name(function), follow=bool(follow), programs=kinds(made)
+    settings = call_settings(
+        "sweep", key, function=_name(function), follow=bool(follow), programs=count_kinds(made)
     )
     if len(found) < n:
         settings["interrupted"] = f"after {len(found)} of {n} values{ended}"
     if curve is not None:
         settings["judged"] = curve.episodes
-    if curve is not None and curve.apart:
-        settings["apart"] = list(curve.apart)
+        if curve.apart:
+            settings["apart"] = list(curve.apart)
     return Sweep(
-        {k: v[: len(found)] for k, v in columns.items()},
-        outcomes,
-        tuple(None if e is None else f"{type(e).__name__}: {e}" for e in errors),
-        tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
-        settings,
-        *(() if curve is None else curve[:2]),
+        values={k: v[: len(found)] for k, v in columns.items()},
+        results=outcomes,
+        errors=tuple(None if e is None else f"{type(e).__name__}: {e}" for e in errors),
+        simulators=tuple(None if isinstance(s, Exception) else s for s in made[: len(found)]),
+        settings=settings,
+        curve=None if curve is None else curve.curve,
+        ratios=None if curve is None else curve.ratios,
     )
 
 
-def _joined(function, rows, found):
+def _join(function, rows, found):
     """The `Joined` of the rows that are done, where they are one kind of cheap systems."""
-    if function is not failure_probability or kinds(rows.made) > 1:
+    if function is not failure_probability or count_kinds(rows.made) > 1:
         return None
     try:
-        return joined(rows.keys, rows.made, [result for result, _ in found])
+        return join_rows(rows.keys, rows.made, [result for result, _ in found])
     except KeyboardInterrupt:  # the rows stand for themselves
         return None
 

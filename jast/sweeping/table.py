@@ -21,8 +21,8 @@ from jast.stress_testing import Report
 
 __all__ = ["Answer", "Crossing", "Sweep", "answer"]
 
-NOTE, WIDE = "note", 60
-"""The last column of a table, and the characters of a cell at most."""
+NOTE = "note"  # the name of a table's last column
+CELL = 60  # characters of a cell at most
 
 
 class Answer(NamedTuple):
@@ -49,9 +49,9 @@ class Crossing(NamedTuple):
     """
 
     name: str
-    """Of the setting"""
+    """Of the setting."""
     value: float
-    """By interpolation of log probabilities"""
+    """By interpolation of log probabilities."""
     interval: tuple[float, float]
     """Where the intervals of the rows, interpolated likewise, hold ``level``; infinite where they
     still do at the last value of the sweep
@@ -63,7 +63,7 @@ class Crossing(NamedTuple):
         return f"{self.name} {self.value:.6g} [{low:.6g}, {high:.6g}] at probability {self.level:g}"
 
 
-@results.result("episodes")
+@results.result_class("episodes")
 class Sweep(NamedTuple):
     """A table: what a function said of each of N systems. Row i is ``function(key_i,
     simulators[i])`` with ``key_i = jax.random.fold_in(key, i)``; where ``settings["follow"]``
@@ -80,24 +80,24 @@ class Sweep(NamedTuple):
     """
 
     values: dict[str, tuple[Any, ...]]
-    """The settings: name -> N values"""
+    """The settings: name -> N values."""
     results: tuple[Any, ...]
-    """[N] what the function returned; None where it raised"""
-    errors: tuple[Any, ...]
-    """[N] texts of what was raised; None where nothing was"""
+    """[N] what the function returned; None where it raised."""
+    errors: tuple[str | None, ...]
+    """[N] texts of what was raised; None where nothing was."""
     simulators: tuple[Any, ...]
-    """[N] `jast.Simulator`; None where it could not be made"""
+    """[N] `jast.Simulator`; None where it could not be made."""
     settings: dict[str, Any]
     """What was asked for; ``programs``: how many kinds of systems there were, which compile apart;
     ``interrupted`` where the last rows are missing; where rows are joined, ``judged``: episodes
     that it took, and ``apart``: rows that contradict what failures say of the ratio to the next
     one, of which one may miss a failure mode
     """
-    curve: Any = None
+    curve: np.ndarray | None = None
     """[N, 3] probabilities and the ends of their intervals that rows have when they are joined with
     their neighbours; NaN where a row's own result stands; None where all do
     """
-    ratios: Any = None
+    ratios: np.ndarray | None = None
     """[N - 1, 3] probability of the next row over that of a row, and the ends of its interval,
     where rows are joined; NaN where one of the two takes no part
     """
@@ -193,14 +193,17 @@ class Sweep(NamedTuple):
             ImportError: where pandas is not installed.
         """
         best = [_best(r) for r in self.results]
-        (low, high), columns = self.interval.T, list(self.values.items())
-        columns += [("probability", self.probability), ("interval_low", low)]
-        columns += [("interval_high", high), ("reliable", self.reliable)]
-        columns.append(
-            ("best_log_prob", [math.nan if b is None else float(b.log_prob) for b in best])
+        low, high = self.interval.T
+        columns = dict(
+            probability=self.probability,
+            interval_low=low,
+            interval_high=high,
+            reliable=self.reliable,
+            best_log_prob=[math.nan if b is None else float(b.log_prob) for b in best],
+            episodes=[getattr(r, "episodes", None) or 0 for r in self.results],
+            error=self.errors,
         )
-        columns.append(("episodes", [getattr(r, "episodes", None) or 0 for r in self.results]))
-        return dataframe([*columns, ("error", self.errors)], [])
+        return dataframe([*self.values.items(), *columns.items()], [])
 
     def plot(self, **how: Any) -> Any:
         """`jast.plot.sweep` of this: the probability of failure against the setting."""
@@ -242,8 +245,7 @@ class Sweep(NamedTuple):
 
 def answer(result: Any) -> Answer:
     """The `Answer` of a result; one of NaN where it speaks of no probability."""
-    if isinstance(result, Report):
-        result = result.probability
+    result = _estimate_of(result)
     if isinstance(result, Estimate):
         return Answer(result.mean, *result.interval, result.reliable)
     if isinstance(result, Nominal):
@@ -252,12 +254,16 @@ def answer(result: Any) -> Answer:
     return Answer()
 
 
+def _estimate_of(result):
+    return result.probability if isinstance(result, Report) else result
+
+
 def _row(result, error, a):
     """The cells of a row: name of the column -> text."""
     if error is not None:
-        return {NOTE: shorten(error, WIDE, placeholder=" ...")}
+        return {NOTE: shorten(error, CELL, placeholder=" ...")}
     cells = {}
-    estimate = result.probability if isinstance(result, Report) else result
+    estimate = _estimate_of(result)
     if not math.isnan(a.high):
         seen = not math.isnan(a.probability)
         cells["probability"] = f"{a.probability:.4g}" if seen else "not seen"
@@ -274,9 +280,9 @@ def _row(result, error, a):
     if (episodes := getattr(result, "episodes", None)) is not None:
         cells["episodes"] = f"{episodes}"
     elif not cells:
-        cells["result"] = shorten(str(result), WIDE, placeholder=" ...")
+        cells["result"] = shorten(str(result), CELL, placeholder=" ...")
     if "probability" in cells and not a.reliable:
-        cells[NOTE] = _against(result)
+        cells[NOTE] = _first_warning(result)
     return cells
 
 
@@ -286,11 +292,10 @@ def _best(result):
     return result.best if isinstance(result, SearchResult) else found.best if found else None
 
 
-def _against(result):
+def _first_warning(result):
     """The first reason not to believe a result."""
-    estimate = result.probability if isinstance(result, Report) else result
-    reasons = getattr(estimate, "warnings", ())
-    return shorten(": ".join(["UNRELIABLE", *reasons[:1]]), WIDE, placeholder=" ...")
+    reasons = getattr(_estimate_of(result), "warnings", ())
+    return shorten(": ".join(["UNRELIABLE", *reasons[:1]]), CELL, placeholder=" ...")
 
 
 def _zeros(x, y):

@@ -2,7 +2,7 @@
 a classifier gets wrong, found with few calls of it.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.weakness.contract import Seen, Selector, Step
 from jast.weakness.data import Data, digits, from_idx, idx
 from jast.weakness.encoded import Encoded, encoded
@@ -40,4 +40,4 @@ __all__ = [
     "validate",
 ]
 
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jast._checks import library, whole
+from jast._checks import import_library, whole_number
 from jast.weakness.result import Result
 
 if TYPE_CHECKING:
@@ -102,7 +102,9 @@ def check_data(function, inputs, labels, classes=None):
             f" received {labels.dtype} of shape {labels.shape}{hint}"
         )
     classes = (
-        max(int(labels.max()) + 1, 2) if classes is None else whole(function, "classes", classes, 2)
+        max(int(labels.max()) + 1, 2)
+        if classes is None
+        else whole_number(function, "classes", classes, 2)
     )
     if classes > MOST_CLASSES:
         raise ValueError(
@@ -247,7 +249,7 @@ def digits() -> tuple[np.ndarray, np.ndarray]:
         >>> inputs.shape, labels.shape
         ((1797, 8, 8), (1797,))
     """
-    bunch = library("digits", "sklearn.datasets", "digits").load_digits()
+    bunch = import_library("digits", "sklearn.datasets", "digits").load_digits()
     return (bunch.images / 16).astype(np.float32), bunch.target.astype(np.int32)
 
 

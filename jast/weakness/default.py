@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jast._checks import number, whole
-from jast.counter import generator
+from jast._checks import number, whole_number
+from jast.counter import numpy_generator
 from jast.weakness import committee
 from jast.weakness.contract import Selector, Step
 from jast.weakness.residual import fit_logistic, residual_log_odds, sigmoid
@@ -70,15 +70,15 @@ def default(
         >>> jast.weakness.default(first=20).settings["first"]
         20
     """
-    first = first if first is None else whole("default", "first", first)
-    repeats = whole("default", "repeats", repeats)
+    first = first if first is None else whole_number("default", "first", first)
+    repeats = whole_number("default", "repeats", repeats)
     growth = number("default", "growth", growth, lambda v: 0 <= v < np.inf, "of at least 0")
     exploration = number("default", "exploration", exploration, lambda v: 0 <= v <= 1, "in 0 ... 1")
     settings = dict(first=first, growth=growth, exploration=exploration, repeats=repeats)
 
     def start(key, data):
         require_memory(data)
-        rng = generator(key)
+        rng = numpy_generator(key)
         reduced = reduce_inputs(rng, data)
         seen_as = make_views(data, reduced)
         close = (
@@ -104,7 +104,7 @@ def default(
         )
 
     def step(key, data, memory, seen, ask):
-        rng = generator(key)
+        rng = numpy_generator(key)
         least = max(10, data.size // 200) if first is None else first
         chosen, likely = _batch(
             rng, memory["suspicion"], seen, max(least, round(growth * len(seen.order))), exploration

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Encoded", "encoded"]
 
 
-@results.shown()
+@results.printable()
 class Encoded(NamedTuple):
     """The autoencoder and the adversary of a result (`encoded`); n inputs, codes of h numbers.
 

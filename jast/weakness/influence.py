@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jast._checks import random_key
-from jast.counter import generator
+from jast._checks import check_random_key
+from jast.counter import numpy_generator
 from jast.weakness import committee
 from jast.weakness.data import are_indices, data_of_result
 from jast.weakness.default import PASSES, STRENGTH
@@ -63,7 +63,7 @@ def influence(
         >>> jast.weakness.influence(key, found, inputs, labels, at=[0, 1]).shape
         (2, 8, 8)
     """
-    random_key("influence", key)
+    check_random_key("influence", key)
     data = data_of_result("influence", result, inputs, labels, classes)
     at = np.asarray(result.failures if at is None else at)
     if at.ndim != 1 or not are_indices(at, data.size):
@@ -73,7 +73,7 @@ def influence(
     at = at.astype(int)
     tried = result.predicted >= 0
     weights = np.tile(np.where(tried, STRENGTH, 1), (MEMBERS, 1))
-    rng = generator(key)
+    rng = numpy_generator(key)
     x = centre(scale_inputs(data), data.image)
     imitation = committee.fit(
         rng,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jast import results
-from jast._checks import number, whole
+from jast._checks import number, whole_number
 from jast.weakness.result import Result
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Judgement", "Roc", "auc", "judge", "precision_recall", "roc"]
 
 
-@results.shown()
+@results.printable()
 class Roc(NamedTuple):
     """A receiver operating characteristic, from (0, 0) to (1, 1).
 
@@ -42,7 +42,7 @@ class Roc(NamedTuple):
         return float(np.trapezoid(self.true_positive, self.false_positive))
 
 
-@results.shown()
+@results.printable()
 class Judgement(NamedTuple):
     """How good the scores of each iteration are on the whole data set; R iterations.
 
@@ -174,7 +174,7 @@ def judge(
         raise ValueError(
             "judge: failed must agree with the result, whose failures are not all among them"
         )
-    if top is not None and whole("judge", "top", top) > n:
+    if top is not None and whole_number("judge", "top", top) > n:
         raise ValueError(f"judge: top must be at most {n}, the inputs there are, received {top!r}")
     rows = []
     for scores in every:

@@ -15,7 +15,7 @@ __all__ = ["History", "Result", "State"]
 ROUGH = " (a guide only: where it was measured, between a seventh and six times the truth)"
 
 
-@results.shown()
+@results.printable()
 class History(NamedTuple):
     """R iterations, each of a batch of calls and what was learned from it.
 
@@ -53,7 +53,7 @@ class History(NamedTuple):
     """[R, n] float32: the scores after each iteration"""
 
 
-@results.shown()
+@results.printable()
 class State(NamedTuple):
     """All that `validate` needs to go on; for `save` and `load`.
 
@@ -91,7 +91,7 @@ class State(NamedTuple):
     """The selector has made all its iterations"""
 
 
-@results.result("calls")
+@results.result_class("calls")
 class Result(NamedTuple):
     """The outcome of a validation of n inputs. NumPy arrays.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jast._checks import whole
-from jast.counter import generator
+from jast._checks import whole_number
+from jast.counter import numpy_generator
 from jast.weakness.contract import Selector, Step
 from jast.weakness.default import default
 from jast.weakness.thesis import thesis
@@ -24,12 +24,12 @@ def random(*, batch: int | None = None) -> Selector:
         >>> jast.weakness.random(batch=5).settings
         {'batch': 5}
     """
-    batch = batch if batch is None else whole("random", "batch", batch)
+    batch = batch if batch is None else whole_number("random", "batch", batch)
 
     def step(key, data, memory, seen, ask):
         free = np.flatnonzero(~seen.tried)
         size = max(10, len(free) // 10) if batch is None else batch
-        chosen = generator(key).permutation(free)[:size]
+        chosen = numpy_generator(key).permutation(free)[:size]
         now = ask(chosen)
         rate = now.failed.sum() / max(len(now.order), 1)
         return Step(memory, np.full(data.size, 0.5), chosen, rate * (~now.tried).sum())

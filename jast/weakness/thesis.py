@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from jast._checks import number, whole
-from jast.counter import generator
+from jast._checks import number, whole_number
+from jast.counter import numpy_generator
 from jast.weakness import networks
 from jast.weakness.contract import Selector, Step
 from jast.weakness.views import require_memory, scale_inputs
@@ -69,13 +69,13 @@ def thesis(
         >>> jast.weakness.thesis(iterations=3).settings["iterations"]
         3
     """
-    whole_number = functools.partial(whole, "thesis")
-    iterations = whole_number("iterations", iterations)
-    sample = whole_number("sample", sample)
-    copies = whole_number("copies", copies, 0)
-    epochs = whole_number("epochs", epochs)
-    encoder_epochs = whole_number("encoder_epochs", encoder_epochs)
-    batch = None if batch is None else whole_number("batch", batch)
+    whole = functools.partial(whole_number, "thesis")
+    iterations = whole("iterations", iterations)
+    sample = whole("sample", sample)
+    copies = whole("copies", copies, 0)
+    epochs = whole("epochs", epochs)
+    encoder_epochs = whole("encoder_epochs", encoder_epochs)
+    batch = None if batch is None else whole("batch", batch)
     real = functools.partial(number, "thesis")
     threshold = real("threshold", threshold, lambda v: 0 <= v <= 1, "in 0 ... 1")
     rate = real("rate", rate, lambda v: 0 < v < np.inf, "above 0")
@@ -83,7 +83,7 @@ def thesis(
     if not isinstance(replacement, bool):
         raise ValueError(f"thesis: replacement must be True or False, received {replacement!r}")
     if hidden is not None:
-        hidden = tuple(whole_number("hidden", width) for width in np.atleast_1d(hidden).tolist())
+        hidden = tuple(whole("hidden", width) for width in np.atleast_1d(hidden).tolist())
     if hidden == ():
         raise ValueError("thesis: hidden must be at least one width, received none")
     settings = dict(
@@ -145,7 +145,7 @@ def draw_halves(key, size, sample, replacement):
     """The ``sample`` inputs of an iteration, by its key and the ``size`` of the data: (those that
     the adversary learns from, those that it proposes from), indices.
     """
-    rng = generator(jax.random.split(key)[0])
+    rng = numpy_generator(jax.random.split(key)[0])
     drawn = rng.integers(size, size=sample) if replacement else rng.permutation(size)[:sample]
     half = (len(drawn) + 1) // 2
     return drawn[:half], drawn[half:]

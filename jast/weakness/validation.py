@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import jax
 import numpy as np
 
-from jast._checks import random_key, whole
-from jast.checkpoints import stored
-from jast.counter import generator
+from jast._checks import check_random_key, whole_number
+from jast.checkpoints import open_checkpoint
+from jast.counter import numpy_generator
 from jast.watch import Watch, terminable
 from jast.weakness.contract import Seen, Selector
 from jast.weakness.data import are_indices, check_data, fingerprint
@@ -108,13 +108,13 @@ def validate(
             "validate: predict must be callable: inputs [m, ...] -> labels [m], received"
             f" {predict!r}"
         )
-    budget = n if budget is None else min(whole("validate", "budget", budget), n)
+    budget = n if budget is None else min(whole_number("validate", "budget", budget), n)
     if state is None:
-        random_key("validate", key)
+        check_random_key("validate", key)
     else:
         _fits(state, data, chosen)
     about = dict(predict=predict, data=fingerprint(data), selector=_described(chosen), state=state)
-    with stored("validate", checkpoint, key, **about) as store, terminable():
+    with open_checkpoint("validate", checkpoint, key, **about) as store, terminable():
         kept = None if store is None else store.state()
         if kept is not None:
             state = restored("", *kept, None)
@@ -151,7 +151,7 @@ def _begin(key, data, selector):
     )
     numbers = np.asarray(jax.random.key_data(key))
     if numbers.shape != (2,):  # of another generator
-        numbers = generator(key).integers(0, 2**32, 2, np.uint32)
+        numbers = numpy_generator(key).integers(0, 2**32, 2, np.uint32)
     memory = selector.start(iteration_key(numbers, 0), data)
     return State(
         _described(selector),
@@ -191,15 +191,7 @@ def _run(state, selector, data, predict, budget, store, progress, callback):
     # what whole iterations have seen of it
     seen = _seen(state.order[: state.complete], answers, data.labels)
     memory, history, finished, incidents = state.memory, state.history, state.finished, []
-    watch = Watch(
-        "validate",
-        budget,
-        "call",
-        progress,
-        callback,
-        done=len(answered),
-        former=lambda done, total, result: (len(result.history.calls), result),
-    )
+    watch = Watch("validate", budget, "call", progress, callback, done=len(answered))
 
     def kept():
         order, predicted, _ = _seen(answered, answers, data.labels)

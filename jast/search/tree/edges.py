@@ -79,7 +79,7 @@ def edges_of(problem, axes, tree, children):
     return Edges(seen, x, visits.astype(jnp.int32), q, parent_q, valid)
 
 
-@results.shown()
+@results.printable()
 class Branches(NamedTuple):
     """B trees of up to S nodes beside their first roots. Row i is the node that simulation i made,
     number i + 1, and the edge that leads to it; the first root has number 0.

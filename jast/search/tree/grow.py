@@ -14,12 +14,12 @@ import numpy as np
 from jast import units
 from jast._jax import is_traced
 from jast.actions import samples
-from jast.checkpoints import stored
+from jast.checkpoints import open_checkpoint
 from jast.counter import tree_keys
 from jast.heads.rounds import HeadTraining, init_heads, train_heads
 from jast.heads.settings import MODES as HEAD_MODES
 from jast.heads.settings import HeadSettings, check_settings
-from jast.incidents import hosted, incidents, merged, since
+from jast.incidents import incidents, merge_incidents, new_incidents, runs_on_host
 from jast.rewards import STANDARD, Lexicographic, lexicographic
 from jast.search.ending import ended, planned, usual
 from jast.search.lockstep import whole
@@ -98,7 +98,7 @@ def grow_trees(
     counts = dict(trees=trees, prunes=prunes, simulations=simulations, top=top)
     given = {k: n for k, n in dict(threads=threads, lanes=lanes).items() if n is not None}
     trees, prunes, simulations, top, *_ = whole(method, **counts, **given)
-    before, ways = incidents(sim), units.ways(method, executor, devices)
+    before, ways = incidents(sim), units.placement(method, executor, devices)
     asked = (
         counts
         | given
@@ -123,7 +123,7 @@ def grow_trees(
     if heads is not None:
         job = enlist(job, key, heads, head_settings, chosen, memoize)
     if job.settings is None:
-        units.not_traced(method, checkpoint=checkpoint, executor=executor, devices=devices)
+        units.require_untraced(method, checkpoint=checkpoint, executor=executor, devices=devices)
         found = traced_result(grow_traced(job.problem, tree_keys(key, trees), job.plan))
         return joined(sim, job.problem.reward, job.pilot, found, top)
     if keep_trees and memoize in ("root", "none"):
@@ -142,23 +142,25 @@ def grow_trees(
     total = trees * fitted.prunes * simulations
     keep(method, sim, total, bool(record))
     with (
-        stored(method, checkpoint, key, **asked) as store,
+        open_checkpoint(method, checkpoint, key, **asked) as store,
         Watch(method, total, "sim", progress, callback) as watch,
     ):
         if store is not None:  # what was free when it began may not be now
-            first = store.settled(lambda: dict(memoize=fitted.memoize, lanes=lanes))
+            first = store.choose_once(lambda: dict(memoize=fitted.memoize, lanes=lanes))
             fitted, lanes = fitted._replace(memoize=first["memoize"]), first["lanes"]
         job = job._replace(plan=fitted)
         ran, school = grow_rounds(job, key, threads, lanes, top, watch, ways._replace(store=store))
     settings = job.settings | dict(prunes=job.plan.prunes, memoize=job.plan.memoize)
     if job.school is not None:
         settings |= _of_heads(heads, job)
-    if short := units.note("simulations", ran, watch.done, watch.total):
+    if short := units.describe_missing("simulations", ran, watch.done, watch.total):
         settings = settings | dict(interrupted=short)
     found = result(sim, job.problem.reward, ran.state, settings, top, school)
     found = joined(sim, job.problem.reward, job.pilot, found, top)
     found = ended(key, sim, job.problem.reward, found, top)
-    return found._replace(incidents=merged(since(before, incidents(sim)), ran.incidents))
+    return found._replace(
+        incidents=merge_incidents(new_incidents(before, incidents(sim)), ran.incidents)
+    )
 
 
 def plan(
@@ -254,8 +256,14 @@ def enlist(
 
 
 def grow_rounds(
-    job: Job, key: jax.Array, threads: int, lanes: int, top: int, watch: Watch, ways: units.Ways
-) -> tuple[units.Ran, HeadTraining | None]:
+    job: Job,
+    key: jax.Array,
+    threads: int,
+    lanes: int,
+    top: int,
+    watch: Watch,
+    ways: units.Placement,
+) -> tuple[units.UnitsRun, HeadTraining | None]:
     """Grow all trees, a round at a time, and teach the heads between two rounds.
 
     Args:
@@ -268,18 +276,19 @@ def grow_rounds(
         ways: how groups of trees are run.
 
     Returns:
-        `jast.units.Ran` with the harvests in the order of the trees, and the heads as they are now.
+        `jast.units.UnitsRun` with the harvests in the order of the trees, and the heads as they
+        are now.
     """
     problem, school, sim = job.problem, job.school, job.problem.sim
-    chunk = max(1, min(job.plan.simulations, HOST_CHUNK if hosted(sim) else CHUNK))
+    chunk = max(1, min(job.plan.simulations, HOST_CHUNK if runs_on_host(sim) else CHUNK))
     words = np.asarray(jax.random.key_data(tree_keys(key, job.trees)))
-    ran = units.Ran((), 0)
+    ran = units.UnitsRun((), 0)
     for first in range(0, job.trees, job.at_once):
         own = words[first : first + job.at_once]
         turn = Round(problem, own, job.plan, lanes, chunk, max(256, 4 * top), first)
         try:
             new = grow_all(turn, watch, ways, threads)
-            ran = units.joined(ran, new)
+            ran = units.concatenate(ran, new)
             if new.ended is not None:
                 break
             if school is not None and job.head_settings.train:

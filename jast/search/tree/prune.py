@@ -27,7 +27,7 @@ from jast.search.tree.simulate import child_state, replay_to, select_lanes
 __all__ = ["Roots", "prune", "recounted"]
 
 
-@results.shown()
+@results.printable()
 class Roots(NamedTuple):
     """What is known of B roots at the end of their turn: K is the greatest number of children."""
 

@@ -16,7 +16,7 @@ from jast._jax import custom_vmap, jit
 from jast.counter import COUNTER, tree_keys
 from jast.episode import Episode, play_back
 from jast.memory import size
-from jast.places import Post, Task
+from jast.places import Task, UnitContext
 from jast.search.tree import simulate
 from jast.search.tree.edges import branches_of, edges_of
 from jast.search.tree.layout import FAILURE, FRESH, INVALID, RAN, make
@@ -141,10 +141,10 @@ class Round(NamedTuple):
     """Number of the first tree."""
 
 
-def grow_all(turn: Round, watch: Watch, ways: units.Ways, threads: int) -> units.Ran:
-    """Grow one tree a key, a group of lanes at a time: `jast.units.Ran` with a tuple of `Harvest`
-    in the order of the keys. ``watch`` counts simulations; an interruption ends all trees at their
-    next chunk.
+def grow_all(turn: Round, watch: Watch, ways: units.Placement, threads: int) -> units.UnitsRun:
+    """Grow one tree a key, a group of lanes at a time: `jast.units.UnitsRun` with a tuple of
+    `Harvest` in the order of the keys. ``watch`` counts simulations; an interruption ends all trees
+    at their next chunk.
     """
     trees, lanes = len(turn.words), turn.lanes
     each = turn.plan.prunes * turn.plan.simulations
@@ -188,7 +188,7 @@ def _keys(turn: Round, rows: np.ndarray) -> jax.Array:
     return jax.random.wrap_key_data(turn.words[rows], impl=COUNTER)
 
 
-def _one_group(turn: Round, number: int, post: Post) -> Harvest:
+def _one_group(turn: Round, number: int, post: UnitContext) -> Harvest:
     problem, words, plan, lanes, chunk, candidates, before = turn
     group = np.arange(number * lanes, min((number + 1) * lanes, len(words)))
     keys, group = _keys(turn, np.resize(group, lanes)), group + before

@@ -5,7 +5,7 @@ length are equally likely and only failing counts; with a density of yours, also
 failure is.
 """
 
-from jast._doors import listed
+from jast._doors import dir_function
 from jast.simulators.arch.cars import Cars
 from jast.simulators.arch.flights import fly, ground_collision_avoidance
 from jast.simulators.arch.gcas import Flight
@@ -24,4 +24,4 @@ __all__ = [
     "ground_collision_avoidance",
     "simulate",
 ]
-__dir__ = listed(__all__)
+__dir__ = dir_function(__all__)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jast._checks import whole
+from jast._checks import whole_number
 from jast.distributions import Independent, Uniform
 from jast.simulator import Simulator
 from jast.simulators.arch import cars, transmission
@@ -202,7 +202,7 @@ def _driven(
     disturbance: Any,
 ) -> Simulator:
     """A model under a requirement."""
-    segments, total = whole(function, "segments", segments), round(model.DURATION / model.DT)
+    segments, total = whole_number(function, "segments", segments), round(model.DURATION / model.DT)
     if total % segments:
         raise ValueError(
             f"{function}: segments must divide {total}, the samples of a run, received {segments}"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jast import distributions as D
-from jast._checks import real, whole
+from jast._checks import real_number, whole_number
 from jast.episode import Episode, replay
 from jast.simulator import Simulator
 from jast.simulators.fms import events
@@ -106,7 +106,7 @@ def fms(
         3
     """
     _double()
-    waypoints = whole("fms", "waypoints", waypoints)
+    waypoints = whole_number("fms", "waypoints", waypoints)
     for name, value, known in (
         ("guard", guard, ("s-turns", "all")),
         ("event", event, (*events.EVENTS,)),
@@ -119,9 +119,9 @@ def fms(
     for name, value in (("fixed", fixed), ("snap", snap), ("database", database)):
         if not isinstance(value, bool):
             raise ValueError(f"fms: {name} must be True or False, received {value!r}")
-    eps = real("fms", "eps", eps, lambda v: 0 <= v < jnp.inf, "of nmi, at least 0")
-    bank = real("fms", "bank", bank, lambda v: 0 < v < 90, "of degrees between 0 and 90")
-    tas = real("fms", "tas", tas, lambda v: 0 < v < jnp.inf, "of knots, positive")
+    eps = real_number("fms", "eps", eps, lambda v: 0 <= v < jnp.inf, "of nmi, at least 0")
+    bank = real_number("fms", "bank", bank, lambda v: 0 < v < 90, "of degrees between 0 and 90")
+    tas = real_number("fms", "tas", tas, lambda v: 0 < v < jnp.inf, "of knots, positive")
     eps, bank, tas = (
         jnp.asarray(v, jnp.float64)
         for v in (eps * (0.0 if fixed else NMI), jnp.radians(bank), tas * KNOT)
