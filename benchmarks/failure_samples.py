@@ -27,7 +27,7 @@ from benchmarks.literature import CASES as LITERATURE
 from benchmarks.sizes import add_choices, options, print_report, printer, size, timed
 from jast import limit_state as latent
 from jast.estimate import failure_probability, failure_samples
-from jast.estimate.populations import settled
+from jast.estimate.populations import equilibrate
 from jast.judge import judged
 
 __all__ = ["density_and_coverage", "run"]
@@ -120,8 +120,8 @@ def chain(key, sim, n, budget):
     start = latent.normal_of(sim, best.failures.episodes)[:1]
     if not len(start):
         return np.full((1, latent.dimension(sim)), np.inf), best.episodes
-    people, chain = settled(second, sim, np.repeat(start, n, axis=0), budget // n)
-    return _numbers(sim, people.z), best.episodes + chain.evaluations
+    moved, sampler = equilibrate(second, sim, np.repeat(start, n, axis=0), budget // n)
+    return _numbers(sim, moved.z), best.episodes + sampler.evaluations
 
 
 METHODS = {"failure_samples": ours, "chain": chain}

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.sizes import options, print_report, printer, size
 from benchmarks.time_to_answer import SYSTEMS
-from jast.estimate.descents import SETTINGS, WAYS
+from jast.estimate.descents import DESCENTS, SETTINGS
 from jast.estimate.particles import SMALL, WINDOW
 
 __all__ = ["CHANGES", "work"]
@@ -26,10 +26,10 @@ CHANGES = {
     "and windows": dict(kinds=(SMALL, WINDOW)),
     "half the moves": dict(moves=0.5),
     "twice the moves": dict(moves=2),
-    "quantile .1": dict(quantile=0.1),
-    "quantile .5": dict(quantile=0.5),
-    "effective .3": dict(effective=0.3),
-    "effective .8": dict(effective=0.8),
+    "quantile .1": dict(level_share=0.1),
+    "quantile .5": dict(level_share=0.5),
+    "effective .3": dict(effective_share=0.3),
+    "effective .8": dict(effective_share=0.8),
 }
 CASES = (
     ("toy, z 3, 100", "distance"),
@@ -50,7 +50,7 @@ def work(name: str, way: str, keys: int, particles: int, changes: dict[str, Any]
         changes[f"kinds_by_{way}"] = changes.pop("kinds")
     settings = replace(SETTINGS, **changes)
     runs = [
-        WAYS[way](key, about.simulator, particles, moves, particles, settings)
+        DESCENTS[way](key, about.simulator, particles, moves, particles, settings)
         for key in jax.random.split(jax.random.key(0), keys)
     ]
     p = np.exp([float(r.log_mean) for r in runs])
@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> None:
         if args.systems and name not in args.systems:
             continue
         for words, changes in CHANGES.items():
-            other = "effective" if way == "distance" else "quantile"
+            other = "effective_share" if way == "distance" else "level_share"
             as_it_is = changes.get("kinds") == getattr(SETTINGS, f"kinds_by_{way}")
             if other in changes or as_it_is:
                 continue

@@ -23,7 +23,7 @@ from benchmarks import cma_es as driver
 from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
 from jast.estimate.batches import resampled
-from jast.estimate.descents import SETTINGS, cooled
+from jast.estimate.descents import SETTINGS, cool_failures
 from jast.failures import empty
 from jast.limit_state import dimension, normal_numbers, policy_of
 from jast.rewards import likelihood
@@ -111,11 +111,13 @@ def slow_cooling(key, sim, budget):
     found = jast.estimate.population(for_failures, sim, budget)
     if (sample := found.proposal) is None:
         return None, found.episodes, None
-    rows = resampled(sample.log_weight, SETTINGS.cooled, 0.5)
-    slowly = int(10 * portfolio.COOLED * budget)
-    points, spent = cooled(for_cooling, sim, sample.points[rows], slowly, True)
-    haul = explorers.of_points(sim, points)
-    more = jast.search.refine(for_refinement, sim, haul.episodes, budget=portfolio.POLISHED)
+    rows = resampled(sample.log_weight, SETTINGS.cooled_failures, 0.5)
+    slowly = int(10 * portfolio.COOLING_SHARE * budget)
+    points, spent = cool_failures(for_cooling, sim, sample.points[rows], slowly, True)
+    found_failures = explorers.failures_at(sim, points)
+    more = jast.search.refine(
+        for_refinement, sim, found_failures.episodes, budget=portfolio.REFINE_EVALUATIONS
+    )
     return _best(more.failures), found.episodes + spent + more.episodes, None
 
 
@@ -149,15 +151,13 @@ METHODS = {
 
 def _without(name, key, sim, budget):
     """`stress` where one of its explorers is not called."""
-    few = {k: v for k, v in explorers.LEAST.items() if k != name}
-
-    def nothing(*_):
-        return explorers.Haul(empty(sim).episodes, 0, 0, 0)
-
+    none = explorers.ExplorerResult(empty(sim).episodes, 0, 0, 0)
+    left_out = explorers.Explorer(lambda *_: none, None)
+    slow = left_out.run if name == SLOW else explorers.slow_cross_entropy
+    changed = {} if name == SLOW else {name: left_out}
     with (
-        mock.patch.object(explorers, "LEAST", few),
-        mock.patch.dict(explorers.EXPLORERS, {name: nothing}),
-        mock.patch.object(portfolio, "onward", nothing if name == SLOW else explorers.onward),
+        mock.patch.dict(explorers.EXPLORERS, changed),
+        mock.patch.object(portfolio, "slow_cross_entropy", slow),
     ):
         return stress(key, sim, budget)
 

@@ -27,7 +27,7 @@ from jast.search.result import table
 from jast.simulator import Simulator
 from jast.simulators.drawings import DRAWN
 from jast.stress_testing import stress
-from jast.stress_testing.portfolio import PORTFOLIO
+from jast.stress_testing.portfolio import DEFAULT_BUDGET
 
 STANDARD = rewards.standard(event_bonus=30.0, density="mode")
 SYSTEMS = {  # name: the simulator, the reward and the actions of a search
@@ -218,7 +218,7 @@ def _explained(options, sim, report):
     about = outline(sim)
     if not (report.modes and about.disturbance.quantile and about.start.quantile):
         return ()
-    budget = min(report.settings["budget"], PORTFOLIO) // 10
+    budget = min(report.settings["budget"], DEFAULT_BUDGET) // 10
     found = cards(jax.random.key(options.seed), sim, report, budget)
     print(f"{found[0][0]}\n")
     return found

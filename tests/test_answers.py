@@ -23,7 +23,7 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.draws import of_weights, share, shares
+from jast.estimate.draws import moments_of_weights, scaled_weights, share_interval
 from jast.estimate.importance_sampling import Traces
 from jast.simulators import walk1d
 
@@ -211,22 +211,22 @@ def test_a_black_box_is_not_called_again(key):
 
 def test_memory_is_bounded(monkeypatch):
     """Failures are thinned and count for more, of the others the nearest stay."""
-    monkeypatch.setattr(draws, "KEPT", 100)
+    monkeypatch.setattr(draws, "MAX_KEPT", 100)
     rng = np.random.default_rng(0)
-    kept, n, log_w = draws.nothing(), 4000, []
+    kept, n, log_w = draws.empty_draws(), 4000, []
     for _ in range(8):
         distance = rng.random(n).astype(np.float32)
         failure = distance < 0.25
         log_w.append(np.where(failure, rng.normal(size=n) - 20, 0.0).astype(np.float32))
         none = np.zeros(n, bool)
-        kept = draws.add(
+        kept = draws.add_draws(
             kept, Traces(log_w[-1], None, failure, none, none.astype(np.int32), distance)
         )
     assert kept.failure.sum() <= 100 and (~kept.failure).sum() <= 200
     assert kept.samples == 8 * n and kept.every == 128
     assert (kept.distance[~kept.failure] <= kept.reach).all()
     assert (~kept.failure).sum() >= 100 and kept.row.max() < 8 * n
-    m = of_weights(kept.log_weight[kept.failure], kept.samples)
+    m = moments_of_weights(kept.log_weight[kept.failure], kept.samples)
     truth = 0.25 * np.exp(-20 + 0.5)
     assert abs(np.exp(m.log_mean) / truth - 1) < 4 * m.relative
 
@@ -237,8 +237,8 @@ def test_shares_cover():
     rng, hits, runs = np.random.default_rng(1), 0, 2000
     for _ in range(runs):
         log_w, a = rng.normal(size=400), rng.random(400) < 0.2
-        w, whole = shares(log_w, False)
-        _, (low, high) = share(whole, w[a].sum(), (w[a] ** 2).sum(), int(a.sum()), 0.95)
+        w, whole = scaled_weights(log_w, False)
+        _, (low, high) = share_interval(whole, w[a].sum(), (w[a] ** 2).sum(), int(a.sum()), 0.95)
         hits += low <= 0.2 <= high
     assert abs(hits / runs - 0.95) < 0.02
 

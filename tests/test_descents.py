@@ -16,26 +16,26 @@ from jast import distributions as D
 from jast.counter import counter_key
 from jast.estimate import (
     adaptive,
-    agreement,
     budgets,
     descents,
     failure_probability,
     population,
+    population_search,
 )
-from jast.estimate.agreement import Answer, answer_of
-from jast.estimate.descents import WAYS, by_distance, by_width
-from jast.estimate.estimate import ROUGH
+from jast.estimate.descents import DESCENTS, by_distance, by_width
+from jast.estimate.estimate import MAX_RELATIVE_ERROR
 from jast.estimate.particles import (
     AFTER,
     SMALL,
     WINDOW,
     Particles,
     Steering,
-    begun,
-    blank,
-    moved,
-    when_reached,
+    allocate_particles,
+    initial_steering,
+    move_particles,
+    record_crossings,
 )
+from jast.estimate.population_search import Answer, answer_of
 from jast.intervals import clopper_pearson
 from jast.limit_state import outcomes
 from jast.simulators import limit_state, walk1d
@@ -53,7 +53,7 @@ CHANCE = 1e-4
 def as_particles(sim, z):
     """Points [n, D] as a population has them."""
     o = jax.device_get(outcomes(sim, jnp.asarray(z)))
-    p = blank(sim, len(z))
+    p = allocate_particles(sim, len(z))
     own = np.arange(z.shape[1]) < o.used[:, None]
     square = (z**2 * own).sum(axis=1)
     given = z.astype(p.z.dtype), o.score, o.used, square.astype(p.z.dtype), o.distance
@@ -76,12 +76,12 @@ def test_moves_among_failures_keep_what_is_normal_there(key, width, kinds):
     z += np.maximum(3 + 1e-5 - z @ e, 0)[:, None].astype(np.float32)
     start = as_particles(HALF, z)
     assert (np.asarray(start.score) == -np.inf).all()
-    after, _, _ = moved(
+    after, _, _ = move_particles(
         HALF,
         start,
         counter_key(key, 1),
         np.arange(N),
-        begun(),
+        initial_steering(),
         moves=40,
         level=-np.inf,
         width=width,
@@ -104,7 +104,7 @@ def test_a_window_draws_neighbours_anew(key):
     sim = limit_state(lambda u: 99.0 - u[0], 10)
     z = np.random.default_rng(0).standard_normal((N, 10)).astype(np.float32)
     still = Steering(np.array([0, 0.3], np.float32), np.zeros(2, np.float32))
-    after, steering, _ = moved(
+    after, steering, _ = move_particles(
         sim, as_particles(sim, z), counter_key(key, 1), np.arange(N), still, moves=2, level=np.inf
     )
     changed = np.asarray(after.z) != z
@@ -125,16 +125,16 @@ def test_what_comes_after_a_level_is_drawn_anew(key):
     start = as_particles(sim, z)
     rows = np.flatnonzero((np.asarray(start.score) <= 1) & (np.asarray(start.score) > -np.inf))
     for_looks, for_moves = counter_key(key, 1), counter_key(key, 2)
-    looked = when_reached(sim, start, for_looks, rows, 1.0)
+    looked = record_crossings(sim, start, for_looks, rows, 1.0)
     path = np.cumsum(z[rows], axis=1)
     reached = [next(t for t, s in enumerate(p, 1) if 3 - abs(s) <= 1) for p in path]
     assert (np.asarray(looked.reached)[: len(rows)] == reached).all() and len(rows) > N
-    after, steering, _ = moved(
+    after, steering, _ = move_particles(
         sim,
         looked,
         for_moves,
         np.arange(len(rows)),
-        begun(),
+        initial_steering(),
         moves=1,
         level=1.0,
         kinds=(AFTER, AFTER),
@@ -149,8 +149,8 @@ def test_small_changes_are_steered_to_a_third_of_acceptance(key):
     """40 moves among failures, a thousandth of all: a share of .2 to .5 is taken at last."""
     run = by_distance(key, HALF, N, 4, N)
     start = as_particles(HALF, run.points)
-    after, steering, _ = moved(
-        HALF, start, counter_key(key, 1), np.arange(N), begun(), moves=40, level=-np.inf
+    after, steering, _ = move_particles(
+        HALF, start, counter_key(key, 1), np.arange(N), initial_steering(), moves=40, level=-np.inf
     )
     assert 0.2 < steering.accepted[0] < 0.5
     assert (0.02 <= steering.size).all() and (steering.size <= 1).all()
@@ -182,7 +182,7 @@ def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
 
     monkeypatch.setattr(descents, "resampled", record)
     n = 256
-    run = WAYS[way](key, HALF, n, 4, n)
+    run = DESCENTS[way](key, HALF, n, 4, n)
     *before, (w, _) = chosen  # the last resampling is of failures, after the estimate
     ancestor = list(range(n))
     for _, rows in before:
@@ -201,7 +201,7 @@ def test_variances_are_those_of_repeated_populations(key, way):
     """The mean of 60 told variances over the variance of 60 estimates. The latter has a relative
     standard error of sqrt(2 / 59) = .18 if they are normal, some .3 as they are: half to double.
     """
-    runs = [WAYS[way](k, HALF, 512, 10, 512) for k in jax.random.split(key, 60)]
+    runs = [DESCENTS[way](k, HALF, 512, 10, 512) for k in jax.random.split(key, 60)]
     p = np.exp([r.log_mean for r in runs]) / norm.sf(3)
     assert 0.5 < np.mean([r.variance for r in runs]) / p.var(ddof=1) < 2
     assert abs(p.mean() - 1) < 4 * p.std() / 60**0.5
@@ -315,9 +315,11 @@ def latch():
 )
 def test_chains_tell_closed_forms(key, way, sim, truth):
     """1.4e-4, 7.3e-4, 1.5e-4 and 4.5e-4, from four populations."""
-    runs = [WAYS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    runs = [DESCENTS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
     a = answer_of(runs)
-    assert abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * agreement.BLUNT
+    assert (
+        abs(a.log_mean - np.log(truth)) < 4 * a.relative < 4 * population_search.MAX_WITNESS_ERROR
+    )
     assert bool(outcomes(sim, jnp.asarray(runs[0].points)).failure.all())
 
 
@@ -325,7 +327,7 @@ def test_the_failures_of_a_population_are_those_of_the_model(key):
     """x.e of a half-space is a truncated normal number, by both ways. As many points as the
     genealogy's variance says are independent: Kolmogorov's distance below 2 / sqrt(1 / variance).
     """
-    for way in WAYS.values():
+    for way in DESCENTS.values():
         run = way(key, HALF, N, 10, N)
         along = run.points.astype(np.float64) @ np.full(4, 0.5)
         gap = stats.kstest(along, stats.truncnorm(3, np.inf).cdf).statistic
@@ -345,7 +347,7 @@ def test_numbers_that_an_episode_did_not_use_are_the_models(key):
 
 def test_nothing_but_invalid_episodes_ends_without_an_answer(key):
     sim = limit_state(lambda u: jnp.nan * u[0], 2)
-    for way in WAYS.values():
+    for way in DESCENTS.values():
         run = way(key, sim, 256, 2, 256)
         assert run.log_mean == -np.inf and run.points.shape == (0, 2)
         assert run.invalid == run.evaluations
@@ -414,7 +416,7 @@ def test_an_interruption_before_anything_is_raised(key, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(WAYS, "distance", interrupted)
+    monkeypatch.setitem(DESCENTS, "distance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         population(key, SIDES, 200_000, particles=N)
 
@@ -424,8 +426,8 @@ def test_a_stopped_call_goes_on_from_its_checkpoint(key, tmp_path, equal, monkey
     call = lambda **more: population(key, SIDES, 200_000, particles=N, **more)
     call(checkpoint=tmp_path, callback=stop_at(3)[0])
     found, alone = call(checkpoint=tmp_path), call()
-    for name in WAYS:
-        monkeypatch.setitem(WAYS, name, None)  # which nobody can call
+    for name in DESCENTS:
+        monkeypatch.setitem(DESCENTS, name, None)  # which nobody can call
     for one in (found, call(checkpoint=tmp_path)):
         assert one.log_mean == alone.log_mean and one.interval == alone.interval
         assert one.history == alone.history and one.evaluations == alone.evaluations
@@ -503,7 +505,7 @@ def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
         horizon=1,
         disturbance=D.Normal(0.0, 1.0),
     )
-    monkeypatch.setattr(budgets, "_rate_on_host", lambda key, sim: 100.0)
+    monkeypatch.setattr(budgets, "_episodes_a_second_on_host", lambda key, sim: 100.0)
     seen = []
     few = lambda key, sim, budget, *_: (
         seen.append(budget) or jast.estimate.monte_carlo(key, sim, 50)
@@ -511,15 +513,15 @@ def test_a_black_box_keeps_the_thrifty_way(key, monkeypatch):
     monkeypatch.setattr(adaptive.few_calls, "few_calls", few)
     found = failure_probability(key, slow, seconds=2.0)
     assert seen == [192] and found.settings["budget"] == 192
-    assert budgets.budget_of("f", key, slow, None, 50) == budgets.DEAR
+    assert budgets.measure_budget("f", key, slow, None, 50) == budgets.DEFAULT_BUDGET
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Populations in `jast.stress` from 50,000 evaluations on, with little to polish."""
-    monkeypatch.setattr(budgets, "CHEAP", 50_000)
-    monkeypatch.setattr(portfolio, "CHEAP", 50_000)
-    monkeypatch.setattr(portfolio, "POLISHED", 6000)
+    monkeypatch.setattr(budgets, "MIN_POPULATION_BUDGET", 50_000)
+    monkeypatch.setattr(portfolio, "MIN_POPULATION_BUDGET", 50_000)
+    monkeypatch.setattr(portfolio, "REFINE_EVALUATIONS", 6000)
 
 
 def test_stress_where_failures_are_frequent(key, small):
@@ -544,7 +546,11 @@ def test_stress_of_a_rare_failure(key, small):
         "populations",
         "cooled",
     ]
-    assert abs(p.log_mean - norm.logsf(4)) < 4 * p.relative_error < 4 * agreement.BLUNT
+    assert (
+        abs(p.log_mean - norm.logsf(4))
+        < 4 * p.relative_error
+        < 4 * population_search.MAX_WITNESS_ERROR
+    )
     assert p.plain[-1] > report.nominal.episodes and p.guaranteed[0] < norm.sf(4) < p.guaranteed[1]
     assert float(report.failures.best.reward) == pytest.approx(-8, abs=0.05)
     assert [m.share for m in report.modes] == [1.0]
@@ -564,7 +570,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(key, sim, truth):
     assert missed < 9 and np.abs(z).max() < 4.5
     assert 0.6 < z.std() < 1.4 and abs(z.mean()) < 0.8
     # two ways part by chance once in 370
-    assert sum(f.reliable != (f.relative_error <= ROUGH) for f in found) <= 2
+    assert sum(f.reliable != (f.relative_error <= MAX_RELATIVE_ERROR) for f in found) <= 2
 
 
 def counted_box():

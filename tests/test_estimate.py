@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 import jast
 from jast.estimate import pareto_k
-from jast.estimate.diagnostics import reasons
-from jast.estimate.estimate import estimate, of_counts
+from jast.estimate.diagnostics import weight_warnings
+from jast.estimate.estimate import estimate_from_counts, estimate_from_weights
 from jast.estimate.importance_sampling import Traces
-from jast.estimate.sums import add, nothing
+from jast.estimate.sums import add_traces, empty_sums
 
 
 def traces(log_w, failure=None, log_shares=None, invalid=None, length=None):
@@ -34,9 +34,9 @@ def traces(log_w, failure=None, log_shares=None, invalid=None, length=None):
 
 def summed(log_w, sizes=(), samples=None, **fields):
     """The sums of all, in chunks that end at ``sizes``."""
-    whole, total = traces(log_w, **fields), nothing(len(log_w) if samples is None else samples)
+    whole, total = traces(log_w, **fields), empty_sums(len(log_w) if samples is None else samples)
     for part in zip(*(np.split(a, list(sizes)) for a in whole), strict=True):
-        total = add(total, Traces(*part))
+        total = add_traces(total, Traces(*part))
     return total
 
 
@@ -77,7 +77,10 @@ def test_streaming_is_one_shot(seed, sizes, spread, offset):
     np.testing.assert_allclose([total.first, total.second], [w.sum(), (w**2).sum()], rtol=1e-12)
     np.testing.assert_allclose(total.by_component, w @ s, rtol=1e-12)
     np.testing.assert_allclose(total.squares, w**2 @ s**2, rtol=1e-12)
-    found, w_all = estimate("x", total), np.exp(np.where(failure, log_w - l.max(), -np.inf))
+    found, w_all = (
+        estimate_from_weights("x", total),
+        np.exp(np.where(failure, log_w - l.max(), -np.inf)),
+    )
     assert found.log_mean == pytest.approx(l.max() + np.log(w_all.mean()), rel=1e-12, abs=1e-12)
     assert found.relative_error == pytest.approx(
         w_all.std(ddof=1) / np.sqrt(n) / w_all.mean(), rel=1e-9
@@ -92,9 +95,11 @@ def test_the_kept_tail_is_enough(n):
     """k-hat from the stream is k-hat of all weights."""
     log_w = np.random.default_rng(n).normal(size=n) * 2
     total = summed(log_w, [n // 3, n // 2])
-    assert estimate("x", total).k_hat == pareto_k(log_w, n)
-    assert (np.diff(total.tail) <= 0).all()
-    assert len(total.tail) <= total.keep < n
+    assert (
+        estimate_from_weights("x", total).k_hat == pareto_k(log_w, n)
+        and (np.diff(total.tail) <= 0).all()
+        and len(total.tail) <= total.keep < n
+    )
 
 
 def test_extreme_weights():
@@ -106,16 +111,20 @@ def test_extreme_weights():
     total = summed(log_w, [3, 10, 12], failure=failure)
     assert (total.failures, total.undefined, total.top) == (9, 0, 1500 + np.log(3))
     assert (total.first, total.second) == pytest.approx((4 / 3, 10 / 9))
-    found = estimate("x", summed(log_w - 3000, [3, 10, 12], failure=failure))
-    assert found.mean == 0
-    assert found.log_mean == pytest.approx(-1500 + np.log(4 / 14))
-    assert np.isfinite(found.relative_error)
-    assert "10^-65" in str(found)
+    found = estimate_from_weights("x", summed(log_w - 3000, [3, 10, 12], failure=failure))
+    assert (
+        found.mean == 0
+        and found.log_mean == pytest.approx(-1500 + np.log(4 / 14))
+        and np.isfinite(found.relative_error)
+        and "10^-65" in str(found)
+    )
     only = summed(np.full(4, -np.inf))
-    assert only.first == 0
-    assert only.failures == 4
-    assert not estimate("x", only).reliable
-    assert np.isnan(estimate("x", only).mean)
+    assert (
+        only.first == 0
+        and only.failures == 4
+        and not estimate_from_weights("x", only).reliable
+        and np.isnan(estimate_from_weights("x", only).mean)
+    )
 
 
 def test_weights_that_are_not_numbers():
@@ -130,9 +139,11 @@ def test_weights_that_are_not_numbers():
     )
     assert (total.failures, total.undefined, total.invalid) == (4, 2, 1)
     assert total.first == pytest.approx(1 + np.exp(-1)) and np.isfinite(total.by_component).all()
-    found = estimate("x", total)
-    assert "2 failing episodes have a weight that is NaN or infinite" in found.warnings
-    assert "1 of 6 episodes are invalid" in found.warnings[-1]
+    found = estimate_from_weights("x", total)
+    assert (
+        "2 failing episodes have a weight that is NaN or infinite" in found.warnings
+        and "1 of 6 episodes are invalid" in found.warnings[-1]
+    )
 
 
 # The Pareto shape
@@ -244,7 +255,7 @@ def test_pareto_k_at_its_ends():
     ],
 )
 def test_reasons(numbers, words):
-    found = reasons(*numbers)
+    found = weight_warnings(*numbers)
     assert len(found) == len(words) and all(w in f for w, f in zip(words, found, strict=True))
 
 
@@ -253,10 +264,14 @@ def test_one_episode_carries_it():
     of failures.
     """
     log_w = np.concatenate([np.zeros(999), [np.log(1e3)]])
-    found = estimate("x", summed(log_w + 0.01 * np.random.default_rng(0).normal(size=1000)))
-    assert not found.reliable
-    assert found.max_share == pytest.approx(0.5, abs=0.01)
-    assert any("one episode carries 50%" in w for w in found.warnings)
+    found = estimate_from_weights(
+        "x", summed(log_w + 0.01 * np.random.default_rng(0).normal(size=1000))
+    )
+    assert (
+        not found.reliable
+        and found.max_share == pytest.approx(0.5, abs=0.01)
+        and any("one episode carries 50%" in w for w in found.warnings)
+    )
 
 
 def test_thin_modes():
@@ -268,7 +283,7 @@ def test_thin_modes():
             [np.zeros(2000), np.full(size, np.log(2000 / 9 / size))]
         ) + 0.1 * np.random.default_rng(0).normal(size=2000 + size)
         shares = np.where(np.arange(2000 + size)[:, None] < 2000, [[0, -np.inf]], [[-np.inf, 0]])
-        found = estimate("x", summed(log_w, log_shares=shares))
+        found = estimate_from_weights("x", summed(log_w, log_shares=shares))
         np.testing.assert_allclose(np.sort(found.modes), [0.1, 0.9], atol=0.01)
         assert (
             any(
@@ -290,43 +305,59 @@ def some(**fields):
 
 def test_printing():
     """UNRELIABLE and why in the first line, or nothing of the kind; remarks at the end."""
-    good = estimate("importance", some(), notes=("interrupted",))
+    good = estimate_from_weights("importance", some(), notes=("interrupted",))
     lines = str(good).splitlines()
-    assert good.reliable
-    assert lines[0].split() == ["method", "importance"]
-    assert lines[-1].split() == ["remark", "interrupted"]
-    assert "UNRELIABLE" not in str(good)
-    assert f"{good.mean:.4g}" in lines[1]
-    assert "0.95 interval [" in lines[1]
-    assert "2000 of 4000 episodes" in str(good)
-    assert "k-hat" in str(good)
-    bad = estimate("importance", some(), reasons=("it was Friday",), notes=("interrupted",))
-    assert str(bad).startswith("UNRELIABLE: it was Friday")
-    assert bad.warnings == ("it was Friday", "interrupted")
-    assert not bad.reliable
-    assert bad.mean == good.mean
-    assert good.interval[0] < good.mean < good.interval[1]
-    assert good.log10_mean == pytest.approx(np.log10(good.mean))
-    assert "invalid" in str(estimate("x", some(invalid=np.arange(4000) == 1)))
+    assert (
+        good.reliable
+        and lines[0].split() == ["method", "importance"]
+        and lines[-1].split() == ["remark", "interrupted"]
+        and "UNRELIABLE" not in str(good)
+    )
+    assert (
+        f"{good.mean:.4g}" in lines[1]
+        and "0.95 interval [" in lines[1]
+        and "2000 of 4000 episodes" in str(good)
+        and "k-hat" in str(good)
+    )
+    bad = estimate_from_weights(
+        "importance", some(), reasons=("it was Friday",), notes=("interrupted",)
+    )
+    assert (
+        str(bad).startswith("UNRELIABLE: it was Friday")
+        and bad.warnings == ("it was Friday", "interrupted")
+        and not bad.reliable
+    )
+    assert (
+        bad.mean == good.mean
+        and good.interval[0] < good.mean < good.interval[1]
+        and good.log10_mean == pytest.approx(np.log10(good.mean))
+    )
+    assert "invalid" in str(estimate_from_weights("x", some(invalid=np.arange(4000) == 1)))
 
 
 def test_counts():
     """Of plain episodes: binomial, exact at both ends."""
     total = summed(np.zeros(50), failure=np.arange(50) < 10)
-    found = of_counts("monte_carlo", total, level=0.9)
+    found = estimate_from_counts("monte_carlo", total, level=0.9)
     tail = scipy.stats.beta.ppf([0.05, 0.95], [10, 11], [41, 40])
-    assert found.mean == 0.2
-    assert found.relative_error == pytest.approx(np.sqrt(0.8 / 10))
-    assert found.interval == pytest.approx(tuple(tail), rel=1e-5)
-    assert found.reliable
-    assert found.level == pytest.approx(0.9)
-    assert "Chernoff" in str(found)
-    assert found.chernoff > found.jeffreys > 0.2
-    everything = of_counts("monte_carlo", summed(np.zeros(50)))
-    assert everything.mean == 1
-    assert everything.interval[1] == 1
-    assert everything.relative_error == 0
-    assert everything.chernoff == 1
+    assert (
+        found.mean == 0.2
+        and found.relative_error == pytest.approx(np.sqrt(0.8 / 10))
+        and found.interval == pytest.approx(tuple(tail), rel=1e-5)
+    )
+    assert (
+        found.reliable
+        and found.level == pytest.approx(0.9)
+        and "Chernoff" in str(found)
+        and found.chernoff > found.jeffreys > 0.2
+    )
+    everything = estimate_from_counts("monte_carlo", summed(np.zeros(50)))
+    assert (
+        everything.mean == 1
+        and everything.interval[1] == 1
+        and everything.relative_error == 0
+        and everything.chernoff == 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -335,7 +366,7 @@ def test_counts():
 )
 def test_what_plain_draws_guarantee(k, n, level):
     """Quantiles of beta distributions, whatever the rest of the estimate says."""
-    found = estimate("x", some(), level=level, reasons=("no",), plain=(k, 0, n))
+    found = estimate_from_weights("x", some(), level=level, reasons=("no",), plain=(k, 0, n))
     tail = (1 - level) / 2
     low = scipy.stats.beta.ppf(tail, k, n - k + 1) if k else 0.0
     high = scipy.stats.beta.isf(tail, k + 1, n - k) if k < n else 1.0
@@ -349,22 +380,24 @@ def test_what_plain_draws_guarantee(k, n, level):
 
 def test_plain_draws_of_the_sums_join_the_others():
     whole = traces(np.full(100, -5.0), failure=np.arange(100) < 30)
-    total = add(nothing(100), whole, np.arange(100) % 10 == 0)
+    total = add_traces(empty_sums(100), whole, np.arange(100) % 10 == 0)
     assert total.plain == (3, 0, 10)
-    assert estimate("x", total, plain=(1, 2, 5)).plain == (4, 2, 15)
-    assert add(total, whole).plain == (3, 0, 10)  # of which nothing is known
-    none = estimate("x", some(), reasons=("no",))
+    assert estimate_from_weights("x", total, plain=(1, 2, 5)).plain == (4, 2, 15)
+    assert add_traces(total, whole).plain == (3, 0, 10)  # of which nothing is known
+    none = estimate_from_weights("x", some(), reasons=("no",))
     assert none.plain is None is none.guaranteed and "doubtful" not in str(none)
     assert f"probability    {none.mean:.4g}   0.95 interval" in str(none)
 
 
 def test_a_reliable_estimate_prints_as_if_there_were_no_plain_draws():
-    assert str(estimate("x", some(), plain=(3, 0, 4000))) == str(estimate("x", some()))
+    assert str(estimate_from_weights("x", some(), plain=(3, 0, 4000))) == str(
+        estimate_from_weights("x", some())
+    )
 
 
 @pytest.mark.parametrize("k", [0, 3])
 def test_counts_are_printed_once(k):
-    found = of_counts("monte_carlo", summed(np.zeros(500), failure=np.arange(500) < k))
+    found = estimate_from_counts("monte_carlo", summed(np.zeros(500), failure=np.arange(500) < k))
     assert found.plain == (k, 0, 500) and found.guaranteed == found.interval
     text = str(found)
     assert not found.reliable
@@ -374,7 +407,10 @@ def test_counts_are_printed_once(k):
 
 
 def test_a_file_keeps_the_plain_draws(tmp_path):
-    for found in (estimate("x", some(), plain=(2, 5, 99)), estimate("x", some())):
+    for found in (
+        estimate_from_weights("x", some(), plain=(2, 5, 99)),
+        estimate_from_weights("x", some()),
+    ):
         jast.save(tmp_path / "e.npz", found)
         back = jast.load(tmp_path / "e.npz")
         assert back.plain == found.plain and back.guaranteed == found.guaranteed
@@ -388,20 +424,20 @@ def test_no_probability_above_1():
     rng = np.random.default_rng(0)
     log_w = 0.3 * rng.normal(size=4000) - 0.045
     log_w += 0.001 - np.log(np.exp(log_w).mean())
-    found = estimate("x", summed(log_w))
+    found = estimate_from_weights("x", summed(log_w))
     assert found.reliable and (found.mean, found.log_mean) == (1.0, 0.0)
     assert found.interval[0] < 1 == found.interval[1] and "probability    1   0.95" in str(found)
-    wrong = estimate("x", summed(log_w + 1), plain=(9, 0, 10))
-    assert not wrong.reliable
-    assert wrong.mean == 1
-    assert "is 2.721, above 1" in wrong.warnings[0]
+    wrong = estimate_from_weights("x", summed(log_w + 1), plain=(9, 0, 10))
+    assert not wrong.reliable and wrong.mean == 1 and "is 2.721, above 1" in wrong.warnings[0]
     assert "doubtful       1   0.95 interval" in str(wrong)
 
 
 def test_the_level_is_the_one_that_was_asked_for():
     """Also where JAX's numbers are single."""
-    assert estimate("x", some(), level=0.95).level == 0.95
-    assert of_counts("x", some(), level=0.95).level == 0.95
+    assert (
+        estimate_from_weights("x", some(), level=0.95).level == 0.95
+        and estimate_from_counts("x", some(), level=0.95).level == 0.95
+    )
 
 
 def test_coverage_of_the_interval():
@@ -411,7 +447,7 @@ def test_coverage_of_the_interval():
     rng, n, truth, covered = np.random.default_rng(0), 1000, 0.4 * np.exp(0.32), 0
     for _ in range(2000):
         w = np.where(rng.random(n) < 0.4, np.exp(0.8 * rng.normal(size=n)), 0)
-        low, high = estimate(
+        low, high = estimate_from_weights(
             "x", summed(np.log(w[w > 0]) - 5, samples=n)._replace(samples=n), level=0.9
         ).interval
         covered += low < truth * np.exp(-5) < high

@@ -30,13 +30,13 @@ from jast.estimate import (
     subset_simulation,
     trace_proposal,
 )
-from jast.estimate.adaptive import LEAST
+from jast.estimate.adaptive import MIN_BUDGET
 from jast.estimate.batches import numbers
 from jast.estimate.design_points import design_points, distinct
-from jast.estimate.estimate import ROUGH, or_rough
+from jast.estimate.estimate import MAX_RELATIVE_ERROR, flag_imprecise
 from jast.estimate.gaussian_family import GaussianFamily, defended
 from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
-from jast.estimate.populations import cool, explore, settled
+from jast.estimate.populations import cool, equilibrate, explore
 from jast.estimate.search_state import begun
 from jast.simulators import landing, limit_state
 
@@ -141,7 +141,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
     model, u = L.of_the_model(q), np.random.default_rng(0).random(100_000)
     share = np.exp(q.log_weights[model].astype(float)).sum()
     assert model.any() and abs(model[L.component(q, u)].mean() - share) < 0.01
-    lines = str(or_rough(found._replace(relative_error=2 * ROUGH))).splitlines()
+    lines = str(flag_imprecise(found._replace(relative_error=2 * MAX_RELATIVE_ERROR))).splitlines()
     assert lines[2].startswith("probability    between ") and lines[3].startswith("doubtful ")
 
 
@@ -216,9 +216,11 @@ def test_no_failure(key):
 @pytest.mark.long
 def test_the_least_budget_is_kept(key):
     """Gradients included; and it is enough for one near plane."""
-    found = failure_probability(key, planes(3.0), LEAST)
-    assert found.evaluations <= LEAST, found.history
-    assert abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error, found.history
+    found = failure_probability(key, planes(3.0), MIN_BUDGET)
+    assert (
+        found.evaluations <= MIN_BUDGET
+        and abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error
+    ), found.history
 
 
 def test_interrupts_keep_whole_chunks(two):
@@ -433,17 +435,21 @@ def test_populations_kept_out(key):
     assert abs(
         np.mean(np.exp([f.log_mean for f in found])) / norm.sf(4.5) - 1
     ) < 4 * 1.03 / np.sqrt(6)
-    assert not explore(key, planes(4.0), SIZE // 2, covered=covered, least=-15.0).reached
+    assert not explore(
+        key, planes(4.0), SIZE // 2, covered=covered, min_log_probability=-15.0
+    ).reached
 
 
 def test_populations_give_up(key):
     """At the evaluations or the probability they are given."""
-    found = explore(key, planes(12.0), SIZE, most=3000)
-    assert not found.reached
-    assert found.log_mean == -np.inf
-    assert found.evaluations <= 3000
-    assert found.points.shape == (0, 4)
-    assert len(explore(key, planes(12.0), SIZE, least=-5.0).levels) <= 5
+    found = explore(key, planes(12.0), SIZE, max_evaluations=3000)
+    assert (
+        not found.reached
+        and found.log_mean == -np.inf
+        and found.evaluations <= 3000
+        and found.points.shape == (0, 4)
+    )
+    assert len(explore(key, planes(12.0), SIZE, min_log_probability=-5.0).levels) <= 5
 
 
 def test_cooling_keeps_every_mode(key):
@@ -467,27 +473,27 @@ def test_failures_of_great_norm_move_until_they_have_settled(key):
     points = (3.0 * noise).at[:, 0].set(4.0 + 3.0 * jnp.abs(noise[:, 0]))
     left, found = [], []
     for most in (0, 600, 20_000):
-        people, chain = settled(key, sim, points, 10, most=most)
-        assert (people.z[:, 0] >= 3).all() and chain.evaluations <= max(most, 11 * 24)
-        left.append((people.z**2).sum(axis=1).mean())
-        found.append(chain.evaluations)
+        moved, sampler = equilibrate(key, sim, points, 10, max_evaluations=most)
+        assert (moved.z[:, 0] >= 3).all() and sampler.evaluations <= max(most, 11 * 24)
+        left.append((moved.z**2).sum(axis=1).mean())
+        found.append(sampler.evaluations)
     assert left[0] > left[1] > left[2] and 110 - 12 < left[2] < 110 + 12 + 0.05 * 110
     assert found[2] < 10_000  # it stops by itself
-    again = settled(key, sim, people.z, 10, most=20_000)[1]
+    again = equilibrate(key, sim, moved.z, 10, max_evaluations=20_000)[1]
     assert again.evaluations == 11 * 24  # what has settled moves once
 
 
 def test_a_rough_estimate_says_so(key):
     """Where nothing else does, the standard error speaks against it; the numbers stay."""
     counted = jast.estimate.monte_carlo(key, planes(1.0), 2000)
-    assert counted.reliable and counted.relative_error > ROUGH
-    rough = or_rough(counted)
+    assert counted.reliable and counted.relative_error > MAX_RELATIVE_ERROR
+    rough = flag_imprecise(counted)
     assert not rough.reliable and rough.mean == counted.mean
     assert rough.warnings[0].startswith(f"relative standard error {counted.relative_error:.2g}")
-    fine = counted._replace(relative_error=ROUGH)
-    assert or_rough(fine) is fine
+    fine = counted._replace(relative_error=MAX_RELATIVE_ERROR)
+    assert flag_imprecise(fine) is fine
     flagged = counted._replace(reliable=False, warnings=("another reason",))
-    assert or_rough(flagged) is flagged
+    assert flag_imprecise(flagged) is flagged
 
 
 def test_log_ratios(key):

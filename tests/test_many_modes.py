@@ -12,11 +12,11 @@ from benchmarks.markov_systems import CASES
 from jast import limit_state as L
 from jast.estimate import failure_probability, monte_carlo, populations
 from jast.estimate.design_points import explained
-from jast.estimate.diagnostics import thin_modes
+from jast.estimate.diagnostics import mode_warnings
 from jast.estimate.gaussian_family import GaussianFamily, _sparse
 from jast.estimate.gaussian_start import explored
 from jast.estimate.gaussians import _greatest, held, to_anchors
-from jast.estimate.populations import Chain, cool, edges
+from jast.estimate.populations import PopulationSampler, bracket_boundary, cool
 from jast.estimate.search_state import State, begun
 from jast.simulators import limit_state
 
@@ -36,33 +36,33 @@ def corner():
     return limit_state(_two, 8)
 
 
-def test_numbers_that_a_failure_does_not_need_are_put_to_rest(key):
+def test_numbers_that_a_failure_does_not_need_are_zeroed(key):
     """All stay failures, none moves out, and nearly all of the six others come to 0: each is tried
     12 times together with half or a quarter of the others, and a try with neither of the first two
     in it succeeds, so a number is left at the most with (1 - 1/8)^9 (1 - 9/64)^9 = .08.
     """
     sim, z = corner(), np.random.default_rng(0).normal(size=(40, 8)).astype(FLOAT)
     z[:, :2] = 3.5
-    chain = Chain(key, sim, 40)
-    rested = chain.rest(chain.judge(z), 18)
+    sampler = PopulationSampler(key, sim, 40)
+    rested = sampler.zero_unneeded(sampler.simulate(z), 18)
     assert (rested.score == -np.inf).all() and (rested.z[:, :2] == 3.5).all()
     left = (rested.z[:, 2:] != 0).mean()
-    assert left < 0.08 + 4 * math.sqrt(0.08 * 0.92 / 240) and chain.evaluations == 40 * 19
+    assert left < 0.08 + 4 * math.sqrt(0.08 * 0.92 / 240) and sampler.evaluations == 40 * 19
 
 
 def test_what_needs_all_its_numbers_is_left_alone(key):
     """No try succeeds, so there are only a few."""
     z = np.full((20, 8), 3.0 / math.sqrt(8) + 1e-3, FLOAT)
-    chain = Chain(key, limit_state(_sum, 8), 20)
-    people = chain.judge(z)
-    assert (chain.rest(people, 18).z == z).all() and chain.evaluations == 20 * 5
+    sampler = PopulationSampler(key, limit_state(_sum, 8), 20)
+    population = sampler.simulate(z)
+    assert (sampler.zero_unneeded(population, 18).z == z).all() and sampler.evaluations == 20 * 5
 
 
-def test_cooled_chains_that_rest_are_nearer(key):
+def test_cooled_failures_without_unneeded_numbers_are_nearer(key):
     """In the corner the least norm is 4.243."""
     far, near = (
-        np.median(np.linalg.norm(cool(key, corner(), 40, rests=rests).points, axis=1))
-        for rests in (0, 18)
+        np.median(np.linalg.norm(cool(key, corner(), 40, zeroing_rounds=rounds).points, axis=1))
+        for rounds in (0, 18)
     )
     assert 4.24 < near < 4.5 < far
 
@@ -70,7 +70,7 @@ def test_cooled_chains_that_rest_are_nearer(key):
 def test_edges_are_on_both_sides_of_the_boundary(key):
     """Each failing point is a 64th of its way farther out than the safe one, in the mean."""
     sim = limit_state(_sum, 8)
-    safe, fails, evaluations = edges(key, sim, 64)
+    safe, fails, evaluations = bracket_boundary(key, sim, 64)
     assert len(fails) >= 6 and evaluations >= 64 + 6 * len(fails)
     assert L.outcomes(sim, fails).failure.all() and not L.outcomes(sim, safe).failure.any()
     gap = np.linalg.norm(fails - safe, axis=1) / np.linalg.norm(fails, axis=1)
@@ -89,11 +89,11 @@ def test_chains_start_where_nothing_known_explains_a_failure(key, monkeypatch):
     """Half of 64 draws fail, beyond one of two planes of which one is known; all that fail by the
     other alone are among the 16 that chains start from, and there are fewer of these without.
     """
-    monkeypatch.setattr(populations, "COOLING", 0)
+    monkeypatch.setattr(populations, "COOLING_STEPS", 0)
     sim = limit_state(Partial(_either, jnp.asarray([0.5, 0.5])), 2)
-    of = lambda known: (cool(key, sim, 16, known=known).points[:, 0] < 0.5).sum()
-    people, *_ = populations.widened(key, sim, 64)
-    others = (people.z[:, 0] < 0.5).sum()
+    of = lambda known: (cool(key, sim, 16, design_points=known).points[:, 0] < 0.5).sum()
+    failures, *_ = populations.draw_wide_failures(key, sim, 64)
+    others = (failures.z[:, 0] < 0.5).sum()
     assert of(np.array([[0.5, 0.0]])) == min(others, 16) > of(None)
 
 
@@ -179,7 +179,7 @@ def test_a_small_mode_known_by_few_draws_counts_by_what_it_does_to_the_whole():
     little beside one of 2 %.
     """
     shares, sizes = np.array([0.975, 0.025]), np.array([5000.0, 20.0])
-    assert len(thin_modes(shares, sizes, 0.006)) == 1 and not thin_modes(shares, sizes, 0.02)
+    assert len(mode_warnings(shares, sizes, 0.006)) == 1 and not mode_warnings(shares, sizes, 0.02)
 
 
 def test_a_count_of_few_failures_is_not_believed():

@@ -19,7 +19,7 @@ from jast.distributions import Normal
 from jast.explain import Criticality, Minimal
 from jast.page import document, report, traces
 from jast.search.failure_modes import Modes
-from jast.stress_testing.words import about, runs
+from jast.stress_testing.words import share_of_runs, two_digits
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +88,14 @@ def test_the_headline_says_how_it_fails(page):
     [(0.18, "1.5"), (1, "10"), (4.687, "49,000"), (8.999, "1,000,000,000"), (12.6, "10^13")],
 )
 def test_large_numbers_are_read_at_a_glance(log10, words):
-    assert about(log10) == words
+    assert two_digits(log10) == words
 
 
 def test_a_share_of_the_runs():
-    assert runs(np.log10(0.25)) == "25 % of the runs" and runs(-2) == "one of 100 runs"
+    assert (
+        share_of_runs(np.log10(0.25)) == "25 % of the runs"
+        and share_of_runs(-2) == "one of 100 runs"
+    )
 
 
 def test_what_is_copied_replays_to_the_bit(page, tmp_path, monkeypatch, capsys):

@@ -22,8 +22,15 @@ from jast.estimate import (
     population_estimate,
 )
 from jast.estimate import descents as ways
-from jast.estimate.agreement import BLUNT, answer_of
-from jast.estimate.particles import Particles, Steering, begun, blank, fresh, moved
+from jast.estimate.particles import (
+    Particles,
+    Steering,
+    allocate_particles,
+    draw_particles,
+    initial_steering,
+    move_particles,
+)
+from jast.estimate.population_search import MAX_WITNESS_ERROR, answer_of
 from jast.estimate.sample import Sample
 from jast.limit_state import normal_numbers, outcomes
 from jast.simulators import limit_state, walk1d
@@ -51,10 +58,19 @@ def test_moves_keep_the_normal_distribution(key, width):
     """30 moves of points of N(0, w^2 I), all of them taken: their numbers still have that
     distribution (Kolmogorov and Smirnov, at 1e-4), and hardly any is where it was.
     """
-    particles, _ = fresh(HALF, blank(HALF, N), counter_key(key, 1), N, width=width)
+    particles, _ = draw_particles(
+        HALF, allocate_particles(HALF, N), counter_key(key, 1), N, width=width
+    )
     before = np.asarray(particles.z)
-    after, _, invalid = moved(
-        HALF, particles, counter_key(key, 2), rows(), begun(), moves=30, level=np.inf, width=width
+    after, _, invalid = move_particles(
+        HALF,
+        particles,
+        counter_key(key, 2),
+        rows(),
+        initial_steering(),
+        moves=30,
+        level=np.inf,
+        width=width,
     )
     z = np.asarray(after.z)
     assert stats.kstest(z[:, 0] / width, "norm").pvalue > 1e-4
@@ -65,11 +81,17 @@ def test_moves_keep_the_normal_distribution(key, width):
 def test_moves_keep_a_level_and_say_what_points_come_to(key):
     """No point leaves the level; score, used numbers and squares are those of its episode."""
     sim = walk1d()
-    particles, _ = fresh(sim, blank(sim, N), counter_key(key, 1), N)
+    particles, _ = draw_particles(sim, allocate_particles(sim, N), counter_key(key, 1), N)
     level = float(np.quantile(np.asarray(particles.score), 0.3))
     inside = np.flatnonzero(np.asarray(particles.score) <= level)
-    after, steering, _ = moved(
-        sim, particles, counter_key(key, 2), np.resize(inside, N), begun(), moves=6, level=level
+    after, steering, _ = move_particles(
+        sim,
+        particles,
+        counter_key(key, 2),
+        np.resize(inside, N),
+        initial_steering(),
+        moves=6,
+        level=level,
     )
     o = jax.device_get(outcomes(sim, after.z))
     assert (np.asarray(after.score) <= level).all()
@@ -86,10 +108,10 @@ def test_places_beyond_the_points_do_not_matter(key):
     """The same 256 points in 1024 places, whatever stands in the others."""
     found = []
     for value in (0.0, 5.0):
-        p = blank(HALF, N)
+        p = allocate_particles(HALF, N)
         p = Particles(jnp.full_like(p.z, value).at[:256].set(0.5), *p[1:])
-        after, steering, _ = moved(
-            HALF, p, counter_key(key, 1), rows(256), begun(), moves=4, level=np.inf
+        after, steering, _ = move_particles(
+            HALF, p, counter_key(key, 1), rows(256), initial_steering(), moves=4, level=np.inf
         )
         found.append((np.asarray(after.z)[:256], steering))
     np.testing.assert_array_equal(found[0][0], found[1][0])
@@ -99,10 +121,12 @@ def test_places_beyond_the_points_do_not_matter(key):
 def test_a_new_width_scales_what_an_episode_did_not_use(key):
     """With a size of 0 nothing else moves."""
     sim = walk1d()
-    particles, _ = fresh(sim, blank(sim, N), counter_key(key, 1), N, width=3.0)
+    particles, _ = draw_particles(
+        sim, allocate_particles(sim, N), counter_key(key, 1), N, width=3.0
+    )
     z, used = np.asarray(particles.z), np.asarray(particles.used)
     still = Steering(np.zeros(2, np.float32), np.zeros(2, np.float32))
-    after, _, _ = moved(
+    after, _, _ = move_particles(
         sim, particles, counter_key(key, 2), rows(), still, moves=1, level=np.inf, width=2, before=3
     )
     own = np.arange(z.shape[1]) < used[:, None]
@@ -114,7 +138,7 @@ def test_the_variance_is_that_of_families(key):
     """By all pairs of points: 1 - n / (n - 1) times the share of pairs, by weight, without a common
     ancestor (Lee and Whiteley 2018, without noise of the resampling).
     """
-    s = ways._Population(key, HALF, 256, 2, 256)
+    s = ways._ParticlePopulation(key, HALF, 256, 2, 256)
     rng = np.random.default_rng(0)
     s.family = rng.integers(40, size=256)
     w = rng.random(256)
@@ -128,26 +152,26 @@ def test_the_variance_of_two_perfect_levels_is_the_sum_of_theirs(key, quantile):
     (1 - q) / (q n): over 200 populations of 1000 points, within 4 standard errors.
     """
     n, found, rng = 1000, [], np.random.default_rng(0)
-    s = ways._Population(key, HALF, n, 2, 128)
+    s = ways._ParticlePopulation(key, HALF, n, 2, 128)
     for _ in range(200):
         first = np.flatnonzero(rng.permutation(n) < quantile * n)
         s.family = np.arange(n)[np.resize(first, n)]
-        found.append(s.variance(ways._where(rng.permutation(n) < quantile * n)))
+        found.append(s.variance(ways._indicator_log_weights(rng.permutation(n) < quantile * n)))
     expected = 2 * (1 - quantile) / (quantile * n)
     assert abs(np.mean(found) - expected) < 4 * np.std(found) / 200**0.5 + 1e-5
 
 
 def test_without_resampling_the_variance_is_the_binomial_one(key):
     """k of n indicators: (1 - k / n) / k, up to n / (n - 1)."""
-    s = ways._Population(key, HALF, 256, 2, 256)
-    log_w = ways._where(np.arange(256) < 64)
+    s = ways._ParticlePopulation(key, HALF, 256, 2, 256)
+    log_w = ways._indicator_log_weights(np.arange(256) < 64)
     assert s.variance(log_w) == pytest.approx((1 - 64 / 256) / 64, rel=0.01)
 
 
 def near(runs, truth, most=4.0):
     """The mean of populations lies within ``most`` of its standard errors of the truth."""
     a = answer_of(runs)
-    return abs(a.log_mean - np.log(truth)) < most * a.relative < most * BLUNT
+    return abs(a.log_mean - np.log(truth)) < most * a.relative < most * MAX_WITNESS_ERROR
 
 
 @pytest.mark.parametrize("way", ["distance", "width"])
@@ -155,7 +179,7 @@ def near(runs, truth, most=4.0):
     "sim, truth", [(HALF, stats.norm.sf(3)), (SIDES, 2 * stats.norm.sf(3))], ids=["one", "two"]
 )
 def test_both_ways_tell_closed_forms(key, way, sim, truth):
-    runs = [ways.WAYS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
+    runs = [ways.DESCENTS[way](k, sim, N, 10, N) for k in jax.random.split(key, 4)]
     assert near(runs, truth)
     fails = outcomes(sim, jnp.asarray(runs[0].points)).failure
     assert bool(fails.all()) and len(runs[0].points) == N
@@ -204,7 +228,7 @@ def test_in_both_precisions(dtype, key):
 def test_cooling_comes_to_the_likeliest(key, together):
     """The design point of a half-space, |z| = 3: within .05 nats of 4.5."""
     run = ways.by_distance(key, HALF, N, 10, N)
-    points, spent = ways.cooled(key, HALF, run.points[:128], 60_000, together)
+    points, spent = ways.cool_failures(key, HALF, run.points[:128], 60_000, together)
     best = 0.5 * (points**2).sum(axis=1).min()
     assert 4.5 <= best * (1 + 1e-5) < 4.55 and spent <= 60_000
 
@@ -216,7 +240,9 @@ def test_cooling_alone_loses_no_mode_and_together_goes_to_the_likelier(key):
     sim = limit_state(lambda u: jnp.minimum(3.0 - u[0], 4.0 + u[0]), 2)
     start = np.zeros((128, 2), np.dtype(normal_numbers(sim)))
     start[:, 0] = np.where(np.arange(128) % 2, 3.1, -4.1)
-    right = lambda together: np.mean(ways.cooled(key, sim, start, 60_000, together)[0][:, 0] > 0)
+    right = lambda together: np.mean(
+        ways.cool_failures(key, sim, start, 60_000, together)[0][:, 0] > 0
+    )
     assert right(False) == 0.5 and right(True) == 1
 
 
@@ -333,7 +359,7 @@ def test_an_interruption_within_a_population_keeps_those_before(key, monkeypatch
     def stopped(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(ways.WAYS, "width", stopped)
+    monkeypatch.setitem(ways.DESCENTS, "width", stopped)
     try:
         found = population(key, SIDES, 400_000, particles=N)
     except KeyboardInterrupt:
@@ -370,16 +396,16 @@ def test_a_cheap_system_is_answered_by_populations_and_names_its_budget(key, mon
     again = failure_probability(key, SIDES, 3 * 2**17)
     assert again.log_mean == found.log_mean and again.interval == found.interval
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 100.0)
-    assert budgets.budget_of("f", key, SIDES, None, 50) == budgets.DEAR
-    assert budgets.budget_of("f", key, SIDES, 20.0, 50) == 1536
+    assert budgets.measure_budget("f", key, SIDES, None, 50) == budgets.DEFAULT_BUDGET
+    assert budgets.measure_budget("f", key, SIDES, 20.0, 50) == 1536
 
 
 def test_seconds_of_a_black_box_are_of_the_clock(key):
     slow = jast.blackbox.from_python(
         lambda x: (bool(abs(x[0]) > 3), 1.0), horizon=1, disturbance=D.Normal(0.0, 1.0)
     )
-    budget = budgets.budget_of("f", key, slow, 0.01, 50)
-    assert budget >= 50 and not budgets.cheap(slow, 10**7)
+    budget = budgets.measure_budget("f", key, slow, 0.01, 50)
+    assert budget >= 50 and not budgets.uses_populations(slow, 10**7)
 
 
 def test_stress_by_populations_tells_both_modes(key):
@@ -405,6 +431,6 @@ def test_plain_draws_are_in_the_checkpoint(key, tmp_path, monkeypatch):
     sim = limit_state(lambda u: 1.0 - u[0], 2)
     found = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
     assert "plain draws" in found.method and found.evaluations == 100_000
-    monkeypatch.setattr(population_estimate, "of_points", None)
+    monkeypatch.setattr(population_estimate, "simulate_points", None)
     again = population(key, sim, 100_000, particles=N, checkpoint=tmp_path)
     assert again.failing == found.failing and again.interval == found.interval

@@ -62,8 +62,8 @@ def test_weights_without_a_variance_are_left_after_a_pilot(key, monkeypatch, v, 
     root = np.sqrt(v, dtype=np.float32)
     one, two = np.eye(2, dtype=np.float32)[None], np.array([[4.0, 0.0]], np.float32)
     q = Latent(np.zeros(1, np.float32), two, root * one, one / root)
-    promise = population_weights.Promise(q, 80_000, 1e-3)
-    monkeypatch.setattr(population_weights, "_promise", lambda *_: promise)
+    promise = population_weights.FittedProposal(q, 80_000, 1e-3)
+    monkeypatch.setattr(population_weights, "_fit_proposal", lambda *_: promise)
     found = population(key, sim, 300_000)
     assert ("importance sampling" in found.method) == serves
     assert any("no variance" in line for line in found.history) != serves
@@ -82,13 +82,13 @@ def test_where_no_gaussians_serve_populations_answer(key):
 @pytest.mark.parametrize("factor, words", [(0.5, "against populations"), (1.0, None)])
 def test_populations_check_it(key, monkeypatch, factor, words):
     """Half the probability, as where a mode were missing, is flagged."""
-    weighted = population_weights.weighted
+    weighted = population_weights.importance_estimate
 
     def wrong(*args):
         found = weighted(*args)
         return found._replace(log_mean=found.log_mean + np.log(factor))
 
-    monkeypatch.setattr(sys.modules["jast.estimate.population"], "weighted", wrong)
+    monkeypatch.setattr(sys.modules["jast.estimate.population"], "importance_estimate", wrong)
     found = population(key, PLANE, 300_000)
     assert found.reliable == (words is None)
     assert words is None or words in found.warnings[0]
@@ -134,7 +134,7 @@ def test_the_first_population_by_width_costs_as_much_as_it_may(key):
     """
     sim = limit_state(lambda u: 24.0 - jnp.linalg.norm(u), 400)  # P = P(chi2_400 > 576) = 1.5e-8
     whole = descents.by_width(key, sim, 1024, 10, 1024)
-    less = descents.by_width(key, sim, 1024, 10, 1024, most=60_000)
+    less = descents.by_width(key, sim, 1024, 10, 1024, max_evaluations=60_000)
     assert whole.size == 1024 and 128 <= less.size < 512
     assert less.evaluations < 1.3 * (60_000 + 2 * 1024) < whole.evaluations
 
@@ -149,13 +149,13 @@ def test_the_width_where_failures_are_least_rare(key):
 
 
 def test_where_no_way_leads_to_failures_the_rest_is_plain_draws(key, monkeypatch):
-    lost = lambda key, sim, n, moves, capacity, settings, **_: (
-        descents._Population(key, sim, n, moves, capacity, settings)
-        .lost()
+    lost = lambda key, sim, n, moves, capacity, **_: (
+        descents._ParticlePopulation(key, sim, n, moves, capacity)
+        .without_failures()
         ._replace(plain=np.array([0, 0, n]), evaluations=np.int64(n))
     )
-    monkeypatch.setitem(descents.WAYS, "distance", lost)
-    monkeypatch.setitem(descents.WAYS, "width", lost)
+    monkeypatch.setitem(descents.DESCENTS, "distance", lost)
+    monkeypatch.setitem(descents.DESCENTS, "width", lost)
     found = population(key, PLANE, 200_000)
     assert "plain draws" in found.method and found.evaluations == 200_000
 

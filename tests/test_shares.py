@@ -14,11 +14,11 @@ from scipy import stats
 from jast import intervals, records
 from jast.estimate import clopper_pearson
 from jast.estimate.descents import by_distance
-from jast.estimate.sample import sample_of
+from jast.estimate.sample import sample_from
 from jast.limit_state import Latent, normal_numbers, played
 from jast.search.failure_modes import UNKNOWN, Mode, Modes
 from jast.simulators import limit_state
-from jast.stress_testing.shares import corrected, cost, shares
+from jast.stress_testing.shares import corrected_shares, mode_shares, shares_cost
 
 BUDGET = 10_000
 
@@ -73,9 +73,12 @@ def covered(sim, heads, share, proposals):
     """How often the interval of the first share holds the truth, and the mean width."""
     ways, inside, widths = known(sim, heads), 0, []
     for i, q in enumerate(proposals):
-        found, _, spent = shares(jax.random.key(i), sim, q, ways, BUDGET)
+        found, _, spent = mode_shares(jax.random.key(i), sim, q, ways, BUDGET)
         # paths that begin within their 500 evaluations, a room for 45, may take 24 lifts more each
-        assert sum(m.share for m in found) == pytest.approx(1) and spent <= cost(BUDGET) + 24 * 45
+        assert (
+            sum(m.share for m in found) == pytest.approx(1)
+            and spent <= shares_cost(BUDGET) + 24 * 45
+        )
         for m in found:
             assert 0 <= m.share_interval[0] <= m.share <= m.share_interval[1] <= 1
         low, high = found[0].share_interval
@@ -102,7 +105,7 @@ def test_few_failures_cover(key):
 
 def populations(sim, seeds, n=256):
     """The `Sample` of a small population by each seed."""
-    return sample_of([by_distance(jax.random.key(s), sim, n, 5, n) for s in seeds])
+    return sample_from([by_distance(jax.random.key(s), sim, n, 5, n) for s in seeds])
 
 
 @pytest.mark.parametrize(
@@ -130,7 +133,7 @@ def test_a_mode_of_no_failure_is_bounded_by_counts(key):
     of fewer draws where one was chosen twice.
     """
     sim, heads, _ = sides(3.0, 6.0)
-    first, second = shares(key, sim, mixture(sim, heads[:1]), known(sim, heads), BUDGET)[0]
+    first, second = mode_shares(key, sim, mixture(sim, heads[:1]), known(sim, heads), BUDGET)[0]
     assert (first.share, second.share) == (1, 0)
     low, high = second.share_interval
     assert low == 0 and clopper_pearson(0, 128)[1] <= high < clopper_pearson(0, 64)[1]
@@ -139,23 +142,23 @@ def test_a_mode_of_no_failure_is_bounded_by_counts(key):
 
 def test_where_nothing_fails_nothing_is_told(key):
     sim, heads, _ = sides(7.0, 7.0)
-    found, failing, spent = shares(
+    found, failing, spent = mode_shares(
         key, sim, mixture(sim, np.zeros((1, 1))), known(sim, heads), BUDGET
     )
     assert failing == 0 and spent == 1024
     assert np.isnan([[m.share, *m.share_interval] for m in found]).all()
-    found, *rest = shares(key, sim, mixture(sim, heads), known(sim, heads), BUDGET - 1)
+    found, *rest = mode_shares(key, sim, mixture(sim, heads), known(sim, heads), BUDGET - 1)
     assert rest == [0, 0] and np.isnan([m.share for m in found]).all()
 
 
 def test_one_mode_has_all(key):
     sim, heads, _ = sides(3.0, 3.0)
-    (only,), *rest = shares(key, sim, None, known(sim, heads[:1]), BUDGET)
+    (only,), *rest = mode_shares(key, sim, None, known(sim, heads[:1]), BUDGET)
     assert (only.share, only.share_interval) == (1, (1, 1)) and rest == [0, 0]
 
 
 def wrong(rng, m, towards, seldom):
-    """What `corrected` is given of ``m`` failures: 60 % of mode 0, of whose others a part
+    """What `corrected_shares` is given of ``m`` failures: 60 % of mode 0, of whose others a part
     ``towards`` lies towards mode 0 too; each its own unit, or of one of eight whose shares differ
     as a beta distribution of ``seldom`` counts, and that are chosen as log-normal weights ask.
     """
@@ -176,7 +179,7 @@ def test_a_correction_by_few_failures_covers(towards, seldom):
     tenth of all; the mean lies within 4 standard errors.
     """
     rng, n = np.random.default_rng(0), 200
-    found = [corrected(*wrong(rng, 1024, towards, seldom)) for _ in range(n)]
+    found = [corrected_shares(*wrong(rng, 1024, towards, seldom)) for _ in range(n)]
     told = np.array([shares[0] for shares, _ in found])
     assert abs(told.mean() - 0.6) < 4 * told.std() / math.sqrt(n)
     low, high = np.array([limits[0] for _, limits in found]).T
@@ -187,13 +190,13 @@ def test_a_correction_by_few_failures_covers(towards, seldom):
 
 def test_an_effective_number_of_draws():
     """Whole numbers are Clopper and Pearson's; few degrees of freedom are fewer draws."""
-    np.testing.assert_allclose(intervals.of_effective(0.3, 50), clopper_pearson(15, 50))
+    np.testing.assert_allclose(intervals.effective_interval(0.3, 50), clopper_pearson(15, 50))
     k, n = 2.5, 12.5 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 3.3)) ** 2
     k *= n / 12.5
     expected = stats.beta.ppf(0.025, k, n - k + 1), stats.beta.ppf(0.975, k + 1, n - k)
-    np.testing.assert_allclose(intervals.of_effective(0.2, 12.5, 3.3), expected, rtol=1e-9)
+    np.testing.assert_allclose(intervals.effective_interval(0.2, 12.5, 3.3), expected, rtol=1e-9)
     for freedom in (-1.0, 0.0, 1e-9, 0.01):
-        low, high = intervals.of_effective(0.2, 12.5, freedom)
+        low, high = intervals.effective_interval(0.2, 12.5, freedom)
         assert low == pytest.approx(0, abs=1e-6) and high == pytest.approx(1)
 
 

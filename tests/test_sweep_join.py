@@ -12,7 +12,7 @@ from systems import line
 
 import jast
 from jast.estimate import Estimate
-from jast.estimate.sample import Sample, counted
+from jast.estimate.sample import Sample, draws_of_sample
 from jast.sweeping.join import join_rows
 
 LIMITS = np.linspace(3.0, 3.7, 8)
@@ -54,7 +54,7 @@ def row(rng, i, families, copies=1, error=0.05, sides=(-1, 1), **about):
             reliable=True,
             warnings=(),
             proposal=sample if copies > 1 else None,
-            draws=counted(jax.random.key(0), MADE[i], sample, 10 * len(z)),
+            draws=draws_of_sample(jax.random.key(0), MADE[i], sample, 10 * len(z)),
             settings=dict(budget=300_000),
         )
         ._replace(**about)

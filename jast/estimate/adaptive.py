@@ -16,11 +16,11 @@ from jast._jax import briefly
 from jast.checkpoints import keep_answers, open_checkpoint
 from jast.estimate import budgets, few_calls
 from jast.estimate.by_proposal import Asked, by_proposal
-from jast.estimate.estimate import Estimate, or_rough
+from jast.estimate.estimate import Estimate, flag_imprecise
 from jast.estimate.importance_sampling import importance
 from jast.estimate.multilevel import failure_proposal
 from jast.estimate.population import by_populations
-from jast.estimate.redrawn import fits
+from jast.estimate.redrawn import is_proposal_of
 from jast.estimate.sample import Sample
 from jast.intervals import checked_level
 from jast.results import call_settings
@@ -32,9 +32,12 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["adaptive_cross_entropy", "failure_probability"]
+__all__ = ["MIN_BUDGET", "adaptive_cross_entropy", "failure_probability"]
 
-NAME, LEAST = "failure_probability", 5000
+MIN_BUDGET = 5000
+"""Episodes below which a surrogate answers."""
+LEVELS = 20
+"""Iterations of `adaptive_cross_entropy`."""
 
 
 def failure_probability(
@@ -142,41 +145,53 @@ def failure_probability(
         >>> 0.8 < found.mean / truth < 1.25
         True
     """
-    name = NAME
+    name = "failure_probability"
     check_random_key(name, key)
-    budgets.given(name, budget, seconds)
+    budgets.check_budget_or_seconds(name, budget, seconds)
     if budget is not None:
         budget = whole_number(name, "budget", budget, few_calls.LEAST)
     level = checked_level(name, level)
     latent.check(name, sim)
     if near is not None and not isinstance(near, Estimate):
         raise ValueError(f"{name}: near must be an Estimate, received {type(near).__name__}")
-    similar = near.proposal if near is not None and fits(sim, near.proposal) else None
-    similar = None if isinstance(similar, Sample) else similar  # which draws nothing
-    alone = failures is None and similar is None
+    similar = None
+    if near is not None and is_proposal_of(sim, near.proposal):
+        similar = None if isinstance(near.proposal, Sample) else near.proposal  # it draws nothing
+    guided = failures is not None or similar is not None
     if budget is None:
-        guided = not alone and seconds is None
-        of_time = lambda: budgets.budget_of(name, key, sim, seconds, few_calls.LEAST)
-        budget = budgets.DEAR if guided else of_time()
+        budget = budgets.DEFAULT_BUDGET
+        if not guided or seconds is not None:
+            budget = budgets.measure_budget(name, key, sim, seconds, few_calls.LEAST)
     settings = call_settings(name, key, budget=budget, gradients=bool(gradients), level=level)
     known = None if failures is None else latent.normal_of(sim, failures.episodes)
-    ways = units.placement(name, executor, devices)
+    ways, watched = units.placement(name, executor, devices), (progress, callback)
     about = dict(sim=sim, budget=budget, gradients=bool(gradients), known=known, near=similar)
-    few = not budgets.cheap(sim, budget)
+    few = not budgets.uses_populations(sim, budget)
     with (
         open_checkpoint(name, checkpoint, key, **about) as store,
         keep_answers(store),
         briefly(few),
     ):
-        if alone and not few:
-            ways, watched = ways._replace(store=store), (progress, callback)
+        ways = ways._replace(store=store)
+        if not (guided or few):
             found = by_populations(name, key, sim, budget, level=level, watched=watched, ways=ways)
-        elif budget < LEAST:
+        elif budget < MIN_BUDGET:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
-            ways, watched = ways._replace(store=store), (progress, callback)
-            given = bool(gradients), failures, known, similar, level, watched, ways
-            found = or_rough(by_proposal(Asked(name, key, sim, budget, *given)))
+            wanted = Asked(
+                name=name,
+                key=key,
+                sim=sim,
+                budget=budget,
+                gradients=bool(gradients),
+                failures=failures,
+                known=known,
+                near=similar,
+                level=level,
+                watched=watched,
+                ways=ways,
+            )
+            found = flag_imprecise(by_proposal(wanted))
     return found._replace(settings=settings)
 
 
@@ -211,19 +226,19 @@ def adaptive_cross_entropy(
     """
     name = "adaptive_cross_entropy"
     check_random_key(name, key)
-    budget = whole_number(name, "budget", budget, LEAST)
+    budget = whole_number(name, "budget", budget, MIN_BUDGET)
     level = checked_level(name, level)
     settings = call_settings(name, key, budget=budget, level=level)
     for_search, key = jax.random.split(key)
-    found = failure_proposal(for_search, sim, samples=budget // 100, iterations=20)
+    found = failure_proposal(for_search, sim, samples=budget // 100, iterations=LEVELS)
     result = importance(key, sim, found.policy, budget - int(found.episodes), level=level)
-    against = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
-    words = "one Gaussian covers one failure mode, and no others were looked for"
+    reasons = () if bool(found.reached) else ("the search for a proposal did not reach failures",)
+    remark = "one Gaussian covers one failure mode, and no others were looked for"
     return result._replace(
         method=name,
         episodes=budget,
         settings=settings,
-        reliable=result.reliable and not against,
-        warnings=(*against, *result.warnings, words),
+        reliable=result.reliable and not reasons,
+        warnings=(*reasons, *result.warnings, remark),
         history=tuple(str(found).splitlines()),
     )

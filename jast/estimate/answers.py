@@ -5,6 +5,7 @@ of a given probability, and when failures happen. No episode is simulated.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,16 +14,34 @@ import numpy as np
 from jast import results
 from jast._checks import number
 from jast.estimate import diagnostics
-from jast.estimate.draws import Draws, Moments, interval, moments, of_weights, share, shares
+from jast.estimate.draws import (
+    Draws,
+    Moments,
+    mean_interval,
+    moments_of_sums,
+    moments_of_weights,
+    scaled_weights,
+    share_interval,
+)
 from jast.estimate.estimate import Estimate
 from jast.intervals import checked_level
 
 if TYPE_CHECKING:
     import chex
 
-__all__ = ["Exceedance", "FailureTimes", "distance_quantile", "exceedance", "failure_times"]
+__all__ = [
+    "Exceedance",
+    "FailureTimes",
+    "distance_quantile",
+    "draws_and_level",
+    "exceedance",
+    "failure_times",
+]
 
-POINTS = 64
+GRID_POINTS = 64
+"""Thresholds by default: a smooth curve in a picture."""
+TIME_QUANTILES = (0.05, 0.5, 0.95)
+"""Of the time of a failure: the median, and nine of ten lie between the others."""
 
 
 @results.printable()
@@ -38,16 +57,16 @@ class Exceedance(NamedTuple):
         True
     """
 
-    thresholds: Any
+    thresholds: np.ndarray
     """[k] rising; 0 is the failure"""
-    probability: Any
+    probability: np.ndarray
     """[k]"""
-    low: Any
+    low: np.ndarray
     """[k] ends of the pointwise interval at ``level``"""
-    high: Any
-    ess: Any
+    high: np.ndarray
+    ess: np.ndarray
     """[k] effective sample size of the draws within a threshold"""
-    reliable: Any
+    reliable: np.ndarray
     """[k] bool: whether the estimate is, and the draws within this threshold are enough for a
     number"""
     level: float
@@ -70,18 +89,18 @@ class FailureTimes(NamedTuple):
         (True, 1.0)
     """
 
-    probability: Any
+    probability: np.ndarray
     """[T + 1] that an episode fails at this step; their sum is the failure probability"""
-    low: Any
+    low: np.ndarray
     """[T + 1] ends of the interval at ``level``; where no failure was seen, from 0"""
-    high: Any
-    given_failure: Any
+    high: np.ndarray
+    given_failure: np.ndarray
     """[T + 1] the same, given that it fails; sum 1"""
-    quantiles: dict[str, Any]
+    quantiles: dict[float, tuple[int, int, int]]
     """Of the time, given a failure: 0.05, 0.5, 0.95 -> (step, low, high)"""
     mean: float
     """Mean time of a failure"""
-    ess: Any
+    ess: np.ndarray
     """[T + 1] effective sample size of the failures at this step"""
     reliable: bool
     """Whether the estimate is, and there are enough effective failures for the times"""
@@ -126,8 +145,8 @@ def exceedance(
         True
     """
     name = "exceedance"
-    draws, level = asked(name, estimate, level)
-    within = _Within(draws)
+    draws, level = draws_and_level(name, estimate, level)
+    within = _DistanceDistribution(draws)
     if thresholds is None:
         thresholds = within.grid()
     try:
@@ -137,9 +156,18 @@ def exceedance(
     if not (u.size and np.isfinite(u).all()):
         raise ValueError(f"{name}: thresholds must be finite numbers, received {thresholds!r}")
     rows = [within.at(v, level) for v in u]
-    p, low, high, ess, good = (np.array(a) for a in zip(*rows, strict=True))
-    good = good.astype(bool) & (estimate.reliable | draws.counted)
-    return Exceedance(u, p, low, high, ess, good, level, estimate.method, estimate.unseen)
+    probability, low, high, ess, good = (np.array(a) for a in zip(*rows, strict=True))
+    return Exceedance(
+        thresholds=u,
+        probability=probability,
+        low=low,
+        high=high,
+        ess=ess,
+        reliable=good.astype(bool) & (estimate.reliable | draws.counted),
+        level=level,
+        method=estimate.method,
+        unseen=estimate.unseen,
+    )
 
 
 def distance_quantile(
@@ -169,21 +197,23 @@ def distance_quantile(
         True
     """
     name = "distance_quantile"
-    draws, level = asked(name, estimate, level)
+    draws, level = draws_and_level(name, estimate, level)
     p = number(name, "probability", probability, lambda v: 0 < v < 1, "above 0 and below 1")
-    within = _Within(draws)
+    within = _DistanceDistribution(draws)
 
-    def cross(reached):
-        i = _first(within.count, reached)
+    def first_distance(reached):
+        i = within.first_index(reached)
         return None if i is None else float(within.severity[i])
 
-    middle = cross(lambda i: within.probability(i) >= p)
-    stops = middle == 0.0 == within.severity[0] and within.ties(0.0) > p * (1 + 1e-9)
-    if middle is None or stops or math.isnan(within.at(middle, level)[0]):
+    middle = first_distance(lambda i: within.probability(i) >= p)
+    if middle is None or math.isnan(within.at(middle, level)[0]):
         return math.nan, (math.nan, math.nan)
-    low, high = (cross(lambda i, k=k: within.interval(i, level)[k] >= p) for k in (1, 0))
-    ends = (-math.inf if low is None else low, math.inf if high is None else high)
-    return middle, ends
+    # where all failures are at 0, the distance is not known below it
+    at_zero = within.probability(np.searchsorted(within.severity, 0.0, "right") - 1)
+    if middle == 0.0 == within.severity[0] and at_zero > p * (1 + 1e-9):
+        return math.nan, (math.nan, math.nan)
+    low, high = (first_distance(lambda i, k=k: within.interval(i, level)[k] >= p) for k in (1, 0))
+    return middle, (-math.inf if low is None else low, math.inf if high is None else high)
 
 
 def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureTimes:
@@ -210,40 +240,40 @@ def failure_times(estimate: Estimate, *, level: float | None = None) -> FailureT
         True
     """
     name = "failure_times"
-    draws, level = asked(name, estimate, level)
+    draws, level = draws_and_level(name, estimate, level)
     log_w, at = (a[draws.failure] for a in (draws.log_weight, draws.length))
     if not len(at):
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    m, n = of_weights(log_w, draws.samples), draws.samples
-    w, whole = shares(log_w, draws.counted)
+    m = moments_of_weights(log_w, draws.samples)
+    w, total = scaled_weights(log_w, draws.counted)
     first, second, count = np.bincount(at, w), np.bincount(at, w**2), np.bincount(at)
     with np.errstate(divide="ignore"):
-        sums = [np.log(np.bincount(at, w**i)) + i * float(log_w.max()) for i in (1, 2, 3)]
-    nothing = share(whole, 0.0, 0.0, 0, level)[1][1] * math.exp(m.log_mean)
-    each = moments(sums, n)
-    rows = [Moments(*(a[t] for a in each)) for t in range(len(count))]
+        log_sums = [np.log(np.bincount(at, w**i)) + i * float(log_w.max()) for i in (1, 2, 3)]
+    each = moments_of_sums(log_sums, draws.samples)
+    # above a step at which no failure was seen: what is not excluded among the failures
+    unseen = share_interval(total, 0.0, 0.0, 0, level)[1][1] * math.exp(m.log_mean)
     ends = [
-        interval(r, level, k if draws.counted else None, n) if k else (0.0, nothing)
-        for r, k in zip(rows, count.tolist(), strict=True)
+        mean_interval(draws, _at_index(each, t), k, level) if k else (0.0, unseen)
+        for t, k in enumerate(count.tolist())
     ]
-    by = [
-        share(whole, *sums_, level)
-        for sums_ in zip(np.cumsum(first), np.cumsum(second), np.cumsum(count), strict=True)
-    ]
+    sums_by_step = zip(np.cumsum(first), np.cumsum(second), np.cumsum(count), strict=True)
+    shares = [share_interval(total, *sums, level) for sums in sums_by_step]
+    low, high = np.array(ends).T
     return FailureTimes(
-        np.exp(np.minimum(each.log_mean, 0.0)),
-        *np.array(ends).T,
-        first / whole.first,
-        {q: _time(by, q) for q in (0.05, 0.5, 0.95)},
-        float(first @ np.arange(len(first)) / whole.first),
-        np.where(count > 0, each.ess, 0.0),
-        estimate.reliable and bool(draws.counted or m.ess >= diagnostics.ESS),
-        level,
-        estimate.method,
+        probability=np.exp(np.minimum(each.log_mean, 0.0)),
+        low=low,
+        high=high,
+        given_failure=first / total.first,
+        quantiles={q: _time_quantile(shares, q) for q in TIME_QUANTILES},
+        mean=float(first @ np.arange(len(first)) / total.first),
+        ess=np.where(count > 0, each.ess, 0.0),
+        reliable=estimate.reliable and bool(draws.counted or m.ess >= diagnostics.MIN_ESS),
+        level=level,
+        method=estimate.method,
     )
 
 
-def asked(name, estimate, level):
+def draws_and_level(name: str, estimate: Any, level: float | None) -> tuple[Draws, float]:
     """(`Draws`, level) of an ``estimate``; ValueError where it holds none."""
     if not isinstance(estimate, Estimate):
         raise ValueError(
@@ -260,68 +290,65 @@ def asked(name, estimate, level):
     return estimate.draws, level
 
 
-class _Within:
+def _at_index(m, i):
+    """The one of many `Moments`."""
+    return Moments(*(a[i] for a in m))
+
+
+class _DistanceDistribution:
     """Sums over the draws within each severity."""
 
     def __init__(self, draws):
         order = np.argsort(draws.severity, kind="stable")
         self.draws, self.severity = draws, draws.severity[order]
         self.log_w = draws.log_weight[order].astype(np.float64)
-        self.count = len(order)
-        self.moments = moments(
+        self.moments = moments_of_sums(
             [np.logaddexp.accumulate(i * self.log_w) for i in (1, 2, 3)], draws.samples
         )
-        self.top = np.maximum.accumulate(self.log_w) if self.count else self.log_w
 
     def probability(self, i):
         return math.exp(min(self.moments.log_mean[i], 0.0))  # weights may have a mean above 1
 
-    def ties(self, v):
-        """The probability within ``v``."""
-        return self.probability(np.searchsorted(self.severity, v, "right") - 1)
-
     def interval(self, i, level):
-        m = Moments(*(a[i] for a in self.moments))
-        return interval(m, level, i + 1 if self.draws.counted else None, self.draws.samples)
+        return mean_interval(self.draws, _at_index(self.moments, i), i + 1, level)
 
-    def at(self, u, level):
-        """(probability, low, high, effective sample size, whether to believe it) within ``u``."""
-        i = int(np.searchsorted(self.severity, u, "right")) - 1
+    def first_index(self, holds):
+        """The first draw from which on ``holds`` does; None where it never does."""
+        n = len(self.severity)
+        i = bisect_left(range(n), True, key=holds)
+        return i if i < n else None
+
+    def at(self, threshold, level):
+        """(probability, low, high, effective sample size, whether to believe it) within it."""
+        i = int(np.searchsorted(self.severity, threshold, "right")) - 1
         unknown = math.nan, math.nan, math.nan
-        if i < 0 or u > self.draws.reach:
+        if i < 0 or threshold > self.draws.reach:
             return *unknown, 0.0, False
-        ess = float(self.moments.ess[i])
-        if not self.draws.counted:
-            log_w = self.log_w[: i + 1]
-            k_hat = diagnostics.pareto_k(log_w, self.draws.samples, i + 1)
-            carried = math.exp(self.top[i] - self.moments.log_mean[i]) / self.draws.samples
-            if diagnostics.reasons(i + 1, ess, k_hat, carried):
-                return *unknown, ess, False
+        ess, n = float(self.moments.ess[i]), self.draws.samples
+        if not self.draws.counted and diagnostics.warnings_of_weights(self.log_w[: i + 1], n, ess):
+            return *unknown, ess, False
         return self.probability(i), *self.interval(i, level), ess, True
 
     def grid(self):
         """Thresholds that the draws say something of."""
-        if not self.count:
+        n = len(self.severity)
+        if not n:
             return np.zeros(1)
-        low = min(self.severity[min(diagnostics.ESS, self.count) - 1], 0.0)
-        i = _first(self.count, lambda i: self.probability(i) >= 0.5)
+        low = min(self.severity[min(diagnostics.MIN_ESS, n) - 1], 0.0)
+        i = self.first_index(lambda i: self.probability(i) >= 0.5)
         high = max(self.severity[-1 if i is None else i], 0.0)
-        return np.union1d(np.linspace(low, high, POINTS), [0.0])
+        return np.union1d(np.linspace(low, high, GRID_POINTS), [0.0])
 
 
-def _first(n, holds):
-    """The first of ``n`` numbers from which on ``holds`` does; None where it never does."""
-    low, high = 0, n
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if holds(middle) else (middle + 1, high)
-    return low if low < n else None
-
-
-def _time(by, q):
-    """(the step by which a share ``q`` of the failures happened, low, high), of the shares ``by``
+def _time_quantile(shares, q):
+    """(the step by which a share ``q`` of the failures happened, low, high), of the ``shares`` by
     each step and their intervals.
     """
+
+    def first_step(values):
+        return next((t for t, v in enumerate(values) if v >= q), len(shares) - 1)
+
+    middle, ends = zip(*shares, strict=True)
+    low, high = zip(*ends, strict=True)
     # a share whose upper end is below q speaks for a later time
-    marks = zip(*((r, high, low) for r, (low, high) in by), strict=True)
-    return tuple(next((t for t, v in enumerate(each) if v >= q), len(by) - 1) for each in marks)
+    return first_step(middle), first_step(high), first_step(low)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jast.estimate.adapt import adapted
 from jast.estimate.gaussians import effective
-from jast.estimate.populations import LAST, QUANTILE, explore, settled
+from jast.estimate.populations import FINAL_MOVES, LEVEL_SHARE, equilibrate, explore
 from jast.estimate.search_state import Family, State, log_ratios, mixed_ratio
 
 __all__ = ["audited", "uncovered"]
@@ -77,8 +77,8 @@ def _settled(family, state):
     if z is None or not len(z):
         return state, None
     key, everywhere = family.chance.next_key(), family.left_out(state.q, math.inf)
-    people, chain = settled(
-        key, family.sim, z, family.settings.moves, covered=everywhere, most=most
+    people, chain = equilibrate(
+        key, family.sim, z, family.settings.moves, covered=everywhere, max_evaluations=most
     )
     rows = people.score == -np.inf
     state = state.noted(f"audit: {len(z)} failures of wide noise moved", chain.evaluations)
@@ -114,13 +114,20 @@ def _elsewhere(family, state):
     room = family.settings.search_ends * family.budget - state.spent
     room = min(family.settings.audit_share * family.budget, room)
     # as many points as can afford the levels down to there
-    size = int(room / (least / math.log(QUANTILE) + LAST + 4))
+    size = int(room / (least / math.log(LEVEL_SHARE) + FINAL_MOVES + 4))
     size = min(size, max(family.budget // 200, family.settings.fewest))
     if size < family.settings.fewest:
         return state.against(UNFINISHED), None
     key, outside = family.chance.next_key(), family.left_out(state.q, _least(family, state))
     most = int(family.settings.ties * room)
-    p = explore(key, family.sim, size, covered=outside, least=least, most=most)
+    p = explore(
+        key,
+        family.sim,
+        size,
+        covered=outside,
+        min_log_probability=least,
+        max_evaluations=most,
+    )
     state = state.noted(f"audit: a population of {size}", p.evaluations)
     if not p.complete:
         state = state.against(UNFINISHED)

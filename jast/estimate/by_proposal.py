@@ -17,17 +17,17 @@ from jast._jax import was_interrupted
 from jast.estimate import diagnostics, sums
 from jast.estimate.adapt import adapted
 from jast.estimate.audit import audited
-from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import Estimate, estimate, of_counts
+from jast.estimate.draws import with_source
+from jast.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
 from jast.estimate.final_draws import estimated
 from jast.estimate.gaussian_family import GaussianFamily
 from jast.estimate.gaussian_start import explored, looked
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.plain import of_points
+from jast.estimate.plain import simulate_points
 from jast.estimate.search_settings import SETTINGS, SearchSettings
 from jast.estimate.search_state import Family, State, begun, serves
-from jast.estimate.subset import by_levels
+from jast.estimate.subset import fallback_estimate
 from jast.estimate.tilt_family import TiltFamily
 from jast.estimate.tilt_start import cooled, given, led_down, with_given
 from jast.failures import Failures
@@ -77,7 +77,7 @@ class Search(NamedTuple):
     @property
     def enough(self) -> bool:
         """Whether what is left of the budget tells the probability by the proposal."""
-        return self.worth * (self.family.budget - self.state.spent) > diagnostics.ESS
+        return self.worth * (self.family.budget - self.state.spent) > diagnostics.MIN_ESS
 
 
 def by_proposal(asked: Asked) -> Estimate:
@@ -220,7 +220,7 @@ def _drawn(asked, search, against):
     often = math.exp(min(log_p, 0.0)) * n >= asked.settings.plain_failures
     if not search.enough and not often and log_p > -math.inf:
         reasons = [*against, *state.reasons] or [ASTRAY]
-        found = by_levels(key, sim, n, log_p, asked.level, reasons)
+        found = fallback_estimate(key, sim, n, log_p, asked.level, reasons)
         if found is not None:
             spent, history = state.spent + found.episodes, (*state.history, *found.history)
             return found._replace(episodes=spent, history=history, plain=state.plain)
@@ -234,11 +234,11 @@ def _drawn(asked, search, against):
         reasons = [*against, *state.reasons, *(() if search.enough else (ASTRAY,))]
         found = estimated(key, sim, q, f.batch, watch, asked.ways, reasons=reasons, **about)
         return found._replace(proposal=f.on_device(state.q))
-    total, notes, lost = chunks(of_points, (key, sim, f.batch, n), f.batch, watch, asked.ways)
+    total, notes, lost = chunks(simulate_points, (key, sim, f.batch, n), f.batch, watch, asked.ways)
     spent, reasons = state.spent + total.samples, [*against, *lost]  # others are about the proposal
     about |= dict(evaluations=spent, proposal=_proposal(search))
-    found = of_counts(name, total, notes=notes, reasons=reasons, **about)
-    return found._replace(draws=drawn_by(found.draws, key, f.batch, "model"))
+    found = estimate_from_counts(name, total, notes=notes, reasons=reasons, **about)
+    return found._replace(draws=with_source(found.draws, key, f.batch, "model"))
 
 
 def _of_the_search(asked, search, against):
@@ -253,9 +253,9 @@ def _of_the_search(asked, search, against):
         f"interrupted after {state.spent} of {asked.budget} evaluations: the estimate uses the same"
         " episodes that chose the proposal"
     )
-    return estimate(
+    return estimate_from_weights(
         asked.name,
-        sums.add(sums.nothing(len(rows)), seen),
+        sums.add_traces(sums.empty_sums(len(rows)), seen),
         level=asked.level,
         reasons=[*against, said],
         evaluations=state.spent,

@@ -10,7 +10,7 @@ failures by their distance alone, the second asks of an episode only whether it 
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -22,16 +22,29 @@ from jast.estimate.particles import (
     LANES,
     SMALL,
     WINDOW,
-    begun,
-    blank,
-    fresh,
-    moved,
-    when_reached,
+    allocate_particles,
+    draw_particles,
+    initial_steering,
+    move_particles,
+    record_crossings,
 )
+from jast.estimate.populations import next_level
 from jast.limit_state import dimension
 from jast.simulator import Simulator
 
-__all__ = ["WAYS", "Descent", "Settings", "by_distance", "by_width", "cooled"]
+__all__ = [
+    "DESCENTS",
+    "SETTINGS",
+    "Descent",
+    "Settings",
+    "by_distance",
+    "by_width",
+    "cool_failures",
+    "population_size",
+]
+
+BISECTIONS = 40
+"""Halvings of the step to a narrower width: to the last digits of a float32."""
 
 
 @dataclass(frozen=True)
@@ -50,26 +63,26 @@ class Settings:
     """Of the moves between two levels of a distance that is known at each step."""
     kinds_by_width: tuple[int, int] = SMALL, WINDOW
     """Of all other moves; without windows the variance of the breaker is 9 times as great."""
-    quantile: float = 0.2
+    level_share: float = 0.2
     """Share of the points that a level keeps."""
-    effective: float = 0.5
+    effective_share: float = 0.5
     """Share of effective points that a narrower width leaves."""
     widths: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
     """Of the noise, in which failures are looked for."""
-    failing: float = 0.1
+    failing_share: float = 0.1
     """Share of the points that fails at the first width."""
-    least: float = -690.0
+    min_log_probability: float = -690.0
     """Log probability below which a population gives up: that of the least double."""
-    scattered: float = 0.25
+    max_variance: float = 0.25
     """Relative variance above which a population from wide noise gives up: it witnesses nothing."""
-    numbers: int = 2**26
+    max_numbers: int = 2**26
     """Numbers that a population holds at most; of longer episodes it has fewer points."""
-    coldest: float = 0.05
+    final_width: float = 0.05
     """Width to which failures are cooled: the likeliest are then a twentieth of a standard
     deviation away."""
-    coolings: int = 40
+    cooling_steps: int = 40
     """Widths on the way there."""
-    cooled: int = 128
+    cooled_failures: int = 128
     """Failures that are cooled, as many as are simulated side by side: few of them with many moves
     each get farther than many."""
 
@@ -80,36 +93,38 @@ SETTINGS = Settings()
 class Descent(NamedTuple):
     """What one population came to. On the host."""
 
-    points: Any
+    points: np.ndarray
     """[m, D] failures, nearly as p(z | failure) has them; empty where none was reached"""
-    used: Any
+    used: np.ndarray
     """[m] int32: how many of the numbers decided each"""
-    distance: Any
+    distance: np.ndarray
     """[m] miss distances"""
-    family: Any
+    family: np.ndarray
     """[m] int64: which of its first points each descends from"""
-    log_mean: Any
+    log_mean: np.ndarray
     """Log of the estimate; -inf where no failure was reached"""
-    variance: Any
+    variance: np.ndarray
     """Of the estimate over its square, by the genealogy of the points"""
-    plain: Any
+    plain: np.ndarray
     """[3] of the model's own draws: those that fail, that are invalid, and all"""
-    levels: Any
+    levels: np.ndarray
     """Miss distances of the levels, or widths, in their order"""
-    evaluations: Any
-    invalid: Any
-    size: Any
+    evaluations: np.ndarray
+    invalid: np.ndarray
+    size: np.ndarray
     """Points that it has"""
 
 
-class _Population:
+class _ParticlePopulation:
     """A population on its way: the particles, the family of each, and the counts."""
 
     def __init__(self, key, sim, n, moves, capacity, settings=SETTINGS):
-        self.sim, self.n, self.moves, self.settings = sim, n, moves, settings
-        self.rng, self.key, self.calls = numpy_generator(key, 1), key, 0
-        self.particles, self.steering = blank(sim, capacity), begun()
-        self.evaluations, self.invalid = 0, 0
+        self.key, self.calls = key, 0
+        self.sim, self.settings = sim, settings
+        self.n, self.moves = n, moves
+        self.rng = numpy_generator(key, 1)
+        self.particles, self.steering = allocate_particles(sim, capacity), initial_steering()
+        self.evaluations = self.invalid = 0
         self.log_mean, self.family = 0.0, np.arange(n)
         # else the distance is known at the end of an episode, and nothing comes after it
         self.watched = not sim.episodic and sim.horizon > 1
@@ -121,17 +136,17 @@ class _Population:
 
     def draw(self, width):
         """Begin with independent points of this width; returns which of them fail."""
-        self.particles, invalid = fresh(
-            self.sim, self.particles, self.next_key(), self.n, width=width
-        )
-        self.evaluations, self.invalid = self.evaluations + self.n, self.invalid + invalid
+        key = self.next_key()
+        self.particles, invalid = draw_particles(self.sim, self.particles, key, self.n, width=width)
+        self.evaluations += self.n
+        self.invalid += invalid
         failing = self.score() == -np.inf
         if width == 1:
             self.plain = int(failing.sum()), invalid, self.n
         return failing
 
-    def first(self, failing, n):
-        """Leave only the first ``n`` independent points, in whole blocks; which of them fail."""
+    def keep_first(self, failing, n):
+        """Leave only the first ``n`` independent points, in full blocks; which of them fail."""
         self.n = int(max(min(n, self.n) // LANES * LANES, LANES))
         self.family = np.arange(self.n)
         return failing[: self.n]
@@ -139,12 +154,12 @@ class _Population:
     def score(self):
         return np.asarray(self.particles.score)[: self.n]
 
-    def weigh(self, log_w):
-        """The estimate with one more factor, the mean weight; which is all where it is the last."""
+    def multiply(self, log_w):
+        """Multiply the estimate by the mean of these weights; after the last it is complete."""
         top = log_w.max()
         self.log_mean += top + math.log(np.exp(log_w - top).mean())
 
-    def move(self, log_w, level, **width):
+    def resample_and_move(self, log_w, level, **width):
         """Go on from points chosen by weight (systematic resampling)."""
         rows = resampled(log_w, self.n, self.rng.random())
         self.family = self.family[rows]
@@ -153,9 +168,10 @@ class _Population:
             kinds = self.settings.kinds_by_distance
             # what is chosen more than once is simulated once
             chosen, rows = np.unique(rows, return_inverse=True)
-            self.particles = when_reached(self.sim, self.particles, self.next_key(), chosen, level)
+            key = self.next_key()
+            self.particles = record_crossings(self.sim, self.particles, key, chosen, level)
             self.evaluations += len(chosen)
-        self.particles, self.steering, invalid = moved(
+        self.particles, self.steering, invalid = move_particles(
             self.sim,
             self.particles,
             self.next_key(),
@@ -166,10 +182,8 @@ class _Population:
             kinds=kinds,
             **width,
         )
-        self.evaluations, self.invalid = (
-            self.evaluations + self.moves * self.n,
-            self.invalid + invalid,
-        )
+        self.evaluations += self.moves * self.n
+        self.invalid += invalid
 
     def variance(self, log_w):
         """Relative variance of the estimate whose last weights are these: what families of a common
@@ -177,25 +191,28 @@ class _Population:
         draws alone: systematic resampling adds no noise of its own, as multinomial would.
         """
         w = np.exp(log_w - log_w.max())
-        together = (np.bincount(self.family, w, self.n) ** 2).sum() / w.sum() ** 2
-        return max(1 - self.n / (self.n - 1) * (1 - together), 0.0)
+        same_family = (np.bincount(self.family, w, self.n) ** 2).sum() / w.sum() ** 2
+        return max(1 - self.n / (self.n - 1) * (1 - same_family), 0.0)
 
-    def lost(self):
+    def without_failures(self):
         """The `Descent` that reached no failure."""
-        p, d = self.particles, dimension(self.sim)
-        none = np.zeros((0, d), p.z.dtype), np.zeros(0, np.int32), np.zeros(0, p.z.dtype)
-        return self._end(*none, np.zeros(0, np.int64), -math.inf, math.nan)
+        dtype, none = self.particles.z.dtype, np.zeros(0)
+        points, used = np.zeros((0, dimension(self.sim)), dtype), none.astype(np.int32)
+        family = none.astype(np.int64)
+        return self._result(points, used, none.astype(dtype), family, -math.inf, math.nan)
 
-    def arrived(self, log_w, before=None):
-        """The `Descent` whose last weights, of failures, are these; ``before``: see `moved`."""
-        self.weigh(log_w)
+    def with_failures(self, log_w, before=None):
+        """The `Descent` whose last weights, of failures, are these; ``before``: see
+        `move_particles`.
+        """
+        self.multiply(log_w)
         variance = self.variance(log_w)
-        self.move(log_w, -np.inf, before=before)
+        self.resample_and_move(log_w, -np.inf, before=before)
         p = jax.device_get(self.particles)
-        own = (a[: self.n] for a in (p.z, p.used, p.distance))
-        return self._end(*own, self.family, self.log_mean, variance)
+        points, used, distance = (a[: self.n] for a in (p.z, p.used, p.distance))
+        return self._result(points, used, distance, self.family, self.log_mean, variance)
 
-    def _end(self, points, used, distance, family, log_mean, variance):
+    def _result(self, points, used, distance, family, log_mean, variance):
         return Descent(
             points=points,
             used=used,
@@ -211,38 +228,33 @@ class _Population:
         )
 
 
-def size(sim: Simulator, particles: int, settings: Settings = SETTINGS) -> int:
+def population_size(sim: Simulator, particles: int) -> int:
     """Points of a population of ``sim``: as many as are asked for, if they fit."""
-    return max(min(particles, settings.numbers // max(dimension(sim), 1)) // 128 * 128, 128)
+    most = SETTINGS.max_numbers // max(dimension(sim), 1)
+    return max(min(particles, most) // LANES * LANES, LANES)
 
 
 def by_distance(
-    key: jax.Array,
-    sim: Simulator,
-    n: int,
-    moves: int,
-    capacity: int,
-    settings: Settings = SETTINGS,
+    key: jax.Array, sim: Simulator, n: int, moves: int, capacity: int, settings: Settings = SETTINGS
 ) -> Descent:
     """Down the levels of the miss distance: each is the sample quantile of the scores, until
     failures are as many. ``n`` points in ``capacity`` places, a size of the compiled program.
     """
-    s = _Population(key, sim, n, moves, capacity, settings)
-    s.draw(1.0)
+    population = _ParticlePopulation(key, sim, n, moves, capacity, settings)
+    population.draw(1.0)
     level = math.inf
     while True:
-        score = s.score()
-        if np.mean(score == -np.inf) >= settings.quantile:
-            return s.arrived(_where(score == -np.inf))
-        level = _next(score, level, settings.quantile)
-        if level is None or s.log_mean < settings.least:
-            return s.lost()
-        log_w = _where(score <= level)
+        score = population.score()
+        enough = np.mean(score == -np.inf) >= settings.level_share
+        level = -math.inf if enough else next_level(score, level, settings.level_share)
+        if level is None or (not enough and population.log_mean < settings.min_log_probability):
+            return population.without_failures()
+        log_w = _indicator_log_weights(score <= level)
         if level == -math.inf:
-            return s.arrived(log_w)
-        s.weigh(log_w)
-        s.levels.append(level)
-        s.move(log_w, level)
+            return population.with_failures(log_w)
+        population.multiply(log_w)
+        population.levels.append(level)
+        population.resample_and_move(log_w, level)
 
 
 def by_width(
@@ -252,85 +264,85 @@ def by_width(
     moves: int,
     capacity: int,
     settings: Settings = SETTINGS,
-    most: float = math.inf,
+    max_evaluations: float = math.inf,
 ) -> Descent:
     """From the least width of the noise at which failures are frequent to the model's own, each
     step as far as leaves enough effective points; moves among failures only. Of the ``n`` points
-    as many go on as cost ``most`` evaluations, nearly: in long episodes the way has many widths.
+    as many go on as cost ``max_evaluations``, nearly: in long episodes the way has many widths.
     """
-    s = _Population(key, sim, n, moves, capacity, settings)
-    width, failing = _wide(s, settings)
-    s.levels.append(width)
+    population = _ParticlePopulation(key, sim, n, moves, capacity, settings)
+    width, failing = _find_width(population, settings)
+    levels = population.levels
+    levels.append(width)
     if width > 1:
-        failing = s.first(failing, most / (moves * _widths(dimension(sim), width, settings)))
+        steps = _expected_steps(dimension(sim), width, settings)
+        failing = population.keep_first(failing, max_evaluations / (moves * steps))
     if failing.sum() < 2:
-        return s.lost()
-    log_w = _where(failing)
+        return population.without_failures()
+    log_w = _indicator_log_weights(failing)
     while width > 1:
-        s.weigh(log_w)
-        before = s.levels[-2] if len(s.levels) > 1 else width
-        s.move(log_w, -np.inf, width=width, before=before)
-        square, used = (np.asarray(a, np.float64)[: s.n] for a in s.particles[3:1:-1])
-        width = _narrower(square, used, width, settings.effective)
-        log_w = _ratio(square, used, s.levels[-1], width)
-        s.levels.append(width)
-        if s.log_mean < settings.least or s.variance(log_w) > settings.scattered:
-            return s.lost()
-    return s.arrived(log_w, before=s.levels[-2] if len(s.levels) > 1 else None)
+        population.multiply(log_w)
+        before = levels[-2] if len(levels) > 1 else width
+        population.resample_and_move(log_w, -np.inf, width=width, before=before)
+        p = population.particles
+        square, used = (np.asarray(a, np.float64)[: population.n] for a in (p.square, p.used))
+        width = _next_width(square, used, width, settings.effective_share)
+        log_w = _log_density_ratio(square, used, levels[-1], width)
+        levels.append(width)
+        gone = population.log_mean < settings.min_log_probability
+        if gone or population.variance(log_w) > settings.max_variance:
+            return population.without_failures()
+    return population.with_failures(log_w, before=levels[-2] if len(levels) > 1 else None)
 
 
-def _wide(s, settings):
+def _find_width(population, settings):
     """The least width at which failures are frequent, or else where they are least rare; and which
     of its points, drawn, fail.
     """
     shares = []
     for width in settings.widths:
-        failing = s.draw(width)
+        failing = population.draw(width)
         shares.append(failing.mean())
-        if shares[-1] >= settings.failing:
+        if shares[-1] >= settings.failing_share:
             return width, failing
     best = settings.widths[int(np.argmax(shares))]
-    return best, failing if best == width else s.draw(best)
+    return best, failing if best == width else population.draw(best)
 
 
-def _widths(d, width, settings):
+def _expected_steps(d, width, settings):
     """How many widths lie between this one and 1 where ``d`` numbers are used: the weights of the
     step from w to (1 - a) w have a relative variance of some exp(2 d a^2) - 1.
     """
-    return math.log(width) * math.sqrt(2 * d / -math.log(settings.effective)) + 1
+    return math.log(width) * math.sqrt(2 * d / -math.log(settings.effective_share)) + 1
 
 
-def cooled(
-    key: jax.Array,
-    sim: Simulator,
-    points: np.ndarray,
-    evaluations: int,
-    together: bool,
-    settings: Settings = SETTINGS,
+def cool_failures(
+    key: jax.Array, sim: Simulator, points: np.ndarray, evaluations: int, resample: bool
 ) -> tuple[np.ndarray, int]:
     """The failures ``points`` [m, D] cooled to the likeliest, for so many ``evaluations``, nearly,
     and how many they were.
 
-    Where not ``together`` no point replaces another, so no mode is lost, however little of the
+    Unless they ``resample`` no point replaces another, so no mode is lost, however little of the
     probability it has. Else those of high density replace the others at each width, as in every
     population, and moves are spent where failures are likeliest.
     """
-    m, rng, rows, steering = len(points), numpy_generator(key, 6), np.arange(len(points)), begun()
-    particles = blank(sim, size(sim, settings.particles, settings))
+    m, rng = len(points), numpy_generator(key, 6)
+    rows, steering = np.arange(m), initial_steering()
+    particles = allocate_particles(sim, population_size(sim, SETTINGS.particles))
     z = np.zeros(particles.z.shape, particles.z.dtype)
     z[:m] = points
     # all of them fail, and only a failure takes the place of one
     particles = particles._replace(z=jax.device_put(z))
-    moves = max(evaluations // (m * settings.coolings), 2)
-    widths = np.geomspace(1.0, settings.coldest, settings.coolings).tolist()
+    moves = max(evaluations // (m * SETTINGS.cooling_steps), 2)
+    widths = np.geomspace(1.0, SETTINGS.final_width, SETTINGS.cooling_steps).tolist()
     for i, width in enumerate(widths):
-        if together and i:
+        if resample and i:
             square = np.asarray(particles.square)[:m].astype(np.float64)
             used, last = np.asarray(particles.used)[:m], widths[i - 1]
             # as far on the way to this width as leaves enough effective points
-            near = _narrower(square, used, last, settings.effective, width)
-            rows = resampled(_ratio(square, used, last, near), m, rng.random())
-        particles, steering, _ = moved(
+            near = _next_width(square, used, last, SETTINGS.effective_share, width)
+            rows = resampled(_log_density_ratio(square, used, last, near), m, rng.random())
+        particles, steering, _ = move_particles(
             sim,
             particles,
             counter_key(key, 3, i),
@@ -343,46 +355,34 @@ def cooled(
     return np.asarray(particles.z)[:m], moves * len(widths) * m
 
 
-WAYS = {"distance": by_distance, "width": by_width}
+DESCENTS = {"distance": by_distance, "width": by_width}
+"""The ways down, which know nothing of each other."""
 
 
-def _where(chosen):
+def _indicator_log_weights(chosen):
     """Log weights of 1 where ``chosen``, else of 0."""
     return np.where(chosen, 0.0, -np.inf)
 
 
-def _next(score, last, quantile):
-    """The next level: the sample quantile of the scores, below the last one; -inf where only
-    failures are; None where nothing is.
-    """
-    level = np.partition(score, k := math.ceil(quantile * len(score)) - 1)[k]
-    if level < last:
-        return float(level)
-    below = score[score < last]
-    return float(below.max()) if below.size else None
-
-
-def _ratio(square, used, before, width):
+def _log_density_ratio(square, used, before, width):
     """log of N(0, width^2 I) over N(0, before^2 I), of points whose ``used`` numbers have these
     sums of ``square``.
     """
     return used * math.log(before / width) - 0.5 * square * (1 / width**2 - 1 / before**2)
 
 
-def _narrower(square, used, width, least, floor=1.0):
-    """The least width, from ``floor`` on, whose weights leave a share of ``least`` effective
-    points.
-    """
+def _next_width(square, used, width, effective_share, floor=1.0):
+    """The least width, from ``floor`` on, whose weights leave this share of effective points."""
 
     def enough(new):
-        w = _ratio(square, used, width, new)
+        w = _log_density_ratio(square, used, width, new)
         w = np.exp(w - w.max())
-        return w.sum() ** 2 >= least * len(w) * (w**2).sum()
+        return w.sum() ** 2 >= effective_share * len(w) * (w**2).sum()
 
     if enough(floor):
         return floor
     low, high = floor, width
-    for _ in range(40):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high

@@ -4,6 +4,7 @@ greatest weights, and the rules made of them.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +12,32 @@ import numpy as np
 if TYPE_CHECKING:
     import chex
 
+__all__ = [
+    "MIN_ESS",
+    "MIN_MODE_SHARE",
+    "mode_warnings",
+    "pareto_k",
+    "tail_size",
+    "warnings_of_weights",
+    "weight_warnings",
+]
 
-__all__ = ["pareto_k", "reasons"]
-
-K_HAT, ESS, SHARE, PER_FAILURE, MATTERS, FEW, PART = 0.7, 100, 0.05, 0.01, 0.02, 30, 0.5
+MAX_K_HAT = 0.7
+"""Pareto shape above which no standard error is trusted (Vehtari and others 2024)."""
+MIN_ESS = 100
+"""Effective draws of an estimate: a relative standard error of a tenth. A convention."""
+MAX_WEIGHT_SHARE = 0.05
+"""Part of an estimate that one episode may carry. A convention."""
+MIN_ESS_PER_FAILURE = 0.01
+"""Effective draws a failure: of a proposal below it the weights hardly overlap. A convention."""
+MIN_MODE_SHARE = 0.02
+"""Part of the estimate from which on a failure mode matters. A convention."""
+MIN_MODE_ESS = 30
+"""Effective draws of such a mode: its own standard error is then below a fifth."""
+MIN_ERROR_SHARE = 0.5
+"""Part of the standard error of the whole that the mode's own has to be, to matter."""
+MIN_TAIL = 5
+"""Weights that a shape is fitted to, at least."""
 
 
 def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None) -> float:
@@ -44,21 +67,27 @@ def pareto_k(log_weights: chex.Array, samples: int, failures: int | None = None)
         return float("nan")
     log_w = log_w[log_w > -np.inf]
     failures = len(log_w) if failures is None else failures
-    m = int(np.ceil(min(samples / 5, 3 * np.sqrt(samples), max(failures / 5, 5))))
-    m = min(m, len(log_w) - 1)
-    if m < 5:
+    m = min(tail_size(samples), math.ceil(max(failures / 5, MIN_TAIL)), len(log_w) - 1)
+    if m < MIN_TAIL:
         return float("nan")
     w = np.exp(log_w[-m - 1 :] - log_w[-1])
     excess = w[1:] - w[0]
     excess = excess[excess > 1e-9]
     if not excess.size:
         return float("-inf")
-    if len(excess) >= 5:
-        return _shape(excess)
+    if len(excess) >= MIN_TAIL:
+        return _fit_shape(excess)
     return float("-inf") if excess[-1] < w[0] else float("inf")  # a few above a crowd of equal ones
 
 
-def _shape(x):
+def tail_size(samples: int) -> int:
+    """How many of the greatest of so many weights a shape is fitted to, at most: min(n / 5,
+    3 sqrt(n)) (Vehtari and others 2024).
+    """
+    return math.ceil(min(samples / 5, 3 * math.sqrt(samples)))
+
+
+def _fit_shape(x):
     """The estimate of Zhang and Stephens (2009) from rising excesses ``x`` above 0, with the weak
     prior of PSIS (10 observations at 0.5).
     """
@@ -73,48 +102,50 @@ def _shape(x):
     return float((n * np.log1p(-best * x).mean() + 5) / (n + 10))
 
 
-def by_mode(sums, groups):
-    """(share of the estimate, effective sample size) of groups of components, greatest share first:
-    [m], [m].
-    """
-    first = np.array([sums.by_component[g].sum() for g in groups])
-    second = np.array([sums.squares[g].sum() for g in groups])
-    order = np.argsort(-first, kind="stable")
-    return (
-        first[order] / sums.first,
-        np.where(second > 0, first**2 / np.where(second > 0, second, 1), 0)[order],
-    )
-
-
-def thin_modes(shares, sizes, error):
+def mode_warnings(shares: np.ndarray, sizes: np.ndarray, error: float) -> list[str]:
     """Texts for the modes that few effective episodes speak for and that matter: also to the
     relative ``error`` of the whole.
     """
     if len(shares) < 2:
         return []
     return [
-        f"a failure mode with {v:.1%} of the estimate has an effective sample size of only {n:.3g}"
-        for v, n in zip(shares, sizes, strict=True)
-        if v > MATTERS and n < FEW and v**2 > n * (PART * error) ** 2
+        f"a failure mode with {share:.1%} of the estimate has an effective sample size of only"
+        f" {size:.3g}"
+        for share, size in zip(shares, sizes, strict=True)
+        if share > MIN_MODE_SHARE
+        and size < MIN_MODE_ESS
+        and share**2 > size * (MIN_ERROR_SHARE * error) ** 2
     ]
 
 
-def reasons(failures, ess, k_hat, max_share):
+def weight_warnings(failures: int, ess: float, k_hat: float, max_share: float) -> list[str]:
     """Why weights must not be trusted: a list of texts, empty where nothing speaks against them."""
     found = []
-    if ess < ESS:
-        found.append(f"effective sample size {ess:.3g}, below {ESS}")
+    if ess < MIN_ESS:
+        found.append(f"effective sample size {ess:.3g}, below {MIN_ESS}")
     if np.isnan(k_hat):
         found.append(f"{failures} failures are too few to judge the tail of the weights")
-    elif k_hat > K_HAT:
+    elif k_hat > MAX_K_HAT:
         found.append(
-            f"Pareto k-hat {k_hat:.2f}, above {K_HAT}: the weights have so heavy a tail that their"
-            " standard error cannot be trusted"
+            f"Pareto k-hat {k_hat:.2f}, above {MAX_K_HAT}: the weights have so heavy a tail that"
+            " their standard error cannot be trusted"
         )
-    if max_share > SHARE:
-        found.append(f"one episode carries {max_share:.0%} of the estimate, above {SHARE:.0%}")
-    if ess < PER_FAILURE * failures:
+    if max_share > MAX_WEIGHT_SHARE:
         found.append(
-            f"effective sample size {ess:.3g} is below {PER_FAILURE:.0%} of the {failures} failures"
+            f"one episode carries {max_share:.0%} of the estimate, above {MAX_WEIGHT_SHARE:.0%}"
+        )
+    if ess < MIN_ESS_PER_FAILURE * failures:
+        found.append(
+            f"effective sample size {ess:.3g} is below {MIN_ESS_PER_FAILURE:.0%} of the {failures}"
+            " failures"
         )
     return found
+
+
+def warnings_of_weights(log_weights: chex.Array, samples: int, ess: float) -> list[str]:
+    """`weight_warnings` of these weights [m] above 0, of ``samples`` in all, whose effective sample
+    size is known.
+    """
+    m = len(log_weights)
+    max_share = math.exp(np.max(log_weights) - np.logaddexp.reduce(log_weights))
+    return weight_warnings(m, ess, pareto_k(log_weights, samples, m), max_share)

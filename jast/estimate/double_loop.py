@@ -13,7 +13,7 @@ from jax.scipy.special import logsumexp
 
 from jast._checks import check_random_key, whole_number
 from jast.contract import contract
-from jast.estimate.estimate import estimate
+from jast.estimate.estimate import estimate_from_weights
 from jast.estimate.importance_sampling import Traces, chunks, one_trace
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["double_loop"]
 
-LANES = 16384
+MAX_LANES = 16384
+"""Traces of a chunk, side by side."""
 
 
 def double_loop(
@@ -81,53 +82,53 @@ def double_loop(
         >>> int(counted.evaluations)
         500
     """
-    check_random_key("double_loop", key)
-    starts = whole_number("double_loop", "starts", starts, 2)
-    samples = whole_number("double_loop", "samples", samples)
-    if samples > LANES:
-        raise ValueError(f"double_loop: samples must be at most {LANES}, received {samples!r}")
-    level = checked_level("double_loop", level)
-    contract("double_loop", sim)
-    proposal = as_proposal("double_loop", sim, proposal)
+    name = "double_loop"
+    check_random_key(name, key)
+    starts = whole_number(name, "starts", starts, 2)
+    samples = whole_number(name, "samples", samples)
+    if samples > MAX_LANES:
+        raise ValueError(f"{name}: samples must be at most {MAX_LANES}, received {samples!r}")
+    level = checked_level(name, level)
+    contract(name, sim)
+    proposal = as_proposal(name, sim, proposal)
     if len(proposal.log_weights) > 1:
         raise ValueError(
-            "double_loop: proposal must have one component, since its traces share their start,"
+            f"{name}: proposal must have one component, since its traces share their start,"
             f" received {len(proposal.log_weights)}"
         )
-    settings = call_settings("double_loop", key, starts=starts, samples=samples, level=level)
-    lanes = max(1, min(starts, LANES // samples))
-    watch = Watch("double_loop", starts, "start", progress, callback)
-    total, notes, lost = chunks(_chunk, (key, sim, proposal, lanes, samples), lanes, watch)
-    found = estimate(
-        "double_loop",
-        total,
-        level=level,
-        reasons=lost,
-        notes=notes,
-        evaluations=total.samples * samples,
-    )
+    settings = call_settings(name, key, starts=starts, samples=samples, level=level)
+    lanes = max(1, min(starts, MAX_LANES // samples))
+    watch = Watch(name, starts, "start", progress, callback)
+    shared = key, sim, proposal, lanes, samples
+    total, notes, reasons = chunks(_simulate_chunk, shared, lanes, watch)
+    about = dict(level=level, reasons=reasons, notes=notes)
+    found = estimate_from_weights(name, total, evaluations=total.samples * samples, **about)
     return found._replace(settings=settings, draws=None)
 
 
-def _chunk(shared, i, post):
+def _simulate_chunk(shared, i, post):
     key, *about = shared
-    return _outer(jax.random.fold_in(key, i), *about)
+    return _simulate_starts(jax.random.fold_in(key, i), *about)
 
 
 @partial(jax.jit, static_argnames=("lanes", "samples"))
-def _outer(key, sim, proposal, lanes, samples):
+def _simulate_starts(key, sim, proposal, lanes, samples):
     """`Traces` [lanes], a row a start: its weight is the mean over its traces."""
 
     def one(key):
         for_start, for_traces = jax.random.split(key)
         keys = jax.random.split(for_traces, samples)
         rows = jax.vmap(lambda k: one_trace(k, sim, proposal, start_key=for_start))(keys)
-        hits = jnp.where(rows.failure, rows.log_weight, -jnp.inf)
-        fails, bad = jnp.any(rows.failure), jnp.any(rows.invalid)
-        everything = logsumexp(rows.log_weight)
-        log_weight = jnp.where(fails, logsumexp(hits), everything) - jnp.log(samples)
+        fails = jnp.any(rows.failure)
+        failing = logsumexp(jnp.where(rows.failure, rows.log_weight, -jnp.inf))
+        log_weight = jnp.where(fails, failing, logsumexp(rows.log_weight)) - jnp.log(samples)
         return Traces(
-            log_weight, rows.shares[0], fails, bad, jnp.sum(rows.length), jnp.min(rows.distance)
+            log_weight=log_weight,
+            shares=rows.shares[0],
+            failure=fails,
+            invalid=jnp.any(rows.invalid),
+            length=jnp.sum(rows.length),
+            distance=jnp.min(rows.distance),
         )
 
     return jax.vmap(one)(jax.random.split(key, lanes))

@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jast import results
 from jast.estimate import diagnostics
-from jast.estimate.sums import skewness
+from jast.estimate.draws import Draws
+from jast.estimate.sums import Sums, mode_shares, moments
 from jast.intervals import checked_level, chernoff, clopper_pearson, jeffreys, log_normal
 
-__all__ = ["Estimate", "doubtful", "estimate", "guarantee", "of_counts"]
+__all__ = [
+    "MAX_INVALID_SHARE",
+    "Estimate",
+    "estimate_from_counts",
+    "estimate_from_mean",
+    "estimate_from_weights",
+    "flag_imprecise",
+    "guaranteed_words",
+    "is_doubtful",
+]
 
-INVALID, COUNTED = 0.01, 10
-"""Part of an estimate that invalid episodes may add; failures from which a count is believed."""
+MAX_INVALID_SHARE = 0.01
+"""Part of an estimate that invalid episodes may add if they failed. A convention."""
+MIN_COUNTED_FAILURES = 10
+"""Failures from which on a count is believed: its relative standard error is then below a third."""
+MAX_RELATIVE_ERROR = 0.05
+"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
+MAX_LISTED_MODES = 12
+"""Modes that are printed: a line of the screen."""
 
 
 @results.result_class("samples")
@@ -44,7 +61,7 @@ class Estimate(NamedTuple):
     """Of the mean"""
     relative_error: float
     """standard_error / mean, also where both are below the least double"""
-    interval: tuple[Any, ...]
+    interval: tuple[float, float]
     """(low, high) at ``level``: log-normal (above 0, skewed as the estimate is), with ``high``
     corrected for the skewness of the weights; of plain counts Clopper and Pearson's
     """
@@ -69,11 +86,11 @@ class Estimate(NamedTuple):
     """Episodes in which the simulator returned a number that is not finite; they count as not
     failing
     """
-    modes: Any
+    modes: np.ndarray | None
     """[K] the part of the estimate that each component or failure mode carries, of sum 1"""
     reliable: bool
     """No known reason against it"""
-    warnings: tuple[Any, ...]
+    warnings: tuple[str, ...]
     """Texts: the reasons why not, then remarks"""
     chernoff: float | None = None
     """Of plain counts: upper bound at one-sided ``level`` (the paper's eq. 17)"""
@@ -85,13 +102,13 @@ class Estimate(NamedTuple):
     """
     proposal: Any = None
     """What it was drawn from, where the method found it: for `jast.estimate.failure_samples`"""
-    history: Any = None
+    history: tuple[str, ...] | None = None
     """How that was found, a text a line"""
     settings: dict[str, Any] | None = None
     """What was asked for: ``method`` and numbers"""
-    mode_intervals: Any = None
+    mode_intervals: np.ndarray | None = None
     """[K, 2] intervals of the probability of each of ``modes``"""
-    draws: Any = None
+    draws: Draws | None = None
     """`jast.estimate.Draws`: the weighted draws, for `jast.estimate.exceedance`, `failure_times`
     and `events`; None where there are none
     """
@@ -127,73 +144,49 @@ class Estimate(NamedTuple):
         return low, clopper_pearson(failing + invalid, n, self.level)[1] if invalid else high
 
     def __str__(self) -> str:
-        rows, low, high = [], *self.interval
-        if (known := guarantee(self)) is not None:
-            rows.append(("probability", " ".join(known)))
-        if not math.isnan(self.log_mean):
-            value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
-            value += f"   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"
-            if known is None:
-                rows.append(("probability", value))
-            elif doubtful(self):
-                rows.append(("doubtful", f"{value}, not to be believed"))
-            rows.append(
-                ("relative SE", f"{100 * self.relative_error:.3g} %   log10 {self.log10_mean:.4f}")
-            )
-        elif known is None:
-            known = f"below {high:.4g} at {self.level:.4g}" if high < 1 else "nothing is known"
-            rows.append(("probability", f"no failure seen: {known}"))
+        rows = [*self._probability_rows()]
         if self.chernoff is not None:
-            rows.append(
-                (
-                    "upper bounds",
-                    (
-                        f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)  "
-                        f" one-sided {self.level:.4g}"
-                    ),
-                )
-            )
-        rows.append(
-            (
-                "failures",
-                f"{self.failing} of {self.samples} episodes   {self.episodes} evaluations",
-            )
-        )
+            bounds = f"{self.chernoff:.4g} (Chernoff)   {self.jeffreys:.4g} (Jeffreys)  "
+            rows.append(("upper bounds", f"{bounds} one-sided {self.level:.4g}"))
+        counts = f"{self.failing} of {self.samples} episodes   {self.episodes} evaluations"
+        rows.append(("failures", counts))
         if self.chernoff is None and self.failing and not math.isnan(self.max_share):
-            rows.append(
-                (
-                    "weights",
-                    (
-                        f"ESS {self.ess:.4g}{_tail(self.k_hat)}   greatest share"
-                        f" {100 * self.max_share:.2g} %"
-                    ),
-                )
-            )
+            k_hat = "" if math.isnan(self.k_hat) else f"   k-hat {self.k_hat:.2f}"
+            share = f"greatest share {100 * self.max_share:.2g} %"
+            rows.append(("weights", f"ESS {self.ess:.4g}{k_hat}   {share}"))
         if self.modes is not None and len(self.modes) > 1 and self.failing:
-            rows.append(
-                (
-                    "modes",
-                    "  ".join(f"{100 * v:.1f} %" for v in self.modes[:12])
-                    + (" ..." if len(self.modes) > 12 else ""),
-                )
-            )
+            text = "  ".join(f"{100 * v:.1f} %" for v in self.modes[:MAX_LISTED_MODES])
+            rows.append(("modes", text + " ..." * (len(self.modes) > MAX_LISTED_MODES)))
         if self.invalid:
             rows.append(("invalid", f"{self.invalid}"))
         if self.unseen is not None and self.unseen > self.interval[1]:
             rows.append(("unseen", f"below {self.unseen:.2g}, by draws of the model"))
         head = [] if self.reliable else ["UNRELIABLE: " + f"\n{'':12}".join(self.warnings)]
-        tail = [f"{'remark':<14} {text}" for text in self.warnings] if self.reliable else []
-        return "\n".join(
-            [
-                *head,
-                f"{'method':<14} {self.method}",
-                *(f"{name:<14} {text}" for name, text in rows),
-                *tail,
-            ]
-        )
+        rows = [("method", self.method), *rows]
+        if self.reliable:
+            rows += [("remark", text) for text in self.warnings]
+        return "\n".join([*head, *(f"{name:<14} {text}" for name, text in rows)])
+
+    def _probability_rows(self) -> Iterator[tuple[str, str]]:
+        """What is printed of the probability; first what plain draws guarantee."""
+        (low, high), guaranteed = self.interval, guaranteed_words(self)
+        if guaranteed is not None:
+            yield "probability", " ".join(guaranteed)
+        if not math.isnan(self.log_mean):
+            value = f"{self.mean:.4g}" if self.mean > 1e-300 else f"10^{self.log10_mean:.4f}"
+            value += f"   {self.level:.4g} interval [{low:.4g}, {high:.4g}]"
+            if guaranteed is None:
+                yield "probability", value
+            elif is_doubtful(self):
+                yield "doubtful", f"{value}, not to be believed"
+            percent = f"{100 * self.relative_error:.3g} %"
+            yield "relative SE", f"{percent}   log10 {self.log10_mean:.4f}"
+        elif guaranteed is None:
+            bound = f"below {high:.4g} at {self.level:.4g}" if high < 1 else "nothing is known"
+            yield "probability", f"no failure seen: {bound}"
 
 
-def guarantee(p: Estimate) -> tuple[str, str] | None:
+def guaranteed_words(p: Estimate) -> tuple[str, str] | None:
     """In words, the interval that plain draws guarantee, and its level and counts: what to say
     first of ``p``. None where it is reliable, and without plain draws.
     """
@@ -206,133 +199,148 @@ def guarantee(p: Estimate) -> tuple[str, str] | None:
     return f"between {low:.3g} and {high:.3g}", counts
 
 
-def doubtful(p: Estimate) -> bool:
-    """Whether ``p`` has a number of its own to say behind its `guarantee`; plain counts have none
-    but these.
+def is_doubtful(p: Estimate) -> bool:
+    """Whether ``p`` has a number of its own to say behind its `guaranteed_words`; plain counts have
+    none but these.
     """
-    return guarantee(p) is not None and p.chernoff is None and not math.isnan(p.log_mean)
+    return guaranteed_words(p) is not None and p.chernoff is None and not math.isnan(p.log_mean)
 
 
-ROUGH = 0.05
-"""Relative standard error above which 10 % more or less lies within a 95 % interval."""
-
-
-def or_rough(found: Estimate) -> Estimate:
+def flag_imprecise(found: Estimate) -> Estimate:
     """The `Estimate` that is UNRELIABLE where nothing is wrong with it but its standard error."""
-    if not (found.reliable and found.relative_error > ROUGH):
+    if not (found.reliable and found.relative_error > MAX_RELATIVE_ERROR):
         return found
-    enough = found.episodes * (found.relative_error / ROUGH) ** 2
+    enough = found.episodes * (found.relative_error / MAX_RELATIVE_ERROR) ** 2
     text = (
-        f"relative standard error {found.relative_error:.2g}, above {ROUGH}: the interval is too"
-        f" wide for an answer, and some {enough:.1g} evaluations would narrow it to that"
+        f"relative standard error {found.relative_error:.2g}, above {MAX_RELATIVE_ERROR}: the"
+        f" interval is too wide for an answer, and some {enough:.1g} evaluations would narrow it to"
+        " that"
     )
     return found._replace(reliable=False, warnings=(text, *found.warnings))
 
 
-def estimate(
-    method,
-    sums,
+def estimate_from_mean(
+    method: str,
+    log_mean: float,
+    relative: float,
+    level: float,
+    interval: tuple[float, float],
     *,
-    level=0.95,
-    reasons=(),
-    notes=(),
-    evaluations=None,
-    groups=None,
-    proposal=None,
-    history=None,
-    control=0,
-    plain=(0, 0, 0),
-):
-    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` speak against it from outside,
-    ``notes`` are remarks.
-
-    ``groups``: lists of components that are one failure mode (default: each by itself).
-    ``control``: episodes that were the model's own draws. ``plain``: (failing, invalid, episodes)
-    of such draws beside those of ``sums``.
+    mean: float | None = None,
+    **about: Any,
+) -> Estimate:
+    """The `Estimate` of this mean, NaN where no failure was seen, with its ``relative`` standard
+    error; ``mean``: where it is known more exactly than its logarithm; ``about``: its other fields,
+    of which those about weights have defaults.
     """
-    level = checked_level(method, level)
-    n, seen = sums.samples, sums.first > 0
-    found = list(reasons)
-    if sums.undefined:
-        found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
-    found += _if_invalid_failed(sums)
-    log_mean = sums.top + math.log(sums.first / n) if seen else math.nan
-    above = math.exp(min(log_mean, 700.0)) if log_mean > 0 else 0.0
-    log_mean = min(log_mean, 0.0)  # a mean of weights exceeds 1 by chance; min keeps a NaN
-    # eq. 14 over the square of the mean; n - 1 for an unbiased variance
-    relative = (
-        math.sqrt(max(n * sums.second / sums.first**2 - 1, 0) / (n - 1))
-        if seen and n > 1
-        else math.nan
-    )
-    ess = sums.first**2 / sums.second if seen else 0.0
-    k_hat = diagnostics.pareto_k(sums.tail, n, sums.failures)
-    share = math.exp(sums.tail[0] - sums.top) / sums.first if seen else math.nan
-    found += (
-        diagnostics.reasons(sums.failures, ess, k_hat, share) if seen else ["no failure was seen"]
-    )
-    modes = mode_intervals = None
-    if seen:
-        groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
-        modes, sizes = diagnostics.by_mode(sums, groups)
-        mode_intervals = _of_modes(log_mean, modes, sizes, n, level)
-        found += diagnostics.thin_modes(modes, sizes, relative)
-    mean = math.exp(log_mean) if seen else math.nan
-    if above > 1 + 4 * above * relative:
-        found.append(f"the estimate is {above:.4g}, above 1: a density does not fit its samples")
-    plain = tuple(a + b for a, b in zip(sums.plain, plain, strict=True))
+    mean = math.exp(log_mean) if mean is None else mean
+    defaults = dict(k_hat=math.nan, max_share=math.nan, modes=None, steps=0)
     return Estimate(
         method=method,
         log_mean=log_mean,
         mean=mean,
         standard_error=mean * relative,
         relative_error=relative,
-        interval=log_normal(log_mean, relative, level, skewness(sums)) if seen else (0.0, 1.0),
+        interval=interval,
         level=level,
-        ess=ess,
-        k_hat=k_hat,
-        max_share=share,
+        **defaults | about,
+    )
+
+
+def estimate_from_weights(
+    method: str,
+    sums: Sums,
+    *,
+    level: float = 0.95,
+    reasons: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    evaluations: int | None = None,
+    groups: Sequence[Sequence[int]] | None = None,
+    control: int = 0,
+    plain: tuple[int, int, int] = (0, 0, 0),
+    **about: Any,
+) -> Estimate:
+    """The `Estimate` of `jast.estimate.sums.Sums`; ``reasons`` are more texts for which it is
+    UNRELIABLE, ``notes`` are remarks, ``about`` further fields.
+
+    ``evaluations``: episodes in all (default: those of ``sums``). ``groups``: lists of components
+    that are one failure mode (default: each by itself). ``control``: episodes that were the model's
+    own draws. ``plain``: (failing, invalid, episodes) of such draws beside those of ``sums``.
+    """
+    level, n = checked_level(method, level), sums.samples
+    plain = tuple(a + b for a, b in zip(sums.plain, plain, strict=True))
+    found = list(reasons)
+    if sums.undefined:
+        found.append(f"{sums.undefined} failing episodes have a weight that is NaN or infinite")
+    found += _invalid_warnings(sums.invalid, sums.invalid_first, sums.first)
+    about |= dict(
         failing=sums.failures,
         samples=n,
         episodes=n if evaluations is None else evaluations,
         steps=sums.steps,
         invalid=sums.invalid,
-        modes=modes,
-        reliable=not found,
-        warnings=(*found, *_remarks(sums), *notes),
         unseen=-math.log1p(-level) / control if control else None,
-        proposal=proposal,
-        history=history,
-        mode_intervals=mode_intervals,
         draws=sums.draws,
         plain=plain if plain[-1] else None,
     )
+    log_mean = relative = math.nan
+    interval, ess = (0.0, 1.0), 0.0
+    if not sums.first > 0:
+        found.append("no failure was seen")
+    else:
+        m = moments(sums)  # eq. 14 over the square of the mean; n - 1 for an unbiased variance
+        relative = float(m.relative) if n > 1 else math.nan
+        # a mean of weights exceeds 1 by chance
+        above, log_mean = math.exp(min(m.log_mean, 700.0)), min(float(m.log_mean), 0.0)
+        interval = log_normal(log_mean, relative, level, float(m.skewness))
+        ess = float(sums.first**2 / sums.second)
+        k_hat = diagnostics.pareto_k(sums.tail, n, sums.failures)
+        share = math.exp(sums.tail[0] - sums.top) / sums.first
+        found += diagnostics.weight_warnings(sums.failures, ess, k_hat, share)
+        groups = [[i] for i in range(len(sums.by_component))] if groups is None else groups
+        modes, sizes = mode_shares(sums, groups)
+        found += diagnostics.mode_warnings(modes, sizes, relative)
+        if above > 1 + 4 * above * relative:
+            found.append(
+                f"the estimate is {above:.4g}, above 1: a density does not fit its samples"
+            )
+        mode_intervals = _mode_intervals(log_mean, modes, sizes, n, level)
+        about |= dict(k_hat=k_hat, max_share=share, modes=modes, mode_intervals=mode_intervals)
+    warnings = (*found, *_invalid_remarks(sums), *notes)
+    about |= dict(ess=ess, reliable=not found, warnings=warnings)
+    return estimate_from_mean(method, log_mean, relative, level, interval, **about)
 
 
-def of_counts(
-    method, sums, *, level=0.95, reasons=(), notes=(), evaluations=None, proposal=None, history=None
-):
-    """The `Estimate` of episodes of the model itself: exact interval and upper bounds."""
+def estimate_from_counts(
+    method: str,
+    sums: Sums,
+    *,
+    level: float = 0.95,
+    reasons: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    evaluations: int | None = None,
+    **about: Any,
+) -> Estimate:
+    """The `Estimate` of episodes of the model itself: exact interval and upper bounds. Arguments as
+    of `estimate_from_weights`.
+    """
     level = checked_level(method, level)
     n, k = sums.samples, sums.failures
-    mean = k / n if k else math.nan
-    found = [
-        *reasons,
-        *(() if k else (f"no failure in {n} episodes: only the upper bounds are known",)),
-        *((f"{k} failures are too few: only the interval is known",) if 0 < k < COUNTED else ()),
-    ]
-    found += _if_invalid_failed(sums._replace(first=float(k), invalid_first=float(sums.invalid)))
-    relative = math.sqrt((1 - mean) / k) if k else math.nan
-    return Estimate(
-        method=method,
-        log_mean=math.log(mean) if k else math.nan,
+    mean, found = k / n if k else math.nan, list(reasons)
+    if k == 0:
+        found.append(f"no failure in {n} episodes: only the upper bounds are known")
+    elif k < MIN_COUNTED_FAILURES:
+        found.append(f"{k} failures are too few: only the interval is known")
+    found += _invalid_warnings(sums.invalid, sums.invalid, k)
+    interval = clopper_pearson(k, n, level)
+    return estimate_from_mean(
+        method,
+        math.log(mean),
+        math.sqrt((1 - mean) / k) if k else math.nan,
+        level,
+        interval,
         mean=mean,
-        standard_error=mean * relative,
-        relative_error=relative,
-        interval=clopper_pearson(k, n, level),
-        level=level,
         ess=float(k),
-        k_hat=math.nan,
         max_share=1 / k if k else math.nan,
         failing=k,
         samples=n,
@@ -341,51 +349,39 @@ def of_counts(
         invalid=sums.invalid,
         modes=np.ones(1) if k else None,
         reliable=not found,
-        warnings=(*found, *_remarks(sums), *notes),
+        warnings=(*found, *_invalid_remarks(sums), *notes),
         chernoff=chernoff(k, n, level),
         jeffreys=jeffreys(k, n, level),
-        proposal=proposal,
-        history=history,
-        mode_intervals=np.array([clopper_pearson(k, n, level)]) if k else None,
+        mode_intervals=np.array([interval]) if k else None,
         draws=sums.draws,
-        plain=(k, sums.invalid, n) if n else None,
+        plain=(k, sums.invalid, n),
+        **about,
     )
 
 
-def _of_modes(log_mean, modes, sizes, n, level):
+def _mode_intervals(log_mean, modes, sizes, n, level):
     """[K, 2] intervals of parts of the estimate, by their shares and effective sample sizes."""
-    out = []
-    for v, size in zip(modes, sizes, strict=True):
-        relative = math.sqrt(max(n / size - 1, 0) / max(n - 1, 1)) if size > 0 else math.inf
-        out.append(log_normal(log_mean + math.log(v), relative, level) if size > 0 else (0.0, 1.0))
-    return np.array(out)
+
+    def interval(share, size):
+        if not size > 0:
+            return 0.0, 1.0
+        relative = math.sqrt(max(n / size - 1, 0) / max(n - 1, 1))
+        return log_normal(log_mean + math.log(share), relative, level)
+
+    return np.array([interval(*mode) for mode in zip(modes, sizes, strict=True)])
 
 
-def _tail(k_hat):
-    return "" if math.isnan(k_hat) else f"   k-hat {k_hat:.2f}"
-
-
-def _if_invalid_failed(sums):
+def _invalid_warnings(invalid, weight, failing_weight):
     """Texts: where the episodes without a finite number would matter if they were failures."""
-    if not sums.invalid_first > INVALID * sums.first:
+    if not weight > MAX_INVALID_SHARE * failing_weight:
         return []
-    share = (
-        f"{sums.invalid_first / sums.first:.2g} times the estimate"
-        if sums.first > 0
-        else "all of it"
-    )
+    share = f"{weight / failing_weight:.2g} times the estimate" if failing_weight else "all of it"
     return [
-        f"{sums.invalid} episodes are invalid (a number that is not finite): if they failed, they"
+        f"{invalid} episodes are invalid (a number that is not finite): if they failed, they"
         f" would add {share}"
     ]
 
 
-def _remarks(sums):
-    if not sums.invalid:
-        return ()
-    return (
-        (
-            f"{sums.invalid} of {sums.samples} episodes are invalid (a number that is not finite)"
-            " and count as not failing"
-        ),
-    )
+def _invalid_remarks(sums):
+    text = "episodes are invalid (a number that is not finite) and count as not failing"
+    return (f"{sums.invalid} of {sums.samples} {text}",) if sums.invalid else ()

@@ -20,15 +20,21 @@ from jast import results, rewards
 from jast._checks import check_random_key, whole_number
 from jast.episode import play_back
 from jast.estimate import diagnostics
-from jast.estimate.answers import asked
-from jast.estimate.draws import interval, key_of, of_weights, share, shares
+from jast.estimate.answers import draws_and_level
+from jast.estimate.draws import (
+    mean_interval,
+    moments_of_weights,
+    scaled_weights,
+    share_interval,
+    source_key,
+)
 from jast.estimate.importance_sampling import component
 from jast.estimate.plain import episode_keys
 from jast.estimate.proposals import as_proposal
-from jast.estimate.redrawn import numbers_of, points
+from jast.estimate.redrawn import dimension_of, redraw_chunk
 from jast.intervals import clopper_pearson, log_normal
 from jast.limit_state import dimension, policy_of
-from jast.pytrees import select, with_strong_types, zero_where
+from jast.pytrees import as_partial, select, with_strong_types, zero_where
 
 if TYPE_CHECKING:
     import chex
@@ -40,8 +46,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Event", "GivenStart", "events", "given_start"]
 
-BLOCK = 1024
-OF = ("state", "start", "episode")
+BLOCK_EPISODES = 1024
+"""Draws that are made again side by side, in one program whatever their number."""
+BLOCK_STARTS = 2**16
+"""First states of the model that are looked at side by side."""
+EVENT_ARGUMENTS = ("state", "start", "episode")
 
 
 @results.printable()
@@ -59,11 +68,11 @@ class Event(NamedTuple):
 
     probability: float
     """That an episode fails and the event happens in it"""
-    interval: tuple[Any, ...]
+    interval: tuple[float, float]
     """(low, high) at ``level``"""
     given_failure: float
     """Probability of the event given a failure"""
-    given_interval: tuple[Any, ...]
+    given_interval: tuple[float, float]
     """(low, high) at ``level``"""
     ess: float
     """Effective sample size of the failures in which it happened"""
@@ -71,7 +80,7 @@ class Event(NamedTuple):
     """How many these are"""
     reliable: bool
     """Whether the estimate is, and these failures are enough for a number"""
-    warnings: tuple[Any, ...]
+    warnings: tuple[str, ...]
     """Why not"""
     level: float
 
@@ -92,16 +101,16 @@ class GivenStart(NamedTuple):
 
     probability: float
     """Of a failure, given a start in the set"""
-    interval: tuple[Any, ...]
+    interval: tuple[float, float]
     """(low, high) at ``level``"""
     start: float
     """Probability of a start in the set"""
-    start_interval: tuple[Any, ...]
+    start_interval: tuple[float, float]
     """(low, high) at ``level``"""
     together: Event
     """The failures that start there"""
     reliable: bool
-    warnings: tuple[Any, ...]
+    warnings: tuple[str, ...]
     level: float
 
 
@@ -145,11 +154,11 @@ def events(
         1.0
     """
     name = "events"
-    draws, level = asked(name, estimate, level)
-    if of not in OF:
-        raise ValueError(f"{name}: of must be one of {OF}, received {of!r}")
-    functions = _functions(name, named)
-    happened = _happened(name, sim, estimate, draws, functions, of, proposal)
+    draws, level = draws_and_level(name, estimate, level)
+    if of not in EVENT_ARGUMENTS:
+        raise ValueError(f"{name}: of must be one of {EVENT_ARGUMENTS}, received {of!r}")
+    functions = _check_functions(name, named)
+    happened = _evaluate_events(name, sim, estimate, draws, functions, of, proposal)
     log_w = draws.log_weight[draws.failure]
     return {k: _event(estimate, draws, log_w, v, level) for k, v in happened.items()}
 
@@ -187,125 +196,127 @@ def given_start(
     """
     name = "given_start"
     check_random_key(name, key)
-    kept, level = asked(name, estimate, level)
-    functions = _functions(name, named)
-    happened = _happened(name, sim, estimate, kept, functions, "start", proposal)
+    kept, level = draws_and_level(name, estimate, level)
+    functions = _check_functions(name, named)
+    happened = _evaluate_events(name, sim, estimate, kept, functions, "start", proposal)
     n, log_w = whole_number(name, "draws", draws), kept.log_weight[kept.failure]
-    count, done = dict.fromkeys(functions, 0), 0
-    for i in range(-(-n // 2**16)):
-        rows = min(2**16, n - done)
-        seen = _starts(jax.random.fold_in(key, i), sim, functions, 2**16)
+    count = dict.fromkeys(functions, 0)
+    for i in range(-(-n // BLOCK_STARTS)):
+        seen = _evaluate_starts(jax.random.fold_in(key, i), sim, functions, BLOCK_STARTS)
         for k, v in seen.items():
-            count[k] += int(np.asarray(v)[:rows].sum())
-        done += rows
-    out = {}
-    for k, v in happened.items():
-        event, m = _event(estimate, kept, log_w, v, level), count[k]
-        reasons = list(event.warnings)
-        if m < diagnostics.ESS:
-            reasons.append(f"only {m} of {n} starts are in the set")
-        p, ends = np.nan, (0.0, 1.0)
-        if m and event.failing:
-            of_both = of_weights(log_w[v], kept.samples)
-            # of a ratio of two independent means, to first order
-            relative = float(np.hypot(of_both.relative, np.sqrt((1 - m / n) / m)))
-            log_p = float(of_both.log_mean) - np.log(m / n)
-            p, ends = min(float(np.exp(log_p)), 1.0), log_normal(log_p, relative, level)
-        elif m:
-            p, ends = 0.0, (0.0, min(event.interval[1] * n / m, 1.0))
-        good = event.reliable and m >= diagnostics.ESS
-        out[k] = GivenStart(
-            p, ends, m / n, clopper_pearson(m, n, level), event, good, tuple(reasons), level
-        )
-    return out
+            count[k] += int(np.asarray(v)[: n - i * BLOCK_STARTS].sum())
+    return {
+        k: _given_start(kept, log_w, v, _event(estimate, kept, log_w, v, level), count[k], n)
+        for k, v in happened.items()
+    }
+
+
+def _given_start(draws, log_w, happened, event, m, n):
+    """The `GivenStart` of the failing draws in which the ``event`` ``happened``, where ``m`` of
+    ``n`` starts are in the set.
+    """
+    few, level = m < diagnostics.MIN_ESS, event.level
+    p, ends = np.nan, (0.0, 1.0)
+    if m and event.failing:
+        both = moments_of_weights(log_w[happened], draws.samples)
+        # of a ratio of two independent means, to first order
+        relative = float(np.hypot(both.relative, np.sqrt((1 - m / n) / m)))
+        log_p = float(both.log_mean) - np.log(m / n)
+        p, ends = min(float(np.exp(log_p)), 1.0), log_normal(log_p, relative, level)
+    elif m:
+        p, ends = 0.0, (0.0, min(event.interval[1] * n / m, 1.0))
+    return GivenStart(
+        probability=p,
+        interval=ends,
+        start=m / n,
+        start_interval=clopper_pearson(m, n, level),
+        together=event,
+        reliable=event.reliable and not few,
+        warnings=(*event.warnings, *([f"only {m} of {n} starts are in the set"] if few else [])),
+        level=level,
+    )
 
 
 def _event(estimate, draws, log_w, happened, level):
     """The `Event` of the failing draws in which it ``happened`` [m]."""
-    w, whole_ = shares(log_w, draws.counted)
-    chosen = w[happened]
+    w, total = scaled_weights(log_w, draws.counted)
+    chosen, log_w = w[happened], log_w[happened]
     k, n = len(chosen), draws.samples
-    given = share(whole_, chosen.sum(), (chosen**2).sum(), k, level)
+    given, given_ends = share_interval(total, chosen.sum(), (chosen**2).sum(), k, level)
     reasons = [] if estimate.reliable else ["the estimate is UNRELIABLE"]
-    if not k:
-        # above by what is not excluded among the failures
-        high = given[1][1] * float(np.exp(of_weights(log_w, n).log_mean))
+    if k:
+        m = moments_of_weights(log_w, n)
+        p, ess = min(float(np.exp(m.log_mean)), 1.0), float(m.ess)
+        ends = mean_interval(draws, m, k, level)
+        if not draws.counted:
+            reasons += diagnostics.warnings_of_weights(log_w, n, ess)
+    else:  # above by what is not excluded among the failures
+        p = ess = 0.0
+        all_failing = moments_of_weights(draws.log_weight[draws.failure], n)
+        ends = 0.0, given_ends[1] * float(np.exp(all_failing.log_mean))
         reasons.append("the event happened in no failure")
-        return Event(0.0, (0.0, high), *given, 0.0, 0, False, tuple(reasons), level)
-    m = of_weights(log_w[happened], n)
-    if not draws.counted:
-        k_hat = diagnostics.pareto_k(log_w[happened], n, k)
-        reasons += diagnostics.reasons(k, float(m.ess), k_hat, float(chosen.max() / chosen.sum()))
-    ends = interval(m, level, k if draws.counted else None, n)
-    p = min(float(np.exp(m.log_mean)), 1.0)
-    return Event(p, ends, *given, float(m.ess), k, not reasons, tuple(reasons), level)
+    return Event(
+        probability=p,
+        interval=ends,
+        given_failure=given,
+        given_interval=given_ends,
+        ess=ess,
+        failing=k,
+        reliable=not reasons,
+        warnings=tuple(reasons),
+        level=level,
+    )
 
 
-def _functions(name: str, named: Any) -> dict[str, Callable]:
+def _check_functions(name: str, named: Any) -> dict[str, Callable]:
     good = isinstance(named, Mapping) and named
     if not good or not all(isinstance(k, str) and callable(f) for k, f in named.items()):
         raise ValueError(f"{name}: named must be a dict of name -> function, received {named!r}")
-    return {
-        k: f if isinstance(f, jax.tree_util.Partial) else jax.tree_util.Partial(f)
-        for k, f in named.items()
-    }
+    return {k: as_partial(f) for k, f in named.items()}
 
 
-def _happened(name, sim, estimate, draws, functions, of, proposal):
+def _evaluate_events(name, sim, estimate, draws, functions, of, proposal):
     """Name -> [m] bool, in which of the failing draws each event happened."""
     rows, length = draws.row[draws.failure], draws.length[draws.failure]
     if not len(rows):
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if (received := numbers_of(draws.source)) not in (None, dimension(sim)):
+    if (received := dimension_of(draws.source)) not in (None, dimension(sim)):
         raise ValueError(
             f"{name}: sim must be the simulator of the estimate, with {received} random"
             f" numbers in an episode, received one with {dimension(sim)}"
         )
-    if draws.source == "policy":
-        if proposal is None:
-            raise ValueError(f"{name}: proposal must be the one that the estimate was made with")
-        proposal = as_proposal(name, sim, proposal)
-    key, out = key_of(draws), {k: [] for k in functions}
+    by_policy = draws.source == "policy"
+    if by_policy and proposal is None:
+        raise ValueError(f"{name}: proposal must be the one that the estimate was made with")
+    proposal = as_proposal(name, sim, proposal) if by_policy else None
+    key, out = source_key(draws), {k: [] for k in functions}
     for i in np.unique(rows // draws.lanes):
         mine = rows // draws.lanes == i
         lanes, steps = rows[mine] % draws.lanes, length[mine]
-        if draws.source == "policy":
+        if by_policy:
             made = jax.random.split(jax.random.fold_in(key, i), draws.lanes)
         elif draws.source == "keys":
             made = episode_keys(key, int(i), np.arange(draws.lanes))
         else:
-            made = points(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
-        for a in range(0, len(lanes), BLOCK):
-            part = np.arange(a, a + BLOCK).clip(max=len(lanes) - 1)
-            seen = _judged(
-                sim, functions, proposal, made[lanes[part]], jnp.asarray(steps[part]), of
-            )
+            made = redraw_chunk(key, int(i), sim, draws.source, int(lanes.max()) + 1, draws.lanes)
+        for a in range(0, len(lanes), BLOCK_EPISODES):
+            part = np.arange(a, a + BLOCK_EPISODES).clip(max=len(lanes) - 1)
+            some, until = made[lanes[part]], jnp.asarray(steps[part])
+            seen = _evaluate_block(sim, functions, proposal, some, until, of)
             for k, v in seen.items():
-                if v.shape != (BLOCK,) or v.dtype != bool:
-                    raise ValueError(
-                        f"{name}: {k} must return a bool scalar, received"
-                        f" {v.dtype}{list(v.shape[1:])}"
-                    )
+                if v.shape != (BLOCK_EPISODES,) or v.dtype != bool:
+                    received = f"{v.dtype}{list(v.shape[1:])}"
+                    raise ValueError(f"{name}: {k} must return a bool scalar, received {received}")
                 out[k].append(np.asarray(v)[: len(lanes) - a])
     return {k: np.concatenate(v) for k, v in out.items()}
 
 
 @partial(jax.jit, static_argnums=5)
-def _judged(sim, functions, proposal, made, length, of):
+def _evaluate_block(sim, functions, proposal, made, length, of):
     """Name -> what it returns for each of the draws ``made``, points or keys, of known length."""
 
     def one(made, length):
-        if proposal is None and jax.dtypes.issubdtype(made.dtype, jax.dtypes.prng_key):
-            keys = jax.random.split(made, sim.horizon + 1)  # as `jast.rollout` does
-            x0 = D.sample(sim.start(), keys[0])
-            choose = lambda s, t: D.sample(sim.disturbance(s), jax.random.clone(keys[t + 1]))
-        elif proposal is None:
-            player = policy_of(sim, made)
-            x0, choose = D.mode(player.start()), lambda s, t: D.mode(player.disturbance(s, t))
-        else:
-            own, for_start, for_steps = component(made, proposal)
-            x0 = D.sample(own.start(), for_start)
-            choose = lambda s, t: D.sample(own.disturbance(s, t), jax.random.fold_in(for_steps, t))
+        x0, choose = _disturbances(sim, proposal, made)
         first = with_strong_types(sim.init(x0))
 
         def step(state, t):
@@ -323,8 +334,24 @@ def _judged(sim, functions, proposal, made, length, of):
     return jax.vmap(one)(made, length)
 
 
+def _disturbances(sim, proposal, made):
+    """(x0, function of a state and the time that gives the next disturbance) of the draw ``made``:
+    a key of a ``proposal``, else the key of an episode of the model, else a point.
+    """
+    if proposal is not None:
+        own, for_start, for_steps = component(made, proposal)
+        x0 = D.sample(own.start(), for_start)
+        return x0, lambda s, t: D.sample(own.disturbance(s, t), jax.random.fold_in(for_steps, t))
+    if jax.dtypes.issubdtype(made.dtype, jax.dtypes.prng_key):
+        keys = jax.random.split(made, sim.horizon + 1)  # as `jast.rollout` does
+        x0 = D.sample(sim.start(), keys[0])
+        return x0, lambda s, t: D.sample(sim.disturbance(s), jax.random.clone(keys[t + 1]))
+    player = policy_of(sim, made)
+    return D.mode(player.start()), lambda s, t: D.mode(player.disturbance(s, t))
+
+
 @partial(jax.jit, static_argnums=3)
-def _starts(key, sim, functions, n):
+def _evaluate_starts(key, sim, functions, n):
     def one(key):
         first = with_strong_types(sim.init(D.sample(sim.start(), key)))
         return {k: jnp.asarray(f(first)) for k, f in functions.items()}

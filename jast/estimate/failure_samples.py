@@ -20,9 +20,9 @@ from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
 from jast.estimate.importance_sampling import played
 from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.populations import settled
+from jast.estimate.populations import equilibrate
 from jast.estimate.proposals import as_proposal
-from jast.estimate.redrawn import numbers_of, redrawn
+from jast.estimate.redrawn import dimension_of, redraw
 from jast.estimate.sample import Sample
 from jast.frames import dataset
 from jast.memory import require_episodes
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FailureSamples", "failure_samples"]
 
-PER_SAMPLE = 10
+DRAWS_PER_SAMPLE = 10
+"""Episodes that are drawn for each failure, so that few of them are copies."""
 
 
 @results.result_class("ess")
@@ -78,14 +79,12 @@ class FailureSamples(NamedTuple):
         return results.renamed(self, "episodes", "failures")
 
     def __str__(self) -> str:
-        n, e = len(self.failures.length), self.failures
-        steps = (
-            f"{np.min(e.length)} to {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to"
-            f" {np.max(e.log_prob):.4g}"
-        )
+        e = self.failures
         return (
-            f"{n} failures from {self.distinct} distinct ones (ESS {self.ess:.4g}),"
-            f" {self.accepted:.0%} of the last moves accepted; {steps}"
+            f"{len(e.length)} failures from {self.distinct} distinct ones (ESS {self.ess:.4g}),"
+            f" {self.accepted:.0%} of the last moves accepted; {np.min(e.length)} to"
+            f" {np.max(e.length)} steps, log p {np.min(e.log_prob):.4g} to"
+            f" {np.max(e.log_prob):.4g}"
         )
 
 
@@ -141,33 +140,21 @@ def failure_samples(
             f"{name}: source must hold a proposal, received an estimate by {source.method} without"
             " one"
         )
-    require_episodes(name, sim, PER_SAMPLE * samples)
+    require_episodes(name, sim, DRAWS_PER_SAMPLE * samples)
     about = dict(sim=sim, source=q, samples=samples, moves=moves)
     with open_checkpoint(name, checkpoint, key, **about) as store, keep_answers(store):
-        return _sampled(name, key, sim, q, samples, moves)
+        return _draw_failures(name, key, sim, q, samples, moves)
 
 
-def _sampled(name, key, sim, q, samples, moves):
+def _draw_failures(name, key, sim, q, samples, moves):
     key, for_draws, for_rows = jax.random.split(key, 3)
-    n = PER_SAMPLE * samples
-    if (received := numbers_of(q)) is not None:
-        if received != latent.dimension(sim):
-            raise ValueError(
-                f"{name}: source must be of this simulator, with {latent.dimension(sim)} random"
-                f" numbers in an episode, received one with {received}"
-            )
-        if isinstance(q, Sample):  # they are failures, which nobody has to look for
-            z, log_w, failure, n = q.points, q.log_weight, np.ones(len(q.points), bool), 0
-        else:
-            z, o, log_w = redrawn(for_draws, sim, q, n)
-            failure = o.failure
-    elif isinstance(q, Tilts):
-        if (received := q.frame.centre.shape[0]) != (expected := shape(sim).seen):
-            raise ValueError(
-                f"{name}: source must be of this simulator, whose states show {expected} numbers,"
-                f" received one of a simulator that shows {received}"
-            )
-        z, o, log_w = redrawn(for_draws, sim, q, n)
+    n = DRAWS_PER_SAMPLE * samples
+    _check_source(name, sim, q)
+    if isinstance(q, Sample):  # they are failures, which nobody has to look for
+        z, log_w = q.points, q.log_weight
+        failure, n = np.ones(len(z), bool), 0
+    elif isinstance(q, latent.Latent | Tilts):
+        z, o, log_w = redraw(for_draws, sim, q, n)
         failure = o.failure
     else:
         q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
@@ -180,11 +167,27 @@ def _sampled(name, key, sim, q, samples, moves):
             f" with no failure in {n} episodes"
         )
     rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
-    people, chain = settled(key, sim, z[rows], moves)
-    episodes = answer_once(partial(latent.episodes, sim), people.z)
-    # the numbers that decided nothing are no part of an episode; a knife edge may fall on the other
-    # side in another program
+    moved, sampler = equilibrate(key, sim, z[rows], moves)
+    episodes = answer_once(partial(latent.episodes, sim), moved.z)
+    # numbers that decided nothing are no part of an episode; and rounding differs between compiled
+    # programs, so an episode on the edge of failure may not fail again
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
     return FailureSamples(
-        episodes, effective(log_w), len(np.unique(rows)), chain.accepted, n + chain.evaluations
+        failures=episodes,
+        ess=effective(log_w),
+        distinct=len(np.unique(rows)),
+        accepted=sampler.accepted,
+        evaluations=n + sampler.evaluations,
     )
+
+
+def _check_source(name, sim, q):
+    """ValueError where ``q`` is of a simulator with other numbers."""
+    if isinstance(q, Tilts):
+        received, expected = q.frame.centre.shape[0], shape(sim).seen
+        words = f"whose states show {expected} numbers, received one of a simulator that shows"
+    else:
+        received, expected = dimension_of(q), latent.dimension(sim)
+        words = f"with {expected} random numbers in an episode, received one with"
+    if received not in (None, expected):
+        raise ValueError(f"{name}: source must be of this simulator, {words} {received}")

@@ -17,7 +17,7 @@ from jast._jax import was_interrupted
 from jast.estimate import sums
 from jast.estimate.active_learning import CANDIDATES, Learner, learn
 from jast.estimate.design_points import distinct
-from jast.estimate.estimate import INVALID, Estimate, of_counts
+from jast.estimate.estimate import MAX_INVALID_SHARE, Estimate, estimate_from_counts
 from jast.estimate.gaussians import as_latent
 from jast.estimate.importance_sampling import Traces
 from jast.estimate.surrogate_failures import expected
@@ -142,7 +142,7 @@ def _estimate(s, rounds, level):
         found.append(f"relative standard error {relative:.0%}")
     if mean > 0 and np.abs(c).max() / n > CHANGE * mean:
         found.append(f"one call changes the estimate by {np.abs(c).max() / n / mean:.0%}")
-    if w[invalid].sum() / n > INVALID * max(mean, 0.0):
+    if w[invalid].sum() / n > MAX_INVALID_SHARE * max(mean, 0.0):
         found.append(
             f"{int(s.invalid.sum())} episodes are invalid (a number that is not finite): if they"
             " failed, the estimate would change"
@@ -198,9 +198,9 @@ def _counted(s, level):
     none = np.zeros(n)
     seen = Traces(none, none[:, None], failing, invalid, none.astype(int))
     s.history.append(f"plain draws: {n} calls, {int(failing.sum())} failures")
-    return of_counts(
+    return estimate_from_counts(
         NAME,
-        sums.add(sums.nothing(n), seen)._replace(steps=s.steps),
+        sums.add_traces(sums.empty_sums(n), seen)._replace(steps=s.steps),
         level=level,
         evaluations=s.spent,
         history=tuple(s.history),

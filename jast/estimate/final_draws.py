@@ -12,8 +12,8 @@ from jast import limit_state as latent
 from jast.counter import numpy_generator
 from jast.estimate import batches, diagnostics, markov_tilts
 from jast.estimate.batches import of_chunk, picks
-from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import Estimate, estimate
+from jast.estimate.draws import with_source
+from jast.estimate.estimate import Estimate, estimate_from_weights
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts
 from jast.simulator import Simulator
@@ -42,14 +42,14 @@ def estimated(
 ) -> Estimate:
     """The `Estimate` of as many draws of ``q`` as ``watch`` has, ``lanes`` at a time, after
     ``spent`` evaluations. A ``share`` of them are the model's own, of which ``drawn`` stand beside
-    them; ``about``: of `jast.estimate.estimate.estimate`.
+    them; ``about``: of `jast.estimate.estimate.estimate_from_weights`.
     """
     modes, model = _modes(q), _model(q)
     plain = lambda i: model[latent.component(q, picks(key, i, lanes, q.log_weights.dtype))]
     shared = key, sim, q, _members(modes, len(model)), lanes, watch.total
     total, notes, lost = chunks(_traces, shared, lanes, watch, ways, plain)
     central = [i for i, mode in enumerate(modes) if _central(q)[mode].all()]
-    found = estimate(
+    found = estimate_from_weights(
         watch.name,
         total,
         notes=notes,
@@ -60,7 +60,7 @@ def estimated(
         control=int(share * total.samples) + drawn,
         **about,
     )
-    return found._replace(draws=drawn_by(found.draws, key, lanes, q))
+    return found._replace(draws=with_source(found.draws, key, lanes, q))
 
 
 def _model(q):
@@ -91,12 +91,12 @@ def _members(modes, components):
 
 
 def _groups(modes, central, total):
-    """So many modes as `estimate` has them, by number; what the ``central`` ones carry, in which
-    the model's own draws lie, is a mode of its own where it matters, and else counts with the
-    greatest.
+    """So many modes as `estimate_from_weights` has them, by number; what the ``central`` ones
+    carry, in which the model's own draws lie, is a mode of its own where it matters, and else
+    counts with the greatest.
     """
     share = lambda i: total.by_component[i] / total.first
-    plain = [i for i in central if share(i) < diagnostics.MATTERS]
+    plain = [i for i in central if share(i) < diagnostics.MIN_MODE_SHARE]
     others = sorted((i for i in range(modes) if i not in plain), key=share)
     groups = [[i] for i in others]
     return [*groups[:-1], [*groups[-1], *plain]] if groups else [[i] for i in range(modes)]

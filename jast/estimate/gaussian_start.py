@@ -10,7 +10,7 @@ import numpy as np
 from jast.estimate.design_points import descended, distinct, explained, likely
 from jast.estimate.gaussian_family import GaussianFamily, Points, rare
 from jast.estimate.gaussians import nearest, unit
-from jast.estimate.populations import cool, edges, explore
+from jast.estimate.populations import bracket_boundary, cool, explore
 from jast.estimate.search_state import State, taken
 from jast.judge import judged
 
@@ -73,7 +73,7 @@ def _population(f, state):
     `Gaussians` that are fitted to it.
     """
     size, most = max(f.budget // 100, 100), int(0.4 * (f.budget - state.spent))
-    p = explore(f.chance.next_key(), f.sim, size, most=most)
+    p = explore(f.chance.next_key(), f.sim, size, max_evaluations=most)
     state = state.noted(
         f"subset simulation: {len(p.levels)} levels, log p {p.log_mean:.2f}", p.evaluations
     )
@@ -106,7 +106,7 @@ def _descended(f, room):
     ):
         go(f.chance.rng.standard_normal((n - s.descents_tried, f.dimension)))
     while len(points) and evaluations < room:
-        safe, fails, paid = edges(
+        safe, fails, paid = bracket_boundary(
             f.chance.next_key(), f.sim, (s.wide_first if first else s.wide) * n
         )
         evaluations += paid
@@ -128,7 +128,9 @@ def _cooled(f, anchors, spent, room):
     s = f.settings
     known, evaluations, given = anchors, 0, len(anchors)
     while evaluations < room:
-        cold = cool(f.chance.next_key(), f.sim, f.chains, known=known, rests=s.rests)
+        cold = cool(
+            f.chance.next_key(), f.sim, f.chains, design_points=known, zeroing_rounds=s.rests
+        )
         used = np.arange(f.dimension)[None] < cold.used[:, None]
         known = np.concatenate([known, np.where(used, cold.points, 0.0)])
         evaluations += cold.evaluations

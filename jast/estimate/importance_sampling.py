@@ -26,8 +26,8 @@ from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.episode import rollout
 from jast.estimate import sums
-from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import estimate
+from jast.estimate.draws import with_source
+from jast.estimate.estimate import estimate_from_weights
 from jast.estimate.proposals import as_proposal
 from jast.intervals import checked_level
 from jast.memory import require_episodes
@@ -195,8 +195,10 @@ def importance(
         shared = key, sim, proposal, lanes, mode == "paper"
         watch = Watch("importance", samples, "episode", progress, callback)
         total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
-    found = estimate("importance", total, level=level, reasons=[*reasons, *lost], notes=notes)
-    draws = drawn_by(found.draws, key, lanes, "policy")
+    found = estimate_from_weights(
+        "importance", total, level=level, reasons=[*reasons, *lost], notes=notes
+    )
+    draws = with_source(found.draws, key, lanes, "policy")
     return found._replace(settings=settings, draws=draws)
 
 
@@ -218,11 +220,11 @@ def chunks(simulate, shared, lanes, watch, ways=units.HERE, plain=None):
         total, done = kept
         rows = jax.tree.map(lambda a: a[: samples - i * lanes], rows)
         own = None if plain is None else plain(i)[: len(rows.failure)]
-        return sums.add(total, rows, own), done + len(rows.failure)
+        return sums.add_traces(total, rows, own), done + len(rows.failure)
 
     task = Task(simulate, shared, lambda: Traces(*Traces._fields))
     size = lambda done: min(done * lanes, samples)
-    start = sums.nothing(samples), 0
+    start = sums.empty_sums(samples), 0
     with watch:
         ran = units.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
     total, done = ran.state

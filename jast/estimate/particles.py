@@ -29,22 +29,25 @@ __all__ = [
     "WINDOW",
     "Particles",
     "Steering",
-    "blank",
-    "fresh",
-    "moved",
-    "when_reached",
+    "allocate_particles",
+    "draw_particles",
+    "initial_steering",
+    "move_particles",
+    "record_crossings",
 ]
 
 LANES = 128
 """Points that are simulated side by side: their numbers then stay in the caches of a core."""
-ACCEPTANCE = 0.35
+TARGET_ACCEPTANCE = 0.35
 """Share of the moves that are taken, to which their sizes are steered; .2 to .5 serve alike."""
-SMALL, WINDOW, AFTER, NONE = range(4)
+SMALL, WINDOW, AFTER, STAY = range(4)
 """Kinds of moves: of all numbers, of some neighbours, of those after the level was reached; and the
 point as it is.
 """
-STEERED = 0.02, 1.0
+SIZE_BOUNDS = 0.02, 1.0
 """Least and greatest size of a move: 1 is an independent draw, or a window of all numbers."""
+FIRST_SIZES = 0.5, 0.3
+"""Of the two moves, before they are steered."""
 
 
 class Particles(NamedTuple):
@@ -74,12 +77,12 @@ class Steering(NamedTuple):
     """Share of the last moves that were taken"""
 
 
-def begun() -> Steering:
+def initial_steering() -> Steering:
     """Before the first move."""
-    return Steering(np.array([0.5, 0.3], np.float32), np.full(2, np.nan, np.float32))
+    return Steering(np.array(FIRST_SIZES, np.float32), np.full(2, np.nan, np.float32))
 
 
-def blank(sim: Simulator, n: int) -> Particles:
+def allocate_particles(sim: Simulator, n: int) -> Particles:
     """``n`` places for points."""
     dtype = np.dtype(normal_numbers(sim))
     zeros = np.zeros(n, dtype)
@@ -95,7 +98,7 @@ def blank(sim: Simulator, n: int) -> Particles:
     )
 
 
-def fresh(
+def draw_particles(
     sim: Simulator, particles: Particles, key: jax.Array, n: int, width: float = 1.0
 ) -> tuple[Particles, int]:
     """``n`` new independent points of N(0, width^2 I) in the place of ``particles``, and how many
@@ -103,23 +106,25 @@ def fresh(
     """
     rows = np.arange(n, dtype=np.int32)
     steering = Steering(np.ones(2, np.float32), np.zeros(2, np.float32))
-    after, _, invalid = moved(
+    after, _, invalid = move_particles(
         sim, particles, key, rows, steering, moves=1, level=np.inf, width=width
     )
     return after, invalid
 
 
-def when_reached(
+def record_crossings(
     sim: Simulator, particles: Particles, key: jax.Array, rows: np.ndarray, level: float
 ) -> Particles:
     """The points of ``rows`` [m], which are at most at the ``level``, in the first m places, with
     the moment at which each came to it.
     """
-    kinds = NONE, NONE
-    return moved(sim, particles, key, rows, begun(), moves=1, level=level, kinds=kinds)[0]
+    after, _, _ = move_particles(
+        sim, particles, key, rows, initial_steering(), moves=1, level=level, kinds=(STAY, STAY)
+    )
+    return after
 
 
-def moved(
+def move_particles(
     sim: Simulator,
     particles: Particles,
     key: jax.Array,
@@ -146,33 +151,35 @@ def moved(
     ratio = 1.0 if before is None else width / before
     counts = np.int32(live), np.int32(moves), np.array(kinds, np.int32)
     numbers = (dtype.type(v) for v in (level, width, ratio))
-    out, size, accepted, invalid = _moved(
+    out, size, accepted, invalid = _move_on_device(
         sim, particles, key, places, steering.size, *counts, *numbers
     )
     return out, Steering(np.asarray(size), np.asarray(accepted)), int(invalid)
 
 
 @partial(jax.jit, donate_argnums=1)
-def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
+def _move_on_device(sim, particles, key, rows, size, live, moves, kinds, level, width, ratio):
     n, d = particles.z.shape
     lanes = min(LANES, n)
     play = jax.vmap(lambda z: outcome_by_level(sim, z, level))
     number = jnp.arange(d, dtype=jnp.int32)[None]
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
-    def small(z, noise, key, size, reached):
+    def change_all(z, noise, key, size, reached):
         return jnp.sqrt(1 - size**2) * z + size * noise
 
-    def window(z, noise, key, size, reached):
+    def change_window(z, noise, key, size, reached):
         begin = jnp.floor(jax.random.uniform(key, (lanes, 1), z.dtype) * d).astype(jnp.int32)
         length = jnp.maximum(jnp.floor(size * d), 1).astype(jnp.int32)
         return jnp.where(jnp.mod(number - begin, d) < length, noise, z)
 
-    def after(z, noise, key, size, reached):
+    def change_after(z, noise, key, size, reached):
         return jnp.where(number < reached[:, None], z, noise)
 
-    def none(z, noise, key, size, reached):
+    def stay(z, noise, key, size, reached):
         return z
+
+    by_kind = change_all, change_window, change_after, stay  # SMALL, WINDOW, AFTER, STAY
 
     def block(i, carry, key, kind, size):
         particles, accepted, invalid = carry
@@ -180,21 +187,27 @@ def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ra
         for_noise, for_window = jax.random.split(jax.random.fold_in(key, i))
         noise = width * jax.random.normal(for_noise, old.z.shape, old.z.dtype)
         about = old.z, noise, for_window, size.astype(old.z.dtype), old.reached
-        z = lax.switch(kind, (small, window, after, none), *about)
+        z = lax.switch(kind, by_kind, *about)
         o, reached = play(z)
         score = o.score.astype(old.score.dtype)
-        square = jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1)
+        proposed = Particles(
+            z=z,
+            score=score,
+            used=o.used,
+            square=jnp.sum(jnp.where(number < o.used[:, None], z**2, 0), axis=1),
+            distance=o.distance.astype(score.dtype),
+            reached=reached,
+        )
         taken = score <= level
         new = jax.tree.map(
-            lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-            Particles(z, score, o.used, square, o.distance.astype(score.dtype), reached),
-            old,
+            lambda a, b: jnp.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), proposed, old
         )
         particles = jax.tree.map(
             lambda a, b: lax.dynamic_update_slice_in_dim(a, b, i * lanes, 0), particles, new
         )
-        count = lambda a: jnp.sum(a & (i * lanes + lane < live), dtype=jnp.int32)
-        return particles, accepted + count(taken), invalid + count(o.invalid)
+        own = i * lanes + lane < live
+        accepted += jnp.sum(taken & own, dtype=jnp.int32)
+        return particles, accepted, invalid + jnp.sum(o.invalid & own, dtype=jnp.int32)
 
     def move(t, carry):
         particles, size, accepted, invalid = carry
@@ -205,7 +218,7 @@ def _moved(sim, particles, key, rows, size, live, moves, kinds, level, width, ra
             0, (live + lanes - 1) // lanes, run, (particles, zero, zero)
         )
         share = taken.astype(size.dtype) / live.astype(size.dtype)
-        steered = jnp.clip(size[i] * jnp.exp(share - ACCEPTANCE), *STEERED)
+        steered = jnp.clip(size[i] * jnp.exp(share - TARGET_ACCEPTANCE), *SIZE_BOUNDS)
         size, accepted = size.at[i].set(steered), accepted.at[i].set(share)
         return particles, size, accepted, invalid + wrong
 

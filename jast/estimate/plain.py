@@ -18,8 +18,8 @@ from jast.checkpoints import open_checkpoint
 from jast.contract import contract
 from jast.crude import outcome
 from jast.estimate.batches import plain_chunk, rows_of
-from jast.estimate.draws import drawn_by
-from jast.estimate.estimate import Estimate, of_counts
+from jast.estimate.draws import with_source
+from jast.estimate.estimate import Estimate, estimate_from_counts
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.incidents import runs_on_host
 from jast.intervals import checked_level
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "of_points"]
+__all__ = ["episode_keys", "lanes_of_points", "monte_carlo", "simulate_points"]
 
-LANES = 16384
-"""Episodes of a unit of work that are drawn by keys."""
-BLOCK = 128
+CHUNK_EPISODES = 16384
+"""Episodes of a unit of work that are drawn by keys: a second of a cheap system, or less."""
+BLOCK_EPISODES = 128
 """Episodes that run side by side: their states then stay in the caches of a core."""
 
 
@@ -95,30 +95,30 @@ def monte_carlo(
     level = checked_level(name, level)
     contract(name, sim)
     by_points = outline(sim).closed
-    simulate = of_points if by_points else _of_keys
-    lanes = lanes_of_points(sim) if by_points else LANES
+    simulate = simulate_points if by_points else _simulate_keys
+    lanes = lanes_of_points(sim) if by_points else CHUNK_EPISODES
     ways = units.placement(name, executor, devices)
     with open_checkpoint(name, checkpoint, key, sim=sim, samples=samples) as store:
         watch = Watch(name, samples, "episode", progress, callback)
         shared = key, sim, lanes, samples
-        total, notes, lost = chunks(simulate, shared, lanes, watch, ways._replace(store=store))
+        ways = ways._replace(store=store)
+        total, notes, reasons = chunks(simulate, shared, lanes, watch, ways)
     settings = call_settings(name, key, samples=samples, level=level)
-    found = of_counts(name, total, level=level, notes=notes, reasons=lost)
-    draws = drawn_by(found.draws, key, lanes, "model" if by_points else "keys")
+    found = estimate_from_counts(name, total, level=level, notes=notes, reasons=reasons)
+    draws = with_source(found.draws, key, lanes, "model" if by_points else "keys")
     return found._replace(settings=settings, draws=draws)
 
 
 def lanes_of_points(sim: Simulator) -> int:
-    """Episodes of a unit of `of_points`: fewer where they take many random numbers."""
+    """Episodes of a unit of `simulate_points`: fewer where they take many random numbers."""
     return 4 * rows_of(sim)
 
 
-def of_points(shared: tuple[Any, ...], i: int, post: Any) -> Traces:
+def simulate_points(shared: tuple[Any, ...], i: int, post: Any) -> Traces:
     """`Traces` of chunk ``i`` of the model, by normal numbers, in the program of `jast.judge`."""
     key, sim, lanes, samples = shared
-    n = min(lanes, samples - i * lanes)
-    o, none = judged(sim, plain_chunk(key, i, n, sim)), np.zeros(n)
-    return Traces(none, none[:, None], o.failure, o.invalid, o.length, o.distance)
+    o = judged(sim, plain_chunk(key, i, min(lanes, samples - i * lanes), sim))
+    return _plain_traces(o.failure, o.invalid, o.length, o.distance)
 
 
 def episode_keys(key: jax.Array, chunk: int, rows: np.ndarray) -> jax.Array:
@@ -126,32 +126,44 @@ def episode_keys(key: jax.Array, chunk: int, rows: np.ndarray) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.fold_in(key, chunk), rows)
 
 
-def _of_keys(shared, i, post):
-    """As `of_points`, by draws of distributions without a quantile function in closed form."""
+def _simulate_keys(shared, i, post):
+    """As `simulate_points`, where distributions have no quantile function in closed form."""
     key, sim, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
-    size = n if runs_on_host(sim) else BLOCK  # of a system on the host no episode is run in vain
-    out = jax.device_get(_played(jax.random.fold_in(key, i), sim, np.int32(n), size))
-    failure, invalid, length, distance = (a[:n] for a in out)
-    none = np.zeros(n)
-    return Traces(none, none[:, None], failure, invalid, length, distance)
+    size = (
+        n if runs_on_host(sim) else BLOCK_EPISODES
+    )  # of a system on the host no episode is run in vain
+    out = jax.device_get(_simulate_chunk(jax.random.fold_in(key, i), sim, np.int32(n), size))
+    return _plain_traces(*(a[:n] for a in out))
+
+
+def _plain_traces(failure, invalid, length, distance):
+    """`Traces` of which all weights are 1."""
+    log_weight = np.zeros(len(failure))
+    return Traces(
+        log_weight=log_weight,
+        shares=log_weight[:, None],
+        failure=failure,
+        invalid=invalid,
+        length=length,
+        distance=distance,
+    )
 
 
 @partial(jit, static_argnames="size")
-def _played(key, sim, n, size):
-    """(failure, invalid, length, distance) [LANES] of the first ``n`` episodes of a chunk, ``size``
-    of them side by side; of the others what is left of their blocks.
+def _simulate_chunk(key, sim, n, size):
+    """(failure, invalid, length, distance) [CHUNK_EPISODES] of the first ``n`` episodes of a chunk,
+    ``size`` of them side by side; of the others what is left of their blocks.
     """
 
+    def one(number):
+        end, length = outcome(jax.random.fold_in(key, number), sim, number < n, log_likelihood)
+        return end.failure, end.invalid, length, end.distance
+
     def block(i, out):
-        number = i * size + jnp.arange(size, dtype=jnp.int32)
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-        end, length = jax.vmap(lambda k, live: outcome(k, sim, live, log_likelihood))(
-            keys, number < n
-        )
-        new = end.failure, end.invalid, length, end.distance
+        new = jax.vmap(one)(i * size + jnp.arange(size, dtype=jnp.int32))
         return tuple(lax.dynamic_update_slice(a, b, (i * size,)) for a, b in zip(out, new))
 
-    none = jnp.zeros(LANES, bool)
-    start = none, none, jnp.zeros(LANES, jnp.int32), jnp.zeros(LANES, outline(sim).dtype)
+    dtypes = bool, bool, jnp.int32, outline(sim).dtype
+    start = tuple(jnp.zeros(CHUNK_EPISODES, dtype) for dtype in dtypes)
     return lax.fori_loop(0, (n + size - 1) // size, block, start)

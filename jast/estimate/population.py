@@ -16,12 +16,12 @@ from jast import units
 from jast._checks import check_random_key, whole_number
 from jast.checkpoints import open_checkpoint
 from jast.counter import counter_key
-from jast.estimate.descents import SETTINGS, Settings, size
+from jast.estimate.descents import SETTINGS, population_size
 from jast.estimate.estimate import Estimate
-from jast.estimate.particles import blank, fresh
-from jast.estimate.population_estimate import of_plain_draws, of_populations
-from jast.estimate.population_search import Search
-from jast.estimate.population_weights import weighted
+from jast.estimate.particles import allocate_particles, draw_particles
+from jast.estimate.population_estimate import estimate_from_plain_draws, estimate_from_populations
+from jast.estimate.population_search import PopulationSearch
+from jast.estimate.population_weights import importance_estimate
 from jast.intervals import checked_level
 from jast.memory import require
 from jast.results import call_settings
@@ -35,11 +35,15 @@ if TYPE_CHECKING:
 
 __all__ = ["by_populations", "episodes_a_second", "population"]
 
-LEAST = 20_000
+MIN_BUDGET = 20_000
 """Evaluations of a call at least: a population of 128 points meets 1e-6 within them."""
-PILOT = 500
+MIN_PARTICLES = 128
+"""Points of a population at least: as many as are simulated side by side."""
+POINTS_DIVISOR = 500
 """Share of the budget, as its denominator, that a population has as points: at 5 moves and 13
 levels, as of a probability of 1e-9, one takes an eighth of the budget."""
+TIMED_SECONDS = 0.05
+"""CPU seconds of the draws by which a rate is measured."""
 
 
 def population(
@@ -112,13 +116,14 @@ def population(
     """
     name = "population"
     check_random_key(name, key)
-    budget = whole_number(name, "budget", budget, LEAST)
-    particles = whole_number(name, "particles", particles, 128)
+    budget = whole_number(name, "budget", budget, MIN_BUDGET)
+    particles = whole_number(name, "particles", particles, MIN_PARTICLES)
     level = checked_level(name, level)
     latent.check(name, sim)
     ways = units.placement(name, executor, devices)
-    about = dict(sim=sim, budget=budget, particles=particles)
-    with open_checkpoint(name, checkpoint, key, **about) as store:
+    with open_checkpoint(
+        name, checkpoint, key, sim=sim, budget=budget, particles=particles
+    ) as store:
         found = by_populations(
             name,
             key,
@@ -138,16 +143,16 @@ def episodes_a_second(key: jax.Array, sim: Simulator) -> float:
     """
     on_cpu = jax.default_backend() == "cpu"
     clock = time.process_time if on_cpu else time.perf_counter
-    n = size(sim, SETTINGS.particles)
-    particles, key = blank(sim, n), counter_key(key, 4)
-    particles, _ = fresh(sim, particles, key, 128)
-    m, spent = 128, 0.0
-    while True:  # a dear system is not run 8192 times for this
+    n = population_size(sim, SETTINGS.particles)
+    particles, key = allocate_particles(sim, n), counter_key(key, 4)
+    particles, _ = draw_particles(sim, particles, key, MIN_PARTICLES)
+    m = MIN_PARTICLES
+    while True:  # an expensive system is not run 8192 times for this
         begun = clock()
-        particles, _ = fresh(sim, particles, key, m)
+        particles, _ = draw_particles(sim, particles, key, m)
         jax.block_until_ready(particles)
         spent = clock() - begun
-        if spent > 0.05 or m == n:
+        if spent > TIMED_SECONDS or m == n:
             return m / max(spent, 1e-9)
         m = min(8 * m, n)
 
@@ -162,28 +167,27 @@ def by_populations(
     level: float = 0.95,
     watched: tuple = (False, None),
     ways: units.Placement = units.HERE,
-    settings: Settings = SETTINGS,
 ) -> Estimate:
     """The `Estimate` of `population`, for the function of this ``name``."""
-    capacity = size(sim, particles, settings)
-    n = size(sim, min(capacity, max(budget // PILOT, 128)), settings)
+    capacity = population_size(sim, particles)
+    n = population_size(sim, min(capacity, max(budget // POINTS_DIVISOR, MIN_PARTICLES)))
     numbers = capacity * latent.dimension(sim) * np.dtype(latent.normal_numbers(sim)).itemsize
     require(name, 4 * numbers, f"populations of {capacity} points", "use fewer particles")
     with Watch(name, budget, "episode", *watched) as watch:
-        s = Search(key, sim, budget, n, capacity, watch, ways, settings)
-        s.run(s.kind("distance"), 1)
-        plain = s.plain_is_best()
-        if not plain and not s.interrupted:
-            s.run(s.kind("width"), 1)
-        kinds, weighed = () if plain else s.witnesses(), None
-        if not kinds:  # they are all that tells the probability
-            return of_plain_draws(s, name, level)
-        s.witness(kinds)
-        if len(kinds) == 2 and not s.interrupted:
-            weighed = weighted(s, name, kinds, level)
-        if weighed is None:
-            s.fill(kinds[0], s.budget - s.spent)
+        search = PopulationSearch(key, sim, budget, n=n, capacity=capacity, watch=watch, ways=ways)
+        search.run(search.first_kind("distance"), 1)
+        plain = search.plain_is_best()
+        if not plain and not search.interrupted:
+            search.run(search.first_kind("width"), 1)
+        kinds, by_weights = () if plain else search.choose_kinds(), None
+        if not kinds:  # plain draws are all that tells the probability
+            return estimate_from_plain_draws(search, name, level)
+        search.run_witness(kinds)
+        if len(kinds) == 2 and not search.interrupted:
+            by_weights = importance_estimate(search, name, kinds, level)
+        if by_weights is None:
+            search.fill(kinds[0], search.budget - search.spent)
         else:
             watch.reach(budget)
             watch.tell()
-    return of_populations(s, name, kinds, level, weighed)
+    return estimate_from_populations(search, name, kinds, level, by_weights)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jast.estimate.batches import resampled
-from jast.estimate.draws import Draws, drawn_by
+from jast.estimate.draws import Draws, with_source
 from jast.outline import outline
 from jast.pytrees import count_numbers
 
@@ -17,10 +17,18 @@ if TYPE_CHECKING:
     from jast.estimate.descents import Descent
     from jast.simulator import Simulator
 
-__all__ = ["KEPT", "Sample", "counted", "independent", "sample_of"]
+__all__ = [
+    "MAX_FAILURES",
+    "Sample",
+    "draws_of_sample",
+    "independent_draws",
+    "sample_from",
+    "steps_of",
+]
 
-KEPT = 20_000
-"""Failures that are kept for further answers."""
+MAX_FAILURES = 20_000
+"""Failures that are kept for further answers: their shares are then known to less than a per cent.
+"""
 
 
 class Sample(NamedTuple):
@@ -35,53 +43,64 @@ class Sample(NamedTuple):
         11
     """
 
-    points: Any
+    points: np.ndarray
     """[m, D]"""
-    used: Any
+    used: np.ndarray
     """[m] int32: how many of the numbers decided each"""
-    distance: Any
+    distance: np.ndarray
     """[m] miss distances"""
-    log_weight: Any
+    log_weight: np.ndarray
     """[m] of the population that it comes from, whose estimate may be greater or less"""
-    group: Any
+    group: np.ndarray
     """[m] int32: which first point of which population it descends from; members of one are not
     independent
     """
 
 
-def sample_of(runs: Sequence[Descent]) -> Sample:
+def sample_from(runs: Sequence[Descent]) -> Sample:
     """The `Sample` of all populations of one kind."""
     runs = [r for r in runs if len(r.points)]
-    parts = [
-        (r.points, r.used, r.distance, np.full(len(r.points), float(r.log_mean))) for r in runs
-    ]
-    first = np.cumsum([0, *(int(r.size) for r in runs)])
-    families = [r.family + n for r, n in zip(runs, first[:-1], strict=True)]
-    groups = np.unique(np.concatenate(families), return_inverse=True)[1].astype(np.int32)
-    return Sample(*map(np.concatenate, zip(*parts, strict=True)), groups)
+    log_weight = [np.full(len(r.points), float(r.log_mean)) for r in runs]
+    first = np.cumsum([0, *(int(r.size) for r in runs)])[:-1]
+    families = [r.family + n for r, n in zip(runs, first, strict=True)]
+    group = np.unique(np.concatenate(families), return_inverse=True)[1]
+    return Sample(
+        points=np.concatenate([r.points for r in runs]),
+        used=np.concatenate([r.used for r in runs]),
+        distance=np.concatenate([r.distance for r in runs]),
+        log_weight=np.concatenate(log_weight),
+        group=group.astype(np.int32),
+    )
 
 
-def independent(key: Any, sim: Simulator, sample: Sample, log_mean: float, worth: int) -> Draws:
+def steps_of(sim: Simulator, used: np.ndarray) -> np.ndarray:
+    """The steps [m] of episodes that ``used`` so many numbers."""
+    about = outline(sim)
+    return (used - count_numbers(about.x0)) // max(count_numbers(about.x), 1)
+
+
+def independent_draws(
+    key: Any, sim: Simulator, sample: Sample, log_mean: float, worth: int
+) -> Draws:
     """`Draws` as of ``worth`` independent ones, half of them failures of the ``sample``: those of
     one population have common ancestors, and all of them would claim too much.
     """
-    m = int(np.clip(worth // 2, 2, min(len(sample.points), KEPT)))
+    m = int(np.clip(worth // 2, 2, min(len(sample.points), MAX_FAILURES)))
     rows = resampled(sample.log_weight, m, 0.5)
-    some = Sample(*(a[rows] for a in sample))
-    return counted(key, sim, some, 2 * m)._replace(log_weight=np.full(m, log_mean + math.log(2)))
+    drawn = draws_of_sample(key, sim, Sample(*(a[rows] for a in sample)), 2 * m)
+    return drawn._replace(log_weight=np.full(m, log_mean + math.log(2)))
 
 
-def counted(key: Any, sim: Simulator, sample: Sample, samples: int) -> Draws:
+def draws_of_sample(key: Any, sim: Simulator, sample: Sample, samples: int) -> Draws:
     """`Draws` of the model, so many, whose failures are the ``sample``."""
-    about, m = outline(sim), len(sample.points)
-    steps = (sample.used - count_numbers(about.x0)) // max(count_numbers(about.x), 1)
+    m = len(sample.points)
     found = Draws(
         log_weight=np.zeros(m),
         distance=sample.distance,
         failure=np.ones(m, bool),
-        length=steps.astype(np.int32),
+        length=steps_of(sim, sample.used).astype(np.int32),
         row=np.arange(m),
         samples=samples,
         reach=0.0,
     )
-    return drawn_by(found, key, max(m, 1), sample)
+    return with_source(found, key, max(m, 1), sample)

@@ -13,9 +13,9 @@ from jast import limit_state as latent
 from jast import units
 from jast._checks import check_random_key, whole_number
 from jast.checkpoints import open_checkpoint
-from jast.estimate.estimate import Estimate
-from jast.estimate.populations import LAST, QUANTILE, Explored, explore
-from jast.intervals import checked_level, log_normal
+from jast.estimate.estimate import Estimate, estimate_from_mean
+from jast.estimate.populations import FINAL_MOVES, LEVEL_SHARE, Explored, explore
+from jast.intervals import checked_level, log_normal, student_factor
 from jast.memory import require_episodes
 from jast.places import Task
 from jast.results import call_settings
@@ -27,10 +27,21 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["subset_simulation"]
+__all__ = ["fallback_estimate", "subset_simulation"]
 
-LOST = "a failure mode that few members of a population reach can be lost without a sign"
-REPLICATES, FEWEST, LEAST = 5, 3, 100
+LOST_MODE_REMARK = (
+    "a failure mode that few members of a population reach can be lost without a sign"
+)
+MIN_SAMPLES = 100
+"""Members of a population at least: levels are quantiles of them."""
+MIN_REPLICATES = 3
+"""Populations at least: their spread is the standard error."""
+FALLBACK_REPLICATES = 5
+"""Populations where no proposal was found."""
+MIN_LOG_PROBABILITY = -690.0
+"""Where a population gives up: the log of the least double, nearly."""
+MAX_REPLICATE_ERROR = 0.5
+"""Relative standard error of the populations above which they disagree. A convention."""
 
 
 def subset_simulation(
@@ -84,10 +95,8 @@ def subset_simulation(
     """
     name = "subset_simulation"
     check_random_key(name, key)
-    samples, replicates = (
-        whole_number(name, "samples", samples, 100),
-        whole_number(name, "replicates", replicates, FEWEST),
-    )
+    samples = whole_number(name, "samples", samples, MIN_SAMPLES)
+    replicates = whole_number(name, "replicates", replicates, MIN_REPLICATES)
     level = checked_level(name, level)
     latent.check(name, sim)
     require_episodes(name, sim, samples)
@@ -97,36 +106,38 @@ def subset_simulation(
         open_checkpoint(name, checkpoint, key, **about) as store,
         Watch(name, replicates, "population", progress, callback) as watch,
     ):
-        task = Task(_unit, (jax.random.split(key, replicates), sim, samples), lambda: (0,) * 7)
-        add = lambda runs, number, parts: (*runs, _explored(*parts))
-        ran = units.run(task, replicates, add, (), watch, ways._replace(store=store))
-    runs, short = ran.state, units.describe_missing("populations", ran, len(ran.state), replicates)
-    if len(runs) < FEWEST:
+        shared = jax.random.split(key, replicates), sim, samples
+        task = Task(_run_replicate, shared, lambda: Explored(*Explored._fields))
+        ran = units.run(
+            task,
+            replicates,
+            lambda runs, number, run: (*runs, run),
+            (),
+            watch,
+            ways._replace(store=store),
+        )
+    runs = ran.state
+    short = units.describe_missing("populations", ran, len(runs), replicates)
+    if len(runs) < MIN_REPLICATES:
         raise KeyboardInterrupt if ran.ended == "" else RuntimeError(f"{name}: {short}")
     reasons = [] if short is None else [short, *map(str, ran.incidents)]
     settings = call_settings(name, key, samples=samples, replicates=replicates, level=level)
-    return of_populations(name, runs, samples, level, reasons)._replace(settings=settings)
+    return estimate_from_replicates(name, runs, samples, level, reasons)._replace(settings=settings)
 
 
-def _unit(shared, number, post):
-    """The `Explored` of a population, as arrays."""
+def _run_replicate(shared, number, post):
+    """The `Explored` of a population, of arrays."""
     keys, sim, samples = shared
-    return tuple(map(np.asarray, explore(keys[number], sim, samples, least=-690.0)))
+    found = explore(keys[number], sim, samples, min_log_probability=MIN_LOG_PROBABILITY)
+    return jax.tree.map(np.asarray, found)
 
 
-def _explored(points, used, log_mean, levels, evaluations, invalid, complete):
-    """`Explored` of its arrays."""
-    numbers = float(log_mean), tuple(levels.tolist()), int(evaluations), int(invalid)
-    return Explored(points, used, *numbers, bool(complete))
-
-
-def of_populations(
-    method: str, runs: list[Explored], samples: int, level: float, reasons: Sequence[str] = ()
+def estimate_from_replicates(
+    method: str, runs: Sequence[Explored], samples: int, level: float, reasons: Sequence[str] = ()
 ) -> Estimate:
     """The `Estimate` of independent populations of ``samples``; ``reasons`` speak against it."""
     replicates = len(runs)
-    evaluations, invalid = sum(r.evaluations for r in runs), sum(r.invalid for r in runs)
-    logs = np.array([r.log_mean for r in runs])
+    logs = np.array([float(r.log_mean) for r in runs])
     history = tuple(
         f"population: {len(r.levels)} levels, log p {r.log_mean:.3f}, {r.evaluations} evaluations"
         for r in runs
@@ -134,75 +145,51 @@ def of_populations(
     seen, found = int(np.isfinite(logs).sum()), list(reasons)
     if seen < replicates:
         found.append(f"{replicates - seen} of {replicates} populations reached no failure")
-    top = logs.max() if seen else 0.0
-    p = np.exp(logs - top)
-    log_mean, relative = (
-        (top + math.log(p.mean()), float(p.std(ddof=1) / math.sqrt(replicates) / p.mean()))
-        if seen
-        else (math.nan, math.nan)
-    )
-    if relative > 0.5:
+    log_mean = relative = max_share = math.nan
+    interval, ess = (0.0, 1.0), 0.0
+    if seen:
+        p = np.exp(logs - logs.max())
+        log_mean = float(logs.max()) + math.log(p.mean())
+        relative = float(p.std(ddof=1) / math.sqrt(replicates) / p.mean())
+        # few replicates: Student's t in place of the normal quantile, as a wider error
+        interval = log_normal(log_mean, relative * student_factor(replicates - 1, level), level)
+        ess, max_share = float(p.sum() ** 2 / (p**2).sum()), float(p.max() / p.sum())
+    if relative > MAX_REPLICATE_ERROR:
         found.append(f"the replicates disagree: relative standard error {relative:.0%}")
-    # few replicates: Student's t in place of the normal quantile, as a wider error
-    interval = (
-        log_normal(log_mean, relative * _student(replicates - 1, level), level)
-        if seen
-        else (0.0, 1.0)
-    )
-    mean = math.exp(log_mean)
-    return Estimate(
-        method=method,
-        log_mean=log_mean,
-        mean=mean,
-        standard_error=mean * relative,
-        relative_error=relative,
-        interval=interval,
-        level=level,
-        ess=float(p.sum() ** 2 / (p**2).sum()) if seen else 0.0,
-        k_hat=math.nan,
-        max_share=float(p.max() / p.sum()) if seen else math.nan,
+    return estimate_from_mean(
+        method,
+        log_mean,
+        relative,
+        level,
+        interval,
+        ess=ess,
+        max_share=max_share,
         failing=sum(len(r.points) for r in runs),
         samples=sum(max(len(r.points), samples) for r in runs),
-        episodes=evaluations,
-        steps=0,
-        invalid=invalid,
-        modes=None,
+        episodes=int(sum(r.evaluations for r in runs)),
+        invalid=int(sum(r.invalid for r in runs)),
         reliable=not found,
-        warnings=(*found, LOST),
+        warnings=(*found, LOST_MODE_REMARK),
         history=history,
     )
 
 
-def by_levels(
+def fallback_estimate(
     key: jax.Array, sim: Simulator, budget: int, log_mean: float, level: float, reasons: list[str]
 ) -> Estimate | None:
     """The `Estimate` of populations for ``budget`` evaluations, where ``log_mean`` is about what
     they will find; None where the budget is too small.
     """
-    levels = max(log_mean, -690.0) / math.log(QUANTILE) + 2
-    size = int(budget / REPLICATES / (levels + LAST + 1))
-    if size < LEAST:
+    levels = max(log_mean, MIN_LOG_PROBABILITY) / math.log(LEVEL_SHARE) + 2
+    most = budget // FALLBACK_REPLICATES
+    size = int(budget / FALLBACK_REPLICATES / (levels + FINAL_MOVES + 1))
+    if size < MIN_SAMPLES:
         return None
     runs = [
-        explore(k, sim, size, least=-690.0, most=budget // REPLICATES)
-        for k in jax.random.split(key, REPLICATES)
+        explore(k, sim, size, min_log_probability=MIN_LOG_PROBABILITY, max_evaluations=most)
+        for k in jax.random.split(key, FALLBACK_REPLICATES)
     ]
     if not any(r.reached for r in runs):
         return None
-    words = f"this is the answer of subset simulation, {REPLICATES} populations of {size}"
-    return of_populations("failure_probability", runs, size, level, [*reasons, words])
-
-
-def _student(degrees, level):
-    """The quantile of Student's t over that of the normal distribution (Cornish and Fisher's
-    expansion; to 2 % from 2 degrees on).
-    """
-    from statistics import NormalDist
-
-    z = NormalDist().inv_cdf((1 + level) / 2)
-    terms = (
-        (z**3 + z) / 4 / degrees
-        + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / degrees**2
-        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384 / degrees**3
-    )
-    return 1 + terms / z
+    said = f"this is the answer of subset simulation, {FALLBACK_REPLICATES} populations of {size}"
+    return estimate_from_replicates("failure_probability", runs, size, level, [*reasons, said])

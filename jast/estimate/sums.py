@@ -2,14 +2,18 @@
 precision, any range.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jast.estimate import draws
+from jast.estimate.diagnostics import tail_size
+from jast.estimate.draws import Draws, Moments, add_draws, empty_draws, moments_of_sums
 
-__all__ = ["add", "nothing", "skewness"]
+__all__ = ["Sums", "add_traces", "empty_sums", "mode_shares", "moments"]
 
 
 class Sums(NamedTuple):
@@ -34,58 +38,50 @@ class Sums(NamedTuple):
     """Sum of the squares"""
     third: float
     """Sum of the cubes"""
-    by_component: Any
+    by_component: np.ndarray | None
     """[K] sums by the component that made a trace (its probability)"""
-    squares: Any
+    squares: np.ndarray | None
     """[K] sums of the squares of these parts"""
-    tail: Any
+    tail: np.ndarray
     """The greatest log weights, at most ``keep``, falling"""
     keep: int
-    draws: Any = None
+    draws: Draws | None = None
     """`jast.estimate.draws.Draws` of the traces that have a miss distance"""
     plain: tuple[int, int, int] = (0, 0, 0)
     """(failing, invalid, episodes) of those that are known to be the model's own draws"""
 
 
-def nothing(samples):
+def empty_sums(samples: int) -> Sums:
     """The `Sums` before the first of ``samples`` episodes."""
     return Sums(
-        0,
-        0,
-        0,
-        0,
-        0.0,
-        0,
-        -np.inf,
-        0.0,
-        0.0,
-        0.0,
-        None,
-        None,
-        np.zeros(0),
-        tail_size(samples),
-        draws.nothing(),
+        samples=0,
+        steps=0,
+        failures=0,
+        invalid=0,
+        invalid_first=0.0,
+        undefined=0,
+        top=-np.inf,
+        first=0.0,
+        second=0.0,
+        third=0.0,
+        by_component=None,
+        squares=None,
+        tail=np.zeros(0),
+        keep=tail_size(samples) + 1,
+        draws=empty_draws(),
     )
 
 
-def tail_size(samples):
-    """How many of the greatest weights the Pareto fit looks at: min(n / 5, 3 sqrt(n)) (Vehtari et
-    al. 2024).
-    """
-    return int(np.ceil(min(samples / 5, 3 * np.sqrt(samples)))) + 1
-
-
-def add(total, traces, plain=None):
+def add_traces(total: Sums, traces: Any, plain: np.ndarray | None = None) -> Sums:
     """`Sums` with the `Traces` [n] (NumPy) as well; ``plain`` [n]: which of them are the model's
     own draws, None where that is not known.
     """
-    plain = np.zeros(len(traces.failure), bool) if plain is None else plain
+    failure, invalid = np.asarray(traces.failure), np.asarray(traces.invalid)
+    plain = np.zeros(len(failure), bool) if plain is None else plain
     log_w = np.asarray(traces.log_weight, np.float64)
-    good = np.asarray(traces.failure) & (log_w < np.inf)
+    good, bad = failure & (log_w < np.inf), log_w[invalid]
     shares = np.exp(np.asarray(traces.shares, np.float64)[good])
-    log_w = log_w[good]
-    bad = np.asarray(traces.log_weight, np.float64)[np.asarray(traces.invalid)]
-    bad = bad[bad < np.inf]
+    log_w, bad = log_w[good], bad[bad < np.inf]
     top = max(total.top, log_w.max(initial=-np.inf), bad.max(initial=-np.inf))
     rescale = np.exp(total.top - top) if total.top > -np.inf else 0.0
     w = np.exp(log_w - top) if top > -np.inf else np.zeros(0)
@@ -93,14 +89,15 @@ def add(total, traces, plain=None):
     tail = np.concatenate([total.tail, log_w])
     if len(tail) > total.keep:
         tail = np.partition(tail, -total.keep)[-total.keep :]
+    added = int(failure[plain].sum()), int(invalid[plain].sum()), int(plain.sum())
     return Sums(
-        samples=total.samples + len(traces.failure),
+        samples=total.samples + len(failure),
         steps=total.steps + int(np.asarray(traces.length, np.int64).sum()),
-        failures=total.failures + int(np.asarray(traces.failure).sum()),
-        invalid=total.invalid + int(np.asarray(traces.invalid).sum()),
+        failures=total.failures + int(failure.sum()),
+        invalid=total.invalid + int(invalid.sum()),
         invalid_first=total.invalid_first * rescale
         + (np.exp(bad - top).sum() if bad.size and top > -np.inf else 0.0),
-        undefined=total.undefined + int(np.asarray(traces.failure).sum()) - len(log_w),
+        undefined=total.undefined + int(failure.sum()) - len(log_w),
         top=top,
         first=total.first * rescale + w.sum(),
         second=total.second * rescale**2 + (w**2).sum(),
@@ -109,19 +106,24 @@ def add(total, traces, plain=None):
         squares=squares if total.squares is None else total.squares * rescale**2 + squares,
         tail=np.sort(tail)[::-1],
         keep=total.keep,
-        draws=draws.add(total.draws, traces),
-        plain=(
-            total.plain[0] + int(np.asarray(traces.failure)[plain].sum()),
-            total.plain[1] + int(np.asarray(traces.invalid)[plain].sum()),
-            total.plain[2] + int(plain.sum()),
-        ),
+        draws=add_draws(total.draws, traces),
+        plain=tuple(a + b for a, b in zip(total.plain, added, strict=True)),
     )
 
 
-def skewness(sums):
-    """Of the mean of the weights, 0 where it is not known."""
-    n, m = sums.samples, sums.first / max(sums.samples, 1)
-    variance = sums.second / max(n, 1) - m**2
-    if n < 2 or not variance > 0:
-        return 0.0
-    return (sums.third / n - 3 * m * sums.second / n + 2 * m**3) / variance**1.5 / math.sqrt(n)
+def moments(sums: Sums) -> Moments:
+    """`Moments` of the weights, where a failure was seen."""
+    log_sums = [math.log(v) for v in (sums.first, sums.second, sums.third)]
+    m = moments_of_sums(log_sums, sums.samples)
+    return m._replace(log_mean=m.log_mean + sums.top)
+
+
+def mode_shares(sums: Sums, groups: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """(share of the estimate, effective sample size) of groups of components, greatest share first:
+    [m], [m].
+    """
+    first = np.array([sums.by_component[g].sum() for g in groups])
+    second = np.array([sums.squares[g].sum() for g in groups])
+    order = np.argsort(-first, kind="stable")
+    sizes = np.divide(first**2, second, out=np.zeros(len(first)), where=second > 0)
+    return first[order] / sums.first, sizes[order]

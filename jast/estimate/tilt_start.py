@@ -17,7 +17,7 @@ from jast.estimate.adapt import adapted, refitted
 from jast.estimate.audit import uncovered
 from jast.estimate.design_points import distinct
 from jast.estimate.gaussians import effective
-from jast.estimate.populations import cool, settled
+from jast.estimate.populations import cool, equilibrate
 from jast.estimate.recorded_tilts import recorded
 from jast.estimate.search_state import State, taken
 from jast.estimate.tilt_family import Mixture, Points, TiltFamily, of_level
@@ -155,7 +155,7 @@ def _around(f, state, z):
     model has them.
     """
     everywhere = f.left_out(f.untilted(), math.inf)
-    people, chain = settled(f.chance.next_key(), f.sim, z, f.settings.moves, covered=everywhere)
+    people, chain = equilibrate(f.chance.next_key(), f.sim, z, f.settings.moves, covered=everywhere)
     places = len(np.unique(z, axis=0))
     state = state.noted(f"failures given: around {places} of them", chain.evaluations)
     return _failing(f, state, people.z)

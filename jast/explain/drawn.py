@@ -11,9 +11,9 @@ from jax.scipy.special import ndtr, ndtri
 from jast import limit_state as latent
 from jast.distributions.spread import chances
 from jast.episode import replay
-from jast.estimate.answers import asked
+from jast.estimate.answers import draws_and_level
 from jast.estimate.estimate import Estimate
-from jast.estimate.redrawn import failing, numbers_of
+from jast.estimate.redrawn import dimension_of, redraw_failures
 from jast.explain.point import used_numbers
 from jast.outline import outline
 from jast.simulator import Simulator
@@ -39,7 +39,7 @@ def failing_draws(
     Raises:
         ValueError: in the name of the function ``name``, where it drew none, or other numbers.
     """
-    kept, _ = asked(name, estimate, None)
+    kept, _ = draws_and_level(name, estimate, None)
     if isinstance(kept.source, str) and kept.source != "model":
         raise ValueError(
             f"{name}: estimate must have drawn normal numbers, received one by {estimate.method}"
@@ -47,12 +47,12 @@ def failing_draws(
         )
     if not kept.failure.any():
         raise ValueError(f"{name}: estimate must have seen a failure, received one that saw none")
-    if (of := numbers_of(kept.source)) not in (None, d := latent.dimension(sim)):
+    if (of := dimension_of(kept.source)) not in (None, d := latent.dimension(sim)):
         raise ValueError(
             f"{name}: sim must be the simulator of the estimate, with {of} random numbers in an"
             f" episode, received one with {d}"
         )
-    return failing(sim, kept, most)
+    return redraw_failures(sim, kept, most)
 
 
 def free_undecided(

@@ -11,7 +11,7 @@ import numpy as np
 from jast import _checks, results
 from jast import limit_state as latent
 from jast.counter import numpy_generator
-from jast.estimate.answers import asked
+from jast.estimate.answers import draws_and_level
 from jast.estimate.batches import resampled
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
@@ -149,7 +149,7 @@ def indices(
     """
     name = "indices"
     _checks.check_random_key(name, key)
-    kept, level = asked(name, estimate, level)
+    kept, level = draws_and_level(name, estimate, level)
     draws = _checks.whole_number(name, "draws", draws, 0)
     latent.check(name, sim)
     rng = numpy_generator(key)

@@ -15,7 +15,7 @@ from jast import limit_state as latent
 from jast.episode import replay
 from jast.estimate.estimate import Estimate
 from jast.estimate.gaussians import effective
-from jast.estimate.redrawn import fits, redrawn
+from jast.estimate.redrawn import is_proposal_of, redraw
 from jast.estimate.sample import Sample
 from jast.explain.drawn import UNRELIABLE, normalised
 from jast.intervals import checked_level
@@ -115,7 +115,7 @@ def sensitivity(
     )
     latent.check(name, sim)
     q = getattr(estimate, "proposal", None)
-    if not fits(sim, q):
+    if not is_proposal_of(sim, q):
         raise ValueError(
             f"{name}: estimate must be one by failure_probability that holds a proposal for this"
             f" simulator, received {getattr(estimate, 'method', type(estimate).__name__)}"
@@ -133,7 +133,7 @@ def sensitivity(
     for i in range(-(-samples // LANES)):
         own = jax.random.fold_in(key, i)
         n = min(LANES, len(q.points)) if isinstance(q, Sample) else LANES
-        z, o, log_w = redrawn(own, sim, q, n)
+        z, o, log_w = redraw(own, sim, q, n)
         rows = np.flatnonzero(np.asarray(o.failure) & np.isfinite(log_w))
         if len(rows):
             # all lanes, so that there is one program

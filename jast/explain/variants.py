@@ -11,7 +11,7 @@ from jast.episode import Episode
 from jast.estimate.batches import resampled
 from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
-from jast.estimate.redrawn import failing, fits
+from jast.estimate.redrawn import is_proposal_of, redraw_failures
 from jast.explain.gathered import distinct_rows, gather_episodes, named_kinds
 from jast.explain.point import used_numbers
 from jast.judge import Judge
@@ -72,7 +72,7 @@ def find_seeds(function: str, sim: Simulator, given: Any, labels: Any, most: int
     modes = given if isinstance(given, Modes) else getattr(given, "modes", None)
     modes = modes if isinstance(modes, Modes) else None
     if labels is None and _holds_points(sim, kept):
-        z, log_w, length, spent = failing(sim, kept, most)
+        z, log_w, length, spent = redraw_failures(sim, kept, most)
         found = Seeds(
             z=z,
             used=used_numbers(sim, length),
@@ -122,7 +122,7 @@ def _holds_points(sim: Simulator, kept: Draws | None) -> bool:
     if kept is None or not kept.failure.any():
         return False
     of_model = isinstance(kept.source, str) and kept.source == "model"
-    return of_model or fits(sim, kept.source)
+    return of_model or is_proposal_of(sim, kept.source)
 
 
 def _label_by_mode(function: str, sim: Simulator, seeds: Seeds, modes: Any) -> Seeds:

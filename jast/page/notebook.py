@@ -5,7 +5,7 @@ from typing import Any
 
 from jast.page.document import text
 from jast.results import html_table
-from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict
+from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict_rows
 
 __all__ = ["cell"]
 
@@ -17,7 +17,7 @@ def cell(report: Any) -> str:
     told = belief(report.probability)
     reasons = "".join(f"<li>{text(reason)}</li>" for reason in told.reasons)
     ours = "", "probability", "doubtful"
-    facts = {name: words for name, words in verdict(report) if name not in ours}
+    facts = {name: words for name, words in verdict_rows(report) if name not in ours}
     facts["evaluations"] = f"{report.episodes:,}"
     parts = [
         f"<h3>{text(headline(report)[0])}</h3>",

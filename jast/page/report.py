@@ -12,7 +12,7 @@ from jast.episode import Episode
 from jast.page.document import document, plain, rows, table, text, write
 from jast.page.traces import exact, groups, pictures, short, states_of, trace
 from jast.simulator import Simulator
-from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict, work
+from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict_rows, work_rows
 
 __all__ = ["write_report"]
 
@@ -145,7 +145,7 @@ def _head(report: Any, modes: list[dict]) -> str:
     """The verdict on one screen."""
     words, mood = headline(report)
     ours = "", "probability", "doubtful"
-    known = [(name, value) for name, value in verdict(report) if name not in ours]
+    known = [(name, value) for name, value in verdict_rows(report) if name not in ours]
     return (
         f'<header><p class="kind">jast: adaptive stress test</p><h1 class="{mood}">{text(words)}'
         f"</h1>{_how(modes[0]) if modes else ''}</header>\n<main>\n<section id=verdict>"
@@ -229,7 +229,7 @@ def _card(number: int, facts: list, data: dict, explanations: list) -> str:
 
 
 def _work(report: Any) -> str:
-    lines = [(*row, "" if best == -np.inf else best) for *row, best in work(report)]
+    lines = [(*row, "" if best == -np.inf else best) for *row, best in work_rows(report)]
     head = ("tried", "calls", "evaluations", "failing", "best log p relative to the mode")
     return f"<section id=tried><h2>What was tried</h2>{table(head, lines)}</section>"
 

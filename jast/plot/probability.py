@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jast.estimate import Estimate, Traces, pareto_k
-from jast.estimate.estimate import doubtful, guarantee
+from jast.estimate.estimate import guaranteed_words, is_doubtful
 from jast.plot import style
 
 if TYPE_CHECKING:
@@ -170,8 +170,8 @@ def _words(row):
     if len(row) > 1:
         return f"{bad} of {len(row)} UNRELIABLE" if bad else f"{len(row)} runs"
     [e] = row
-    if (known := guarantee(e)) is not None:
-        doubt = "" if np.isnan(e.mean) else f"{e.mean:.3g}  " * doubtful(e) + "UNRELIABLE"
+    if (known := guaranteed_words(e)) is not None:
+        doubt = "" if np.isnan(e.mean) else f"{e.mean:.3g}  " * is_doubtful(e) + "UNRELIABLE"
         return "\n".join(filter(None, (known[0], doubt)))
     if np.isnan(e.mean):
         return f"below {e.interval[1]:.3g}" if e.interval[1] < 1 else "no failure seen"

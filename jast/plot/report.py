@@ -28,7 +28,7 @@ from jast.plot.played import (
 from jast.plot.states import draw_traces
 from jast.simulator import Simulator
 from jast.stress_testing import Report
-from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict, work
+from jast.stress_testing.words import advice, belief, headline, mode_facts, verdict_rows, work_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,10 +94,10 @@ def report(
     told = belief(report.probability)
     left = _probability_rows(told)
     ours = "", "probability", "doubtful"
-    known = [(name, words) for name, words in verdict(report) if name not in ours]
+    known = [(name, words) for name, words in verdict_rows(report) if name not in ours]
     right = _wrapped([*known, ("evaluations", f"{report.episodes:,}")], 43)
     title = textwrap.wrap(headline(report)[0], 72)
-    tried = work(report)
+    tried = work_rows(report)
     top = 0.35 + 0.27 * len(title) + 0.15
     facts = max(0.7 + LINE * len(left), LINE * len(right)) + 0.25
     table = LINE * (len(tried) + 2) + 0.3

@@ -1,5 +1,5 @@
 """The explorers of `jast.stress`: ways to find failures, each a function ``(key, sim, budget) ->
-Haul``.
+ExplorerResult``.
 """
 
 from collections.abc import Callable
@@ -25,22 +25,48 @@ from jast.search.go_explore import go_explore
 from jast.search.monte_carlo import monte_carlo
 from jast.simulator import Simulator
 
-__all__ = ["EXPLORERS", "Haul", "explorers_of", "of_points", "onward"]
+__all__ = [
+    "EXPLORERS",
+    "Explorer",
+    "ExplorerResult",
+    "divide_budget",
+    "failures_at",
+    "has_quantiles",
+    "slow_cross_entropy",
+]
 
-KEPT = 128
+MAX_FAILURES = 128
 """Failures that an explorer hands over, the most."""
 PRUNES = 18
 """Of a tree: 10 with more simulations each found failures of `jast.simulators.colav` in half as
 many trees.
 """
-STEPS = 30
-"""Iterations of `onward`: half of them with twice the draws ends in worse basins."""
-AROUND = 0.5
+TREE_EVALUATIONS = 2500
+"""Evaluations for each tree of a forest, and at most as many trees as below."""
+MAX_TREES = 64
+"""Of a forest; a forest with more would prune too rarely."""
+COOLED_EVALUATIONS = 84
+"""Evaluations for each failure that is cooled: its wide draws, and a move at each width."""
+LEVEL_EVALUATIONS = 12
+"""Evaluations for each point that goes down the levels of the distance."""
+LEVEL_POINTS = 50, 1000
+"""Least and greatest number of them."""
+DESCENT_EVALUATIONS = 108
+"""Evaluations for each descent by gradients."""
+DESCENTS = 4, 48
+"""Least and greatest number of them."""
+ITERATIONS = 15
+"""Of the cross-entropy method."""
+SLOW_ITERATIONS = 30
+"""Iterations of `slow_cross_entropy`: half of them with twice the draws ends in worse basins."""
+SLOW_WIDTH = 0.5
 """Width of its first draws around a failure."""
+ELITES = 10
+"""Share of the draws that the cross-entropy method fits, as its denominator. A convention."""
 
 
-class Haul(NamedTuple):
-    """What an explorer brought in."""
+class ExplorerResult(NamedTuple):
+    """What an explorer found."""
 
     episodes: Episode
     """Failing ones [m], on the host."""
@@ -50,125 +76,139 @@ class Haul(NamedTuple):
     invalid: int
 
 
-def plain(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def plain_draws(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Draws of the model."""
-    return _of_search(monte_carlo(key, sim, episodes=budget, reward=likelihood(sim), top=KEPT))
+    reward = likelihood(sim)
+    return _from_search(monte_carlo(key, sim, episodes=budget, reward=reward, top=MAX_FAILURES))
 
 
-def cooled(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def cooled_noise(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Wider noise, cooled down: chains that start where failures are frequent."""
-    return _of_points(sim, cool(key, sim, int(np.clip(budget // 84, 1, KEPT))))
+    return _from_points(sim, cool(key, sim, _number(budget, COOLED_EVALUATIONS, 1, MAX_FAILURES)))
 
 
-def levels(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def distance_levels(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Subset simulation: down the levels of the miss distance."""
-    found = explore(key, sim, int(np.clip(budget // 12, 50, 1000)), most=budget)
-    return _of_points(sim, found)
+    size = _number(budget, LEVEL_EVALUATIONS, *LEVEL_POINTS)
+    return _from_points(sim, explore(key, sim, size, max_evaluations=budget))
 
 
-def slopes(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def gradients(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Gradients of the miss distance, from draws of the model."""
-    found = design_points(key, sim, int(np.clip(budget // 108, 4, 48)))
-    return _of_points(sim, found)
+    found = design_points(key, sim, _number(budget, DESCENT_EVALUATIONS, *DESCENTS))
+    return _from_points(sim, found)
 
 
-def likest(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def cross_entropy(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """The cross-entropy method."""
-    samples = max(10, budget // 15)
-    elites = max(2, samples // 10)
-    return _of_search(
-        cem(key, sim, samples=samples, elites=elites, iterations=15, refine=0, top=KEPT)
-    )
+    return _from_search(_cem(key, sim, budget, ITERATIONS))
 
 
-def onward(key: jax.Array, sim: Simulator, budget: int, failures: Any = None) -> Haul:
+def slow_cross_entropy(
+    key: jax.Array, sim: Simulator, budget: int, failures: Any = None
+) -> ExplorerResult:
     """The cross-entropy method in many small steps, which cross from one basin to another where
     slopes lead nowhere; around the likeliest of ``failures``, if any are given.
     """
-    samples = max(10, budget // STEPS)
-    return _of_search(
-        cem(
-            key,
-            centred(sim),
-            samples=samples,
-            elites=max(2, samples // 10),
-            iterations=STEPS,
-            failures=failures,
-            actions=None if failures is None else wide(AROUND),
-            refine=0,
-            top=KEPT,
-        )
-    )
+    actions = None if failures is None else wide(SLOW_WIDTH)
+    about = dict(failures=failures, actions=actions)
+    return _from_search(_cem(key, centred(sim), budget, SLOW_ITERATIONS, **about))
 
 
-def trees(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def search_forest(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """A forest of search trees."""
-    number = int(np.clip(budget // 2500, 1, 64))
-    each = max(10, budget // (PRUNES * number))
-    return _of_search(
-        forest(key, sim, trees=number, prunes=PRUNES, simulations=each, refine=0, top=KEPT)
-    )
+    trees = _number(budget, TREE_EVALUATIONS, 1, MAX_TREES)
+    each = max(10, budget // (PRUNES * trees))
+    about = dict(trees=trees, prunes=PRUNES, simulations=each)
+    return _from_search(forest(key, sim, **about, refine=0, top=MAX_FAILURES))
 
 
-def kept(key: jax.Array, sim: Simulator, budget: int) -> Haul:
+def kept_states(key: jax.Array, sim: Simulator, budget: int) -> ExplorerResult:
     """Restarts from kept states, for failures that take many things one after another."""
-    return _of_search(go_explore(key, sim, episodes=budget, refine=0, top=KEPT))
+    return _from_search(go_explore(key, sim, episodes=budget, refine=0, top=MAX_FAILURES))
 
 
-EXPLORERS: dict[str, Callable[[jax.Array, Simulator, int], Haul]] = {
-    "plain draws": plain,
-    "widened noise, cooled": cooled,
-    "gradients": slopes,
-    "levels of distance": levels,
-    "cross-entropy": likest,
-    "forest": trees,
-    "kept states": kept,
+class Explorer(NamedTuple):
+    """A way to find failures, and where it serves."""
+
+    run: Callable[[jax.Array, Simulator, int], ExplorerResult]
+    min_evaluations: int | None
+    """Below which it is not worth a call; None where it is called only if nothing else found a
+    failure"""
+    needs_quantiles: bool = False
+    """Whether the disturbances need quantile functions"""
+    needs_gradients: bool = False
+
+
+EXPLORERS = {
+    "widened noise, cooled": Explorer(cooled_noise, COOLED_EVALUATIONS, needs_quantiles=True),
+    "plain draws": Explorer(plain_draws, 30),
+    "gradients": Explorer(
+        gradients, DESCENT_EVALUATIONS * DESCENTS[0], needs_quantiles=True, needs_gradients=True
+    ),
+    "levels of distance": Explorer(
+        distance_levels, LEVEL_EVALUATIONS * LEVEL_POINTS[0], needs_quantiles=True
+    ),
+    "cross-entropy": Explorer(cross_entropy, 600),
+    "forest": Explorer(search_forest, 2000),
+    "kept states": Explorer(kept_states, None),
 }
-LATENT = {"widened noise, cooled", "gradients", "levels of distance"}
-LEAST = {
-    "widened noise, cooled": 84,
-    "plain draws": 30,
-    "gradients": 432,
-    "levels of distance": 600,
-    "cross-entropy": 600,
-    "forest": 2000,
-}
-"""Evaluations below which an explorer is not worth a call; those that come first are left last.
-"kept states" is called only where nothing else found a failure.
-"""
+"""By name; where the budget is small, those that come first are called."""
 
 
-def explorers_of(sim: Simulator, budget: int) -> dict[str, int]:
-    """The names of those that work on ``sim``, with what each has of ``budget`` evaluations."""
+def has_quantiles(sim: Simulator) -> bool:
+    """Whether an episode of ``sim`` is a point of normal numbers."""
     about = outline(sim)
-    quantiles = about.start.quantile and about.disturbance.quantile
-    floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(about.x))
-    chosen, left = [], budget
-    for name, least in LEAST.items():
-        fits = (quantiles or name not in LATENT) and least <= left
-        if fits and (name != "gradients" or (floats and not runs_on_host(sim))):
-            chosen.append(name)
-            left -= least
-    return {name: LEAST[name] + left // len(chosen) for name in chosen}
+    return about.start.quantile and about.disturbance.quantile
 
 
-def _of_search(result: Any) -> Haul:
-    """The `Haul` of a `jast.search.SearchResult`."""
-    found = result.failures.episodes
-    return Haul(found, result.episodes, int(result.failing), int(result.invalid))
+def divide_budget(sim: Simulator, budget: int) -> dict[str, int]:
+    """The names of the explorers that work on ``sim``, with what each has of ``budget``
+    evaluations.
+    """
+    floats = all(jnp.issubdtype(s.dtype, jnp.floating) for s in jax.tree.leaves(outline(sim).x))
+    quantiles, differentiable = has_quantiles(sim), floats and not runs_on_host(sim)
+    least, left = {}, budget
+    for name, explorer in EXPLORERS.items():
+        fits = explorer.min_evaluations is not None and explorer.min_evaluations <= left
+        fits = fits and (quantiles or not explorer.needs_quantiles)
+        if fits and (differentiable or not explorer.needs_gradients):
+            least[name] = explorer.min_evaluations
+            left -= least[name]
+    return {name: n + left // len(least) for name, n in least.items()}
 
 
-def _of_points(sim: Simulator, found: Any) -> Haul:
-    """The `Haul` of an explorer that ends with points."""
-    haul = of_points(sim, np.asarray(found.points))
-    return haul._replace(evaluations=found.evaluations, invalid=int(getattr(found, "invalid", 0)))
-
-
-def of_points(sim: Simulator, points: np.ndarray) -> Haul:
-    """The `Haul` of points [m, D] of normal numbers: those of the first that fail."""
-    points = points[:KEPT]
+def failures_at(sim: Simulator, points: np.ndarray) -> ExplorerResult:
+    """Those of the first points [m, D] of normal numbers that fail."""
+    points = points[:MAX_FAILURES]
     if not len(points):
-        return Haul(empty(sim).episodes, 0, 0, 0)
+        return ExplorerResult(empty(sim).episodes, 0, 0, 0)
     e = latent.played(sim, points)
     e = jax.tree.map(lambda a: a[e.failure], e)
-    return Haul(e, len(points), len(e.length), 0)
+    return ExplorerResult(e, len(points), len(e.length), 0)
+
+
+def _number(budget, each, least, most):
+    """How many the budget affords at so many evaluations ``each``."""
+    return int(np.clip(budget // each, least, most))
+
+
+def _cem(key, sim, budget, iterations, **about):
+    """The `jast.search.SearchResult` of the cross-entropy method."""
+    samples = max(10, budget // iterations)
+    elites = max(2, samples // ELITES)
+    numbers = dict(samples=samples, elites=elites, iterations=iterations)
+    return cem(key, sim, **numbers, **about, refine=0, top=MAX_FAILURES)
+
+
+def _from_search(result: Any) -> ExplorerResult:
+    """The failures of a `jast.search.SearchResult`."""
+    found = result.failures.episodes
+    return ExplorerResult(found, result.episodes, int(result.failing), int(result.invalid))
+
+
+def _from_points(sim: Simulator, found: Any) -> ExplorerResult:
+    """The failures of an explorer that ends with points."""
+    result = failures_at(sim, np.asarray(found.points))
+    invalid = int(getattr(found, "invalid", 0))
+    return result._replace(evaluations=found.evaluations, invalid=invalid)

@@ -17,25 +17,32 @@ from jast.checkpoints import keep_answers, open_checkpoint
 from jast.contract import check
 from jast.crude import BRIEF, nominal
 from jast.episode import rollout
-from jast.estimate import adaptive, budgets, few_calls
+from jast.estimate import budgets, few_calls
+from jast.estimate.adaptive import MIN_BUDGET as MIN_ESTIMATE_BUDGET
+from jast.estimate.adaptive import failure_probability
 from jast.estimate.batches import resampled
-from jast.estimate.budgets import CHEAP
-from jast.estimate.descents import SETTINGS, cooled
+from jast.estimate.budgets import MIN_POPULATION_BUDGET
+from jast.estimate.descents import SETTINGS, cool_failures
 from jast.estimate.plain import monte_carlo
 from jast.estimate.population import by_populations
-from jast.estimate.redrawn import redrawn
+from jast.estimate.redrawn import redraw
 from jast.estimate.sample import Sample
 from jast.failures import Failures, collect, empty, merge
-from jast.outline import outline
 from jast.results import call_settings
 from jast.rewards import likelihood
 from jast.search.failure_modes import Mode, Modes, modes, spread
 from jast.search.refinement import refine
 from jast.simulator import Simulator, require_simulator
-from jast.stress_testing.explorers import EXPLORERS, Haul, explorers_of, of_points, onward
+from jast.stress_testing.explorers import (
+    EXPLORERS,
+    ExplorerResult,
+    divide_budget,
+    failures_at,
+    has_quantiles,
+    slow_cross_entropy,
+)
 from jast.stress_testing.report import Report, Tried
-from jast.stress_testing.shares import cost as shares_cost
-from jast.stress_testing.shares import shares
+from jast.stress_testing.shares import mode_shares, shares_cost
 from jast.watch import Watch
 
 if TYPE_CHECKING:
@@ -43,26 +50,66 @@ if TYPE_CHECKING:
 
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["PORTFOLIO", "stress"]
+__all__ = ["DEFAULT_BUDGET", "stress"]
 
-DRAWN = 400
+MIN_BUDGET = 300
+"""Evaluations of a call, at least: with fewer no explorer is worth a call."""
+DEFAULT_BUDGET = 200_000
+"""Evaluations by default where populations are not the answer."""
+MAX_SURROGATE_NUMBERS = 20
+"""Numbers of an episode up to which a surrogate tells the probability."""
+REDRAWN_EPISODES = 400
 """Draws of the estimate's proposal, where only it found failures."""
-LEAST, ESTIMABLE, SMALL = 300, 5000, 20
-"""Evaluations of a call, and of an estimate that finds its own proposal; numbers of an episode up
-to which a surrogate does with fewer.
-"""
-PATHS = 0.05
-"""Share of the budget that a look at the modes may cost at most."""
-FIRST, CALLS, FADING, FEW = 0.5, 6, 0.1, 2000
-"""Of the search, the share that all explorers divide evenly; calls that divide the rest; how much
-of its last gain is expected of one that gained nothing since; evaluations below which each explorer
-is called once, and what was found is pulled once.
-"""
+MIN_COUNTED_EPISODES = 100
+"""Plain draws for the probability, at least, where nothing else tells it."""
+MODES_SHARE = 0.05
+"""Share of the budget that telling modes apart may cost at most."""
+EVEN_SHARE = 0.5
+"""Share of the search that all explorers divide evenly."""
+FURTHER_CALLS = 6
+"""Calls of explorers that divide the rest."""
+GAIN_DECAY = 0.1
+"""How much of its last gain is expected of an explorer that gained nothing since."""
+MIN_DIVIDED_BUDGET = 2000
+"""Evaluations below which each explorer is called once, and failures are refined once."""
+OPTIMAL_RESIDUAL = 1e-2
+"""A residual at which a failure is locally likeliest."""
+FEW_MODES = 4
+"""With so few modes, and a likeliest failure that is locally so, `slow_cross_entropy` would find
+nothing else: its evaluations are the estimate's."""
+COOLING_SHARE = 0.2
+"""Share of the evaluations by which failures of the populations are cooled to the likeliest."""
+INDEPENDENT_SHARE = 0.25
+"""Share of these by which no point replaces another, so that no mode is lost. With all of them the
+likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
+none they are as likely as with a quarter, or up to 2 nats likelier."""
+REFINE_EVALUATIONS = 50_000
+"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all: on
+the crossing, the cart-pole and the ship failures are as likely with half as many and twice as many
+coolings, which cost a tenth of the CPU time."""
+POOL_FACTOR = 32
+"""Failures in the pool for each that is returned: modes are told apart among these."""
+REFINED_FACTOR = 8
+"""Failures that refinement starts from for each that is returned."""
+FOUND_FACTOR = 4
+"""Failures of one explorer for each that is returned."""
 
-SETTLED, BASINS = 1e-2, 4
-"""A residual at which a failure is locally likeliest, and as many modes as show that there is
-nothing else to find: the evaluations of `onward` are the estimate's then.
-"""
+
+class BudgetShares(NamedTuple):
+    """Of the budget; what is left is for the probability."""
+
+    nominal: float
+    search: float
+    slow_search: float
+    refine: float
+
+
+LARGE_SHARES = BudgetShares(nominal=0.05, search=0.15, slow_search=0.14, refine=0.18)
+"""Where the estimate finds its own proposal."""
+SURROGATE_SHARES = BudgetShares(nominal=0.05, search=0.3, slow_search=0, refine=0.35)
+"""Where a surrogate tells the probability with few evaluations."""
+COUNTING_SHARES = BudgetShares(nominal=0.125, search=0.35, slow_search=0.2, refine=0.325)
+"""Where only plain draws tell it."""
 
 
 def stress(
@@ -128,102 +175,83 @@ def stress(
     """
     name = "stress"
     _checks.check_random_key(name, key)
-    budgets.given(name, budget, seconds)
+    budgets.check_budget_or_seconds(name, budget, seconds)
     if budget is not None:
-        budget = _checks.whole_number(name, "budget", budget, LEAST)
+        budget = _checks.whole_number(name, "budget", budget, MIN_BUDGET)
     top = _checks.whole_number(name, "top", top, 1)
     require_simulator(name, sim)
     check(sim)
-    about = outline(sim)
-    quantiles = about.start.quantile and about.disturbance.quantile
-    if budget is None and not quantiles and seconds is None:
-        budget = PORTFOLIO
+    if budget is None and seconds is None and not has_quantiles(sim):
+        budget = DEFAULT_BUDGET
     if budget is None:
-        budget = budgets.budget_of(name, key, sim, seconds, LEAST, PORTFOLIO)
+        budget = budgets.measure_budget(name, key, sim, seconds, MIN_BUDGET, DEFAULT_BUDGET)
     settings = call_settings(name, key, budget=budget, top=top)
     ways = units.placement(name, executor, devices)
     with (
         open_checkpoint(name, checkpoint, key, sim=sim, budget=budget, top=top) as store,
         keep_answers(store),
-        briefly(not budgets.cheap(sim, budget)),
+        briefly(not budgets.uses_populations(sim, budget)),
         Watch(name, budget, "sim", progress, callback) as watch,
     ):
-        work = _Work(key, sim, budget, top, watch, ways._replace(store=store), checkpoint)
+        ways = ways._replace(store=store)
+        test = _StressTest(key, sim, budget, top=top, watch=watch, ways=ways, checkpoint=checkpoint)
         try:
-            work.look()
-            if work.cheap:
-                work.populate()
+            test.run_nominal()
+            if test.cheap:
+                test.run_populations()
             else:
-                work.search()
-                work.refine()
-                work.estimate()
+                test.search()
+                test.refine()
+                test.estimate()
         except KeyboardInterrupt:
-            if work.nominal is None:
+            if test.nominal is None:
                 raise
-            settings["interrupted"] = f"after {work.spent} of {budget} evaluations"
-    return work.report(settings)
+            settings["interrupted"] = f"after {test.spent} of {budget} evaluations"
+    return test.report(settings)
 
 
-class Shares(NamedTuple):
-    """Of the budget; what is left is for the probability."""
+class _StressTest:
+    """What is known so far, and what it cost.
 
-    nominal: float
-    search: float
-    onward: float
-    refine: float
-
-
-PORTFOLIO = 200_000
-"""Evaluations by default where populations are not the answer."""
-COOLED = 0.2
-"""Share of the evaluations by which failures of the populations are cooled to the likeliest."""
-ALONE = 0.25
-"""Share of these by which no point replaces another, so that no mode is lost. With all of them the
-likeliest failure of the crossing is .35 nats less likely, of the cart-pole 6, of the ship 4; with
-none they are as likely as with a quarter, or up to 2 nats likelier."""
-POLISHED = 50_000
-"""Evaluations for pulling what was cooled to where log p is greatest, at most an eighth of all: on
-the crossing, the cart-pole and the ship failures are as likely with half as many and twice as many
-coolings, which cost a tenth of the CPU time."""
-LARGE, BY_SURROGATE, NO_ESTIMATE = (
-    Shares(0.05, 0.15, 0.14, 0.18),
-    Shares(0.05, 0.3, 0, 0.35),
-    Shares(0.125, 0.35, 0.2, 0.325),
-)
-
-
-class _Work:
-    """What is known so far, and what it cost."""
+    ``pool`` has the failures of explorers, ``refined`` those that refinement came to, and
+    ``failures`` what the report shows.
+    """
 
     def __init__(self, key, sim, budget, top, watch, ways, checkpoint):
-        self.key, self.sim, self.budget, self.top, self.watch = key, sim, budget, top, watch
-        self.ways, self.checkpoint = ways, checkpoint
-        about = outline(sim)
-        self.latent = about.start.quantile and about.disturbance.quantile
-        self.reward = likelihood(sim)
+        self.key, self.sim = key, sim
+        self.budget, self.top = budget, top
+        self.watch, self.ways = watch, ways
+        self.checkpoint, self.reward = checkpoint, likelihood(sim)
         self.nominal = self.probability = None
-        self.pool = self.failures = self.known = empty(sim)
-        self.modes, self.tried, self.spent, self.invalid = Modes(), [], 0, 0
+        self.pool = self.failures = self.refined = empty(sim)
+        self.modes, self.tried = Modes(), []
+        self.spent = self.invalid = 0
         self.residual = self.late = np.nan
-        large = (1 - sum(LARGE)) * budget >= ESTIMABLE
-        self.estimable = self.latent and (large or latent.dimension(sim) <= SMALL)
-        self.cheap = self.latent and budgets.cheap(sim, budget)
-        shares = (LARGE if large else BY_SURROGATE) if self.estimable else NO_ESTIMATE
-        self.parts = Shares(*(int(share * min(budget, PORTFOLIO)) for share in shares))
-        self.paths = int(PATHS * budget)
+        self.has_points = has_quantiles(sim)
+        large = (1 - sum(LARGE_SHARES)) * budget >= MIN_ESTIMATE_BUDGET
+        few_numbers = self.has_points and latent.dimension(sim) <= MAX_SURROGATE_NUMBERS
+        self.estimable = self.has_points and (large or few_numbers)
+        self.cheap = self.has_points and budgets.uses_populations(sim, budget)
+        shares = COUNTING_SHARES
+        if self.estimable:
+            shares = LARGE_SHARES if large else SURROGATE_SHARES
+        # what populations do not answer gains little from more
+        self.parts = BudgetShares(*(int(share * min(budget, DEFAULT_BUDGET)) for share in shares))
+        self.modes_budget = int(MODES_SHARE * budget)
 
     def next_key(self):
         self.key, key = jax.random.split(self.key)
         return key
 
     def note(self, name, evaluations, failing=0, best=-np.inf, invalid=0):
+        """Count a piece of the work."""
         self.tried.append(Tried(name, int(evaluations), int(failing), float(best)))
         self.spent += int(evaluations)
         self.invalid += int(invalid)
         self.watch.reach(min(self.spent, self.budget))
         self.watch.tell()
 
-    def look(self):
+    def run_nominal(self):
         """The system as it is."""
         # populations draw plainly, too, and so few are compiled quickly
         key, episodes = self.next_key(), BRIEF if self.cheap else self.parts.nominal
@@ -234,136 +262,142 @@ class _Work:
         if n.first is not None:
             found.append(rollout(jax.random.fold_in(key, n.first), self.sim))
         for e in found:
-            one = jax.tree.map(lambda a: np.asarray(a)[None], e._replace(states=None))
-            self.pool = merge(self.pool, collect(self.sim, self.reward, one), top=2)
-        best = _best(self.pool)
-        self.note("nominal", n.episodes, n.failing, best, n.invalid)
+            self.pool = merge(self.pool, self.collect([e]), top=2)
+        self.note("nominal", n.episodes, n.failing, _best_log_density(self.pool), n.invalid)
 
-    def populate(self):
+    def collect(self, episodes):
+        """The `Failures` of single episodes."""
+        each = [e._replace(states=None) for e in episodes]
+        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
+        return collect(self.sim, self.reward, stacked)
+
+    def run_populations(self):
         """The probability by populations, and the likeliest failures from theirs."""
-        cooling = int(COOLED * self.budget)
-        polishing = min(POLISHED, self.budget // 8)
-        rest = self.budget - self.spent - cooling - 2 * polishing
-        rest = max(rest, CHEAP // 2)
+        cooling = int(COOLING_SHARE * self.budget)
+        refining = min(REFINE_EVALUATIONS, self.budget // 8)
+        rest = self.budget - self.spent - cooling - 2 * refining
+        rest = max(rest, MIN_POPULATION_BUDGET // 2)
         self.watch.doing("estimating")
         p = by_populations("stress", self.next_key(), self.sim, rest, ways=self.ways)
-        self.probability = self.beside_nominal(p)
-        self.note("populations", p.episodes, p.failing, invalid=p.invalid)
+        self.keep_probability(p, "populations")
         sample = p.proposal
         if not isinstance(sample, Sample):
             # nothing leads to failures, or all does
-            self.parts = Shares(0, polishing, 0, polishing)
+            self.parts = BudgetShares(nominal=0, search=refining, slow_search=0, refine=refining)
             if not len(self.pool):
                 self.search()
             return self.refine()
-        rows = resampled(sample.log_weight, SETTINGS.cooled, 0.5)
-        for name, together, share in (
-            ("cooled", False, ALONE),
-            ("cooled together", True, 1 - ALONE),
+        rows = resampled(sample.log_weight, SETTINGS.cooled_failures, 0.5)
+        for name, resample, share in (
+            ("cooled", False, INDEPENDENT_SHARE),
+            ("cooled together", True, 1 - INDEPENDENT_SHARE),
         ):
-            some, most = sample.points[rows], int(share * cooling)
             self.watch.doing("cooling failures")
-            points, spent = cooled(self.next_key(), self.sim, some, most, together)
-            self.gather(name, of_points(self.sim, points)._replace(evaluations=spent))
-        self.parts, self.paths = Shares(0, 0, 0, polishing), polishing // 4
+            points, spent = cool_failures(
+                self.next_key(), self.sim, sample.points[rows], int(share * cooling), resample
+            )
+            self.add_failures(name, failures_at(self.sim, points)._replace(evaluations=spent))
+        self.parts = BudgetShares(nominal=0, search=0, slow_search=0, refine=refining)
+        self.modes_budget = refining // 4
         self.refine()
-        if self.modes and p.reliable:
-            self.tell_shares(sample)
+        self.tell_shares(sample)
 
     def search(self):
         """Every explorer once; then those again whose failures get likelier for what they cost."""
         total = self.parts.search
-        end, few = self.spent + total, total < FEW
-        first = explorers_of(self.sim, total if few else int(FIRST * total))
+        end, once = self.spent + total, total < MIN_DIVIDED_BUDGET
+        first = divide_budget(self.sim, total if once else int(EVEN_SHARE * total))
         gains = {name: self.explore(name, each) for name, each in first.items()}
+        if once:
+            return
+        if not len(self.pool):  # nothing points to failures, or they are far away
+            self.explore("kept states", end - self.spent + self.parts.slow_search)
         calls = dict.fromkeys(first, 1)
-        again = int((1 - FIRST) * total / CALLS)
-        if not few and not len(self.pool):  # nothing points to failures, or they are far away
-            self.explore("kept states", end - self.spent + self.parts.onward)
-        while not few and self.spent + again <= end:
+        again = int((1 - EVEN_SHARE) * total / FURTHER_CALLS)
+        while self.spent + again <= end:
             # of those that expect as much, the one that was called least
             name = max(first, key=lambda n: (gains[n], -calls[n]))
             # what paid once may pay again, but less is expected of it
-            gains[name] = max(self.explore(name, again), FADING * gains[name])
+            gains[name] = max(self.explore(name, again), GAIN_DECAY * gains[name])
             calls[name] += 1
 
     def explore(self, name, budget):
         """Call one explorer; returns by how much the likeliest failure got likelier per
         evaluation.
         """
-        before = _best(self.pool)
+        before = _best_log_density(self.pool)
         self.watch.doing(f"searching by {name}")
-        haul = EXPLORERS[name](self.next_key(), self.sim, budget)
-        best = _best(self.gather(name, haul))
+        result = EXPLORERS[name].run(self.next_key(), self.sim, budget)
+        best = _best_log_density(self.add_failures(name, result))
         if best <= before:
             return 0.0
         gain = 1.0 if before == -np.inf else best - before
-        return gain / max(haul.evaluations, 1)
+        return gain / max(result.evaluations, 1)
 
-    def gather(self, name: str, haul: Haul) -> Failures:
-        """The failures that an explorer brought in, which join the pool."""
-        found = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        self.pool = merge(self.pool, found, top=32 * self.top)
-        self.note(name, haul.evaluations, haul.failing, _best(found), haul.invalid)
+    def add_failures(self, name: str, result: ExplorerResult) -> Failures:
+        """The failures that an explorer found, which join the pool."""
+        found = collect(self.sim, self.reward, result.episodes, top=FOUND_FACTOR * self.top)
+        self.pool = merge(self.pool, found, top=POOL_FACTOR * self.top)
+        best = _best_log_density(found)
+        self.note(name, result.evaluations, result.failing, best, result.invalid)
         return found
 
     def refine(self):
         """The pool to where log p is greatest: many failures a little, then each mode's best."""
         if not len(self.pool):
             return
-        if not self.latent:
+        if not self.has_points:
             self.failures, best = self.pool, self.pool[0]
             self.modes = Modes([Mode(best, int(self.pool.counts.sum()), 1.0)])
             return
-        self.pool = spread(self.sim, self.pool, 8 * self.top)
-        self.failures = chosen = self.pool
-        budget = self.parts.refine
-        for part in (1.0,) if budget < FEW else (0.5, 0.5):
-            if chosen is not self.pool and not self.settled():
-                chosen = self.onward(chosen)
-            self.watch.doing("refining failures")
-            result = refine(self.next_key(), self.sim, chosen, budget=max(100, int(part * budget)))
-            found = result.failures
-            if len(found):
-                self.residual, self.late = float(result.residual[0]), float(result.late[0])
-                self.failures = merge(self.failures, found, top=8 * self.top)
-                self.known = merge(self.known, found, top=self.top)
-            self.note(
-                "refine",
-                result.episodes,
-                len(found),
-                _best(found),
-                result.invalid,
-            )
-            known = found if len(found) else self.pool[:1]
-            self.watch.doing("telling modes apart")
-            if self.modes:  # none is lost to a second refinement that had no time for it
-                known = merge(known, self.bests(), top=8 * self.top)
-            self.modes = modes(self.sim, known, self.pool, budget=self.paths)
-            self.note("telling modes apart", self.modes.evaluations)
-            chosen = self.bests()
-        self.failures = merge(self.bests(), self.failures, top=self.top)
+        self.pool = self.failures = spread(self.sim, self.pool, REFINED_FACTOR * self.top)
+        budget, start = self.parts.refine, self.pool
+        if budget < MIN_DIVIDED_BUDGET:
+            self.refine_from(start, budget)
+        else:
+            start = self.refine_from(start, int(0.5 * budget))
+            if not self.is_locally_likeliest():
+                start = self.search_slowly(start)
+            self.refine_from(start, int(0.5 * budget))
+        self.failures = merge(self.best_of_modes(), self.failures, top=self.top)
 
-    def settled(self) -> bool:
+    def refine_from(self, start: Failures, budget: int) -> Failures:
+        """Refine the failures ``start`` and tell modes apart; returns the best of each mode."""
+        self.watch.doing("refining failures")
+        result = refine(self.next_key(), self.sim, start, budget=max(100, budget))
+        found = result.failures
+        if len(found):
+            self.residual, self.late = float(result.residual[0]), float(result.late[0])
+            self.failures = merge(self.failures, found, top=REFINED_FACTOR * self.top)
+            self.refined = merge(self.refined, found, top=self.top)
+        best = _best_log_density(found)
+        self.note("refine", result.episodes, len(found), best, result.invalid)
+        self.watch.doing("telling modes apart")
+        candidates = found if len(found) else self.pool[:1]
+        if self.modes:  # none is lost to a second refinement that had no time for it
+            candidates = merge(candidates, self.best_of_modes(), top=REFINED_FACTOR * self.top)
+        self.modes = modes(self.sim, candidates, self.pool, budget=self.modes_budget)
+        self.note("telling modes apart", self.modes.evaluations)
+        return self.best_of_modes()
+
+    def is_locally_likeliest(self) -> bool:
         """Whether slopes have led to the likeliest failure, and there are few basins."""
-        return self.residual < SETTLED and len(self.modes) <= BASINS
+        return self.residual < OPTIMAL_RESIDUAL and len(self.modes) <= FEW_MODES
 
-    def onward(self, known: Failures) -> Failures:
+    def search_slowly(self, start: Failures) -> Failures:
         """Likelier failures by many small steps, one half of them from the likeliest known."""
-        budget = self.parts.onward // 2
-        if budget < FEW:
-            return known
+        budget = self.parts.slow_search // 2
+        if budget < MIN_DIVIDED_BUDGET:
+            return start
         self.watch.doing("searching by slow cross-entropy")
-        for name, around in (("slow cross-entropy", None), ("the same, from the best", known)):
-            haul = onward(self.next_key(), self.sim, budget, around)
-            known = merge(known, self.gather(name, haul), top=8 * self.top)
-        return known
+        for name, around in (("slow cross-entropy", None), ("the same, from the best", start)):
+            result = slow_cross_entropy(self.next_key(), self.sim, budget, around)
+            start = merge(start, self.add_failures(name, result), top=REFINED_FACTOR * self.top)
+        return start
 
-    def bests(self) -> Failures:
+    def best_of_modes(self) -> Failures:
         """The likeliest failure of each mode."""
-        each = [m.failure._replace(states=None) for m in self.modes]
-        stacked = jax.tree.map(lambda *a: np.stack([np.asarray(b) for b in a]), *each)
-        return collect(self.sim, self.reward, stacked)
+        return self.collect([m.failure for m in self.modes])
 
     def estimate(self):
         """The probability, with what is left."""
@@ -372,70 +406,70 @@ class _Work:
         folder = None if self.checkpoint is None else Path(self.checkpoint) / "probability"
         places = dict(executor=self.ways.executor, devices=self.ways.devices, checkpoint=folder)
         if not self.estimable:
-            more = monte_carlo(self.next_key(), self.sim, max(rest, 100), **places)
-            self.note("plain draws", more.episodes, more.failing, invalid=more.invalid)
-            self.probability = self.beside_nominal(more)
-            return
-        known = self.known if len(self.known) else None
+            n = max(rest, MIN_COUNTED_EPISODES)
+            p = monte_carlo(self.next_key(), self.sim, n, **places)
+            return self.keep_probability(p, "plain draws")
         if not len(self.pool):  # the estimate may find what the search did not
-            rest -= self.parts.refine + self.parts.onward
-        rest = max(rest - self.counted(), few_calls.LEAST)
-        p = adaptive.failure_probability(self.next_key(), self.sim, rest, failures=known, **places)
-        self.probability = self.beside_nominal(p)
-        self.note("probability", p.episodes, p.failing, invalid=p.invalid)
+            rest -= self.parts.refine + self.parts.slow_search
+        if len(self.modes) > 1:
+            rest -= shares_cost(self.budget)
+        failures = self.refined if len(self.refined) else None
+        rest = max(rest, few_calls.LEAST)
+        p = failure_probability(self.next_key(), self.sim, rest, failures=failures, **places)
+        self.keep_probability(p, "probability")
         if p.proposal is None:
             return
         if not len(self.pool):
-            self.take(p.proposal)
-        if self.modes and p.reliable:
-            self.tell_shares(p.proposal)
+            self.redraw_failures(p.proposal)
+        self.tell_shares(p.proposal)
 
-    def beside_nominal(self, p):
-        """The `Estimate` ``p`` with the nominal draws among its plain ones, which they are too."""
-        drawn, nominal = p.plain or (0, 0, 0), self.nominal
-        own = nominal.failing, nominal.invalid, nominal.episodes
-        return p._replace(plain=tuple(a + b for a, b in zip(drawn, own, strict=True)))
+    def keep_probability(self, p, name):
+        """Keep the `Estimate` ``p``, with the nominal draws among its plain ones, which they are
+        too.
+        """
+        drawn, own = p.plain or (0, 0, 0), self.nominal
+        own = own.failing, own.invalid, own.episodes
+        plain = tuple(a + b for a, b in zip(drawn, own, strict=True))
+        self.probability = p._replace(plain=plain)
+        self.note(name, p.episodes, p.failing, invalid=p.invalid)
 
-    def take(self, q):
+    def redraw_failures(self, q):
         """Failures that the estimate's proposal draws, where the search found none."""
-        points, drawn, _ = redrawn(self.next_key(), self.sim, q, DRAWN)
-        haul = of_points(self.sim, np.asarray(points)[np.asarray(drawn.failure)])
-        self.pool = collect(self.sim, self.reward, haul.episodes, top=4 * self.top)
-        best = _best(self.pool)
-        self.note("the estimate's failures", DRAWN + haul.evaluations, haul.failing, best)
+        points, drawn, _ = redraw(self.next_key(), self.sim, q, REDRAWN_EPISODES)
+        result = failures_at(self.sim, np.asarray(points)[np.asarray(drawn.failure)])
+        evaluations = REDRAWN_EPISODES + result.evaluations
+        self.add_failures("the estimate's failures", result._replace(evaluations=evaluations))
         self.refine()
-
-    def counted(self):
-        """What telling the shares of modes will take."""
-        return shares_cost(self.budget) if len(self.modes) > 1 else 0
 
     def tell_shares(self, q):
         """The share of the probability that each mode has, of failures drawn from the proposal."""
-        drawn = self.probability.draws
-        if drawn is not None and isinstance(drawn.source, latent.Latent):
-            q = drawn.source  # independent draws tell more than few populations
-        budget = min(self.budget, PORTFOLIO)
+        p = self.probability
+        if not (self.modes and p.reliable):
+            return
+        if p.draws is not None and isinstance(p.draws.source, latent.Latent):
+            q = p.draws.source  # independent draws tell more than few populations
         self.watch.doing("shares of modes")
-        self.modes, failing, cost = shares(self.next_key(), self.sim, q, self.modes, budget)
+        budget = min(self.budget, DEFAULT_BUDGET)
+        self.modes, failing, cost = mode_shares(self.next_key(), self.sim, q, self.modes, budget)
         if cost:
             self.note("shares of modes", cost, failing)
 
     def report(self, settings):
         return Report(
-            self.nominal,
-            self.failures[: self.top],
-            self.modes,
-            self.probability,
-            self.residual,
-            self.late,
-            tuple(self.tried),
-            self.spent,
-            self.invalid,
-            settings,
-            self.sim,
+            nominal=self.nominal,
+            failures=self.failures[: self.top],
+            modes=self.modes,
+            probability=self.probability,
+            residual=self.residual,
+            late=self.late,
+            tried=tuple(self.tried),
+            episodes=self.spent,
+            invalid=self.invalid,
+            settings=settings,
+            sim=self.sim,
         )
 
 
-def _best(failures: Failures) -> float:
+def _best_log_density(failures: Failures) -> float:
     """log p relative to the mode of the likeliest; -inf where there is none."""
     return float(failures.best.reward) if len(failures) else -np.inf

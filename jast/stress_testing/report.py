@@ -13,7 +13,7 @@ from jast.estimate.estimate import Estimate
 from jast.failures import Failures
 from jast.search.failure_modes import Modes
 from jast.simulator import Simulator
-from jast.stress_testing.words import advice, verdict, work
+from jast.stress_testing.words import advice, verdict_rows, work_rows
 
 if TYPE_CHECKING:
     from jast.typing import PathLike
@@ -64,7 +64,7 @@ class Report(NamedTuple):
     boundary of failure as a share of its whole slope; NaN where the distance has no gradient."""
     late: float
     """log p that the likeliest failure gained in the last tenth of its refinement."""
-    tried: tuple[Any, ...]
+    tried: tuple[Tried, ...]
     """`Tried`: what was done, in order."""
     episodes: int
     """Evaluations in all; one with its gradient counts for more."""
@@ -75,7 +75,7 @@ class Report(NamedTuple):
     functions."""
 
     @property
-    def spent(self) -> dict[str, Any]:
+    def spent(self) -> dict[str, int]:
         """Evaluations by the name of what they were spent on."""
         spent = {}
         for part in self.tried:
@@ -83,10 +83,10 @@ class Report(NamedTuple):
         return spent
 
     def __str__(self) -> str:
-        lines = [*(f"{name:<13}{text}" for name, text in verdict(self)), ""]
+        lines = [*(f"{name:<13}{text}" for name, text in verdict_rows(self)), ""]
         if self.modes:
             lines += [str(self.modes), ""]
-        lines += [*_work(self), "", advice(self)]
+        lines += [*_work_lines(self), "", advice(self)]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -130,12 +130,12 @@ class Report(NamedTuple):
         write_report(path, self, sim, draw, explanations)
 
 
-def _work(r):
+def _work_lines(r):
     """What was tried, each name once."""
     lines = [
         f"{'tried':<22} {'calls':>5} {'evaluations':>12} {'failing':>9} {'best log p rel.':>16}"
     ]
-    for name, calls, evaluations, failing, best in work(r):
+    for name, calls, evaluations, failing, best in work_rows(r):
         text = "-" if best == -np.inf else f"{best:.4f}"
         lines.append(f"{name:<22} {calls:5d} {evaluations:12d} {failing:9d} {text:>16}")
     lines.append(f"{'in all':<28} {r.episodes:12d}")

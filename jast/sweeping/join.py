@@ -19,10 +19,10 @@ import numpy as np
 
 from jast.counter import numpy_generator
 from jast.estimate import Estimate
-from jast.estimate.agreement import APART, BLUNT
-from jast.estimate.budgets import cheap
+from jast.estimate.budgets import uses_populations
 from jast.estimate.descents import SETTINGS
-from jast.estimate.redrawn import failing
+from jast.estimate.population_search import MAX_DISAGREEMENT, MAX_WITNESS_ERROR
+from jast.estimate.redrawn import redraw_failures
 from jast.estimate.sample import Sample
 from jast.intervals import log_normal
 from jast.judge import judged
@@ -79,7 +79,7 @@ class Row(NamedTuple):
         fails = judged(sim, self.points).failure
         share = max(float(self.share @ fails), np.finfo(float).tiny)
         moves = np.bincount(self.family, self.share * (fails / share - 1))
-        return (math.log(share) if moves @ moves < BLUNT**2 else math.nan), moves
+        return (math.log(share) if moves @ moves < MAX_WITNESS_ERROR**2 else math.nan), moves
 
 
 def join_rows(
@@ -97,7 +97,7 @@ def join_rows(
     steps = np.diff(np.eye(m), axis=0)
     against = np.concatenate([steps, -np.eye(m - 1)], axis=1)
     spread = np.sqrt(np.diagonal(against @ covariance @ against.T))
-    apart = np.abs(against @ said) > APART * spread
+    apart = np.abs(against @ said) > MAX_DISAGREEMENT * spread
     used = np.isfinite(said)
     used[m:] &= ~apart
     of_curve = np.concatenate([np.eye(m), steps])[used]
@@ -143,7 +143,7 @@ def _measure(chain):
 
 def _takes_part(sim, r):
     """Whether a result is reliable, and of a cheap system whose failures are points."""
-    good = isinstance(r, Estimate) and r.reliable and cheap(sim, r.settings["budget"])
+    good = isinstance(r, Estimate) and r.reliable and uses_populations(sim, r.settings["budget"])
     return good and r.draws is not None and isinstance(r.draws.source, Sample | Latent)
 
 
@@ -153,8 +153,8 @@ def _row_of(key, sim, r):
         sample = r.proposal
         points, used, log_w, family = sample.points, sample.used, sample.log_weight, sample.group
     else:  # draws of Gaussians, or of the model, which are independent
-        most = SETTINGS.numbers // dimension(sim)
-        points, log_w, length, _ = failing(sim, r.draws, most)
+        most = SETTINGS.max_numbers // dimension(sim)
+        points, log_w, length, _ = redraw_failures(sim, r.draws, most)
         about, family = outline(sim), np.arange(len(points))
         used = count_numbers(about.x0) + length * count_numbers(about.x)
     # what its own episode did not use may decide a neighbour's, so it is drawn from the model

@@ -14,7 +14,7 @@ from jast import results
 from jast._checks import number
 from jast.crude import Nominal
 from jast.estimate import Estimate
-from jast.estimate.estimate import doubtful, guarantee
+from jast.estimate.estimate import guaranteed_words, is_doubtful
 from jast.frames import dataframe
 from jast.search import SearchResult
 from jast.stress_testing import Report
@@ -268,8 +268,8 @@ def _row(result, error, a):
         seen = not math.isnan(a.probability)
         cells["probability"] = f"{a.probability:.4g}" if seen else "not seen"
         cells["interval"] = f"[{a.low:.4g}, {a.high:.4g}]"
-    if isinstance(estimate, Estimate) and guarantee(estimate) is not None:
-        if doubtful(estimate):
+    if isinstance(estimate, Estimate) and guaranteed_words(estimate) is not None:
+        if is_doubtful(estimate):
             cells["doubtful"] = cells["probability"]
         low, high = estimate.guaranteed
         cells["probability"] = f"{estimate.plain[0]} of {estimate.plain[-1]} fail"
