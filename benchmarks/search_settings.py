@@ -17,11 +17,18 @@ from benchmarks.sizes import add_choices, options, print_report, printer, size
 from jast.estimate import by_proposal
 from jast.estimate.search_settings import SETTINGS
 
-SHARES = ("cooled_share", "search_ends", "endless", "slow", "halfway", "refits_end")
+SHARES = (
+    "exploration_end",
+    "search_end",
+    "singleton_share_most",
+    "unexplained_ratio",
+    "defensive_scale",
+    "refits_end",
+)
 """Which are near to 1: halved alone, and doubled as far as 1 allows."""
 
 
-FIXED = ("gates",)
+FIXED = ("components_each",)
 """Which other code is made for."""
 
 
@@ -36,8 +43,8 @@ def answers(settings, problems, budget):
     """[(log of the ratio to the truth in standard errors, standard error, reliable)] of each."""
     out = []
     for seed, (_, sim, truth) in problems:
-        asked = by_proposal.Asked("failure_probability", jax.random.key(seed), sim, budget)
-        p = by_proposal.by_proposal(asked._replace(settings=settings))
+        request = by_proposal.Request("failure_probability", jax.random.key(seed), sim, budget)
+        p = by_proposal.estimate_by_proposal(request._replace(settings=settings))
         off = (p.mean / truth - 1) / p.relative_error if p.failing else math.nan
         out.append((off, p.relative_error, p.reliable and p.relative_error < 0.05))
     return out
@@ -63,7 +70,9 @@ def main(argv=None):
     args = parser.parse_args(argv)
     seeds = args.seeds or size(args, 3, 1, 1)
     every = tuple(n for n in SETTINGS._fields if n not in FIXED)
-    names = args.only or size(args, every, ("covered", "enough"), ("covered",))
+    names = args.only or size(
+        args, every, ("coverage_factor", "refit_efficiency"), ("coverage_factor",)
+    )
     families = args.families or size(args, list(FAMILIES), ["two_sided", "branches"], ["walks"])
     first = args.first
     problems = [(first + i, draw(f, first + i)) for i in range(seeds) for f in families]

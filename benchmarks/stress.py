@@ -22,7 +22,7 @@ import jast
 from benchmarks import cma_es as driver
 from benchmarks.sizes import add_choices, installed, options, print_report, size
 from benchmarks.stress_systems import CASES, JUDGED, LOOPS
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.descents import SETTINGS, cool_failures
 from jast.failures import empty
 from jast.limit_state import dimension, normal_numbers, policy_of
@@ -111,7 +111,7 @@ def slow_cooling(key, sim, budget):
     found = jast.estimate.population(for_failures, sim, budget)
     if (sample := found.proposal) is None:
         return None, found.episodes, None
-    rows = resampled(sample.log_weight, SETTINGS.cooled_failures, 0.5)
+    rows = resample(sample.log_weight, SETTINGS.cooled_failures, 0.5)
     slowly = int(10 * portfolio.COOLING_SHARE * budget)
     points, spent = cool_failures(for_cooling, sim, sample.points[rows], slowly, True)
     found_failures = explorers.failures_at(sim, points)

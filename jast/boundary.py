@@ -19,11 +19,14 @@ from jast.limit_state import outcome, policy_of
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = ["Descents", "EPISODES", "descents", "differentiable"]
+__all__ = ["Descents", "EPISODES", "STEPS", "descents", "differentiable"]
 
-STEPS, HALVINGS = 12, 5
-EPISODES = STEPS * (HALVINGS + 1)
-"""Episodes of one descent, beside `STEPS` that are differentiated."""
+STEPS = 12  # of a descent
+HALVINGS = 5  # of the way back to the boundary, in each step
+EPISODES = STEPS * (HALVINGS + 1)  # of a descent, beside `STEPS` that are differentiated
+FARTHER = 1.5  # times as far out as the last step, which may be 0, so with
+FIRST = 3  # more, a step may end: a linear extrapolation of a curved function can be wild
+BEYOND = 1.0 + 1e-4  # of the boundary, so that rounding leaves failures failures
 
 
 class Descents(NamedTuple):
@@ -62,7 +65,10 @@ def differentiable(sim, z):
     and without a random number.
     """
     policy = policy_of(sim, z)
-    choose = lambda state, t, _: D.mode(policy.disturbance(state, t))
+
+    def choose(state, t, _):
+        return D.mode(policy.disturbance(state, t))
+
     return play_chosen(sim, log_likelihood, D.mode(policy.start()), choose, (), sim.horizon)
 
 
@@ -77,37 +83,27 @@ def _one(sim, start):
         (g, e), slope = jax.value_and_grad(distance, has_aux=True)(z)
         square = jnp.sum(slope**2)
         usable = jnp.isfinite(g) & jnp.isfinite(square) & (square > 0)
-        aim = jnp.where(
-            usable, (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1), 0
-        ) * jnp.where(usable, slope, 0)
-        aim = jnp.where(usable, aim, z)
-        # a linear extrapolation of a curved function can be wild: no step ends farther out than the
-        # last one by more than half
-        length = jnp.linalg.norm(aim)
-        most = 1.5 * jnp.linalg.norm(z) + 3
-        aim = (
-            aim
-            * jnp.minimum(1, most / jnp.maximum(length, 1e-6))
-            * jnp.asarray(1.0 + 1e-4, z.dtype)
-        )
+        length = (jnp.dot(slope, z) - g) / jnp.where(usable, square, 1)
+        aim = jnp.where(usable, jnp.where(usable, length, 0) * jnp.where(usable, slope, 0), z)
+        most = FARTHER * jnp.linalg.norm(z) + FIRST
+        shorter = jnp.minimum(1, most / jnp.maximum(jnp.linalg.norm(aim), 1e-6))
+        aim = aim * shorter * jnp.asarray(BEYOND, z.dtype)
 
         def halve(ends, i):
             outside, inside = ends
-            here = jnp.where(i == 0, inside, (outside + inside) / 2)
-            there = outcome(sim, here)
             halves = i > 0
-            ends = (
-                jnp.where(there.failure | ~halves, outside, here),
-                jnp.where(there.failure & halves, here, inside),
-            )
-            return ends, (there.failure, there.length)
+            here = jnp.where(halves, (outside + inside) / 2, inside)
+            there = outcome(sim, here)
+            outside = jnp.where(there.failure | ~halves, outside, here)
+            inside = jnp.where(there.failure & halves, here, inside)
+            return (outside, inside), (there.failure, there.length)
 
         # one program for the aim and for the halves of the way to it
         number = jnp.arange(HALVINGS + 1, dtype=jnp.int32)
         (outside, inside), (failures_there, lengths) = jax.lax.scan(halve, (z, aim), number)
         fails = failures_there[0]
         better = fails & (~found | (jnp.sum(inside**2) < jnp.sum(best**2)))
-        whole = lambda v: jnp.sum(v, dtype=jnp.int32)
+        whole = partial(jnp.sum, dtype=jnp.int32)
         failing = whole(e.failure) + whole(failures_there)
         useful, failures, invalid, first, slopes, steps = counts
         counts = (
@@ -135,4 +131,16 @@ def _one(sim, start):
     first = start, start, jnp.zeros((), bool), start, least, counts
     index = jnp.arange(STEPS, dtype=jnp.int32)
     (_, best, found, nearest, least, counts), _ = jax.lax.scan(step, first, index)
-    return Descents(best, found, nearest, least, *counts)
+    useful, failing, invalid, first, slopes, steps = counts
+    return Descents(
+        point=best,
+        found=found,
+        nearest=nearest,
+        distance=least,
+        useful=useful,
+        failing=failing,
+        invalid=invalid,
+        first=first,
+        slopes=slopes,
+        steps=steps,
+    )

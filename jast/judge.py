@@ -17,8 +17,9 @@ from jast.simulator import Simulator
 
 __all__ = ["Judge", "judged", "lanes_of"]
 
-LANES, BLOCK, HELD = 4096, 128, 2**20
-"""Points of a call at most, those that run side by side, and numbers that a call may take."""
+LANES = 4096  # points of a call at most
+BLOCK = 128  # points that run side by side
+HELD = 2**20  # numbers that a call may take
 
 
 class Judge:
@@ -43,11 +44,15 @@ def judged(sim: Simulator, z: np.ndarray) -> latent.Outcomes:
     lanes, out = lanes_of(d), []
     for i in range(0, n, lanes):
         part = z[i : i + lanes]
-        padded = np.zeros((lanes, d), z.dtype)
-        padded[: len(part)] = part
-        run = lambda part, all=padded: _in_blocks(sim, all, np.int32(len(part)))
-        out.append(answer_once(run, part, rows=len(part)))
+        out.append(answer_once(partial(_padded, sim, lanes), part, rows=len(part)))
     return out[0] if len(out) == 1 else latent.Outcomes(*map(np.concatenate, zip(*out)))
+
+
+def _padded(sim, lanes, z):
+    """`Outcomes` [lanes], of which the first ones are of ``z`` [n, D]."""
+    filled = np.zeros((lanes, z.shape[1]), z.dtype)
+    filled[: len(z)] = z
+    return _in_blocks(sim, filled, np.int32(len(z)))
 
 
 def lanes_of(d: int) -> int:

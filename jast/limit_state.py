@@ -7,9 +7,11 @@ nothing, so densities are taken over the used ones. With Cholesky factors, lower
 are a cumulative sum.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,28 +34,51 @@ from jast.pytrees import count_numbers, map_in_lanes
 from jast.rewards import likelihood
 from jast.simulator import Simulator
 
-__all__ = ["log_ratios", "outcomes", "place"]
+if TYPE_CHECKING:
+    import chex
 
-ROWS = 2**18
-"""Numbers that densities are worked out for at a time."""
-LANES = 32
-"""Episodes that are played side by side on the host's order: any number of them by one program."""
+__all__ = [
+    "Latent",
+    "Outcomes",
+    "check",
+    "component",
+    "dimension",
+    "episodes",
+    "flat",
+    "is_model",
+    "latents",
+    "log_ratios",
+    "normal_numbers",
+    "normal_of",
+    "outcome",
+    "outcome_by_level",
+    "outcomes",
+    "outcomes_of",
+    "place",
+    "played",
+    "policy_of",
+    "side_by_side",
+    "unit",
+]
+
+ROWS = 2**18  # numbers that densities are worked out for at a time
+LANES = 32  # episodes that are played side by side, so that one program serves any number of them
 
 
 class Outcomes(NamedTuple):
     """What episodes [n] came to."""
 
-    failure: Any
+    failure: chex.Array
     """bool"""
-    distance: Any
+    distance: chex.Array
     """Miss distance; inf where invalid"""
-    used: Any
+    used: chex.Array
     """int32: how many of the numbers of z decided it"""
-    length: Any
+    length: chex.Array
     """int32: steps"""
-    invalid: Any
+    invalid: chex.Array
     """bool"""
-    log_p: Any = None
+    log_p: chex.Array | None = None
     """Log density of its disturbances, relative to the mode where these have modes; None where
     nobody asked"""
 
@@ -70,13 +95,13 @@ class Outcomes(NamedTuple):
 class Latent(NamedTuple):
     """A mixture of K Gaussians over z [D], one drawn a trace."""
 
-    log_weights: Any
+    log_weights: chex.Array
     """[K], of sum 1 as probabilities; -inf for a component that is not used"""
-    means: Any
+    means: chex.Array
     """[K, D]"""
-    factors: Any
+    factors: chex.Array
     """[K, D, D] lower Cholesky factors of the covariances"""
-    inverses: Any
+    inverses: chex.Array
     """[K, D, D] their inverses"""
 
 
@@ -106,7 +131,7 @@ def normal_numbers(sim: Simulator) -> Any:
     return jnp.result_type(*(D.float_dtype(s.dtype) for s in jax.tree.leaves((about.x0, about.x))))
 
 
-def ended(
+def _simulate(
     sim: Simulator, z: jax.Array, reward: Callable, level: Any = None
 ) -> tuple[Progress, jax.Array, jax.Array | None]:
     """The `Progress` at the end of the one episode of ``z`` [D], its steps, and of a ``level`` the
@@ -140,18 +165,28 @@ def unit(z: np.ndarray) -> np.ndarray:
 
 def outcome(sim: Simulator, z: jax.Array) -> Outcomes:
     """`Outcomes` of the one episode of ``z`` [D], differentiable in forward mode."""
-    end, length, _ = ended(sim, z, likelihood(sim))
-    used = _used(sim, length)
-    return Outcomes(end.failure, end.distance, used, length, end.invalid, end.reward)
+    end, length, _ = _simulate(sim, z, likelihood(sim))
+    return outcomes_of(sim, end, length)
 
 
 def outcome_by_level(sim: Simulator, z: jax.Array, level: Any) -> tuple[Outcomes, jax.Array]:
     """The same, and how many of the numbers were used when the episode failed or its distance first
     came to the ``level``.
     """
-    end, length, steps = ended(sim, z, likelihood(sim), level)
-    o = Outcomes(end.failure, end.distance, _used(sim, length), length, end.invalid)
-    return o, _used(sim, steps)
+    end, length, steps = _simulate(sim, z, likelihood(sim), level)
+    return outcomes_of(sim, end, length)._replace(log_p=None), _used(sim, steps)
+
+
+def outcomes_of(sim: Simulator, end: Progress, length: jax.Array) -> Outcomes:
+    """`Outcomes` of the `Progress` at the ends of episodes, and their steps."""
+    return Outcomes(
+        failure=end.failure,
+        distance=end.distance,
+        used=_used(sim, length),
+        length=length,
+        invalid=end.invalid,
+        log_p=end.reward,
+    )
 
 
 def _used(sim, steps):
@@ -163,15 +198,17 @@ def _used(sim, steps):
 @jit
 def outcomes(sim, z):
     """`Outcomes` [n] of ``z`` [n, D]."""
-    return jax.vmap(lambda z: outcome(sim, z))(z)
+    return jax.vmap(partial(outcome, sim))(z)
 
 
 @quick
 def episodes(sim, z):
     """The `jast.Episode` of each of ``z`` [n, D], without states."""
-    return jax.vmap(
-        lambda z: rollout(jax.random.key(0), sim, policy_of(sim, z))._replace(states=None)
-    )(z)
+
+    def one(z):
+        return rollout(jax.random.key(0), sim, policy_of(sim, z))._replace(states=None)
+
+    return jax.vmap(one)(z)
 
 
 def place(q: Latent, u: np.ndarray, e: np.ndarray) -> np.ndarray:
@@ -191,7 +228,7 @@ def component(q: Latent, u: np.ndarray) -> np.ndarray:
     return np.minimum(np.searchsorted(edges, u, side="right"), _live(q) - 1)
 
 
-def of_the_model(q: Latent) -> np.ndarray:
+def is_model(q: Latent) -> np.ndarray:
     """Which components [K] are the model itself: their draws are plain ones."""
     unit = (np.asarray(q.factors) == np.eye(q.means.shape[1])).all(axis=(1, 2))
     return unit & ~np.asarray(q.means).any(axis=1)
@@ -227,6 +264,7 @@ def _live(q):
 
 
 def policy_of(sim: Simulator, z: jax.Array) -> Policy:
+    """The `Policy` that plays the one episode of ``z`` [D]."""
     like = outline(sim)
     size0 = count_numbers(like.x0)
     return latent_policy(
@@ -252,16 +290,9 @@ def side_by_side(sim: Simulator, function: Callable, *rows: Any, lanes: int = LA
 
 def flat(sim: Simulator, z0: Any, z: Any) -> jax.Array:
     """The points [n, D] of latents like x0 [n, ...] (``()``: one start) and x [n, horizon, ...]."""
-    rows = [a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)]
-    first = [a.reshape(a.shape[0], -1) for a in jax.tree.leaves(z0)]
-    n = rows[0].shape[0]
-    return jnp.concatenate(
-        [
-            a.astype(normal_numbers(sim))
-            for a in (*first, jnp.concatenate(rows, axis=2).reshape(n, -1))
-        ],
-        axis=1,
-    )
+    steps = jnp.concatenate([a.reshape(*a.shape[:2], -1) for a in jax.tree.leaves(z)], axis=2)
+    parts = [a.reshape(len(steps), -1) for a in (*jax.tree.leaves(z0), steps)]
+    return jnp.concatenate([a.astype(normal_numbers(sim)) for a in parts], axis=1)
 
 
 @partial(jit, static_argnums=2)
@@ -271,9 +302,17 @@ def latents(sim, recorded, of_start):
     """
 
     def one(x0, x, length):
-        e = replay(
-            sim, Episode(x0, x, *(jnp.zeros(()),) * 2, jnp.zeros((), bool), length, jnp.zeros(()))
+        zero = jnp.zeros(())
+        given = Episode(
+            x0=x0,
+            disturbances=x,
+            log_prob=zero,
+            distance=zero,
+            failure=zero.astype(bool),
+            length=length,
+            reward=zero,
         )
+        e = replay(sim, given)
         states = jax.tree.map(lambda a: a[:-1], e.states)
         z = jax.vmap(lambda s, x: D.to_normal(sim.disturbance(s), x))(states, e.disturbances)
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length

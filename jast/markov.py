@@ -8,8 +8,7 @@ import jax.numpy as jnp
 
 __all__ = ["WIDTHS", "proposed"]
 
-WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0
-"""Of the noise, in the order in which failures are looked for."""
+WIDTHS = 1.0, 1.5, 2.0, 3.0, 4.0, 6.0  # of the noise, in the order in which they are tried
 
 
 def proposed(z: jax.Array, noise: jax.Array, scale: Any, width: Any) -> jax.Array:

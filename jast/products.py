@@ -6,10 +6,8 @@ import numpy as np
 
 __all__ = ["gram", "product", "rows_of"]
 
-ALONE, LEAST = 2**18, 64
-"""Multiplications up to which OpenBLAS uses one thread; rows of a block, at least: larger matrices
-are worth the threads.
-"""
+SINGLE_THREADED = 2**18  # multiplications up to which OpenBLAS uses one thread
+LEAST_ROWS = 64  # of a block: larger matrices are worth the threads
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -30,7 +28,7 @@ def gram(a: np.ndarray, w: np.ndarray) -> np.ndarray:
     return sum((a[i].T * w[i]) @ a[i] for i in parts)
 
 
-def rows_of(n, each):
+def rows_of(n: int, each: int) -> int:
     """Rows of a block of ``n``, where one takes ``each`` multiplications."""
-    rows = ALONE // max(each, 1)
-    return rows if rows >= LEAST else max(n, 1)
+    rows = SINGLE_THREADED // max(each, 1)
+    return rows if rows >= LEAST_ROWS else max(n, 1)

@@ -7,11 +7,11 @@ import pytest
 from test_failure_probability import FAR, planes
 
 from jast.estimate import audit
-from jast.estimate.audit import Missing, audited, uncovered
+from jast.estimate.audit import Missing, audit_proposal, uncovered
 from jast.estimate.gaussian_family import GaussianFamily, Points
-from jast.estimate.gaussians import as_latent, unit
+from jast.estimate.gaussians import as_latent, unit_gaussians
 from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import State, begun, taken
+from jast.estimate.search_state import SearchState, add_batch, search_context
 
 BUDGET = 500_000  # a batch is 20,000 episodes
 
@@ -25,9 +25,9 @@ def searched(key, sim, *shares, settings=SETTINGS):
     """A family, and a search with a batch of a proposal: unit Gaussians at the nearest failures of
     `planes` up and down, by these shares.
     """
-    f = GaussianFamily(sim, BUDGET, begun(key), settings)
-    centres = [(w, unit(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))]
-    state = taken(f, State(spent=BUDGET // 5), f.draw(as_latent(centres, f.dtype)))
+    f = GaussianFamily(sim, BUDGET, search_context(key), settings)
+    centres = [(w, unit_gaussians(np.full((1, 4), m))) for w, m in zip(shares, (2.0, -2.0))]
+    state = add_batch(f, SearchState(spent=BUDGET // 5), f.draw(as_latent(centres, f.dtype)))
     return f, state
 
 
@@ -39,7 +39,7 @@ def test_a_lost_mode_is_taken_into_the_proposal(key):
     """It is as likely as what is known: half of the draws go there in the end."""
     f, state = searched(key, planes(4.0, 4.0), 1.0)
     assert uncovered(f, state, at(-2.0)).all()
-    state = audited(f, state)
+    state = audit_proposal(f, state)
     assert not state.reasons and not uncovered(f, state, at(-2.0)).any()
     of_down = np.asarray(state.q.means).sum(axis=1) < 0
     assert 0.3 < np.exp(np.asarray(state.q.log_weights, float))[of_down].sum() < 0.7
@@ -47,8 +47,8 @@ def test_a_lost_mode_is_taken_into_the_proposal(key):
 
 def test_what_the_last_audit_finds_is_a_reason(key):
     f, state = searched(key, planes(4.0, 4.0), 1.0, settings=LAST)
-    state = audited(f, state)
-    assert len(state.reasons) == 1 and state.missing > SETTINGS.tolerated
+    state = audit_proposal(f, state)
+    assert len(state.reasons) == 1 and state.missing > SETTINGS.tolerated_mass
     assert "failures that the proposal hardly draws" in state.reasons[0]
 
 
@@ -58,7 +58,7 @@ def test_nothing_is_said_where_nothing_was_lost(down, shares, key):
     batch to know what is there.
     """
     f, state = searched(key, planes(4.0, down), *shares)
-    assert not audited(f, state).reasons
+    assert not audit_proposal(f, state).reasons
 
 
 def test_a_share_is_missing_where_no_batch_could_have_drawn(key):
@@ -66,9 +66,9 @@ def test_a_share_is_missing_where_no_batch_could_have_drawn(key):
     population does; of the lower mode it knows nothing, however much it saw elsewhere.
     """
     f, state = searched(key, planes(4.0, 4.0), 1.0)
-    unmet = lambda share, mean: audit._unmet(f, state, Missing(share, at(mean, 3)))
-    assert unmet(0.04, 2.0) < 1e-3 and unmet(0.9, 2.0) < 1e-3
-    assert unmet(0.04, -2.0) == pytest.approx(0.04, rel=0.01) and unmet(0.0, -2.0) == 0
+    unseen = lambda share, mean: audit._unseen_mass(f, state, Missing(share, at(mean, 3)))
+    assert unseen(0.04, 2.0) < 1e-3 and unseen(0.9, 2.0) < 1e-3
+    assert unseen(0.04, -2.0) == pytest.approx(0.04, rel=0.01) and unseen(0.0, -2.0) == 0
 
 
 @pytest.mark.parametrize("mean, against", [(2.0, 0), (-2.0, 1)])
@@ -90,21 +90,22 @@ def test_a_population_is_no_reason_where_the_batches_have_met_its_points(
     )
     monkeypatch.setattr(audit, "explore", lambda *a, **k: found)
     monkeypatch.setattr(audit, "uncovered", lambda f, state, points: np.full(len(points.z), True))
-    assert len(audited(f, state).reasons) == against
+    assert len(audit_proposal(f, state).reasons) == against
 
 
 def test_failures_of_wide_noise_that_are_not_covered_name_no_share(key, monkeypatch):
     """Nobody knows what they weigh. Two may be chance, three are a reason."""
     f, state = searched(key, planes(4.0, FAR), 1.0, settings=LAST)
-    monkeypatch.setattr(audit, "_elsewhere", lambda f, state: (state, None))
+    monkeypatch.setattr(audit, "_explore_uncovered", lambda f, state: (state, []))
     for n, reasons in ((2, ()), (3, (audit.FORGOTTEN,))):
-        monkeypatch.setattr(audit, "_settled", lambda f, state, n=n: (state, at(-2.0, n)))
-        assert audited(f, state).reasons == reasons
+        cooled = lambda f, state, n=n: (state, at(-2.0, n))
+        monkeypatch.setattr(audit, "_equilibrate_cooled", cooled)
+        assert audit_proposal(f, state).reasons == reasons
 
 
 def test_a_budget_too_small_for_an_audit_is_said(key):
     f, state = searched(key, planes(4.0), 1.0)
-    state = audited(f, state._replace(spent=int(0.849 * BUDGET)))
+    state = audit_proposal(f, state._replace(spent=int(0.849 * BUDGET)))
     assert state.reasons == (audit.UNFINISHED,)
 
 
@@ -113,12 +114,12 @@ def test_what_few_draws_tell_of_a_thin_part_is_said(key):
     probability, a single one does not.
     """
     f, state = searched(key, planes(4.0), 1.0)
-    q = as_latent([(1.0, unit(np.full((1, 4), -2.0)))], f.dtype)
-    state = audit._thin(f, state._replace(q=q))
+    q = as_latent([(1.0, unit_gaussians(np.full((1, 4), -2.0)))], f.dtype)
+    state = audit._check_uncovered_share(f, state._replace(q=q))
     assert not state.reasons
     few = state.log_weight.copy()
     few[1:] = few[0] - 20
-    [reason] = audit._thin(f, state._replace(log_weight=few)).reasons
+    [reason] = audit._check_uncovered_share(f, state._replace(log_weight=few)).reasons
     assert reason == "100% of the probability found lies where the proposal hardly draws"
 
 

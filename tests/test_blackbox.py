@@ -18,7 +18,7 @@ import jast
 from jast import blackbox
 from jast.blackbox import worker
 from jast.distributions import Categorical, Independent, Joint, MultivariateNormalDiag, Normal
-from jast.estimate.recorded_tilts import recorded
+from jast.estimate.recorded_tilts import numbers_of_episodes
 from jast.incidents import GROUPS, Log, incidents, new_incidents
 
 NORMAL = Normal(0.0, 1.0)
@@ -290,7 +290,7 @@ def test_recorded_episodes_of_an_object_are_played_once_each(key):
     sim = box(blackboxes.Walk, 4, episodic=False)
     episodes = jax.vmap(lambda k: jast.rollout(k, sim))(jax.random.split(key, 3))
     before = blackbox.calls(sim).rows
-    z = recorded(sim, episodes._replace(states=None))
+    z = numbers_of_episodes(sim, episodes._replace(states=None))
     assert z.shape == (3, 4) and blackbox.calls(sim).rows - before <= 3 * (1 + 4)
     x = np.where(np.arange(4) < np.asarray(episodes.length)[:, None], episodes.disturbances, 0)
     np.testing.assert_allclose(z, x, rtol=1e-5, atol=1e-6)

@@ -173,14 +173,14 @@ def test_the_variance_of_a_chain_is_that_of_all_pairs(key, way, monkeypatch):
     systematic resampling has not); and where weights are 0 and 1 the estimate is the product of
     their means.
     """
-    chosen, real = [], descents.resampled
+    chosen, real = [], descents.resample
 
     def record(log_w, size, shift):
         rows = real(log_w, size, shift)
         chosen.append((np.exp(log_w - log_w.max()), rows))
         return rows
 
-    monkeypatch.setattr(descents, "resampled", record)
+    monkeypatch.setattr(descents, "resample", record)
     n = 256
     run = DESCENTS[way](key, HALF, n, 4, n)
     *before, (w, _) = chosen  # the last resampling is of failures, after the estimate
@@ -482,7 +482,7 @@ def test_known_failures_and_neighbours_lead_a_proposal(key, monkeypatch):
     known = jast.estimate.monte_carlo(key, walk1d(), 2000)
     near = population(key, SIDES, 40_000, particles=256)
     monkeypatch.setattr(adaptive, "by_populations", by_populations)
-    monkeypatch.setattr(adaptive, "by_proposal", sought)
+    monkeypatch.setattr(adaptive, "estimate_by_proposal", sought)
     monkeypatch.setattr(budgets, "episodes_a_second", lambda key, sim: 1e6)
     failures = jast.failures.collect(
         SIDES, jast.rewards.likelihood(SIDES), episodes_of(SIDES, near.proposal.points[:10])

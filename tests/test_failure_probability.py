@@ -31,13 +31,20 @@ from jast.estimate import (
     trace_proposal,
 )
 from jast.estimate.adaptive import MIN_BUDGET
-from jast.estimate.batches import numbers
+from jast.estimate.batches import log_ratio, random_numbers
 from jast.estimate.design_points import design_points, distinct
 from jast.estimate.estimate import MAX_RELATIVE_ERROR, flag_imprecise
-from jast.estimate.gaussian_family import GaussianFamily, defended
-from jast.estimate.gaussians import Gaussians, as_latent, fit, log_density, shrunk, together, unit
+from jast.estimate.gaussian_family import GaussianFamily, defensive_parts
+from jast.estimate.gaussians import (
+    Gaussians,
+    as_latent,
+    fit_mixture,
+    mix,
+    shrink_eigenvalues,
+    unit_gaussians,
+)
 from jast.estimate.populations import cool, equilibrate, explore
-from jast.estimate.search_state import begun
+from jast.estimate.search_state import search_context
 from jast.simulators import landing, limit_state
 
 norm = scipy.stats.norm
@@ -138,7 +145,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
     assert abs(k - n * truth) < 4 * np.sqrt(n * truth)
     assert found.guaranteed[0] < truth < found.guaranteed[1] and "plain draws" not in str(found)
     q = found.draws.source
-    model, u = L.of_the_model(q), np.random.default_rng(0).random(100_000)
+    model, u = L.is_model(q), np.random.default_rng(0).random(100_000)
     share = np.exp(q.log_weights[model].astype(float)).sum()
     assert model.any() and abs(model[L.component(q, u)].mean() - share) < 0.01
     lines = str(flag_imprecise(found._replace(relative_error=2 * MAX_RELATIVE_ERROR))).splitlines()
@@ -147,7 +154,7 @@ def test_the_draws_of_the_model_guarantee_an_interval(key):
 
 def test_plain_draws_where_no_proposal_serves(key, monkeypatch):
     """Then subset simulation answers, flagged, and its guarantee is the first batch's."""
-    monkeypatch.setattr(by_proposal.Search, "enough", property(lambda s: False))
+    monkeypatch.setattr(by_proposal.Search, "suffices", property(lambda s: False))
     found = failure_probability(key, planes(4.0), BUDGET)
     assert "subset simulation" in str(found.warnings) and found.plain == (0, 0, BUDGET // 25)
     lines = str(found).splitlines()
@@ -217,10 +224,8 @@ def test_no_failure(key):
 def test_the_least_budget_is_kept(key):
     """Gradients included; and it is enough for one near plane."""
     found = failure_probability(key, planes(3.0), MIN_BUDGET)
-    assert (
-        found.evaluations <= MIN_BUDGET
-        and abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error
-    ), found.history
+    assert found.evaluations <= MIN_BUDGET, found.history
+    assert abs(found.log_mean - norm.logsf(3)) < 4 * found.relative_error, found.history
 
 
 def test_interrupts_keep_whole_chunks(two):
@@ -243,7 +248,7 @@ def test_interrupts_keep_whole_chunks(two):
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, jax.errors.JaxRuntimeError])
 def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
-    fit, fits = adapt.refitted, []
+    fit, fits = adapt.refit, []
 
     def interrupted(family, state):
         fits.append(state.spent + family.batch)
@@ -251,7 +256,7 @@ def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
             raise raised("INTERNAL: CpuCallback error: KeyboardInterrupt: ")
         return fit(family, state)
 
-    monkeypatch.setattr(adapt, "refitted", interrupted)
+    monkeypatch.setattr(adapt, "refit", interrupted)
     found = failure_probability(jax.random.key(5), planes(4.0, 4.5), BUDGET)
     [why] = [w for w in found.warnings if "interrupted" in w]
     assert why.startswith(f"interrupted after {fits[1]} of {BUDGET} evaluations")
@@ -264,7 +269,7 @@ def test_interrupted_in_its_search_it_gives_what_it_has(raised, monkeypatch):
 def test_points_that_are_all_anchors_leave_other_directions_to_the_model():
     rng = np.random.default_rng(0)
     points = rng.standard_normal((31, 180)) + 0.4
-    g = fit(rng, points, np.full(31, 1 / 31), 15.5, anchors=points)
+    g = fit_mixture(rng, points, np.full(31, 1 / 31), 15.5, anchors=points)
     assert g.values.max() >= 1 and (g.values > 1e-5).all()
     assert np.isfinite(as_latent([(1.0, g)], np.float32).factors).all()
 
@@ -275,10 +280,10 @@ def test_interrupted_before_any_batch_there_is_nothing(monkeypatch):
         def stop(*_, error=error):
             raise error
 
-        monkeypatch.setattr(by_proposal, "looked", stop)
+        monkeypatch.setattr(by_proposal, "draw_model", stop)
         with pytest.raises(KeyboardInterrupt):
             failure_probability(jax.random.key(5), planes(4.0), BUDGET)
-    monkeypatch.setattr(by_proposal, "looked", lambda *_: 1 / 0)
+    monkeypatch.setattr(by_proposal, "draw_model", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         failure_probability(jax.random.key(5), planes(4.0), BUDGET)
 
@@ -426,7 +431,7 @@ def test_populations_kept_out(key):
     """What a proposal covers is left out: only the other side is found, and the estimate is of it
     alone.
     """
-    q = as_latent([(1.0, unit(4 * DIAGONAL[None]))], jnp.zeros(()).dtype)
+    q = as_latent([(1.0, unit_gaussians(4 * DIAGONAL[None]))], jnp.zeros(()).dtype)
     covered = q, jnp.asarray(0.0, jnp.zeros(()).dtype)
     found = [
         explore(k, planes(4.0, 4.5), SIZE // 2, covered=covered) for k in jax.random.split(key, 6)
@@ -443,12 +448,10 @@ def test_populations_kept_out(key):
 def test_populations_give_up(key):
     """At the evaluations or the probability they are given."""
     found = explore(key, planes(12.0), SIZE, max_evaluations=3000)
-    assert (
-        not found.reached
-        and found.log_mean == -np.inf
-        and found.evaluations <= 3000
-        and found.points.shape == (0, 4)
-    )
+    assert not found.reached
+    assert found.log_mean == -np.inf
+    assert found.evaluations <= 3000
+    assert found.points.shape == (0, 4)
     assert len(explore(key, planes(12.0), SIZE, min_log_probability=-5.0).levels) <= 5
 
 
@@ -534,10 +537,12 @@ def test_draws_of_a_mixture(key):
     basis = np.linalg.qr(rng.normal(size=(1, 4, 4)))[0]
     g = Gaussians(np.ones(1), np.array([[3.0, 0, 0, -1]]), np.array([[0.2, 1, 2, 0.5]]), basis)
     dtype, n = jnp.zeros(()).dtype, 20_000
-    q = together(
-        as_latent([(1.0, unit(np.full((1, 4), -20.0)))], dtype), as_latent([(1.0, g)], dtype), 0.25
+    q = mix(
+        as_latent([(1.0, unit_gaussians(np.full((1, 4), -20.0)))], dtype),
+        as_latent([(1.0, g)], dtype),
+        0.25,
     )
-    z = np.asarray(L.place(q, *numbers(key, n, 4, dtype)), float)
+    z = np.asarray(L.place(q, *random_numbers(key, n, 4, dtype)), float)
     near = z.sum(axis=1) < -40
     assert abs(near.mean() - 0.75) < 4 * np.sqrt(0.1875 / n)
     assert logsumexp(q.log_weights) == pytest.approx(0, abs=1e-5)
@@ -554,20 +559,20 @@ def test_shrunk():
     """
     rng = np.random.default_rng(0)
     values = np.linalg.eigvalsh(np.cov(rng.normal(size=(20, 80)), bias=True))
-    found = shrunk(values, 80)
+    found = shrink_eigenvalues(values, 80)
     assert values.max() / values.min() > 5
     assert np.ptp(found) == 0
     assert found[0] == pytest.approx(values.mean())
     x = rng.normal(size=(20, 80)) * np.array([12.0**0.5] + [1.0] * 19)[:, None]
     values = np.linalg.eigvalsh(np.cov(x, bias=True))
-    found = shrunk(values, 80)
+    found = shrink_eigenvalues(values, 80)
     assert found[-1] == values[-1] > 8
     assert np.ptp(found[:-1]) == 0
     assert 0.8 < found[0] < 1.1
     different = np.array([0.1, 0.5, 1.0, 3.0])
-    np.testing.assert_allclose(shrunk(different, 1e6), different)
-    assert shrunk(np.array([0.3]), 1).tolist() == [0.3]
-    assert (shrunk(different, 0.5) == different.mean()).all()
+    np.testing.assert_allclose(shrink_eigenvalues(different, 1e6), different)
+    assert shrink_eigenvalues(np.array([0.3]), 1).tolist() == [0.3]
+    assert (shrink_eigenvalues(different, 0.5) == different.mean()).all()
 
 
 @pytest.mark.parametrize("points", [60, 2000])
@@ -584,9 +589,11 @@ def test_noise_in_many_dimensions_is_not_fitted(points):
         return x
 
     x, fresh = drawn(points), drawn(1000)
-    g = fit(rng, x, np.full(points, 1 / points), points, anchors=np.eye(100)[:1] * 5)
+    g = fit_mixture(rng, x, np.full(points, 1 / points), points, anchors=np.eye(100)[:1] * 5)
     truth = norm.logpdf(fresh[:, 1:]).sum(axis=1) + np.log(5) - 5 * (fresh[:, 0] - 5)
-    assert (truth - log_density(g, fresh)).mean() < 0.5 + 100 / points
+    ratio = log_ratio(as_latent([(1.0, g)], float), fresh, np.full(1000, 100))
+    fitted = ratio + norm.logpdf(fresh).sum(axis=1)
+    assert (truth - fitted).mean() < 0.5 + 100 / points
     np.testing.assert_allclose(np.median(g.values), 1.0, atol=4 * np.sqrt(2 / points / 100))
 
 
@@ -602,14 +609,17 @@ def test_fit_of_two_components():
         rng.normal([-3, 1, 0], 1.0, (3000, 3)),
     )
     w = np.where(far, 0.3 / 0.7, 1.0) * rng.uniform(0.5, 1.5, 3000)  # so that both weigh the same
-    g = fit(rng, z, w / w.sum(), w.sum() ** 2 / (w**2).sum(), limit=2)
+    g = fit_mixture(rng, z, w / w.sum(), w.sum() ** 2 / (w**2).sum(), limit=2)
     order = np.argsort(g.means[:, 0])
     assert len(order) == 2
     np.testing.assert_allclose(g.weights[order], [0.5, 0.5], atol=0.05)
     np.testing.assert_allclose(g.means[order], [[-3, 1, 0], [3, 0, 0]], atol=0.15)
     covariance = g.vectors[order[1]] @ np.diag(g.values[order[1]]) @ g.vectors[order[1]].T
     np.testing.assert_allclose(covariance, np.diag([0.25, 1, 1]), atol=0.15)
-    assert len(fit(rng, rng.normal(size=(2000, 3)), np.full(2000, 1 / 2000), 2000).weights) == 1
+    assert (
+        len(fit_mixture(rng, rng.normal(size=(2000, 3)), np.full(2000, 1 / 2000), 2000).weights)
+        == 1
+    )
 
 
 # Failures as they would happen
@@ -681,7 +691,7 @@ def test_samples_without_a_failure(key, proposal):
 def test_the_shares_of_a_defended_proposal_are_those_of_a_mixture(rare, values):
     """Its wide copies and, unless failures are rare, a share of the model, which sum to 1."""
     g = Gaussians(np.ones(1), np.zeros((1, 2)), np.array([values]), np.eye(2)[None])
-    parts = defended(g, 0.0, rare)
+    parts = defensive_parts(g, 0.0, rare)
     assert np.isclose(sum(share for share, _ in parts), 1.0)
     assert len(parts) == 1 + (min(values) < 1) + (not rare)
 
@@ -728,9 +738,9 @@ def test_a_proposal_that_lost_failures_is_given_up(key, monkeypatch):
     """
 
     lost = lambda f, state: state._replace(missing=9.0, reasons=("lost",))
-    monkeypatch.setattr(by_proposal, "audited", lost)
-    gaussians = (by_proposal._gaussians,)
-    monkeypatch.setattr(by_proposal, "_ways", lambda asked: gaussians)  # tilts serve here
+    monkeypatch.setattr(by_proposal, "audit_proposal", lost)
+    gaussians = (by_proposal._search_gaussians,)
+    monkeypatch.setattr(by_proposal, "_families", lambda request: gaussians)  # tilts serve here
     plain = failure_probability(key, planes(1.5), BUDGET)
     assert plain.reliable and plain.chernoff is not None
     assert plain.interval[0] < norm.sf(1.5) < plain.interval[1]
@@ -778,8 +788,8 @@ def test_no_mode_is_lost_in_silence_with_few_evaluations(family, seed):
 def test_mirror_images_of_failures(key):
     """Of two planes the other one is found a tenth farther out, not where it is out of reach."""
     for down, lifts in ((4.4, [1.1]), (8.0, [])):
-        f = GaussianFamily(planes(4.0, down), BUDGET, begun(key))
+        f = GaussianFamily(planes(4.0, down), BUDGET, search_context(key))
         anchors = np.full((1, 4), 2.001)
-        points, evaluations = gaussian_start._mirrored(f, anchors)
+        points, evaluations = gaussian_start._mirror(f, anchors)
         assert evaluations == len(gaussian_start.LIFTS) and len(points) == len(lifts)
         assert np.allclose(points, [-lift * anchors[0] for lift in lifts] or points)

@@ -69,7 +69,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences():
 
 def test_the_sites_of_one_failure_match_the_moments_of_a_half_normal():
     k, failing = np.array([[4.0]]), np.array([True])
-    tau, nu = surrogate._sites(k, np.array([1e-6]), np.zeros(1), failing, 0.0)
+    tau, nu = surrogate._fit_sites(k, np.array([1e-6]), np.zeros(1), failing, 0.0)
     variance = 1 / (1 / 4 + tau[0])
     assert variance == pytest.approx(4 * (1 - 2 / np.pi), rel=0.05)
     assert variance * nu[0] == pytest.approx(-2 * np.sqrt(2 / np.pi), rel=0.05)

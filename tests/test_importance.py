@@ -28,7 +28,7 @@ from jast.estimate import (
     policy_proposal,
     trace_proposal,
 )
-from jast.estimate.importance_sampling import LANES, chunks, even, played
+from jast.estimate.importance_sampling import LANES, chunk_size, chunks, draw_episodes
 from jast.policy import Policy, nominal_policy, recorded
 from jast.simulators import landing, landing_probability, walk1d
 from jast.watch import Watch
@@ -98,7 +98,7 @@ def test_weights_of_several_traces(key, epsilon):
     """Algorithm 1 in each component, p / (eps p + (1 - eps) p(x - x*)) a step, start included, and
     eq. 20 over the components.
     """
-    e, log_w = played(key, SIM, trace_proposal(SIM, BOTH, epsilon), N)
+    e, log_w = draw_episodes(key, SIM, trace_proposal(SIM, BOTH, epsilon), N)
     x = rows(e)
     log_q = np.stack(
         [
@@ -131,7 +131,7 @@ def test_weights_of_a_policy(key):
     """Algorithm 2: the model moved to the policy's mode in the state at hand, eps mixed in at each
     step; the start of the policy's, mixed likewise.
     """
-    e, log_w = played(key, SIM, policy_proposal(SIM, STEER), N)
+    e, log_w = draw_episodes(key, SIM, policy_proposal(SIM, STEER), N)
     x = rows(e)
     before = np.cumsum(x, axis=1)[:, :-1]
     aim = (np.where(before < 0, -1, 1) - before) / (10 - np.arange(10))
@@ -455,7 +455,8 @@ def test_chunks_are_those_of_log_weights(key):
     )
     own, _ = jax.random.split(key)
     parts = [
-        jax.device_get(log_weights(jax.random.fold_in(own, i), SIM, q, even(MORE))) for i in (0, 1)
+        jax.device_get(log_weights(jax.random.fold_in(own, i), SIM, q, chunk_size(MORE)))
+        for i in (0, 1)
     ]
     log_w, failure, shares = (
         np.concatenate([getattr(p, f) for p in parts])[:MORE]
@@ -470,7 +471,7 @@ def test_chunks_are_those_of_log_weights(key):
     np.testing.assert_allclose(
         np.sort(found.modes), np.sort((w @ np.exp(shares.astype(float))) / w.sum()), rtol=1e-6
     )
-    assert seen == [(even(MORE), MORE), (MORE, MORE)]
+    assert seen == [(chunk_size(MORE), MORE), (MORE, MORE)]
     assert str(importance(key, SIM, q, MORE)) == str(found)
 
 
@@ -483,12 +484,12 @@ def test_interrupts_keep_whole_chunks(key, capsys):
     q = trace_proposal(SIM, BOTH)
     found, first = (
         importance(key, SIM, q, MORE, callback=stop, progress=True),
-        importance(key, SIM, q, even(MORE)),
+        importance(key, SIM, q, chunk_size(MORE)),
     )
-    assert found.samples == found.evaluations == even(MORE)
+    assert found.samples == found.evaluations == chunk_size(MORE)
     assert found.mean == first.mean
     assert found.relative_error == first.relative_error
-    assert found.warnings == (f"interrupted after {even(MORE)} of {MORE} episodes",)
+    assert found.warnings == (f"interrupted after {chunk_size(MORE)} of {MORE} episodes",)
     assert found.reliable
     assert "importance" in capsys.readouterr().err
     watch = Watch("importance", MORE, "episode", False, None)

@@ -13,11 +13,11 @@ from jast import limit_state as L
 from jast.estimate import failure_probability, monte_carlo, populations
 from jast.estimate.design_points import explained
 from jast.estimate.diagnostics import mode_warnings
-from jast.estimate.gaussian_family import GaussianFamily, _sparse
-from jast.estimate.gaussian_start import explored
-from jast.estimate.gaussians import _greatest, held, to_anchors
+from jast.estimate.gaussian_family import GaussianFamily, _fit_sparse
+from jast.estimate.gaussian_start import explore_failures
+from jast.estimate.gaussians import _greatest, most_components, shrink_to_anchors
 from jast.estimate.populations import PopulationSampler, bracket_boundary, cool
-from jast.estimate.search_state import State, begun
+from jast.estimate.search_state import SearchState, search_context
 from jast.simulators import limit_state
 
 FLOAT = jnp.zeros(()).dtype
@@ -106,9 +106,9 @@ def test_a_mean_is_shrunk_to_its_design_point_by_what_may_be_noise():
     1961: by (D - 2) / (n gap^2)); not at all in two dimensions.
     """
     anchors, mean = np.zeros((1, 12)), np.full(12, 0.5)
-    np.testing.assert_allclose(to_anchors(mean, 2.0, anchors), anchors[0], atol=1e-12)
-    np.testing.assert_allclose(to_anchors(mean, 1000.0, anchors), mean * (1 - 10 / 3000))
-    np.testing.assert_array_equal(to_anchors(mean[:2], 2.0, anchors[:, :2]), mean[:2])
+    np.testing.assert_allclose(shrink_to_anchors(mean, 2.0, anchors), anchors[0], atol=1e-12)
+    np.testing.assert_allclose(shrink_to_anchors(mean, 1000.0, anchors), mean * (1 - 10 / 3000))
+    np.testing.assert_array_equal(shrink_to_anchors(mean[:2], 2.0, anchors[:, :2]), mean[:2])
 
 
 def test_a_proposal_holds_as_many_components_as_memory_allows(key):
@@ -117,9 +117,9 @@ def test_a_proposal_holds_as_many_components_as_memory_allows(key):
     """
     rising = np.arange(300.0)
     for d, most, directions in ((2, 256, 125), (300, 186, 92), (400, 104, 51), (1000, 40, 19)):
-        assert held(d) == most
+        assert most_components(d) == most
         np.testing.assert_array_equal(_greatest(rising, d), np.arange(299, 299 - most, -1))
-        f = GaussianFamily(limit_state(_sum, d), 100_000, begun(key))
+        f = GaussianFamily(limit_state(_sum, d), 100_000, search_context(key))
         assert f.directions == directions
     assert _greatest(np.array([0.0, 2.0, 0.0]), 2).tolist() == [1]
 
@@ -129,14 +129,14 @@ def test_a_sparse_proposal_differs_from_the_model_in_the_numbers_that_matter(key
     in the others, and it is narrower in its own alone.
     """
     d = 18
-    f = GaussianFamily(limit_state(_sum, d), 100_000, begun(key))
+    f = GaussianFamily(limit_state(_sum, d), 100_000, search_context(key))
     anchors = 4.0 * np.eye(d)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(d * 50, d))
     mine = np.repeat(np.arange(d), 50)
     points[np.arange(len(points)), mine] = 4 + rng.exponential(0.22, size=len(points))
-    state = State(anchors=anchors, log_weight=np.zeros(len(points)))
-    q = _sparse(f, state, points, anchors)
+    state = SearchState(anchors=anchors, log_weight=np.zeros(len(points)))
+    q = _fit_sparse(f, state, points, anchors)
     own = np.argmax(np.asarray(q.means), axis=1)
     narrow = np.asarray([f[i, i] < 0.9 for f, i in zip(q.factors, own, strict=True)])
     assert len(q.means) == 2 * d and narrow.sum() == d
@@ -151,8 +151,8 @@ def test_all_of_sixty_turned_modes_are_found(key):
     """48 descents from draws of the model come to 33 of 60 equal modes; those from failures that
     these do not explain to nearly all others.
     """
-    f = GaussianFamily(CASES["series 60, turned"][0](), 100_000, begun(key))
-    found = explored(f, State(), None, True).anchors
+    f = GaussianFamily(CASES["series 60, turned"][0](), 100_000, search_context(key))
+    found = explore_failures(f, SearchState(), None, True).anchors
     assert (np.linalg.norm(found, axis=1) < 5.1).sum() >= 57
 
 

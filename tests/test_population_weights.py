@@ -95,11 +95,11 @@ def test_populations_check_it(key, monkeypatch, factor, words):
 
 
 def test_weights_that_speak_against_themselves_are_left(key, monkeypatch):
-    drawn = population_weights.estimated
+    drawn = population_weights.draw_estimate
     doubted = lambda *args, **more: drawn(*args, **more)._replace(
         reliable=False, warnings=("a doubt",)
     )
-    monkeypatch.setattr(population_weights, "estimated", doubted)
+    monkeypatch.setattr(population_weights, "draw_estimate", doubted)
     found = population(key, PLANE, 300_000)
     assert "importance" not in found.method and any("a doubt" in line for line in found.history)
 
@@ -108,21 +108,21 @@ def test_an_interruption_of_the_draws_leaves_the_populations(key, monkeypatch):
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(population_weights, "estimated", interrupted)
+    monkeypatch.setattr(population_weights, "draw_estimate", interrupted)
     found = population(key, PLANE, 300_000)
     assert not found.reliable and "interrupted" in found.warnings[0]
     assert abs(found.log_mean - stats.norm.logsf(4)) < 4 * found.relative_error
 
 
 def test_an_interruption_of_the_pilot_is_the_end_of_the_draws(key, monkeypatch):
-    drawn, calls = population_weights.estimated, []
+    drawn, calls = population_weights.draw_estimate, []
 
     def partly(*args, **more):
         calls.append(1)
         found = drawn(*args, **more)
         return found._replace(samples=found.samples // 2)
 
-    monkeypatch.setattr(population_weights, "estimated", partly)
+    monkeypatch.setattr(population_weights, "draw_estimate", partly)
     found = population(key, PLANE, 300_000)
     assert len(calls) == 1 and "importance" not in found.method
     assert not found.reliable and "interrupted" in found.warnings[0]

@@ -9,12 +9,19 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from jast.estimate import search_settings
-from jast.estimate.adapt import adapted
+from jast.estimate.adapt import adapt_proposal
 from jast.estimate.gaussian_family import GaussianFamily, Points
-from jast.estimate.gaussians import as_latent, unit
-from jast.estimate.markov_tilts import of_the_model
+from jast.estimate.gaussians import as_latent, unit_gaussians
+from jast.estimate.markov_tilts import simulate_points
 from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import State, begun, log_ratios, promise, serves, taken
+from jast.estimate.search_state import (
+    SearchState,
+    add_batch,
+    efficiency,
+    failure_log_ratios,
+    is_efficient,
+    search_context,
+)
 from jast.estimate.tilt_family import TiltFamily
 from jast.simulators import limit_state, ruin
 
@@ -28,18 +35,18 @@ def _first(z):
 @pytest.fixture
 def family(key):
     """Failures where the first of three numbers is above 3, by batches of 4000."""
-    return GaussianFamily(limit_state(_first, D), 100_000, begun(key))
+    return GaussianFamily(limit_state(_first, D), 100_000, search_context(key))
 
 
 def at(family, mean):
     """A unit Gaussian around ``mean`` in the first number."""
-    return as_latent([(1.0, unit(np.array([[mean, 0.0, 0.0]])))], family.dtype)
+    return as_latent([(1.0, unit_gaussians(np.array([[mean, 0.0, 0.0]])))], family.dtype)
 
 
 def searched(family, *means):
-    state = State()
+    state = SearchState()
     for mean in means:
-        state = taken(family, state, family.draw(at(family, mean)))
+        state = add_batch(family, state, family.draw(at(family, mean)))
     return state
 
 
@@ -64,18 +71,17 @@ def test_a_proposal_promises_what_its_draws_are_worth(family):
     state = searched(family, 3.0, 2.0)
     for mean in (3.0, 2.0, 2.5):
         true = norm.sf(BETA) ** 2 / (np.exp(mean**2) * norm.sf(BETA + mean))
-        said = promise(state, log_ratios(family, at(family, mean), state.batches))
+        said = efficiency(state, failure_log_ratios(family, at(family, mean), state.batches))
         assert said == pytest.approx(true, rel=0.1)
     assert state.q is state.batches[0].q
-    assert serves(state, 0.2)
-    assert not serves(state, 0.5)
+    assert is_efficient(state, 0.2) and not is_efficient(state, 0.5)
 
 
 def test_the_model_itself_does_not_serve(key):
     """Its draws are worth what plain draws are."""
-    family = GaussianFamily(limit_state(_half, D), 100_000, begun(key))
-    state = taken(family, State(), family.draw(family.model()))
-    assert state.promised == pytest.approx(0.5, abs=0.04) and not serves(state, 0.0)
+    family = GaussianFamily(limit_state(_half, D), 100_000, search_context(key))
+    state = add_batch(family, SearchState(), family.draw(family.model()))
+    assert state.efficiency == pytest.approx(0.5, abs=0.04) and not is_efficient(state, 0.0)
 
 
 def _half(z):
@@ -85,7 +91,7 @@ def _half(z):
 def test_a_batch_without_failures_changes_the_weights_alone(family):
     """It counts among the episodes."""
     one = searched(family, 3.0)
-    two = taken(family, one, family.draw(at(family, -3.0)))
+    two = add_batch(family, one, family.draw(at(family, -3.0)))
     assert len(two.log_weight) == len(one.log_weight) and two.q is one.q
     assert two.size == 2 * one.size
     # its density at these failures is next to nothing, so that half of the weight stays
@@ -94,21 +100,21 @@ def test_a_batch_without_failures_changes_the_weights_alone(family):
 
 
 def test_adapting_ends_where_nothing_fails(family):
-    start = State(q=at(family, -5.0))
-    state = adapted(family, start, 5, np.inf)
+    start = SearchState(q=at(family, -5.0))
+    state = adapt_proposal(family, start, 5, np.inf)
     assert state.spent == family.batch and state.history[-1].startswith("Gaussians: no failure")
 
 
 def test_adapting_keeps_to_its_end(family):
-    start = State(q=at(family, 3.0))
-    assert adapted(family, start, 8, family.batch - 1) == start
-    state = adapted(family, start, 8, 2 * family.batch)
-    assert state.spent <= 2 * family.batch and state.promised > 0.1
+    start = SearchState(q=at(family, 3.0))
+    assert adapt_proposal(family, start, 8, family.batch - 1) == start
+    state = adapt_proposal(family, start, 8, 2 * family.batch)
+    assert state.spent <= 2 * family.batch and state.efficiency > 0.1
 
 
 def test_a_state_goes_on_to_another_family(family):
-    state = searched(family, 3.0).noted("a", 7).against("b")._replace(plain=(1, 2, 3))
-    new = state.carried()
+    state = searched(family, 3.0).note("a", 7).with_reason("b")._replace(plain=(1, 2, 3))
+    new = state.for_next_family()
     assert new.spent == 7
     assert new.history == ("a, 7 evaluations",)
     assert new.plain == (1, 2, 3)
@@ -123,24 +129,25 @@ def test_families_agree_with_themselves(kind, key):
     them too.
     """
     sim = ruin(goal=5, horizon=12) if kind is TiltFamily else limit_state(_first, D)
-    f = kind(sim, 10_000, begun(key))
+    f = kind(sim, 10_000, search_context(key))
     q = f.untilted() if kind is TiltFamily else at(f, 3.0)
     b = f.draw(q)
     assert len(b.log_weight) > 20
     np.testing.assert_allclose(f.log_ratio(q, b.points), -b.log_weight, atol=1e-4)
-    some = f.rows(b.points, np.arange(5))
+    some = f.select(b.points, np.arange(5))
     np.testing.assert_allclose(f.log_ratio(q, some), -b.log_weight[:5], atol=1e-4)
 
 
 def test_points_of_tilts_are_played_again(key):
     """Those that fail, and what that costs."""
-    f = TiltFamily(ruin(goal=4, horizon=8), 10_000, begun(key))
+    f = TiltFamily(ruin(goal=4, horizon=8), 10_000, search_context(key))
     z = np.random.default_rng(0).standard_normal((300, 8)).astype(np.float32)
-    state, points = f.points_of(State(), z, None)
-    o, *_ = of_the_model(f.sim, f.on_device(f.untilted()), z)
+    state, points = f.as_points(SearchState(), z, None)
+    o, *_ = simulate_points(f.sim, f.on_device(f.untilted()), z)
     assert state.spent == 300 and len(points.length) == o.failure.sum() > 10
     np.testing.assert_array_equal(points.length, np.asarray(o.length)[np.asarray(o.failure)])
-    state, same = GaussianFamily(f.sim, 10_000, begun(key)).points_of(State(), z, z[:, 0])
+    gaussians = GaussianFamily(f.sim, 10_000, search_context(key))
+    state, same = gaussians.as_points(SearchState(), z, z[:, 0])
     assert state.spent == 0
     assert isinstance(same, Points)
     assert len(same.z) == 300
@@ -160,7 +167,7 @@ def test_every_number_of_the_search_has_its_reason():
 
 
 def test_a_search_draws_from_its_key_alone(key):
-    one, two = (begun(key) for _ in range(2))
+    one, two = (search_context(key) for _ in range(2))
     data = lambda k: jax.random.key_data(k).tolist()
     assert [data(one.next_key()) for _ in range(2)] == [data(two.next_key()) for _ in range(2)]
     assert one.rng.random() == two.rng.random() and not one.latest

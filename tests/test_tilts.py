@@ -19,22 +19,22 @@ from benchmarks.stress_systems import latch
 from jast import distributions as D
 from jast.distributions.parts import parts
 from jast.estimate import failure_probability, failure_samples
-from jast.estimate.adapt import adapted
+from jast.estimate.adapt import adapt_proposal
 from jast.estimate.markov_tilts import (
-    assembled,
+    assemble,
     log_weight,
-    numbers,
-    of_the_model,
-    played,
+    random_numbers,
     shape,
-    stacked,
+    simulate_points,
+    simulate_tilts,
+    stack_choices,
 )
-from jast.estimate.recorded_tilts import recorded
+from jast.estimate.recorded_tilts import numbers_of_episodes
 from jast.estimate.search_settings import SETTINGS
-from jast.estimate.search_state import State, begun
+from jast.estimate.search_state import SearchState, search_context
 from jast.estimate.tilt_family import Mixture, TiltFamily
-from jast.estimate.tilt_fit import as_tilts, fit, frame_of, ratios, steps_of
-from jast.estimate.tilt_start import led_down
+from jast.estimate.tilt_fit import as_tilts, fit_tilt, frame_of, log_ratios, steps_of
+from jast.estimate.tilt_start import descend_levels
 from jast.limit_state import normal_numbers
 from jast.simulators import autoregression, ruin
 
@@ -101,10 +101,10 @@ def test_parts_of_a_joint():
     p = parts(d)
     assert p.normals == 4 and [c.shape for c in p.choices] == [(2, 2), (1, 3)]
     np.testing.assert_allclose(
-        np.exp(stacked(p)), [[0.9, 0.1, 0], [0.3, 0.7, 0], [0.2, 0.3, 0.5]], rtol=1e-6
+        np.exp(stack_choices(p)), [[0.9, 0.1, 0], [0.3, 0.7, 0], [0.2, 0.3, 0.5]], rtol=1e-6
     )
     z, i = jnp.asarray([0.5, 1.0, -1.0, 2.0]), jnp.asarray([1, 0, 2], jnp.int32)
-    x = assembled(p, z, i)
+    x = assemble(p, z, i)
     assert x["b"].tolist() == [1, 0]
     assert x["c"] == 2
     assert x["n"] == 2
@@ -125,8 +125,8 @@ def test_parts_of_a_mixture(key):
     p, n = parts(d), 20_000
     a, b = jax.random.split(key)
     z = jax.random.normal(a, (n, 1))
-    i = jax.random.categorical(b, stacked(p)[0], shape=(n, 1)).astype(jnp.int32)
-    x = np.sort(jax.vmap(lambda z, i: assembled(p, z, i))(z, i))
+    i = jax.random.categorical(b, stack_choices(p)[0], shape=(n, 1)).astype(jnp.int32)
+    x = np.sort(jax.vmap(lambda z, i: assemble(p, z, i))(z, i))
     at = jnp.asarray(x[:: n // 20], jnp.zeros(()).dtype)
     gaps = np.searchsorted(x, at) / n - np.asarray(jax.vmap(lambda v: D.cdf(d, v))(at))
     assert np.abs(gaps).max() < 2 / np.sqrt(n)  # Kolmogorov's distance, 1e-3
@@ -159,9 +159,9 @@ def test_parts_and_back(key):
 def test_recorded_episodes_play_again(mixed, key):
     """Their categories to the bit, rare ones too; numbers, ends and distances up to rounding."""
     e = jax.vmap(jast.rollout, (0, None))(jax.random.split(key, 300), mixed)
-    z = recorded(mixed, e._replace(states=None))
-    f = TiltFamily(mixed, 10_000, begun(key))
-    o, log_q, trace = of_the_model(mixed, f.on_device(f.untilted()), z)
+    z = numbers_of_episodes(mixed, e._replace(states=None))
+    f = TiltFamily(mixed, 10_000, search_context(key))
+    o, log_q, trace = simulate_points(mixed, f.on_device(f.untilted()), z)
     np.testing.assert_array_equal(o.length, e.length)
     np.testing.assert_array_equal(o.failure, e.failure)
     np.testing.assert_allclose(o.distance, e.distance, atol=1e-5)
@@ -170,7 +170,7 @@ def test_recorded_episodes_play_again(mixed, key):
     assert e.failure.any() and (np.asarray(o.length) < mixed.horizon).any()
     for j, name in enumerate(("coin", "kind")):
         np.testing.assert_array_equal(
-            trace.choices[:, :, j][live], np.asarray(e.disturbances[name]).T[live]
+            trace.choices[:, :, j].T[live], np.asarray(e.disturbances[name]).T[live]
         )
 
 
@@ -180,7 +180,7 @@ def test_weights_average_to_one(mixed, key, gates):
     rollout.
     """
     n = 4000
-    f = TiltFamily(mixed, 10_000, begun(jax.random.key(1)), gates=gates)
+    f = TiltFamily(mixed, 10_000, search_context(jax.random.key(1)), components_each=gates)
     pilot = f.play(f.untilted()).points
     frame = frame_of(f.about, *pilot, np.ones(500))
     dtype = normal_numbers(mixed)
@@ -191,26 +191,26 @@ def test_weights_average_to_one(mixed, key, gates):
         one.first.scales[:], one.steps.scales[:] = 0, 0
     tilts = [f.model, one, f.model._replace(floor=np.log(0.3))]
     q = as_tilts(tilts, [0.1, 0.5, 0.4], frame, 4, dtype)
-    drawn = numbers(key, n, shape(mixed), mixed.horizon, dtype)
-    o, ratio, trace = jax.device_get(played(mixed, q, *drawn))
+    drawn = random_numbers(key, n, shape(mixed), mixed.horizon, dtype)
+    o, ratio, trace = jax.device_get(simulate_tilts(mixed, q, *drawn))
     log_w, shares = log_weight(q, ratio)
     w = np.exp(np.asarray(log_w, np.float64))
     assert abs(w.mean() - 1) < 4 * w.std() / np.sqrt(n) and w.std() > 0.1
     assert not o.invalid.any() and np.isclose(np.exp(shares).sum(axis=1), 1, atol=1e-4).all()
-    on_host = ratios(tilts, steps_of(f.about, frame, trace, o.length), n)
+    on_host = log_ratios(tilts, steps_of(f.about, frame, trace, o.length), n)
     np.testing.assert_allclose(on_host, ratio[:, :3], atol=2e-3)
 
 
 def test_a_known_tilt_is_found(mixed):
     """Traces of one tilt, of equal weights, give its means and odds back."""
-    f = TiltFamily(mixed, 200_000, begun(jax.random.key(2)))
+    f = TiltFamily(mixed, 200_000, search_context(jax.random.key(2)))
     frame = frame_of(f.about, *f.play(f.untilted()).points, np.ones(4000))
     one = jax.tree.map(np.copy, f.model)
     one.steps.means[0], one.steps.means[1] = 0.8, 0.3
     one.steps.shifts[0, 0, 1] = 1.5
     b = f.play(Mixture([f.model, one], [0.001, 0.999], frame))
     rows = steps_of(f.about, frame, *b.points)
-    found = fit(rows, np.ones(4000), 4000.0, f.model)
+    found = fit_tilt(rows, np.ones(4000), 4000.0, f.model)
     x = rows[1].x
     means = x @ (found.steps.means - one.steps.means)[:, 0, 0, 0]
     odds = x @ (found.steps.shifts - one.steps.shifts)[: x.shape[1], 0] @ [-1, 1, 0]
@@ -281,13 +281,13 @@ def test_several_gaussians_serve_where_one_does_not():
     effective draws a draw.
     """
     sim = autoregression(0.4, 5.5)
-    f = TiltFamily(sim, 20_000, begun(jax.random.key(0)))
-    one = adapted(f, led_down(f, State(), 9000), SETTINGS.refits, 9000)
-    assert one.promised < 0.04
-    f = f._replace(gates=3)
+    f = TiltFamily(sim, 20_000, search_context(jax.random.key(0)))
+    one = adapt_proposal(f, descend_levels(f, SearchState(), 9000), SETTINGS.refits, 9000)
+    assert one.efficiency < 0.04
+    f = f._replace(components_each=3)
     start = one._replace(q=f.refit(one)["refitted"])
-    three = adapted(f, start, SETTINGS.refits, one.spent + 6000)
-    assert three.promised > 0.04 and one.spent < three.spent <= one.spent + 6000
+    three = adapt_proposal(f, start, SETTINGS.refits, one.spent + 6000)
+    assert three.efficiency > 0.04 and one.spent < three.spent <= one.spent + 6000
     truth = autoregression_probability(0.4, 5.5, 100)
     # by all batches, of some 300 effective draws
     assert abs(np.exp(three.log_mean) / truth - 1) < 0.25

@@ -15,144 +15,166 @@ import numpy as np
 from jast import limit_state as latent
 from jast.checkpoints import answer_once
 from jast.counter import numpy_generator
-from jast.estimate.gaussians import Gaussians
-from jast.estimate.surrogate import Surrogate, covariance, fit, normal_cdf, predict
+from jast.estimate.surrogate import Surrogate, covariance, fit, predict, probability_below_zero
 from jast.estimate.surrogate_failures import DOUBT, Pool, expected, pool
+from jast.simulator import Simulator
 from jast.watch import Watch
 
-__all__ = ["CANDIDATES", "Learner", "learn"]
+__all__ = ["CANDIDATES", "Learner", "choose_calls"]
 
-LEARNING, TRAINED, LEARNED = 0.65, 240, 400
-"""Share of the budget for learning and its most calls; points that the surrogate holds at last."""
-BATCHES, FAR = 14, 4
-CANDIDATES, TRIED = 4000, 500
-WARPS = (1.0, 0.2, 0.04)
+LEARNING = 0.65  # share of the budget for learning
+CALLS = 240  # of learning, at most
+HELD = 400  # points that the surrogate is fitted to, at most: a fit takes their third power
+BATCHES = 14  # that the calls of learning are divided into
+LEAST_BATCH = 4
+FIRST_CALLS = 12  # of the initial design, at least
+FIRST_CALLS_EACH = 2  # the same for each coordinate
+FIRST_SHARE = 1 / 3  # of the calls of learning, at most
+FIRST_WIDTH = 2.0  # deviation of every other point of the initial design; the others: the model's
+WARP_EVERY = 4  # batches after which the warp is chosen anew
+POPULATION_EVERY = 2  # batches after which candidates come from a new population
+UNSEEN_SHARE = 1 / 4  # of a batch, for places where nobody has looked
+UNSEEN_TRIED = 200  # directions that these are chosen from
+UNSEEN_NEAREST = 0.1  # quantile of the norms of failures: what is beyond it weighs little
+UNSEEN_FARTHER = 1.5  # times as far out, at most
+CANDIDATES = 4000  # points of a pool
+TRIED = 500  # of these, whose covariances are worked out
+WARPS = (1.0, 0.2, 0.04)  # tried beside none, as parts of the median distance
+TINY = 1e-300  # in place of a weight of 0
+ROUNDING = 1e-6  # part of the variance that rounding leaves of a difference of covariances
 
 
 class Learner:
-    """What is known so far: the calls, the surrogate of them, and the proposal."""
+    """What is known so far: the calls, the surrogate of them, and the points that it leads to."""
 
-    def __init__(self, key: Any, sim: Any, budget: int, watch: Watch):
-        self.sim, self.budget, self.watch, self.rng = sim, budget, watch, numpy_generator(key)
+    def __init__(self, key: Any, sim: Simulator, budget: int, watch: Watch):
+        self.sim, self.budget, self.watch = sim, budget, watch
+        self.rng = numpy_generator(key)
         self.dtype, self.dimension = latent.normal_numbers(sim), latent.dimension(sim)
         self.z, self.distance = np.zeros((0, self.dimension)), np.zeros(0)
         self.failing, self.invalid = np.zeros(0, bool), np.zeros(0, bool)
-        self.steps, self.spent, self.plain = 0, 0, (0, 0, 0)
+        self.steps, self.spent = 0, 0
+        self.plain = (0, 0, 0)  # (failing, invalid, calls) of draws of the model
         self.surrogate: Surrogate | None = None
-        self.fitted: Gaussians | None = None
+        self.fitted: list | None = None
         self.pool: Pool | None = None
         self.history: list[str] = []
-        self.batch = max(min(int(LEARNING * budget), TRAINED) // BATCHES, 4)
+        self.calls = min(int(LEARNING * budget), CALLS)  # of learning
+        self.batch = max(self.calls // BATCHES, LEAST_BATCH)
 
     def call(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Failures and invalid episodes [n] of the system at ``z`` [n, D], which are learned."""
-        out = []
+        """Failures and invalid episodes [n] of the system at ``z`` [n, D], which are recorded."""
+        outcomes = []
         for i in range(0, len(z), self.batch):
             rows = np.asarray(z[i : i + self.batch], self.dtype)
-            run = lambda rows: latent.outcomes(self.sim, jnp.asarray(rows))
-            out.append(answer_once(run, rows))
-            o = out[-1]
+            o = answer_once(self._simulate, rows)
+            outcomes.append(o)
             self.spent, self.steps = self.spent + len(rows), self.steps + int(o.length.sum())
-            self.learn(rows, o.distance, o.failure, o.invalid)
+            self.record(rows, o.distance, o.failure, o.invalid)
             self.watch.more(len(rows))
-        return tuple(np.concatenate([getattr(o, n) for o in out]) for n in ("failure", "invalid"))
+        failure, invalid = zip(*((o.failure, o.invalid) for o in outcomes), strict=True)
+        return np.concatenate(failure), np.concatenate(invalid)
 
-    def learn(self, z, distance, failing, invalid):
+    def _simulate(self, rows):
+        return latent.outcomes(self.sim, jnp.asarray(rows))
+
+    def record(self, z, distance, failing, invalid):
         """Keep what was seen at ``z``."""
         distance = np.where(failing, 0.0, np.asarray(distance, np.float64))
-        new = z.astype(np.float64), distance, failing, invalid | ~np.isfinite(distance)
-        old = self.z, self.distance, self.failing, self.invalid
-        self.z, self.distance, self.failing, self.invalid = (
-            np.concatenate(pair) for pair in zip(old, new, strict=True)
-        )
+        self.z = np.concatenate([self.z, z.astype(np.float64)])
+        self.distance = np.concatenate([self.distance, distance])
+        self.failing = np.concatenate([self.failing, failing])
+        self.invalid = np.concatenate([self.invalid, invalid | ~np.isfinite(distance)])
 
-    def fit(self, anew: bool) -> None:
-        """Fit the surrogate to what was seen; ``anew``: with the choice of its warp."""
-        rows = np.flatnonzero(~self.invalid)[:LEARNED]
+    def fit(self, with_warp: bool) -> None:
+        """Fit the surrogate to what was seen; ``with_warp``: with the choice of its warp."""
+        rows = np.flatnonzero(~self.invalid)[:HELD]
         data = self.z[rows], self.distance[rows], self.failing[rows]
-        if not anew and self.surrogate is not None:
-            self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, 1)
+        if not with_warp and self.surrogate is not None:
+            self.surrogate = fit(*data, self.surrogate, self.surrogate.warp, rounds=1)
             return
         safe = self.distance[rows][~self.failing[rows]]
         middle = float(np.median(safe)) if len(safe) else 0.0
         warps = [math.inf, *(middle * w for w in WARPS if middle > 0)]
         tried = [fit(*data, self.surrogate, warp) for warp in warps]
-        self.surrogate = max(tried, key=lambda s: s.evidence)
+        self.surrogate = max(tried, key=lambda surrogate: surrogate.evidence)
 
-    def look(self, n: int, anew: bool = True) -> None:
+    def draw_pool(self, n: int, anew: bool = True) -> None:
         """Draw ``n`` points of the model around the failures that the surrogate expects."""
-        found = self.z[self.failing]
-        self.pool, self.fitted = pool(self.rng, self.surrogate, found, self.fitted, n, anew)
+        failures = self.z[self.failing]
+        self.pool, self.fitted = pool(self.rng, self.surrogate, failures, self.fitted, n, anew)
 
 
-def learn(s: Learner) -> None:
+def choose_calls(learner: Learner) -> None:
     """The calls of the initial design and those that are chosen."""
-    calls = min(int(LEARNING * s.budget), TRAINED) // s.batch * s.batch
-    first = min(max(12, 2 * s.dimension), calls // 3)
-    first = -(-first // s.batch) * s.batch
-    wide = np.where(np.arange(first) % 2, 2.0, 1.0)[:, None]
-    failing, invalid = s.call(wide * s.rng.standard_normal((first, s.dimension)))
-    # draws of the model itself
-    s.plain = int(failing[::2].sum()), int(invalid[::2].sum()), (first + 1) // 2
+    batch = learner.batch
+    calls = learner.calls // batch * batch
+    first = min(max(FIRST_CALLS, FIRST_CALLS_EACH * learner.dimension), int(FIRST_SHARE * calls))
+    first = -(-first // batch) * batch
+    of_model = np.arange(first) % 2 == 0
+    width = np.where(of_model, 1.0, FIRST_WIDTH)[:, None]
+    failing, invalid = learner.call(width * learner.rng.standard_normal((first, learner.dimension)))
+    learner.plain = int(failing[of_model].sum()), int(invalid[of_model].sum()), int(of_model.sum())
     i = 0
     while True:
-        s.fit(i % 4 == 0)
-        if s.spent >= calls:
+        learner.fit(i % WARP_EVERY == 0)
+        if learner.spent >= calls:
             break
-        s.look(CANDIDATES, i % 2 == 0)
-        far = s.batch // FAR if s.failing.any() else 0
-        s.call(np.concatenate([_far(s, far), _chosen(s, s.batch - far)]))
+        learner.draw_pool(CANDIDATES, i % POPULATION_EVERY == 0)
+        unseen = int(UNSEEN_SHARE * batch) if learner.failing.any() else 0
+        chosen = _least_doubt(learner, batch - unseen)
+        learner.call(np.concatenate([_unseen(learner, unseen), chosen]))
         i += 1
-    s.history.append(
-        f"learning: {s.spent} calls, {int(s.failing.sum())} failures,"
-        f" {int(s.invalid.sum())} invalid"
+    learner.history.append(
+        f"learning: {learner.spent} calls, {int(learner.failing.sum())} failures,"
+        f" {int(learner.invalid.sum())} invalid"
     )
 
 
-def _far(s, n):
+def _unseen(learner, n):
     """Points [n, D] a little farther out than the nearest failures, in directions that nobody has
     looked in: for failures that the surrogate cannot know of.
     """
     if not n:
-        return np.zeros((0, s.dimension))
-    radius = np.linalg.norm(s.z[s.failing], axis=1)
-    u = s.rng.standard_normal((200, s.dimension))
-    u *= (np.quantile(radius, 0.1) * s.rng.uniform(1.0, 1.5, 200) / np.linalg.norm(u, axis=1))[
-        :, None
-    ]
-    near, out = ((u[:, None] - s.z[None]) ** 2).sum(axis=2).min(axis=1), []
+        return np.zeros((0, learner.dimension))
+    radius = np.quantile(np.linalg.norm(learner.z[learner.failing], axis=1), UNSEEN_NEAREST)
+    z = latent.unit(learner.rng.standard_normal((UNSEEN_TRIED, learner.dimension)))
+    z *= radius * learner.rng.uniform(1.0, UNSEEN_FARTHER, (UNSEEN_TRIED, 1))
+    gaps, chosen = ((z[:, None] - learner.z[None]) ** 2).sum(axis=2).min(axis=1), []
     for _ in range(n):
-        out.append(int(np.argmax(near)))
-        near = np.minimum(near, ((u - u[out[-1]]) ** 2).sum(axis=1))
-    return u[out]
+        chosen.append(int(np.argmax(gaps)))
+        gaps = np.minimum(gaps, ((z - z[chosen[-1]]) ** 2).sum(axis=1))
+    return z[chosen]
 
 
-def _chosen(s, n):
+def _least_doubt(learner, n):
     """The ``n`` candidates [n, D] that leave the least doubt."""
-    _, p = expected(s.surrogate, s.pool.z)
-    doubt = s.pool.weights * np.sqrt(p * (1 - p)) + 1e-300
-    if s.invalid.any():  # nothing is learned there
-        doubt = np.where(s.invalid[_nearest(s.pool.z, s.z)], 1e-300, doubt)
-    rows = s.rng.choice(len(p), TRIED, p=doubt / doubt.sum())
-    rows = np.unique(np.concatenate([rows, s.rng.choice(len(p), s.batch, replace=False)]))
-    z = s.pool.z[rows]
-    mean, _ = predict(s.surrogate, z)
+    rng, candidates, surrogate = learner.rng, learner.pool, learner.surrogate
+    _, p = expected(surrogate, candidates.z)
+    doubt = candidates.weights * np.sqrt(p * (1 - p)) + TINY
+    if learner.invalid.any():  # nothing is learned there
+        doubt = np.where(learner.invalid[_nearest(candidates.z, learner.z)], TINY, doubt)
+    rows = rng.choice(len(p), TRIED, p=doubt / doubt.sum())
+    rows = np.unique(np.concatenate([rows, rng.choice(len(p), learner.batch, replace=False)]))
+    z = candidates.z[rows]
+    mean, _ = predict(surrogate, z)
     # posterior covariances among them; what is known after a call at one of them falls by their
     # squares, whatever its outcome
-    k = covariance(z, s.surrogate.z, s.surrogate.logs)[0]
-    c = covariance(z, z, s.surrogate.logs)[0] - k @ s.surrogate.inverse @ k.T
-    # no less than what rounding leaves of a difference of covariances
-    noise, out = s.surrogate.noise + 1e-6 * float(np.exp(s.surrogate.logs[:2]).sum() + 1), []
+    k = covariance(z, surrogate.z, surrogate.logs)[0]
+    c = covariance(z, z, surrogate.logs)[0] - k @ surrogate.inverse @ k.T
+    rounding = ROUNDING * float(np.exp(surrogate.logs[:2]).sum() + 1)
+    noise, chosen = surrogate.noise + rounding, []
     for _ in range(n):
-        v = np.maximum(np.diagonal(c), 0.0) + noise
-        most = np.sqrt(np.outer(v, v))  # of a covariance; rounding may have left more
+        variance = np.maximum(np.diagonal(c), 0.0) + noise
+        most = np.sqrt(np.outer(variance, variance))  # rounding may have left more
         c = np.clip(c, -most, most)
-        p = normal_cdf(-mean / (DOUBT * np.sqrt(v)))
-        gain = (np.sqrt(p * (1 - p)) / v) @ c**2 / v
-        gain[out] = -1.0
-        out.append(int(np.argmax(gain)))
-        c = c - np.outer(c[:, out[-1]], c[:, out[-1]]) / v[out[-1]]
-    return z[out]
+        p = probability_below_zero(mean, DOUBT * np.sqrt(variance))
+        gain = (np.sqrt(p * (1 - p)) / variance) @ c**2 / variance
+        gain[chosen] = -1.0
+        best = int(np.argmax(gain))
+        chosen.append(best)
+        c = c - np.outer(c[:, best], c[:, best]) / variance[best]
+    return z[chosen]
 
 
 def _nearest(z, others):

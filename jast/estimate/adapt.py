@@ -4,13 +4,19 @@ better (de Boer, Kroese, Mannor and Rubinstein 2005).
 
 from __future__ import annotations
 
-from jast.estimate.gaussians import effective
-from jast.estimate.search_state import Family, State, log_ratios, promise, taken
+from jast.estimate.gaussians import effective_sample_size
+from jast.estimate.search_state import (
+    Family,
+    SearchState,
+    add_batch,
+    efficiency,
+    failure_log_ratios,
+)
 
-__all__ = ["adapted", "refitted"]
+__all__ = ["adapt_proposal", "refit"]
 
 
-def adapted(family: Family, state: State, times: int, end: float) -> State:
+def adapt_proposal(family: Family, state: SearchState, times: int, end: float) -> SearchState:
     """The state after at most ``times`` batches, each of a proposal that is fitted to all before
     it, for as long as they get better and until ``end`` evaluations are spent.
     """
@@ -19,32 +25,34 @@ def adapted(family: Family, state: State, times: int, end: float) -> State:
         if state.spent + family.batch > end:
             break
         batch = family.draw(q)
+        state = add_batch(family, state, batch)
         if not len(batch.log_weight):
-            return taken(family, state, batch).noted(f"{family.name}: no failure", family.batch)
-        share, ess = len(batch.log_weight) / batch.size, effective(batch.log_weight)
-        state = taken(family, state, batch)
-        state, q, name = refitted(family, state)
-        state = state.noted(
-            f"{family.name}: {share:.1%} fail, ESS {ess:.4g}; of all: log p {state.log_mean:.3f},"
-            f" ESS {effective(state.log_weight):.4g}; next: {name}",
+            return state.note(f"{family.name}: no failure", family.batch)
+        ess = effective_sample_size(batch.log_weight)
+        state, q, name = refit(family, state)
+        state = state.note(
+            f"{family.name}: {len(batch.log_weight) / batch.size:.1%} fail, ESS {ess:.4g}; of all:"
+            f" log p {state.log_mean:.3f}, ESS {effective_sample_size(state.log_weight):.4g};"
+            f" next: {name}",
             family.batch,
         )
-        own = ess / batch.size  # of long episodes a batch keeps some alone
+        own = ess / batch.size
         stalls = 0 if own > family.settings.gain * best else stalls + 1
-        enough = own > family.settings.enough
-        if stalls and (enough or stalls == family.settings.stalls):
+        efficient = own > family.settings.refit_efficiency
+        if stalls and (efficient or stalls == family.settings.stalls):
             break
         best = max(own, best)
     return state
 
 
-def refitted(family: Family, state: State) -> tuple[State, object, str]:
-    """The state with the proposal that promises the least variance by the failures of all batches:
-    the one that it has, or one of those that the family fits to them; that proposal, and its name.
+def refit(family: Family, state: SearchState) -> tuple[SearchState, object, str]:
+    """The state with the most efficient proposal by the failures of all batches: the one that it
+    has, or one of those that the family fits to them; that proposal, and its name.
     """
     choices = {"as it was": state.q, **family.refit(state)}
-    promises = {
-        name: promise(state, log_ratios(family, q, state.batches)) for name, q in choices.items()
+    each = {
+        name: efficiency(state, failure_log_ratios(family, q, state.batches))
+        for name, q in choices.items()
     }
-    name = max(promises, key=promises.get)
+    name = max(each, key=each.get)
     return state._replace(q=choices[name]), choices[name], name

@@ -15,7 +15,7 @@ from jast._checks import check_random_key, whole_number
 from jast._jax import briefly
 from jast.checkpoints import keep_answers, open_checkpoint
 from jast.estimate import budgets, few_calls
-from jast.estimate.by_proposal import Asked, by_proposal
+from jast.estimate.by_proposal import Request, estimate_by_proposal
 from jast.estimate.estimate import Estimate, flag_imprecise
 from jast.estimate.importance_sampling import importance
 from jast.estimate.multilevel import failure_proposal
@@ -178,20 +178,20 @@ def failure_probability(
         elif budget < MIN_BUDGET:
             found = few_calls.few_calls(key, sim, budget, level, known, progress, callback)
         else:
-            wanted = Asked(
+            wanted = Request(
                 name=name,
                 key=key,
                 sim=sim,
                 budget=budget,
                 gradients=bool(gradients),
                 failures=failures,
-                known=known,
+                failure_points=known,
                 near=similar,
                 level=level,
                 watched=watched,
                 ways=ways,
             )
-            found = flag_imprecise(by_proposal(wanted))
+            found = flag_imprecise(estimate_by_proposal(wanted))
     return found._replace(settings=settings)
 
 

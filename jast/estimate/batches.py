@@ -9,13 +9,27 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast.counter import counter_key, numpy_generator
-from jast.estimate.gaussians import log_sum
+from jast.estimate.gaussians import log_sum, with_log_shares
 from jast.judge import judged, lanes_of
+from jast.simulator import Simulator
 
-__all__ = ["drawn", "numbers"]
+__all__ = [
+    "component_numbers",
+    "draw_mixture",
+    "log_ratio",
+    "numbers_of_chunk",
+    "plain_chunk",
+    "random_numbers",
+    "resample",
+    "rows_of",
+]
 
 
-def log_ratio(q, z, used):
+COMPONENTS = 2  # address of the numbers of an estimate that choose components
+NORMALS = 3  # address of its normal numbers
+
+
+def log_ratio(q: latent.Latent, z: np.ndarray, used: np.ndarray) -> np.ndarray:
     """log q - log p [n] of points ``z`` [n, D] over their first ``used`` numbers."""
     return log_sum(log_joint(q, z, used)) if len(z) else np.zeros(0)
 
@@ -26,39 +40,42 @@ def log_joint(q, z, used):
     return latent.log_ratios(q, z, np.asarray(used)) + np.asarray(q.log_weights, np.float64)
 
 
-def drawn(sim, q, u, e):
+def draw_mixture(
+    sim: Simulator, q: latent.Latent, u: np.ndarray, e: np.ndarray
+) -> tuple[np.ndarray, latent.Outcomes, np.ndarray, np.ndarray]:
     """Episodes of ``q`` by uniform numbers ``u`` [n] and normal ones ``e`` [n, D]: z, `Outcomes`,
     log p - log q, log shares of the components [n, K]. On the host.
     """
     z = latent.place(q, u, e)
     o = judged(sim, z)
-    joint = log_joint(q, z, o.used)
-    log_q = log_sum(joint)
-    return z, o, -log_q, joint - log_q[:, None]
+    log_q, shares = with_log_shares(log_joint(q, z, o.used))
+    return z, o, -log_q, shares
 
 
-def numbers(key, n, d, dtype):
-    """Uniform [n] and normal [n, d] numbers for `drawn`; ``key``: of JAX, or a NumPy generator."""
+def random_numbers(key, n, d, dtype):
+    """Uniform [n] and normal [n, d] numbers for `draw_mixture`; ``key``: of JAX, or a NumPy
+    generator.
+    """
     rng = numpy_generator(key)
     return rng.random(n).astype(dtype), rng.standard_normal((n, d)).astype(dtype)
 
 
-def of_chunk(key, i, n, q):
-    """The `numbers` of the first ``n`` draws of chunk ``i`` of an estimate by ``q``."""
+def numbers_of_chunk(key, i, n, q):
+    """The `random_numbers` of the first ``n`` draws of chunk ``i`` of an estimate by ``q``."""
     d, dtype = q.means.shape[1], q.means.dtype
-    e = numpy_generator(key, 3, i).standard_normal((n, d)).astype(dtype)
-    return picks(key, i, n, dtype), e
+    e = numpy_generator(key, NORMALS, i).standard_normal((n, d)).astype(dtype)
+    return component_numbers(key, i, n, dtype), e
 
 
-def picks(key, i, n, dtype):
+def component_numbers(key, i, n, dtype):
     """The uniform numbers that choose the components of the first ``n`` draws of chunk ``i``."""
-    return numpy_generator(key, 2, i).random(n).astype(dtype)
+    return numpy_generator(key, COMPONENTS, i).random(n).astype(dtype)
 
 
 def plain_chunk(key, i, n, sim):
     """The first ``n`` points [n, D] of chunk ``i`` of the model itself."""
     d, dtype, m = latent.dimension(sim), latent.normal_numbers(sim), rows_of(sim)
-    parts = (_normals(counter_key(key, 3, i, j), m, d, dtype) for j in range(-(-n // m)))
+    parts = (_normals(counter_key(key, NORMALS, i, j), m, d, dtype) for j in range(-(-n // m)))
     return np.concatenate([np.asarray(z) for z in parts])[:n]
 
 
@@ -72,7 +89,7 @@ def rows_of(sim):
     return lanes_of(latent.dimension(sim))
 
 
-def resampled(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
+def resample(log_w: np.ndarray, size: int, shift: float) -> np.ndarray:
     """Rows [size], each as often as its weight asks, by the comb of ``shift`` in [0, 1)
     (systematic resampling). On the host.
     """

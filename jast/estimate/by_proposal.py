@@ -15,34 +15,35 @@ import numpy as np
 from jast import limit_state as latent
 from jast._jax import was_interrupted
 from jast.estimate import diagnostics, sums
-from jast.estimate.adapt import adapted
-from jast.estimate.audit import audited
+from jast.estimate.adapt import adapt_proposal
+from jast.estimate.audit import audit_proposal
 from jast.estimate.draws import with_source
 from jast.estimate.estimate import Estimate, estimate_from_counts, estimate_from_weights
-from jast.estimate.final_draws import estimated
+from jast.estimate.final_draws import draw_estimate
 from jast.estimate.gaussian_family import GaussianFamily
-from jast.estimate.gaussian_start import explored, looked
+from jast.estimate.gaussian_start import draw_model, explore_failures
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, shape
-from jast.estimate.plain import simulate_points
 from jast.estimate.search_settings import SETTINGS, SearchSettings
-from jast.estimate.search_state import Family, State, begun, serves
+from jast.estimate.search_state import Family, SearchState, is_efficient, search_context
 from jast.estimate.subset import fallback_estimate
 from jast.estimate.tilt_family import TiltFamily
-from jast.estimate.tilt_start import cooled, given, led_down, with_given
+from jast.estimate.tilt_start import absorb_given, cool_failures, descend_levels, replay_given
 from jast.failures import Failures
 from jast.incidents import runs_on_host
 from jast.rounding import rounding_problem
 from jast.simulator import Simulator
+from jast.typing import Callback
 from jast.units import HERE, Placement
 from jast.watch import Watch
 
-__all__ = ["by_proposal"]
+__all__ = ["Request", "estimate_by_proposal"]
 
-ASTRAY = "no proposal was found that draws failures in proportion to their probability"
+UNUSABLE = "no proposal was found that draws failures in proportion to their probability"
+LEAST_BATCHES = 2  # that are drawn of the first Gaussians, whatever it cost to find them
 
 
-class Asked(NamedTuple):
+class Request(NamedTuple):
     """What a call asks for."""
 
     name: str
@@ -51,12 +52,12 @@ class Asked(NamedTuple):
     budget: int
     gradients: bool = True
     failures: Failures | None = None
-    known: Any = None
+    failure_points: np.ndarray | None = None
     """[m, D] their normal numbers"""
-    near: Any = None
+    near: latent.Latent | Tilts | None = None
     """The proposal of a similar system"""
     level: float = 0.95
-    watched: tuple[bool, Any] = (False, None)
+    watched: tuple[bool, Callback | None] = (False, None)
     """progress and callback"""
     ways: Placement = HERE
     settings: SearchSettings = SETTINGS
@@ -66,206 +67,233 @@ class Search(NamedTuple):
     """A family of proposals, and what its search knows."""
 
     family: Family
-    state: State
+    state: SearchState
 
     @property
-    def worth(self) -> float:
+    def efficiency(self) -> float:
         """Effective draws of a draw; 0 where plain draws or no draws serve better."""
-        lost = self.state.missing > self.family.settings.lost
-        return 0.0 if lost or not serves(self.state, 0.0) else self.state.promised
+        usable = self.state.missing <= self.family.settings.missing_most
+        return self.state.efficiency if usable and is_efficient(self.state, 0.0) else 0.0
 
     @property
-    def enough(self) -> bool:
+    def suffices(self) -> bool:
         """Whether what is left of the budget tells the probability by the proposal."""
-        return self.worth * (self.family.budget - self.state.spent) > diagnostics.MIN_ESS
+        return self.efficiency * (self.family.budget - self.state.spent) > diagnostics.MIN_ESS
+
+    @property
+    def proposal(self) -> Any:
+        """What an `Estimate` keeps of it."""
+        return None if self.state.q is None else self.family.on_device(self.state.q)
 
 
-def by_proposal(asked: Asked) -> Estimate:
+def estimate_by_proposal(request: Request) -> Estimate:
     """The `Estimate` of a call."""
-    chance, coarse = begun(asked.key), rounding_problem(asked.sim)
-    against = [] if coarse is None else [coarse]
+    context, coarse = search_context(request.key), rounding_problem(request.sim)
+    reasons = [] if coarse is None else [coarse]
     try:
-        return _drawn(asked, _sought(asked, chance), against)
+        return _draw(request, _search(request, context), reasons)
     except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
         if not was_interrupted(error):
             raise
-        if not chance.latest:
+        if not context.latest:
             raise KeyboardInterrupt from error
-        return _of_the_search(asked, Search(*chance.latest[-1]), against)
+        return _estimate_by_batches(request, Search(*context.latest[-1]), reasons)
 
 
-def _sought(asked, chance):
-    """The `Search` that serves best, audited."""
-    best, state = None, State()
-    for explore in _ways(asked):
-        if asked.budget - state.spent < asked.settings.another * asked.budget:
+def _search(request, context):
+    """The most efficient `Search`, audited."""
+    best, state, settings = None, SearchState(), request.settings
+    for search_family in _families(request):
+        if request.budget - state.spent < settings.next_family_share * request.budget:
             break
-        search = explore(asked, chance, state.carried())
+        search = search_family(request, context, state.for_next_family())
         state = search.state
         if best is not None:
-            best = best._replace(state=best.state.after(state))
-        if best is None or (search.worth, search.state.log_p) > (best.worth, best.state.log_p):
+            best = best._replace(state=best.state.with_costs_of(state))
+        if best is None or (search.efficiency, state.log_p) > (best.efficiency, best.state.log_p):
             best = search
-        if best.enough and serves(best.state, asked.settings.serves):
-            best = _audited(best)
+        if best.suffices and is_efficient(best.state, settings.family_efficiency):
+            best = _audit(best)
             state = best.state
-            if best.enough:
+            if best.suffices:
                 return best
-        if math.exp(min(state.log_mean, 0.0)) > asked.settings.serves:
+        if math.exp(min(state.log_mean, 0.0)) > settings.family_efficiency:
             return best  # plain draws serve
-    return _audited(best) if best.enough else best
+    return _audit(best) if best.suffices else best
 
 
-def _ways(asked):
+def _families(request):
     """The searches, in the order in which they are tried."""
-    if _long(asked):
-        return _tilts, _gaussians
-    near = (_tilts,) if isinstance(asked.near, Tilts) else ()
-    return *near, _gaussians, _more_tilts
+    if _has_many_steps(request):
+        return _search_tilts, _search_gaussians
+    near = (_search_tilts,) if isinstance(request.near, Tilts) else ()
+    return *near, _search_gaussians, _search_mixed_tilts
 
 
-def _long(asked):
+def _has_many_steps(request):
     """Whether the system has many steps, or choices: tilts are then tried first."""
-    about = shape(asked.sim)
-    return about.choices or about.choices0 or asked.sim.horizon >= asked.settings.tilts_first
+    about, horizon = shape(request.sim), request.sim.horizon
+    return about.choices or about.choices0 or horizon >= request.settings.tilts_first_horizon
 
 
-def _gaussians(asked, chance, state):
+def _search_gaussians(request, context, state):
     """The `Search` for Gaussians."""
-    f = GaussianFamily(asked.sim, asked.budget, chance, asked.settings)
-    end = state.spent + asked.settings.refits_end * (asked.budget - state.spent)
-    state = looked(f, state)
-    if isinstance(asked.near, latent.Latent):
-        start = state._replace(q=asked.near, anchors=f.centres(asked.near))
-        if serves(near := _from_near(f, start), asked.settings.near_fitted):
+    settings = request.settings
+    f = GaussianFamily(request.sim, request.budget, context, settings)
+    end = state.spent + settings.refits_end * (request.budget - state.spent)
+    state = draw_model(f, state)
+    if isinstance(request.near, latent.Latent):
+        start = state._replace(q=request.near, anchors=f.centres(request.near))
+        near = _adapt_near(f, start)
+        if is_efficient(near, settings.near_fitted_efficiency):
             return Search(f, near)
         state = near._replace(q=None, anchors=None)
-    state = explored(f, state, asked.known, asked.gradients and not runs_on_host(asked.sim))
+    gradients = request.gradients and not runs_on_host(request.sim)
+    state = explore_failures(f, state, request.failure_points, gradients)
     if state.q is not None:
-        end = max(end, state.spent + 2 * f.batch)  # what was found is drawn, however dear it was
-        state = adapted(f, state, asked.settings.refits, end)
+        end = max(end, state.spent + LEAST_BATCHES * f.batch)
+        state = adapt_proposal(f, state, settings.refits, end)
     return Search(f, state)
 
 
-def _tilts(asked, chance, state):
+def _search_tilts(request, context, state):
     """The `Search` for tilts."""
-    f = TiltFamily(asked.sim, asked.budget, chance, asked.settings)
-    if isinstance(asked.near, Tilts):
-        state = _with_failures(f, asked, state)
-        fitting, q = f.near(asked.near)
-        if serves(near := _from_near(fitting, state._replace(q=q)), asked.settings.serves):
-            return Search(*with_given(fitting, near, near.spent + _for_given(asked)))
-        state = near.carried()._replace(given=state.given)
-        if not _long(asked):
+    settings = request.settings
+    f = TiltFamily(request.sim, request.budget, context, settings)
+    if isinstance(request.near, Tilts):
+        state = replay_given(f, state, request.failures)
+        fitting, q = f.near(request.near)
+        near = _adapt_near(fitting, state._replace(q=q))
+        if is_efficient(near, settings.family_efficiency):
+            end = near.spent + settings.given_share * request.budget
+            return Search(*absorb_given(fitting, near, end))
+        state = near.for_next_family()._replace(given=state.given)
+        if not _has_many_steps(request):
             return Search(f, state)
-    return _down_to_tilts(f, asked, state, state.spent + asked.settings.tilts_share * asked.budget)
+    return _descend_to_tilts(f, request, state, settings.tilts_share * request.budget)
 
 
-def _more_tilts(asked, chance, state):
+def _search_mixed_tilts(request, context, state):
     """The `Search` for tilts of several Gaussians, with a part of what is left."""
-    f = TiltFamily(asked.sim, asked.budget, chance, asked.settings, asked.settings.gates)
-    share = asked.settings.tilts_after * (asked.budget - state.spent)
-    return _down_to_tilts(f, asked, state, state.spent + share)
+    settings = request.settings
+    f = TiltFamily(request.sim, request.budget, context, settings)
+    f = f._replace(components_each=settings.components_each)
+    room = settings.tilts_share_after * (request.budget - state.spent)
+    return _descend_to_tilts(f, request, state, room)
 
 
-def _down_to_tilts(f, asked, state, end):
-    s = asked.settings
-    state = led_down(f, _with_failures(f, asked, state), end)
+def _descend_to_tilts(f, request, state, room):
+    """The `Search` for tilts down the levels of the miss distance, for ``room`` evaluations."""
+    settings, end = request.settings, state.spent + room
+    state = descend_levels(f, replay_given(f, state, request.failures), end)
     if state.q is not None:
-        state = adapted(f, state, asked.settings.refits, end)
-        if f.gates == 1 and f.about.normals and state.promised < s.single_serves:
-            f, before = f._replace(gates=s.gates), state.spent
+        state = adapt_proposal(f, state, settings.refits, end)
+        single = f.components_each == 1 and f.about.normals
+        if single and state.efficiency < settings.single_efficiency:
+            f, before = f._replace(components_each=settings.components_each), state.spent
             state = state._replace(q=f.refit(state)["refitted"])
-            state = adapted(f, state, asked.settings.refits, before + s.gates_share * asked.budget)
+            last = before + settings.components_share * request.budget
+            state = adapt_proposal(f, state, settings.refits, last)
             end += state.spent - before
-    return Search(*with_given(f, state, end + _for_given(asked)))
+    return Search(*absorb_given(f, state, end + settings.given_share * request.budget))
 
 
-def _with_failures(f, asked, state):
-    """The state with the failures that came with the call."""
-    if asked.failures is None or state.given is not None:
-        return state
-    return given(f, state, asked.failures.episodes)
-
-
-def _for_given(asked):
-    """Evaluations that they may cost."""
-    return asked.settings.given_share * asked.budget
-
-
-def _from_near(f, state):
-    """The state after a batch of a similar system's proposal, and where it does not serve as it is
-    after some refits.
+def _adapt_near(f, state):
+    """The state after a batch of a similar system's proposal, and where it is not efficient as it
+    is after some refits.
     """
-    state = adapted(f, state.noted("proposal of a similar system"), 1, math.inf)
-    if not len(state.batches[-1].log_weight) or serves(state, f.settings.near_serves):
+    state = adapt_proposal(f, state.note("proposal of a similar system"), 1, math.inf)
+    failed = len(state.batches[-1].log_weight)
+    if not failed or is_efficient(state, f.settings.near_efficiency):
         return state
-    return adapted(f, state, f.settings.near_refits, math.inf)
+    return adapt_proposal(f, state, f.settings.near_refits, math.inf)
 
 
-def _audited(search):
+def _audit(search):
     """The `Search` after the audits of its proposal."""
     f, state = search
-    return Search(f, audited(f, cooled(f, state) if isinstance(f, TiltFamily) else state))
+    state = cool_failures(f, state) if isinstance(f, TiltFamily) else state
+    return Search(f, audit_proposal(f, state))
 
 
-def _drawn(asked, search, against):
-    """The `Estimate` of what is left of the budget; ``against``: reasons from outside."""
+def _draw(request, search, reasons):
+    """The `Estimate` of what is left of the budget; ``reasons``: against it, whatever the search
+    found: by the proposal, by levels or by plain draws.
+    """
     f, state = search
-    name, key, sim = asked.name, asked.key, asked.sim
-    n = max(asked.budget - state.spent, f.batch)  # a search of many parts may have spent all
-    about = dict(level=asked.level, history=state.history)
-    watch = Watch(name, n, "episode", *asked.watched)
-    log_p = state.log_p
-    often = math.exp(min(log_p, 0.0)) * n >= asked.settings.plain_failures
-    if not search.enough and not often and log_p > -math.inf:
-        reasons = [*against, *state.reasons] or [ASTRAY]
-        found = fallback_estimate(key, sim, n, log_p, asked.level, reasons)
+    name, key, sim, level = request.name, request.key, request.sim, request.level
+    n = max(request.budget - state.spent, f.batch)  # a search of many parts may have spent all
+    watch = Watch(name, n, "episode", *request.watched)
+    often = math.exp(min(state.log_p, 0.0)) * n >= request.settings.plain_failures
+    about_proposal = [*reasons, *state.reasons]
+    if not search.suffices and not often and state.log_p > -math.inf:
+        found = fallback_estimate(key, sim, n, state.log_p, level, about_proposal or [UNUSABLE])
         if found is not None:
             spent, history = state.spent + found.episodes, (*state.history, *found.history)
             return found._replace(episodes=spent, history=history, plain=state.plain)
-    if search.enough or search.worth and not often:
-        s = asked.settings
-        share = float(
-            np.clip(1 - 1 / (s.exact**2 * state.promised * n), s.of_the_model, s.of_the_model_most)
-        )
-        about |= dict(spent=state.spent, plain=state.plain, drawn=state.plain[2], share=share)
-        q = f.with_model(state.q, share)
-        reasons = [*against, *state.reasons, *(() if search.enough else (ASTRAY,))]
-        found = estimated(key, sim, q, f.batch, watch, asked.ways, reasons=reasons, **about)
-        return found._replace(proposal=f.on_device(state.q))
-    total, notes, lost = chunks(simulate_points, (key, sim, f.batch, n), f.batch, watch, asked.ways)
-    spent, reasons = state.spent + total.samples, [*against, *lost]  # others are about the proposal
-    about |= dict(evaluations=spent, proposal=_proposal(search))
-    found = estimate_from_counts(name, total, notes=notes, reasons=reasons, **about)
+    if search.suffices or (search.efficiency and not often):
+        against = about_proposal if search.suffices else [*about_proposal, UNUSABLE]
+        return _draw_proposal(request, search, watch, against)
+    shared = key, sim, f.batch, n
+    total, notes, lost = chunks(simulate_points, shared, f.batch, watch, request.ways)
+    found = estimate_from_counts(
+        name,
+        total,
+        notes=notes,
+        reasons=[*reasons, *lost],
+        level=level,
+        history=state.history,
+        evaluations=state.spent + total.samples,
+        proposal=search.proposal,
+    )
     return found._replace(draws=with_source(found.draws, key, f.batch, "model"))
 
 
-def _of_the_search(asked, search, against):
+def _draw_proposal(request, search, watch, reasons):
+    """The `Estimate` by draws of the proposal, some of which are the model's own."""
+    (f, state), s = search, request.settings
+    surplus = 1 - 1 / (s.exact_error**2 * state.efficiency * watch.total)
+    share = np.clip(surplus, s.model_draws_least, s.model_draws_most)
+    found = draw_estimate(
+        request.key,
+        request.sim,
+        f.with_model(state.q, float(share)),
+        f.batch,
+        watch,
+        request.ways,
+        spent=state.spent,
+        reasons=reasons,
+        share=float(share),
+        drawn=state.plain[2],
+        plain=state.plain,
+        level=request.level,
+        history=state.history,
+    )
+    return found._replace(proposal=search.proposal)
+
+
+def _estimate_by_batches(request, search, reasons):
     """The `Estimate` of the batches of a search that was interrupted, by the balance heuristic."""
-    state, rows = search.state, np.arange(search.state.size)
-    failing = rows < len(state.log_weight)
-    log_weights = np.full(len(rows), -np.inf)
-    log_weights[failing] = state.log_weight
-    none = np.zeros(len(rows))
-    seen = Traces(log_weights, none[:, None], failing, none.astype(bool), none.astype(int))
+    state, none = search.state, np.zeros(len(search.state.log_weight))
+    failures = Traces(
+        log_weight=state.log_weight,
+        shares=none[:, None],
+        failure=none == 0,
+        invalid=none != 0,
+        length=none.astype(int),
+    )
+    total = sums.add_traces(sums.empty_sums(state.size), failures)._replace(samples=state.size)
     said = (
-        f"interrupted after {state.spent} of {asked.budget} evaluations: the estimate uses the same"
-        " episodes that chose the proposal"
+        f"interrupted after {state.spent} of {request.budget} evaluations: the estimate uses the"
+        " same episodes that chose the proposal"
     )
     return estimate_from_weights(
-        asked.name,
-        sums.add_traces(sums.empty_sums(len(rows)), seen),
-        level=asked.level,
-        reasons=[*against, said],
+        request.name,
+        total,
+        level=request.level,
+        reasons=[*reasons, said],
         evaluations=state.spent,
-        proposal=_proposal(search),
+        proposal=search.proposal,
         history=state.history,
         plain=state.plain,
     )
-
-
-def _proposal(search):
-    """What an `Estimate` keeps of a search."""
-    f, state = search
-    return None if state.q is None else f.on_device(state.q)

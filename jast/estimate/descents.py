@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jast.counter import counter_key, numpy_generator
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.particles import (
     AFTER,
     LANES,
@@ -161,7 +161,7 @@ class _ParticlePopulation:
 
     def resample_and_move(self, log_w, level, **width):
         """Go on from points chosen by weight (systematic resampling)."""
-        rows = resampled(log_w, self.n, self.rng.random())
+        rows = resample(log_w, self.n, self.rng.random())
         self.family = self.family[rows]
         kinds = self.settings.kinds_by_width
         if level > -np.inf and self.watched:
@@ -341,7 +341,7 @@ def cool_failures(
             used, last = np.asarray(particles.used)[:m], widths[i - 1]
             # as far on the way to this width as leaves enough effective points
             near = _next_width(square, used, last, SETTINGS.effective_share, width)
-            rows = resampled(_log_density_ratio(square, used, last, near), m, rng.random())
+            rows = resample(_log_density_ratio(square, used, last, near), m, rng.random())
         particles, steering, _ = move_particles(
             sim,
             particles,

@@ -6,6 +6,7 @@ import math
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -16,21 +17,19 @@ from jast.checkpoints import answer_once
 from jast.counter import numpy_generator
 from jast.limit_state import dimension, normal_numbers, unit
 from jast.products import product
+from jast.simulator import Simulator
 
-__all__ = ["descended", "design_points", "distinct", "explained", "likely"]
+__all__ = ["descend", "design_points", "distinct", "explained", "may_matter"]
 
-APART = 0.5
-"""Points nearer to one another than so much of their norm are one."""
-MOST, BLOCK = 48, 12
-"""Descents of a call, those that run side by side."""
-LITTLE = math.log(1e-3)
-"""The log of a part of the probability that does not matter."""
-GRADIENT = 3
-"""Evaluations that a value with its gradient is counted as."""
+APART = 0.5  # of the norm of a point: those nearer to it are the same
+MOST = 48  # descents of a call
+BLOCK = 12  # descents that run side by side
+LITTLE = math.log(1e-3)  # log of a part of the probability that does not matter
+GRADIENT = 3  # evaluations that a value with its gradient counts as
 
 
 class DesignPoints(NamedTuple):
-    """On the host."""
+    """Failing points that descents came to, and what these cost. On the host."""
 
     points: np.ndarray
     """[m, D] failing points next to the boundary, distinct and by rising norm if not said
@@ -38,16 +37,18 @@ class DesignPoints(NamedTuple):
     evaluations: int
 
 
-def design_points(key, sim, starts=MOST, limit=16):
+def design_points(
+    key: jax.Array, sim: Simulator, starts: int = MOST, limit: int = 16
+) -> DesignPoints:
     """At most ``limit`` distinct `DesignPoints` of ``sim`` from ``starts`` draws of the model; none
     where the miss distance has no useful gradient.
     """
     z = numpy_generator(key).standard_normal((starts, dimension(sim)))
-    found = descended(sim, z)
+    found = descend(sim, z)
     return found._replace(points=distinct(found.points, limit))
 
 
-def descended(sim, starts):
+def descend(sim: Simulator, starts: np.ndarray) -> DesignPoints:
     """The `DesignPoints` that at most `MOST` ``starts`` [n, D] lead to, in no order."""
     n = len(starts)
     z = np.zeros((MOST, dimension(sim)), normal_numbers(sim))
@@ -72,7 +73,7 @@ def _in_blocks(sim, starts, n):
     return lax.fori_loop(0, (n + BLOCK - 1) // BLOCK, block, nothing)
 
 
-def distinct(points, limit):
+def distinct(points: np.ndarray, limit: int) -> np.ndarray:
     """At most ``limit`` of ``points`` [n, D], of least norm and apart from one another: [m, D]."""
     points = points[np.argsort((points**2).sum(axis=1), kind="stable")]
     kept = points[:0]
@@ -84,16 +85,16 @@ def distinct(points, limit):
     return kept
 
 
-def explained(points, known, slack=1e-3):
+def explained(points: np.ndarray, centres: np.ndarray, slack: float = 1e-3) -> np.ndarray:
     """Which of the failures ``points`` [n, D] lie beyond the plane that stands square on one of the
-    design points ``known`` [m, D], or before it by ``slack`` of its distance: bool [n]. The others
-    fail by something else.
+    design points ``centres`` [m, D], or before it by ``slack`` of its distance: bool [n]. The
+    others fail by something else.
     """
-    size = np.linalg.norm(known, axis=1)
-    return (product(points, unit(known).T) >= (1 - slack) * size).any(axis=1)
+    size = np.linalg.norm(centres, axis=1)
+    return (product(points, unit(centres).T) >= (1 - slack) * size).any(axis=1)
 
 
-def likely(points):
+def may_matter(points: np.ndarray) -> np.ndarray:
     """Which of the design points ``points`` [n, D] may matter beside the nearest: bool [n]."""
     square = (points**2).sum(axis=1)
     return square <= square.min(initial=np.inf) - 2 * LITTLE

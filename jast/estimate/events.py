@@ -28,7 +28,7 @@ from jast.estimate.draws import (
     share_interval,
     source_key,
 )
-from jast.estimate.importance_sampling import component
+from jast.estimate.importance_sampling import choose_component
 from jast.estimate.plain import episode_keys
 from jast.estimate.proposals import as_proposal
 from jast.estimate.redrawn import dimension_of, redraw_chunk
@@ -339,7 +339,7 @@ def _disturbances(sim, proposal, made):
     a key of a ``proposal``, else the key of an episode of the model, else a point.
     """
     if proposal is not None:
-        own, for_start, for_steps = component(made, proposal)
+        own, for_start, for_steps = choose_component(made, proposal)
         x0 = D.sample(own.start(), for_start)
         return x0, lambda s, t: D.sample(own.disturbance(s, t), jax.random.fold_in(for_steps, t))
     if jax.dtypes.issubdtype(made.dtype, jax.dtypes.prng_key):

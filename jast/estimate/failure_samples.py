@@ -15,10 +15,10 @@ from jast import results
 from jast._checks import check_random_key, whole_number
 from jast.checkpoints import answer_once, keep_answers, open_checkpoint
 from jast.episode import Episode
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.estimate import Estimate
-from jast.estimate.gaussians import effective
-from jast.estimate.importance_sampling import played
+from jast.estimate.gaussians import effective_sample_size
+from jast.estimate.importance_sampling import draw_episodes
 from jast.estimate.markov_tilts import Tilts, shape
 from jast.estimate.populations import equilibrate
 from jast.estimate.proposals import as_proposal
@@ -158,7 +158,7 @@ def _draw_failures(name, key, sim, q, samples, moves):
         failure = o.failure
     else:
         q, key_data = as_proposal(name, sim, q), jax.random.key_data(for_draws)
-        e, log_w = answer_once(lambda _: played(for_draws, sim, q, n), key_data)
+        e, log_w = answer_once(lambda _: draw_episodes(for_draws, sim, q, n), key_data)
         z, failure = latent.normal_of(sim, e), e.failure
     log_w = np.where(failure & np.isfinite(log_w), log_w, -np.inf).astype(np.float64)
     if not np.isfinite(log_w).any():
@@ -166,7 +166,7 @@ def _draw_failures(name, key, sim, q, samples, moves):
             f"{name}: source must be a proposal under which failures are frequent, received one"
             f" with no failure in {n} episodes"
         )
-    rows = resampled(log_w, samples, float(jax.random.uniform(for_rows)))
+    rows = resample(log_w, samples, float(jax.random.uniform(for_rows)))
     moved, sampler = equilibrate(key, sim, z[rows], moves)
     episodes = answer_once(partial(latent.episodes, sim), moved.z)
     # numbers that decided nothing are no part of an episode; and rounding differs between compiled
@@ -174,7 +174,7 @@ def _draw_failures(name, key, sim, q, samples, moves):
     episodes = jax.tree.map(lambda a: a[episodes.failure], episodes)
     return FailureSamples(
         failures=episodes,
-        ess=effective(log_w),
+        ess=effective_sample_size(log_w),
         distinct=len(np.unique(rows)),
         accepted=sampler.accepted,
         evaluations=n + sampler.evaluations,

@@ -8,33 +8,38 @@ sum is unbiased, however wrong the surrogate is.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from jast._jax import was_interrupted
 from jast.estimate import sums
-from jast.estimate.active_learning import CANDIDATES, Learner, learn
+from jast.estimate.active_learning import CANDIDATES, Learner, choose_calls
 from jast.estimate.design_points import distinct
 from jast.estimate.estimate import MAX_INVALID_SHARE, Estimate, estimate_from_counts
-from jast.estimate.gaussians import as_latent
 from jast.estimate.importance_sampling import Traces
 from jast.estimate.surrogate_failures import expected
 from jast.intervals import log_normal
+from jast.limit_state import Latent
+from jast.simulator import Simulator
 from jast.watch import Watch
 
 __all__ = ["LEAST", "few_calls"]
 
 NAME = "failure_probability"
-LEAST, ROUNDS = 50, 4
-POINTS = 400_000
-"""Coordinates of the points that the estimate is taken over."""
-PREFERENCES = (0.6, 0.25, 0.15)
-"""Of the last calls: where the surrogate doubts, where it expects failures, and anywhere."""
-ERROR, CHANGE, FEW = 0.25, 0.05, 10
-"""What an estimate is not believed above: relative standard error, share that one call changes; and
-below: failures."""
+LEAST = 50  # calls of a budget
+ROUNDS = 4  # of the last calls, at most; the surrogate learns between them
+POINTS = 400_000  # coordinates of the points that the estimate is taken over
+POOL = (4000, 40_000)  # the least and the greatest number of these points
+BY_DOUBT = 0.6  # of the last calls, by how much the surrogate doubts
+BY_FAILURES = 0.25  # by where it may expect failures
+BY_CHANCE = 0.15  # anywhere: so no weight is large
+TINY = 1e-300  # in place of a sum of 0
+ERROR = 0.25  # relative standard error above which an estimate is not believed
+CHANGE = 0.05  # share of an estimate, above which one call must not change it
+FEW_FAILURES = 10  # below which it is not believed
 
 
 class Round(NamedTuple):
@@ -55,107 +60,99 @@ class Round(NamedTuple):
 
 
 def few_calls(
-    key: Any,
-    sim: Any,
+    key: jax.Array,
+    sim: Simulator,
     budget: int,
     level: float,
-    known: np.ndarray | None = None,
+    failures: np.ndarray | None = None,
     progress: bool = False,
-    callback: Any = None,
+    callback: Callable | None = None,
 ) -> Estimate:
-    """`failure_probability` with ``budget`` calls, `LEAST` to 4999; ``known`` [m, D]: points of
-    failures.
+    """`failure_probability` with ``budget`` calls, `LEAST` to 4999; ``failures`` [m, D]: points of
+    failures that came with the call.
     """
     rounds: list[Round] = []
     with Watch(NAME, budget, "call", progress, callback) as watch:
-        s = Learner(key, sim, budget, watch)
-        if known is not None and len(known):
-            some = distinct(known.astype(np.float64), s.batch)
-            s.learn(some, np.zeros(len(some)), np.ones(len(some), bool), np.zeros(len(some), bool))
+        learner = Learner(key, sim, budget, watch)
+        if failures is not None and len(failures):
+            some = distinct(failures.astype(np.float64), learner.batch)
+            none = np.zeros(len(some))
+            learner.record(some, none, none == 0, none != 0)
         try:
-            learn(s)
-            if not s.failing.any():
-                return _counted(s, level)
-            s.look(CANDIDATES)
-            s.look(max(min(POINTS // s.dimension, 40_000), 4000))
-            _correct(s, rounds)
+            choose_calls(learner)
+            if not learner.failing.any():
+                return _plain(learner, level)
+            learner.draw_pool(CANDIDATES)
+            learner.draw_pool(int(np.clip(POINTS // learner.dimension, *POOL)))
+            _correct(learner, rounds)
         except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
             if not was_interrupted(error):
                 raise
             if not rounds:
                 raise KeyboardInterrupt from error
-    return _estimate(s, rounds, level)
+    return _estimate(learner, rounds, level)
 
 
-def _correct(s, rounds):
+def _correct(learner, rounds):
     """Spend the rest on points of the pool, and append a `Round` for each batch of them."""
-    left, n = s.budget - s.spent, len(s.pool.z)
-    size = max(left // ROUNDS // s.batch, 1) * s.batch
+    left, pool = learner.budget - learner.spent, learner.pool
+    size = max(left // ROUNDS // learner.batch, 1) * learner.batch
     while left:
-        # the last ones together, that no round is small
-        now = left if left < 2 * size else size
+        calls = left if left < 2 * size else size  # the last ones together: no round is small
         if rounds:
-            s.fit(len(rounds) == ROUNDS // 2)
-        w, (p, doubt) = s.pool.weights, expected(s.surrogate, s.pool.z)
-        variance = doubt * (1 - doubt)
-        shares = (w * np.sqrt(variance), w * doubt, np.ones(n))
-        r = sum(a * v / max(v.sum(), 1e-300) for a, v in zip(PREFERENCES, shares, strict=True))
-        rows = s.rng.choice(n, now, p=r / r.sum())
-        failing, invalid = s.call(s.pool.z[rows])
-        over = w / (n * r / r.sum())
-        rounds.append(
-            Round(
-                (w * p).mean(),
-                over[rows] * (failing - p[rows]),
-                over[rows],
-                failing,
-                invalid,
-                float((w * over * variance).mean()),
-                float((w * p).var() / n),
-            )
+            learner.fit(len(rounds) == ROUNDS // 2)
+        w, (p, doubt) = pool.weights, expected(learner.surrogate, pool.z)
+        n, variance = len(w), doubt * (1 - doubt)
+        preference = (
+            BY_DOUBT * _shares(w * np.sqrt(variance))
+            + BY_FAILURES * _shares(w * doubt)
+            + BY_CHANCE * _shares(np.ones(n))
         )
-        left -= now
-        s.history.append(
-            f"correcting: {now} calls, {int(failing.sum())} failures; the surrogate's"
-            f" {rounds[-1].expected:.4g} by {rounds[-1].corrections.mean():+.2g}"
+        preference /= preference.sum()
+        rows = learner.rng.choice(n, calls, p=preference)
+        failing, invalid = learner.call(pool.z[rows])
+        over = w / (n * preference)
+        new = Round(
+            expected=(w * p).mean(),
+            corrections=over[rows] * (failing - p[rows]),
+            weights=over[rows],
+            failing=failing,
+            invalid=invalid,
+            doubted=float((w * over * variance).mean()),
+            sampled=float((w * p).var() / n),
+        )
+        rounds.append(new)
+        left -= calls
+        learner.history.append(
+            f"correcting: {calls} calls, {int(failing.sum())} failures; the surrogate's"
+            f" {new.expected:.4g} by {new.corrections.mean():+.2g}"
         )
 
 
-def _estimate(s, rounds, level):
+def _shares(weights):
+    return weights / max(weights.sum(), TINY)
+
+
+def _estimate(learner, rounds, level):
     """The `Estimate` of the pool and its corrections."""
-    sizes = np.array([len(r.corrections) for r in rounds])
+    each = Round(*zip(*rounds, strict=True))
+    sizes = np.array([len(c) for c in each.corrections])
     n, share = sizes.sum(), sizes / sizes.sum()
-    c, w, failing, invalid = (np.concatenate([r[i] for r in rounds]) for i in (1, 2, 3, 4))
-    mean = float(share @ [r.expected for r in rounds] + c.mean())
+    c, w, failing, invalid = map(np.concatenate, each[1:5])
+    mean = float(share @ each.expected + c.mean())
     seen = float((c**2).sum() / n**2)
-    doubted = float((share**2 / sizes) @ [r.doubted for r in rounds])
-    sampled = float(share @ [r.sampled for r in rounds])
-    error = math.sqrt(max(seen, doubted) + sampled)
-    unseen = -math.log1p(-level) / s.plain[-1]
-    found = []
-    if s.spent < s.budget:
-        found.append(f"interrupted after {s.spent} of {s.budget} calls")
+    doubted = float((share**2 / sizes) @ each.doubted)
+    error = math.sqrt(max(seen, doubted) + float(share @ each.sampled))
     relative = error / mean if mean > 0 else math.inf
-    if not mean > 0:
-        found.append("the system contradicts the surrogate: the corrected estimate is not above 0")
-    elif relative > ERROR:
-        found.append(f"relative standard error {relative:.0%}")
-    if mean > 0 and np.abs(c).max() / n > CHANGE * mean:
-        found.append(f"one call changes the estimate by {np.abs(c).max() / n / mean:.0%}")
-    if w[invalid].sum() / n > MAX_INVALID_SHARE * max(mean, 0.0):
-        found.append(
-            f"{int(s.invalid.sum())} episodes are invalid (a number that is not finite): if they"
-            " failed, the estimate would change"
-        )
-    if s.failing.sum() < FEW:
-        found.append(f"{int(s.failing.sum())} failures are too few to trust the estimate")
+    reasons = _reasons(learner, mean, relative, np.abs(c).max() / n, w[invalid].sum() / n)
     v = w * failing
     ess = float(v.sum() ** 2 / (v**2).sum()) if v.any() else 0.0
     mean = min(mean, 1.0)  # by chance above it: the corrections know no bound
-    log_mean = math.log(mean) if mean > 0 else math.nan
+    unseen = -math.log1p(-level) / learner.plain[-1]
+    mixture = learner.pool.mixture
     return Estimate(
         method=NAME,
-        log_mean=log_mean,
+        log_mean=math.log(mean) if mean > 0 else math.nan,
         mean=mean if mean > 0 else math.nan,
         standard_error=error,
         relative_error=relative,
@@ -166,17 +163,43 @@ def _estimate(s, rounds, level):
         max_share=float(v.max() / v.sum()) if v.any() else math.nan,
         failing=int(failing.sum()),
         samples=int(n),
-        episodes=s.spent,
-        steps=s.steps,
-        invalid=int(s.invalid.sum()),
+        episodes=learner.spent,
+        steps=learner.steps,
+        invalid=int(learner.invalid.sum()),
         modes=None,
-        reliable=not found,
-        warnings=tuple(found),
+        reliable=not reasons,
+        warnings=tuple(reasons),
         unseen=unseen,
-        proposal=as_latent([(1.0, s.pool.mixture)], s.dtype),
-        history=tuple(s.history),
-        plain=s.plain,
+        proposal=Latent(*(np.asarray(a, learner.dtype) for a in mixture)),
+        history=tuple(learner.history),
+        plain=learner.plain,
     )
+
+
+def _reasons(learner, mean, relative, change, invalid):
+    """Why the estimate ``mean`` is not believed; ``change``: what one call adds to it at most,
+    ``invalid``: what the invalid episodes would add if they failed.
+    """
+    reasons = []
+    if learner.spent < learner.budget:
+        reasons.append(f"interrupted after {learner.spent} of {learner.budget} calls")
+    if not mean > 0:
+        reasons.append(
+            "the system contradicts the surrogate: the corrected estimate is not above 0"
+        )
+    elif relative > ERROR:
+        reasons.append(f"relative standard error {relative:.0%}")
+    if mean > 0 and change > CHANGE * mean:
+        reasons.append(f"one call changes the estimate by {change / mean:.0%}")
+    if invalid > MAX_INVALID_SHARE * max(mean, 0.0):
+        reasons.append(
+            f"{int(learner.invalid.sum())} episodes are invalid (a number that is not finite): if"
+            " they failed, the estimate would change"
+        )
+    failures = int(learner.failing.sum())
+    if failures < FEW_FAILURES:
+        reasons.append(f"{failures} failures are too few to trust the estimate")
+    return reasons
 
 
 def _interval(mean, error, level, unseen):
@@ -185,23 +208,29 @@ def _interval(mean, error, level, unseen):
     """
     if 0 < error < mean:
         return log_normal(math.log(mean), error / mean, level)
-    from statistics import NormalDist  # here: slow to import
+    from scipy.special import ndtri  # here: slow to import
 
-    above = max(mean, 0.0) + NormalDist().inv_cdf((1 + level) / 2) * error
+    above = max(mean, 0.0) + float(ndtri((1 + level) / 2)) * error
     return 0.0, min(max(above, unseen), 1.0)
 
 
-def _counted(s, level):
+def _plain(learner, level):
     """The `Estimate` of a system that has not failed: the rest are draws of the model."""
-    n = s.budget - s.spent
-    failing, invalid = s.call(s.rng.standard_normal((n, s.dimension)))
+    n = learner.budget - learner.spent
+    failing, invalid = learner.call(learner.rng.standard_normal((n, learner.dimension)))
     none = np.zeros(n)
-    seen = Traces(none, none[:, None], failing, invalid, none.astype(int))
-    s.history.append(f"plain draws: {n} calls, {int(failing.sum())} failures")
+    seen = Traces(
+        log_weight=none,
+        shares=none[:, None],
+        failure=failing,
+        invalid=invalid,
+        length=none.astype(int),
+    )
+    learner.history.append(f"plain draws: {n} calls, {int(failing.sum())} failures")
     return estimate_from_counts(
         NAME,
-        sums.add_traces(sums.empty_sums(n), seen)._replace(steps=s.steps),
+        sums.add_traces(sums.empty_sums(n), seen)._replace(steps=learner.steps),
         level=level,
-        evaluations=s.spent,
-        history=tuple(s.history),
+        evaluations=learner.spent,
+        history=tuple(learner.history),
     )

@@ -11,7 +11,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast.counter import numpy_generator
 from jast.estimate import batches, diagnostics, markov_tilts
-from jast.estimate.batches import of_chunk, picks
+from jast.estimate.batches import component_numbers, numbers_of_chunk
 from jast.estimate.draws import with_source
 from jast.estimate.estimate import Estimate, estimate_from_weights
 from jast.estimate.importance_sampling import Traces, chunks
@@ -20,13 +20,13 @@ from jast.simulator import Simulator
 from jast.units import Placement
 from jast.watch import Watch
 
-__all__ = ["estimated"]
+__all__ = ["draw_estimate"]
 
-APART = 0.6
-"""Cosine of the angle between two means below which they are two modes."""
+APART = 0.6  # cosine of the angle between two means below which they are two modes
+TILTS = 2  # address of the random numbers of tilts
 
 
-def estimated(
+def draw_estimate(
     key: jax.Array,
     sim: Simulator,
     q: latent.Latent | Tilts,
@@ -44,11 +44,15 @@ def estimated(
     ``spent`` evaluations. A ``share`` of them are the model's own, of which ``drawn`` stand beside
     them; ``about``: of `jast.estimate.estimate.estimate_from_weights`.
     """
-    modes, model = _modes(q), _model(q)
-    plain = lambda i: model[latent.component(q, picks(key, i, lanes, q.log_weights.dtype))]
+    modes, model, at_model = _modes(q)
+
+    def plain(i):
+        numbers = component_numbers(key, i, lanes, q.log_weights.dtype)
+        return model[latent.component(q, numbers)]
+
     shared = key, sim, q, _members(modes, len(model)), lanes, watch.total
     total, notes, lost = chunks(_traces, shared, lanes, watch, ways, plain)
-    central = [i for i, mode in enumerate(modes) if _central(q)[mode].all()]
+    central = [i for i, mode in enumerate(modes) if at_model[mode].all()]
     found = estimate_from_weights(
         watch.name,
         total,
@@ -63,23 +67,14 @@ def estimated(
     return found._replace(draws=with_source(found.draws, key, lanes, q))
 
 
-def _model(q):
-    """Which components [K] of ``q`` are the model itself."""
-    if isinstance(q, Tilts):
-        return np.arange(len(q.log_weights)) == 0
-    return latent.of_the_model(q)
-
-
-def _central(q):
-    """Which components [K] lie where the model does."""
-    return _model(q) if isinstance(q, Tilts) else ~np.asarray(q.means).any(axis=1)
-
-
 def _modes(q):
-    """Groups of the components that are used: lists of numbers."""
+    """Of the components [K] of ``q``: groups of those that are used, as lists of numbers; which are
+    the model itself; and which lie where it does.
+    """
     if isinstance(q, Tilts):
-        return [[0], list(range(1, int(np.isfinite(q.log_weights).sum())))]
-    return _by_direction(q)
+        model = np.arange(len(q.log_weights)) == 0
+        return [[0], list(range(1, int(np.isfinite(q.log_weights).sum())))], model, model
+    return _by_direction(q), latent.is_model(q), ~np.asarray(q.means).any(axis=1)
 
 
 def _members(modes, components):
@@ -95,9 +90,9 @@ def _groups(modes, central, total):
     carry, in which the model's own draws lie, is a mode of its own where it matters, and else
     counts with the greatest.
     """
-    share = lambda i: total.by_component[i] / total.first
-    plain = [i for i in central if share(i) < diagnostics.MIN_MODE_SHARE]
-    others = sorted((i for i in range(modes) if i not in plain), key=share)
+    share = total.by_component / total.first
+    plain = [i for i in central if share[i] < diagnostics.MIN_MODE_SHARE]
+    others = sorted((i for i in range(modes) if i not in plain), key=lambda i: share[i])
     groups = [[i] for i in others]
     return [*groups[:-1], [*groups[-1], *plain]] if groups else [[i] for i in range(modes)]
 
@@ -106,47 +101,47 @@ def _by_direction(q):
     """Groups of the components whose means point the same way: failure modes, as lists of
     numbers.
     """
-    means, left, out = (
-        np.asarray(q.means, np.float64),
-        list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))),
-        [],
-    )
-    ways = latent.unit(means)
+    ways = latent.unit(np.asarray(q.means, np.float64))
+    left, groups = list(np.flatnonzero(np.isfinite(np.asarray(q.log_weights)))), []
     while left:
         group, grown = {left[0]}, True
         while grown:
-            new = {
-                j
-                for j in left
-                if j not in group and max(float(ways[i] @ ways[j]) for i in group) > APART
-            }
-            group, grown = group | new, bool(new)
-        out.append(sorted(group))
+            near = {j for j in left if max(float(ways[i] @ ways[j]) for i in group) > APART}
+            grown, group = not near <= group, group | near
+        groups.append(sorted(group))
         left = [i for i in left if i not in group]
-    return out
+    return groups
 
 
 def _traces(shared, i, post):
     """`Traces` of chunk ``i`` of ``q``; ``members`` [K, K]: of which modes the shares are."""
     key, sim, q, members, lanes, samples = shared
     n = min(lanes, samples - i * lanes)
-    drawn = _of_tilts if isinstance(q, Tilts) else _of_gaussians
-    o, log_w, shares = drawn(key, sim, q, i, n, lanes)
+    draw = _draw_tilts if isinstance(q, Tilts) else _draw_gaussians
+    o, log_w, shares = draw(key, sim, q, i, n, lanes)
     with np.errstate(divide="ignore"):
         shares = np.log(np.exp(shares) @ members)
-    return Traces(log_w, shares, o.failure, o.invalid, o.length, o.distance)
+    return Traces(
+        log_weight=log_w,
+        shares=shares,
+        failure=o.failure,
+        invalid=o.invalid,
+        length=o.length,
+        distance=o.distance,
+    )
 
 
-def _of_gaussians(key, sim, q, i, n, lanes):
+def _draw_gaussians(key, sim, q, i, n, lanes):
     """(`Outcomes`, log p - log q, log shares [n, K]) of the first ``n`` draws of chunk ``i``."""
-    return batches.drawn(sim, q, *of_chunk(key, i, n, q))[1:]
+    return batches.draw_mixture(sim, q, *numbers_of_chunk(key, i, n, q))[1:]
 
 
-def _of_tilts(key, sim, q, i, n, lanes):
+def _draw_tilts(key, sim, q, i, n, lanes):
     """The same of tilts."""
     about, dtype = markov_tilts.shape(sim), latent.normal_numbers(sim)
-    drawn = markov_tilts.numbers(numpy_generator(key, 2, i), lanes, about, sim.horizon, dtype)
-    u, first, noise = drawn
+    u, first, noise = markov_tilts.random_numbers(
+        numpy_generator(key, TILTS, i), lanes, about, sim.horizon, dtype
+    )
     some = u[:n], tuple(a[:n] for a in first), tuple(a[:, :n] for a in noise)
-    o, ratio, _ = markov_tilts.played(sim, q, *some)
+    o, ratio, _ = markov_tilts.simulate_tilts(sim, q, *some)
     return o, *markov_tilts.log_weight(q, ratio)

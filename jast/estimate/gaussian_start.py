@@ -7,148 +7,163 @@ import math
 
 import numpy as np
 
-from jast.estimate.design_points import descended, distinct, explained, likely
-from jast.estimate.gaussian_family import GaussianFamily, Points, rare
-from jast.estimate.gaussians import nearest, unit
+from jast.estimate.design_points import descend, distinct, explained, may_matter
+from jast.estimate.gaussian_family import GaussianFamily, Points
+from jast.estimate.gaussians import nearest_centre, unit_gaussians
 from jast.estimate.populations import bracket_boundary, cool, explore
-from jast.estimate.search_state import State, taken
+from jast.estimate.search_state import SearchState, add_batch
 from jast.judge import judged
 
-__all__ = ["explored", "looked"]
+__all__ = ["draw_model", "explore_failures"]
 
-LIFTS = 1.0, 1.05, 1.1, 1.2
-"""How much farther out than a failure its mirror image is looked for."""
+LIFTS = 1.0, 1.05, 1.1, 1.2  # times as far out as a failure, where its mirror image is tried
+FAR_POINTS = 16  # above which the least weights of design points far out fall with their number
+POPULATION_PART = 100  # of a budget, of which a population's points are one part, but
+POPULATION_LEAST = 100  # no fewer
+POPULATION_SHARE = 0.4  # of what is left, that a population may cost
 
 
-def looked(f: GaussianFamily, state: State) -> State:
+def draw_model(f: GaussianFamily, state: SearchState) -> SearchState:
     """The state after a batch of the model itself."""
     batch = f.draw(f.model())
     failing = len(batch.log_weight)
-    state = taken(f, state, batch)._replace(q=None, plain=(failing, batch.invalid, batch.size))
-    state = state.noted(f"draws of the model: {failing} fail", batch.size)
-    f.chance.latest[:] = [(f, state)]
+    state = add_batch(f, state, batch)._replace(q=None, plain=(failing, batch.invalid, batch.size))
+    state = state.note(f"draws of the model: {failing} fail", batch.size)
+    f.context.latest[:] = [(f, state)]
     return state
 
 
-def explored(f: GaussianFamily, state: State, known: np.ndarray | None, gradients: bool) -> State:
+def explore_failures(
+    f: GaussianFamily, state: SearchState, given: np.ndarray | None, gradients: bool
+) -> SearchState:
     """The state with a first proposal, of Gaussians at what each explorer found; with none where
-    they all found no failure. ``known`` [m, D]: failures that came with the call.
+    they all found no failure. ``given`` [m, D]: failures that came with the call.
     """
-    parts, anchors = [], np.zeros((0, f.dimension))
-    least, room = f.settings.anchor_least, f.settings.cooled_share * (f.budget - state.spent)
+    room = f.settings.exploration_end * (f.budget - state.spent)
+    found = []  # of each explorer that found failures, the nearest first
 
-    def around(state, name, points, evaluations):
-        nonlocal anchors
+    def note(state, name, points, evaluations=0):
         norms = np.linalg.norm(points, axis=1)
-        ends = f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""
         if len(points):
-            anchors = np.concatenate([anchors, points])
-            # those farther out may be what leads to more, but many of them are no more than a few
-            weights = np.exp(-0.5 * (norms**2 - norms[0] ** 2)) + least * min(1, 16 / len(points))
-            parts.append(unit(points)._replace(weights=weights / weights.sum()))
-        return state.noted(f"{name}: {len(points)} points{ends}", evaluations)
+            found.append(points)
+        ends = f" at distances {norms[0]:.3f} to {norms[-1]:.3f}" if len(points) else ""
+        return state.note(f"{name}: {len(points)} points{ends}", evaluations)
 
-    if known is not None and len(known):
-        state = around(state, "failures given", distinct(known.astype(float), f.directions), 0)
-    if len(state.log_weight):  # what no distance and no gradient need lead to
-        own = f.filled(state.batches[0].points)
-        state = around(state, "draws of the model", distinct(own, f.directions), 0)
+    def anchors():
+        return np.concatenate([np.zeros((0, f.dimension)), *found])
+
+    if given is not None and len(given):
+        state = note(state, "failures given", distinct(given.astype(float), f.directions))
+    if len(state.log_weight):  # what neither distances nor gradients may lead to
+        own = f.impute_unused(state.batches[0].points)
+        state = note(state, "draws of the model", distinct(own, f.directions))
     if gradients:
-        state = around(state, "design points by gradients", *_descended(f, room))
-    points, evaluations = _cooled(f, anchors, state.spent, room)
-    near = distinct(points, f.directions)
-    state = around(state, "design points by cooling", near, evaluations)
-    if len(anchors):
-        state = around(state, "their mirror images", *_mirrored(f, anchors))
-    state = state._replace(anchors=anchors, cooled=f.chance.rng.permutation(points))
-    if not len(anchors):
-        state, parts = _population(f, state)
-    for i, g in enumerate(parts, 1):
-        state = f.added(state, g, None if i == 1 else 1 / i, rare(f, state))
+        state = note(state, "design points by gradients", *_descend(f, room))
+    cooled, evaluations = _cool(f, anchors(), state.spent, room)
+    near = distinct(cooled, f.directions)
+    state = note(state, "design points by cooling", near, evaluations)
+    if found:
+        state = note(state, "their mirror images", *_mirror(f, anchors()))
+    state = state._replace(anchors=anchors(), cooled=f.context.rng.permutation(cooled))
+    if not found:
+        return _explore_by_population(f, state)
+    for i, points in enumerate(found, 1):
+        state = f.add(state, _gaussians_at(f, points), None if i == 1 else 1 / i)
     return state
 
 
-def _population(f, state):
-    """The state with a population that goes down the levels of the miss distance, and a list of the
-    `Gaussians` that are fitted to it.
+def _gaussians_at(f, points):
+    """Unit `Gaussians` at ``points`` [m, D], the nearest first, weighted by their densities. Those
+    farther out may be what leads to more, but many of them are no more than a few.
     """
-    size, most = max(f.budget // 100, 100), int(0.4 * (f.budget - state.spent))
-    p = explore(f.chance.next_key(), f.sim, size, max_evaluations=most)
-    state = state.noted(
+    square = np.linalg.norm(points, axis=1) ** 2
+    least = f.settings.anchor_weight_least * min(1, FAR_POINTS / len(points))
+    weights = np.exp(-0.5 * (square - square[0])) + least
+    return unit_gaussians(points)._replace(weights=weights / weights.sum())
+
+
+def _explore_by_population(f, state):
+    """The state with a population that goes down the levels of the miss distance, and a proposal
+    that is fitted to it.
+    """
+    size = max(f.budget // POPULATION_PART, POPULATION_LEAST)
+    most = int(POPULATION_SHARE * (f.budget - state.spent))
+    p = explore(f.context.next_key(), f.sim, size, max_evaluations=most)
+    state = state.note(
         f"subset simulation: {len(p.levels)} levels, log p {p.log_mean:.2f}", p.evaluations
     )
     if not p.reached:
-        return state, []
+        return state
     state = state._replace(populations=(p,))
-    return state, [f.of_population(Points(p.points, p.used))]
+    return f.add(state, f.of_population(Points(p.points, p.used)), None)
 
 
-def _descended(f, room):
+def _descend(f, room):
     """Distinct design points [m, D] by gradients, and evaluations: from draws of the model, then
     from the edges of failures under wider noise that those found do not explain, for as long as
     these lead to others and fewer and fewer are left.
     """
-    s = f.settings
-    n = int(np.clip(f.budget // s.descent_of, s.descents_least, s.descents))
-    first, left = True, math.inf
+    s, rng = f.settings, f.context.rng
+    n = int(np.clip(f.budget // s.evaluations_per_descent, s.descents_least, s.descents_most))
     points, evaluations = np.zeros((0, f.dimension)), 0
 
-    def go(starts):
+    def descend_from(starts):
+        """How many more points may matter."""
         nonlocal points, evaluations
-        before, found = likely(points).sum(), descended(f.sim, starts)
+        before, found = may_matter(points).sum(), descend(f.sim, starts)
         points = distinct(np.concatenate([points, found.points]), f.directions)
         evaluations += found.evaluations
-        return likely(points).sum() - before
+        return may_matter(points).sum() - before
 
-    if (
-        go(f.chance.rng.standard_normal((min(n, s.descents_tried), f.dimension)))
-        and n > s.descents_tried
-    ):
-        go(f.chance.rng.standard_normal((n - s.descents_tried, f.dimension)))
+    first = min(n, s.descents_first)
+    if descend_from(rng.standard_normal((first, f.dimension))) and n > first:
+        descend_from(rng.standard_normal((n - first, f.dimension)))
+    unexplained, first_round = math.inf, True
     while len(points) and evaluations < room:
-        safe, fails, paid = bracket_boundary(
-            f.chance.next_key(), f.sim, (s.wide_first if first else s.wide) * n
-        )
+        draws = s.wide_draws_first if first_round else s.wide_draws
+        safe, fails, paid = bracket_boundary(f.context.next_key(), f.sim, draws * n)
         evaluations += paid
         rest = ~explained(fails, points)
-        if not len(rest) or not s.alone < rest.mean() < s.slow * left:
+        if not len(rest):
             break
-        left, first = math.inf if first else rest.mean(), False
-        if go(safe[rest][:n]) < s.new * min(rest.sum(), n):
+        if not s.singleton_share < rest.mean() < s.unexplained_ratio * unexplained:
+            break
+        unexplained = math.inf if first_round else rest.mean()  # later rounds alone compare
+        first_round = False
+        if descend_from(safe[rest][:n]) < s.new_point_share * min(rest.sum(), n):
             break
     return points, evaluations
 
 
-def _cooled(f, anchors, spent, room):
+def _cool(f, anchors, spent, room):
     """Failures [n, D] by noise that is wide first and then cooled, and evaluations. Chains are
-    started again, first from failures that those found do not explain, where more than `alone` of
-    them end in a direction that no other one has: so much of what they may lead to is still to be
-    met (Good 1953).
+    started again, first from failures that those found do not explain, where more than
+    `singleton_share` of them are the only one of their direction.
     """
     s = f.settings
-    known, evaluations, given = anchors, 0, len(anchors)
+    points, evaluations, given = anchors, 0, len(anchors)
     while evaluations < room:
-        cold = cool(
-            f.chance.next_key(), f.sim, f.chains, design_points=known, zeroing_rounds=s.rests
-        )
+        key = f.context.next_key()
+        cold = cool(key, f.sim, f.chains, design_points=points, zeroing_rounds=s.reduction_tries)
         used = np.arange(f.dimension)[None] < cold.used[:, None]
-        known = np.concatenate([known, np.where(used, cold.points, 0.0)])
+        points = np.concatenate([points, np.where(used, cold.points, 0.0)])
         evaluations += cold.evaluations
-        found = len(known) - given
+        found = len(points) - given
         if not found:
             break
-        owner = nearest(known, distinct(known, len(known)))
-        count = likely(known)[given:] | (found < s.cooled_least)
-        alone = (np.bincount(owner) == 1)[owner[given:]][count].sum() / max(count.sum(), 1)
-        late = found >= s.cooled_least and (
-            alone > s.endless or spent + evaluations > s.cooled_late * f.budget
-        )
-        if late or alone <= max(s.alone, s.alone_met / found):
+        owner = nearest_centre(points, distinct(points, len(points)))
+        counted = may_matter(points)[given:] | (found < s.cooled_least)
+        single = (np.bincount(owner) == 1)[owner[given:]]
+        share = single[counted].sum() / max(counted.sum(), 1)
+        if share <= max(s.singleton_share, s.singleton_count / found):
             break
-    return known[given:], evaluations
+        late = spent + evaluations > s.cooling_end * f.budget
+        if found >= s.cooled_least and (share > s.singleton_share_most or late):
+            break
+    return points[given:], evaluations
 
 
-def _mirrored(f, anchors):
+def _mirror(f, anchors):
     """Failures opposite to those known: what fails to the left often fails to the right. Points,
     the nearest first, and evaluations.
     """

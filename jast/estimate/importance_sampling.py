@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,10 +48,19 @@ if TYPE_CHECKING:
     from jast.simulator import Simulator
     from jast.typing import Callback, Executor, PathLike
 
-__all__ = ["Traces", "chunks", "even", "importance", "log_weights", "played"]
+__all__ = [
+    "Traces",
+    "choose_component",
+    "chunk_size",
+    "chunks",
+    "draw_episodes",
+    "importance",
+    "log_weights",
+    "one_trace",
+]
 
-LANES = 16384
-PROBES = 256
+LANES = 16384  # episodes of a chunk, at most
+PROBES = 256  # of the model's own episodes, which a proposal that may not cover it is tried on
 
 
 @results.printable()
@@ -67,17 +76,17 @@ class Traces(NamedTuple):
         ((100,), True)
     """
 
-    log_weight: Any
+    log_weight: chex.Array
     """log p - log q to the end of the episode, also of those that do not fail"""
-    shares: Any
+    shares: chex.Array
     """[n, K] log of the probability that component k made the trace"""
-    failure: Any
+    failure: chex.Array
     """bool"""
-    invalid: Any
+    invalid: chex.Array
     """bool: the simulator or a density returned NaN; no failure then"""
-    length: Any
+    length: chex.Array
     """int32: steps taken"""
-    distance: Any = None
+    distance: chex.Array | None = None
     """Miss distance; inf where invalid"""
 
 
@@ -117,12 +126,17 @@ def log_weights(
         True
     """
     check_random_key("log_weights", key)
-    if mode not in ("default", "paper"):
-        raise ValueError(f'log_weights: mode must be "default" or "paper", received {mode!r}')
+    to_horizon = _goes_to_horizon("log_weights", mode)
     q = as_proposal("log_weights", sim, proposal)
     samples = whole_number("log_weights", "samples", samples)
     require_episodes("log_weights", sim, samples)
-    return traces(key, sim, q, samples, mode == "paper")
+    return traces(key, sim, q, samples, to_horizon)
+
+
+def _goes_to_horizon(function, mode):
+    if mode not in ("default", "paper"):
+        raise ValueError(f'{function}: mode must be "default" or "paper", received {mode!r}')
+    return mode == "paper"
 
 
 def importance(
@@ -179,8 +193,7 @@ def importance(
     """
     check_random_key("importance", key)
     samples = whole_number("importance", "samples", samples, 2)
-    if mode not in ("default", "paper"):
-        raise ValueError(f'importance: mode must be "default" or "paper", received {mode!r}')
+    to_horizon = _goes_to_horizon("importance", mode)
     level = checked_level("importance", level)
     contract("importance", sim)
     proposal = as_proposal("importance", sim, proposal)
@@ -190,9 +203,9 @@ def importance(
     ways = units.placement("importance", executor, devices)
     about = dict(sim=sim, proposal=proposal, samples=samples, mode=mode)
     reasons = [] if proposal.covers else _uncovered(for_probes, sim, proposal)
-    lanes = even(samples)
+    lanes = chunk_size(samples)
     with open_checkpoint("importance", checkpoint, whole_key, **about) as store:
-        shared = key, sim, proposal, lanes, mode == "paper"
+        shared = key, sim, proposal, lanes, to_horizon
         watch = Watch("importance", samples, "episode", progress, callback)
         total, notes, lost = chunks(of_policies, shared, lanes, watch, ways._replace(store=store))
     found = estimate_from_weights(
@@ -202,7 +215,7 @@ def importance(
     return found._replace(settings=settings, draws=draws)
 
 
-def even(samples):
+def chunk_size(samples: int) -> int:
     """Episodes of a chunk, at most ``LANES``, such that the last one is as full as the others."""
     return -(-samples // -(-samples // LANES))
 
@@ -223,7 +236,10 @@ def chunks(simulate, shared, lanes, watch, ways=units.HERE, plain=None):
         return sums.add_traces(total, rows, own), done + len(rows.failure)
 
     task = Task(simulate, shared, lambda: Traces(*Traces._fields))
-    size = lambda done: min(done * lanes, samples)
+
+    def size(done):
+        return min(done * lanes, samples)
+
     start = sums.empty_sums(samples), 0
     with watch:
         ran = units.run(task, -(-samples // lanes), fold, start, watch, ways, size=size)
@@ -248,22 +264,18 @@ def traces(key, sim, proposal, n, to_horizon=False):
 
 def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
     """One `Traces` row; ``drawn``: another policy that draws it; ``start_key``: of its x0."""
-    own, for_start, for_steps = component(key, proposal)
+    own, for_start, for_steps = choose_component(key, proposal)
     for_start = for_start if start_key is None else start_key
     own = own if drawn is None else drawn
     dtype, (components,) = outline(sim).dtype, proposal.log_weights.shape
 
-    def weigh(ratio, p, make, x):  # of log q_k - log p [K], and whether p is 0
+    def weigh(ratio, p, distribution_of, x):
+        """The log q_k - log p [K] so far, and whether p is 0."""
         ratios, impossible = ratio
-        log_q, log_p = (
-            jax.vmap(lambda policy: make(policy).log_prob(x), axis_size=components)(
-                proposal.policies
-            ),
-            p.log_prob(x),
-        )
-        return ratios + (log_q.astype(dtype) - log_p.astype(dtype)), impossible | (
-            log_p == -jnp.inf
-        )
+        log_of = jax.vmap(lambda policy: distribution_of(policy).log_prob(x), axis_size=components)
+        log_q, log_p = log_of(proposal.policies), p.log_prob(x)
+        ratios = ratios + (log_q.astype(dtype) - log_p.astype(dtype))
+        return ratios, impossible | (log_p == -jnp.inf)
 
     x0 = D.sample(own.start(), for_start)
     first = begin(sim, log_likelihood, x0)
@@ -272,13 +284,10 @@ def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
 
     def body(carry):
         progress, ratio, t, length = carry
-        x = D.sample(own.disturbance(progress.state, t), jax.random.fold_in(for_steps, t))
-        ratio = weigh(
-            ratio,
-            sim.disturbance(progress.state),
-            lambda policy: policy.disturbance(progress.state, t),
-            x,
-        )
+        state = progress.state
+        x = D.sample(own.disturbance(state, t), jax.random.fold_in(for_steps, t))
+        p = sim.disturbance(state)
+        ratio = weigh(ratio, p, lambda policy: policy.disturbance(state, t), x)
         after = advance(sim, log_likelihood, progress, x, t + 1 >= sim.horizon)
         if to_horizon:  # the state of an ended episode stays, while drawing and weighing go on
             after = jax.tree.map(lambda a, b: jnp.where(progress.done, a, b), progress, after)
@@ -292,28 +301,25 @@ def one_trace(key, sim, proposal, to_horizon=False, drawn=None, start_key=None):
     last, prior = conclude(sim, log_likelihood, last), proposal.log_weights.astype(dtype)
     log_q = logsumexp(prior + ratios)
     return Traces(
-        jnp.where(impossible, -jnp.inf, -log_q),
-        jnp.where(impossible, prior, prior + ratios - log_q),
-        last.failure,
-        last.invalid,
-        length,
-        last.distance,
+        log_weight=jnp.where(impossible, -jnp.inf, -log_q),
+        shares=jnp.where(impossible, prior, prior + ratios - log_q),
+        failure=last.failure,
+        invalid=last.invalid,
+        length=length,
+        distance=last.distance,
     )
 
 
-def component(key, proposal):
+def choose_component(key, proposal):
     """The policy that draws the trace of ``key``, and the keys of its start and of its steps."""
     for_component, for_start, for_steps = jax.random.split(key, 3)
-    k = (
-        jax.random.categorical(for_component, proposal.log_weights)
-        if len(proposal.log_weights) > 1
-        else 0
-    )
+    one = len(proposal.log_weights) == 1
+    k = 0 if one else jax.random.categorical(for_component, proposal.log_weights)
     return jax.tree.map(lambda a: a[k], proposal.policies), for_start, for_steps
 
 
 @partial(jit, static_argnames="n")
-def played(key, sim, proposal, n):
+def draw_episodes(key, sim, proposal, n):
     """``n`` episodes drawn from ``proposal``, with their disturbances but without states, and their
     log weights to the end of each.
     """
@@ -321,24 +327,19 @@ def played(key, sim, proposal, n):
     def one(key):
         for_component, for_episode = jax.random.split(key)
         k = jax.random.categorical(for_component, proposal.log_weights)
-        e = rollout(
-            for_episode, sim, jax.tree.map(lambda a: a[k], proposal.policies), log_likelihood
-        )
-        t, states = (
-            jnp.arange(sim.horizon, dtype=jnp.int32),
-            jax.tree.map(lambda a: a[:-1], e.states),
-        )
+        own = jax.tree.map(lambda a: a[k], proposal.policies)
+        e = rollout(for_episode, sim, own, log_likelihood)
+        states = jax.tree.map(lambda a: a[:-1], e.states)
+        t = jnp.arange(sim.horizon, dtype=jnp.int32)
 
         def log_q(policy):
-            steps = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))(
-                states, t, e.disturbances
-            )
-            return jnp.sum(jnp.where(t < e.length, steps, 0)) + policy.start().log_prob(e.x0)
+            log_of = jax.vmap(lambda s, t, x: policy.disturbance(s, t).log_prob(x))
+            steps = jnp.where(t < e.length, log_of(states, t, e.disturbances), 0)
+            return jnp.sum(steps) + policy.start().log_prob(e.x0)
 
         logs = jax.vmap(log_q, axis_size=len(proposal.log_weights))(proposal.policies)
-        return e._replace(states=None), e.log_prob - logsumexp(
-            proposal.log_weights.astype(logs.dtype) + logs
-        ).astype(e.log_prob.dtype)
+        total = logsumexp(proposal.log_weights.astype(logs.dtype) + logs)
+        return e._replace(states=None), e.log_prob - total.astype(e.log_prob.dtype)
 
     return jax.vmap(one)(jax.random.split(key, n))
 
@@ -353,11 +354,8 @@ def _uncovered(key, sim, proposal):
     """Why the proposal cannot be right, tried on episodes of the model."""
     seen = jax.device_get(_probe(key, sim, proposal, PROBES))
     missing = int((~seen.invalid & ~(seen.log_weight < np.inf)).sum())
-    return (
-        [
-            f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes:"
-            " failures that it cannot draw are missing from the estimate"
-        ]
-        if missing
-        else []
+    said = (
+        f"the proposal has density 0 on {missing} of {PROBES} of the model's own episodes: failures"
+        " that it cannot draw are missing from the estimate"
     )
+    return [said] if missing else []

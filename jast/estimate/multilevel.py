@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 __all__ = ["FailureProposal", "failure_proposal"]
 
 
+LEAST_ESS = 2  # of the last elites, for a proposal that reached failures
+
+
 @results.result_class("episodes", batches=True)
 class FailureProposal(NamedTuple):
     """A proposal and how it was found. K iterations; with a leading axis everywhere after
@@ -49,25 +52,25 @@ class FailureProposal(NamedTuple):
         (10,)
     """
 
-    policy: Any
+    policy: Policy
     """`Policy`: the simulator's disturbances, tilted step by step"""
-    start: Any
+    start: sequences.Steps | tuple[()]
     """`Steps` [1, ...] of the latent of x0, ``()`` where x0 is not tilted"""
-    steps: Any
+    steps: sequences.Steps
     """`Steps` [horizon, ...] of the latents of x_1 .. x_T"""
-    levels: Any
+    levels: chex.Array
     """[K]: the miss distance gamma_k that the elites of an iteration reached, 0 where they failed;
     inf where no episode counted
     """
-    failing: Any
+    failing: chex.Array
     """[K] int32: failing episodes of an iteration"""
-    ess: Any
+    ess: chex.Array
     """[K]: effective number of the elites, (sum w)^2 / sum w^2"""
-    episodes: Any
+    episodes: chex.Array
     """int: episodes simulated in all; ``evaluations`` is another name"""
-    invalid: Any
+    invalid: chex.Array
     """int: those in which the simulator returned a number that is not finite"""
-    reached: Any
+    reached: chex.Array
     """bool: whether all of the last elites fail, and are worth two effective episodes or more;
     otherwise the proposal is fitted to near misses too
     """
@@ -100,9 +103,9 @@ class FailureProposal(NamedTuple):
 class Settings(NamedTuple):
     """The traced part."""
 
-    quantile: Any
-    smoothing: Any
-    floor: Any
+    quantile: chex.Array
+    smoothing: chex.Array
+    floor: chex.Array
 
 
 def failure_proposal(
@@ -156,10 +159,8 @@ def failure_proposal(
         True
     """
     check_random_key("failure_proposal", key)
-    samples, iterations = (
-        whole_number("failure_proposal", "samples", samples, 2),
-        whole_number("failure_proposal", "iterations", iterations),
-    )
+    samples = whole_number("failure_proposal", "samples", samples, 2)
+    iterations = whole_number("failure_proposal", "iterations", iterations)
     settings = Settings(
         real_number(
             "failure_proposal", "quantile", quantile, lambda v: 0 < v < 1, "above 0 and below 1"
@@ -183,49 +184,34 @@ def _search(key, sim, settings, tilt_start, samples, iterations):
     )
 
     def iterate(proposal, key):
-        z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(
-            jax.random.split(key, samples)
-        )
+        start, steps = proposal
+        keys = jax.random.split(key, samples)
+        z0, z, e, log_w = jax.vmap(lambda k: _play(k, sim, proposal))(keys)
         valid = jnp.isfinite(e.distance)
         level, fails, counts = _elites(e, jnp.where(valid, log_w, -jnp.inf), settings.quantile)
         ess = jnp.sum(counts)
         reached = jnp.arange(sim.horizon, dtype=jnp.int32)[None, :] < e.length[:, None]
-        fitted = (
-            (
-                sequences.fit(proposal[0], z0, counts[:, None], settings.smoothing, settings.floor)
-                if tilt_start
-                else ()
-            ),
-            sequences.fit(
-                proposal[1],
-                z,
-                jnp.where(reached, counts[:, None], 0),
-                settings.smoothing,
-                settings.floor,
-            ),
-        )
-        return fitted, (
-            level,
-            jnp.sum(e.failure, dtype=jnp.int32),
-            ess,
-            jnp.sum(~valid, dtype=jnp.int32),
-            fails,
-        )
+        kept = settings.smoothing, settings.floor
+        if tilt_start:
+            start = sequences.fit(start, z0, counts[:, None], *kept)
+        steps = sequences.fit(steps, z, jnp.where(reached, counts[:, None], 0), *kept)
+        failing, invalid = (jnp.sum(a, dtype=jnp.int32) for a in (e.failure, ~valid))
+        return (start, steps), (level, failing, ess, invalid, fails)
 
-    last, (levels, failures, ess, invalid, fails) = lax.scan(
+    last, (levels, failing, ess, invalid, fails) = lax.scan(
         iterate, first, jax.random.split(key, iterations)
     )
-    policy = proposing(sim, *last)
-    evaluations = jnp.asarray(samples * iterations, jnp.int32)
+    start, steps = last
     return FailureProposal(
-        policy,
-        *last,
-        levels,
-        failures,
-        ess,
-        evaluations,
-        jnp.sum(invalid, dtype=jnp.int32),
-        fails[-1] & (ess[-1] >= 2),
+        policy=proposing(sim, start, steps),
+        start=start,
+        steps=steps,
+        levels=levels,
+        failing=failing,
+        ess=ess,
+        episodes=jnp.asarray(samples * iterations, jnp.int32),
+        invalid=jnp.sum(invalid, dtype=jnp.int32),
+        reached=fails[-1] & (ess[-1] >= LEAST_ESS),
     )
 
 
@@ -259,17 +245,15 @@ def _play(key, sim, proposal):
 
 
 def _elites(e, log_w, quantile):
-    """(gamma_k, whether it is that of failures, for how many effective episodes each one counts
-    [n]); -inf in ``log_w``: does not count.
+    """(gamma_k, whether the elites fail, weights [n] of the elites that sum to their effective
+    number); -inf in ``log_w``: does not count.
     """
     usable = jnp.isfinite(log_w)
     score = jnp.where(usable, jnp.where(e.failure, -jnp.inf, e.distance), jnp.inf)
     n = jnp.sum(usable, dtype=score.dtype)
     # gamma_k: the sample quantile of the performances, and 0 once it fails
-    place = jnp.clip(
-        jnp.ceil(quantile.astype(score.dtype) * n) - 1, 0, max(len(score) - 1, 0)
-    ).astype(jnp.int32)
-    level = jnp.sort(score)[place]
+    place = jnp.clip(jnp.ceil(quantile.astype(score.dtype) * n) - 1, 0, len(score) - 1)
+    level = jnp.sort(score)[place.astype(jnp.int32)]
     elite = usable & (score <= level)
     # I{S(X) <= gamma} W(X), whose sums are those of the weighted likelihood equations; over its
     # greatest, so that none overflows
@@ -277,7 +261,6 @@ def _elites(e, log_w, quantile):
     top = jnp.max(log_w)
     w = jnp.where(elite, jnp.exp(log_w - jnp.where(jnp.isfinite(top), top, 0)), 0)
     total, squares = jnp.sum(w), jnp.sum(w**2)
-    # they sum to the effective number
     counts = w * jnp.where(squares > 0, total / jnp.where(squares > 0, squares, 1), 0)
     return jnp.maximum(level, 0), jnp.isneginf(level), counts
 

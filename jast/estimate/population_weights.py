@@ -18,10 +18,10 @@ from jast.counter import numpy_generator
 from jast.estimate.batches import log_ratio
 from jast.estimate.diagnostics import tail_size
 from jast.estimate.estimate import Estimate
-from jast.estimate.final_draws import estimated
-from jast.estimate.gaussian_family import defended
-from jast.estimate.gaussians import as_latent, fit
-from jast.estimate.importance_sampling import even
+from jast.estimate.final_draws import draw_estimate
+from jast.estimate.gaussian_family import defensive_parts
+from jast.estimate.gaussians import as_latent, fit_mixture
+from jast.estimate.importance_sampling import chunk_size
 from jast.estimate.particles import LANES
 from jast.estimate.population_search import Answer, Kind, PopulationSearch, pool_answers
 from jast.estimate.sample import sample_from
@@ -101,8 +101,8 @@ def _fit_proposal(search, samples, log_mean, left, components):
     """
     points, log_w = samples[0].points.astype(np.float64), samples[0].log_weight
     weights = np.exp(log_w - np.logaddexp.reduce(log_w))
-    g = fit(numpy_generator(search.key, 7), points, weights, len(points), limit=components)
-    q = as_latent(defended(g, 0.0, True), normal_numbers(search.sim))
+    g = fit_mixture(numpy_generator(search.key, 7), points, weights, len(points), limit=components)
+    q = as_latent(defensive_parts(g, 0.0, True), normal_numbers(search.sim))
     log_moment = max(
         np.logaddexp.reduce(a.log_weight - log_ratio(q, a.points, a.used))
         - np.logaddexp.reduce(a.log_weight)
@@ -122,11 +122,11 @@ def _draw_estimate(search, name, said, key, proposal, level):
     watch = Watch(name, proposal.draws, "episode", False, None)
     ways = search.ways._replace(name=said.replace(" ", "-"))  # each has a checkpoint of its own
     try:
-        found = estimated(
+        found = draw_estimate(
             key,
             search.sim,
             proposal.q,
-            even(proposal.draws),
+            chunk_size(proposal.draws),
             watch,
             ways,
             spent=search.spent,

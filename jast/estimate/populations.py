@@ -16,7 +16,7 @@ from jast.counter import numpy_generator
 from jast.estimate import markov_tilts
 from jast.estimate.batches import log_ratio
 from jast.estimate.design_points import explained
-from jast.estimate.markov_tilts import Tilts, of_the_model, shape
+from jast.estimate.markov_tilts import Tilts, shape, simulate_points
 from jast.judge import judged
 from jast.limit_state import dimension, normal_numbers
 from jast.markov import WIDTHS, proposed
@@ -133,7 +133,7 @@ class PopulationSampler:
         else:
             q, threshold = self.covered
             if isinstance(q, Tilts):
-                o, log_q, _ = of_the_model(self.sim, q, z)
+                o, log_q, _ = simulate_points(self.sim, q, z)
             else:
                 o = judged(self.sim, z)
                 log_q = log_ratio(q, z, o.used)

@@ -29,9 +29,11 @@ from jast.policy import Policy
 from jast.pytrees import conform
 
 if TYPE_CHECKING:
+    import chex
+
     from jast.simulator import Simulator
 
-__all__ = ["Proposal", "policy_proposal", "trace_proposal"]
+__all__ = ["Proposal", "as_proposal", "policy_proposal", "trace_proposal"]
 
 MIXING = ("step", "trace")
 
@@ -52,7 +54,7 @@ class Proposal:
         True
     """
 
-    log_weights: Any
+    log_weights: chex.Array
     """[K], of sum 1 as probabilities"""
     policies: Policy
     """Stacked: a leading axis [K] on every leaf"""
@@ -123,17 +125,14 @@ def trace_proposal(
     else:
         log_weights = jnp.full((k,), -jnp.log(jnp.asarray(k, epsilon.dtype)))
     share = epsilon if mixing == "step" else None
-    first = Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start
-    many = Policy(first, Partial(_trace_step, sim.disturbance, steps, share))
-    one = Policy(
-        (
-            Partial(_trace_start, sim.start, jax.tree.map(lambda a: a[0], start), share)
-            if tilt_start
-            else sim.start
-        ),
-        Partial(_trace_step, sim.disturbance, jax.tree.map(lambda a: a[0], steps), share),
-    )
-    return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
+
+    def component(start, steps):
+        return Policy(
+            Partial(_trace_start, sim.start, start, share) if tilt_start else sim.start,
+            Partial(_trace_step, sim.disturbance, steps, share),
+        )
+
+    return Proposal(log_weights, jax.vmap(component)(start, steps), True)
 
 
 def policy_proposal(
@@ -182,27 +181,25 @@ def policy_proposal(
         )
     tilt_start = tilt_start and outline(sim).random_start
     share = epsilon if mixing == "step" else None
-    on = jnp.ones((), epsilon.dtype)
-    strength = on[None] if mixing == "step" else jnp.stack([on, on * 0])
-    make = lambda strength: Policy(
-        (
+    strength = jnp.ones((1,), epsilon.dtype)
+    log_weights = jnp.zeros((1,), epsilon.dtype)
+    if mixing == "trace":
+        strength = jnp.append(strength, 0)
+        log_weights = jnp.log(jnp.stack([1 - epsilon, epsilon]))
+
+    def component(strength):
+        return Policy(
             Partial(_policy_start, sim.start, policy.start, strength, share)
             if tilt_start
-            else sim.start
-        ),
-        Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share),
-    )
-    log_weights = (
-        jnp.zeros((1,), epsilon.dtype)
-        if mixing == "step"
-        else jnp.log(jnp.stack([1 - epsilon, epsilon]))
-    )
-    many, one = make(strength), make(strength[0])
+            else sim.start,
+            Partial(_policy_step, sim.disturbance, policy.disturbance, strength, share),
+        )
+
     try:
-        ask(sim, lambda start, state, dist: one.disturbance(state, jnp.int32(0)))
+        ask(sim, lambda start, state, dist: component(strength[0]).disturbance(state, jnp.int32(0)))
     except ValueError as error:
         raise ValueError(f"policy_proposal: disturbance: {error}") from None
-    return Proposal(log_weights, _stack(many, one, len(log_weights)), True)
+    return Proposal(log_weights, jax.vmap(component)(strength), True)
 
 
 def as_proposal(function, sim, proposal):
@@ -243,12 +240,8 @@ def _epsilon(function, epsilon, mixing):
 
 def _stacked(sim, episodes):
     """x0, disturbances and lengths with one leading axis [K]."""
-    parts = (
-        list(episodes)
-        if isinstance(episodes, list)
-        or (isinstance(episodes, tuple) and not hasattr(episodes, "_fields"))
-        else [episodes]
-    )
+    several = isinstance(episodes, (list, tuple)) and not hasattr(episodes, "_fields")
+    parts = list(episodes) if several else [episodes]
     if not parts or not all(isinstance(e, Episode) for e in parts):
         raise ValueError(
             "trace_proposal: episodes must be a jast.Episode, a batch of them or a list, received"
@@ -274,21 +267,6 @@ def _stacked(sim, episodes):
                 f"trace_proposal: episodes do not fit the simulator: {error}"
             ) from None
     return jax.tree.map(lambda *leaves: jnp.concatenate([jnp.asarray(a) for a in leaves]), *batched)
-
-
-def _stack(many, one, k):
-    """``many``, whose own leaves have the axis [K], with the leaves that it shares with the
-    simulator repeated to have it as well.
-    """
-    return jax.tree.map(
-        lambda a, b: (
-            jnp.asarray(a)
-            if np.ndim(a) > np.ndim(b)
-            else jnp.broadcast_to(jnp.asarray(a), (k, *np.shape(a)))
-        ),
-        many,
-        one,
-    )
 
 
 def _moved(p, z):

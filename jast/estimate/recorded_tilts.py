@@ -1,7 +1,7 @@
-"""Recorded episodes as the numbers of chance that `jast.estimate.markov_tilts` plays them by again.
+"""Recorded episodes as the random numbers that `jast.estimate.markov_tilts` plays them by again.
 
 A choice has a normal number here too: that of the middle of the interval of uniform numbers that
-`chosen` gives to its category. As rare categories lie near 0, floats tell them all apart.
+`choose_categories` gives to its category. As rare categories lie near 0, floats tell all apart.
 """
 
 from functools import partial
@@ -15,34 +15,35 @@ from jax.scipy.special import ndtri
 from jast._jax import quick
 from jast.distributions.parts import Parts, parts
 from jast.episode import Episode, play_back
-from jast.estimate.markov_tilts import dimension, shape, stacked, starts
+from jast.estimate.markov_tilts import dimension, interval_starts, shape, stack_choices
 from jast.limit_state import normal_numbers, side_by_side
 from jast.rewards import log_likelihood
 from jast.simulator import Simulator
 
-__all__ = ["recorded"]
+__all__ = ["numbers_of_episodes"]
 
-FAR = 37.0
-"""The normal number of a value at the end of a support, whose own is infinite."""
+FAR = 37.0  # the normal number of a value at the end of a support, whose own is infinite
 
 
-def recorded(sim: Simulator, given: Episode) -> np.ndarray:
-    """The points [n, `dimension`] by which `of_the_model` plays the episodes ``given`` [n] again;
-    numbers that decided nothing are 0. On the host.
+def numbers_of_episodes(sim: Simulator, given: Episode) -> np.ndarray:
+    """The points [n, `dimension`] by which `simulate_points` plays the episodes ``given`` [n]
+    again; numbers that decided nothing are 0. On the host.
     """
     if not len(given.length):
         return np.zeros((0, dimension(shape(sim), sim.horizon)), normal_numbers(sim))
     about = given.x0, given.disturbances, given.length
-    return side_by_side(sim, partial(_recorded, sim), *about).astype(normal_numbers(sim))
+    return side_by_side(sim, partial(_numbers, sim), *about).astype(normal_numbers(sim))
 
 
 @quick
-def _recorded(sim, x0, disturbances, length):
+def _numbers(sim, x0, disturbances, length):
     def one(x0, x, length):
         e = play_back(sim, log_likelihood, x0, x, length)
         states = jax.tree.map(lambda a: a[:-1], e.states)
-        first = chance(parts(sim.start()), e.x0)
-        z = jax.vmap(lambda s, x: chance(parts(sim.disturbance(s)), x))(states, e.disturbances)
+        first = _numbers_of_value(parts(sim.start()), e.x0)
+        z = jax.vmap(lambda s, x: _numbers_of_value(parts(sim.disturbance(s)), x))(
+            states, e.disturbances
+        )
         live = jnp.arange(sim.horizon, dtype=jnp.int32) < e.length
         z = jnp.concatenate([first, jnp.where(live[:, None], z, 0).ravel()])
         return jnp.nan_to_num(z, posinf=FAR, neginf=-FAR)
@@ -50,12 +51,12 @@ def _recorded(sim, x0, disturbances, length):
     return jax.vmap(one)(x0, disturbances, length)
 
 
-def chance(p: Parts, x: Any) -> jax.Array:
+def _numbers_of_value(p: Parts, x: Any) -> jax.Array:
     """The normal numbers of the value ``x``, then those of its choices."""
     z, choices = p.inverse(x)
     if not choices:
         return z
-    odds = jnp.exp(jax.nn.log_softmax(stacked(p), axis=-1))
+    odds = jnp.exp(jax.nn.log_softmax(stack_choices(p), axis=-1))
     at = jnp.concatenate(choices)[:, None]
-    begin, width = (jnp.take_along_axis(a, at, axis=1)[:, 0] for a in (starts(odds), odds))
+    begin, width = (jnp.take_along_axis(a, at, axis=1)[:, 0] for a in (interval_starts(odds), odds))
     return jnp.concatenate([z, ndtri(begin + width / 2)])

@@ -12,7 +12,13 @@ from jast.counter import numpy_generator
 from jast.distributions.parts import parts
 from jast.episode import rollout
 from jast.estimate import markov_tilts as tilts
-from jast.estimate.batches import drawn, numbers, of_chunk, plain_chunk, resampled
+from jast.estimate.batches import (
+    draw_mixture,
+    numbers_of_chunk,
+    plain_chunk,
+    random_numbers,
+    resample,
+)
 from jast.estimate.draws import Draws, source_key
 from jast.estimate.sample import Sample, steps_of
 from jast.limit_state import Outcomes
@@ -86,19 +92,19 @@ def redraw_failures(
 
 
 def _redraw_gaussians(key, sim, q, n):
-    return drawn(sim, q, *numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
+    return draw_mixture(sim, q, *random_numbers(key, n, q.means.shape[1], q.means.dtype))[:3]
 
 
 def _redraw_tilts(key, sim, q, n):
     about, dtype = tilts.shape(sim), latent.normal_numbers(sim)
-    chance = tilts.numbers(key, n, about, sim.horizon, dtype)
-    o, ratio, trace = tilts.played(sim, q, *chance)
+    chance = tilts.random_numbers(key, n, about, sim.horizon, dtype)
+    o, ratio, trace = tilts.simulate_tilts(sim, q, *chance)
     z = latent.normal_of(sim, _episodes_of_traces(sim, trace))
     return z, o, tilts.log_weight(q, ratio)[0]
 
 
 def _choose_failures(key, sim, sample, n):
-    rows = resampled(sample.log_weight, n, numpy_generator(key).random())
+    rows = resample(sample.log_weight, n, numpy_generator(key).random())
     used = sample.used[rows]
     o = Outcomes(
         failure=np.ones(n, bool),
@@ -113,7 +119,9 @@ def _choose_failures(key, sim, sample, n):
 _REDRAW = {latent.Latent: _redraw_gaussians, tilts.Tilts: _redraw_tilts, Sample: _choose_failures}
 _REDRAW_CHUNK = {
     str: lambda key, i, sim, q, n, lanes: plain_chunk(key, i, n, sim),
-    latent.Latent: lambda key, i, sim, q, n, lanes: latent.place(q, *of_chunk(key, i, n, q)),
+    latent.Latent: lambda key, i, sim, q, n, lanes: latent.place(
+        q, *numbers_of_chunk(key, i, n, q)
+    ),
     tilts.Tilts: lambda key, i, sim, q, n, lanes: redraw(numpy_generator(key, 2, i), sim, q, lanes)[
         0
     ],
@@ -127,12 +135,12 @@ def _episodes_of_traces(sim, trace):
 
     def one(first, steps):
         def start():
-            x0 = tilts.assembled(parts(sim.start()), first.first_normals, first.first_choices)
+            x0 = tilts.assemble(parts(sim.start()), first.first_normals, first.first_choices)
             return D.Deterministic(x0)
 
         def disturbance(s, t):
             z, i = steps.normals[t], steps.choices[t]
-            return D.Deterministic(tilts.assembled(parts(sim.disturbance(s)), z, i))
+            return D.Deterministic(tilts.assemble(parts(sim.disturbance(s)), z, i))
 
         policy = Policy(start, disturbance)
         return rollout(jax.random.key(0), sim, policy)._replace(states=None)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.draws import Draws, with_source
 from jast.outline import outline
 from jast.pytrees import count_numbers
@@ -86,7 +86,7 @@ def independent_draws(
     one population have common ancestors, and all of them would claim too much.
     """
     m = int(np.clip(worth // 2, 2, min(len(sample.points), MAX_FAILURES)))
-    rows = resampled(sample.log_weight, m, 0.5)
+    rows = resample(sample.log_weight, m, 0.5)
     drawn = draws_of_sample(key, sim, Sample(*(a[rows] for a in sample)), 2 * m)
     return drawn._replace(log_weight=np.full(m, log_mean + math.log(2)))
 

@@ -11,27 +11,27 @@ class SearchSettings(NamedTuple):
     """Shares are of the budget where nothing else is said."""
 
     # which family is tried
-    tilts_first: int = 30
+    tilts_first_horizon: int = 30
     """Steps from which tilts are tried before Gaussians: Gaussians of many steps are dear, and miss
     what happens at any of them."""
     tilts_share: float = 0.35
-    """What the search for tilts has where they come first."""
-    tilts_after: float = 0.3
-    """What it has of what is left where Gaussians come first."""
-    gates: int = 3
-    """Gaussians that a normal number is drawn from one of: nothing happens, or it comes from above
-    or below."""
-    gates_share: float = 0.25
-    """What the search for them has where a single one does not serve."""
-    single_serves: float = 0.1
-    """Effective draws of a draw with which a single one serves."""
-    serves: float = 0.02
+    """What the search for tilts may spend where they come first."""
+    tilts_share_after: float = 0.3
+    """The same of what is left, where Gaussians come first."""
+    components_each: int = 3
+    """Gaussians in the mixture that a tilt draws a normal number from: the model's, one above and
+    one below."""
+    components_share: float = 0.25
+    """What the search for these mixtures may spend where a single Gaussian is not enough."""
+    single_efficiency: float = 0.1
+    """Effective draws of a draw with which a single one is enough."""
+    family_efficiency: float = 0.02
     """Effective draws of a draw with which no other family is tried."""
-    another: float = 0.2
-    """What must be left where another family is tried."""
-    near_serves: float = 0.2
-    """The same for one batch of a neighbour's proposal, which is then taken as it is."""
-    near_fitted: float = 0.05
+    next_family_share: float = 0.2
+    """What must be left for another family to be tried."""
+    near_efficiency: float = 0.2
+    """Effective draws of a draw with which a neighbour's proposal is taken as it is."""
+    near_fitted_efficiency: float = 0.05
     """The same once it is fitted."""
     near_refits: int = 2
     """Batches that a neighbour's proposal is fitted to."""
@@ -39,153 +39,155 @@ class SearchSettings(NamedTuple):
     """What failures that came with the call may cost the search for tilts more."""
 
     # the first Gaussians
-    descent_of: int = 2000
+    evaluations_per_descent: int = 2000
     """Evaluations of a budget for each descent by gradients."""
-    descents: int = 48
+    descents_most: int = 48
     """Descents of a round at most, and directions that sixty modes still need."""
     descents_least: int = 4
     """Descents of a round at the least."""
-    descents_tried: int = 12
+    descents_first: int = 12
     """Descents after which no others are tried where these led nowhere."""
-    wide_first: int = 4
+    wide_draws_first: int = 4
     """Draws of wider noise for each descent that begins at a failure, in the first round."""
-    wide: int = 12
+    wide_draws: int = 12
     """The same in later rounds, where fewer are unexplained."""
-    cooled_share: float = 0.2
-    """Where descents end, and cooling."""
-    cooled_late: float = 0.3
-    """Where cooling looks for no more than `cooled_least` failures."""
+    exploration_end: float = 0.2
+    """Evaluations at which descents end, and cooling."""
+    cooling_end: float = 0.3
+    """Evaluations at which cooling ends once it has `cooled_least` failures."""
     cooled_least: int = 36
-    """Failures that wide noise is cooled to at the least: one direction in ten is then met."""
-    chain_of: int = 800
+    """Failures that wide noise is cooled to at the least: they show a direction that one in ten of
+    them has."""
+    evaluations_per_chain: int = 800
     """Evaluations of a budget for each chain of cooled noise."""
     chains_least: int = 8
     """Chains at the least."""
-    chains: int = 128
+    chains_most: int = 128
     """Chains at most, and directions of a proposal."""
-    chains_of_tilts: int = 24
-    """The same of tilts, which lead to most modes by themselves."""
-    rests: int = 18
+    chains_most_of_tilts: int = 24
+    """The same of tilts, which find most modes by themselves."""
+    reduction_tries: int = 18
     """Times that a failure is tried without some of its numbers."""
-    alone: float = 0.03
-    """Part of the failures alone in a direction with which the search for directions ends."""
-    alone_met: int = 3
+    singleton_share: float = 0.03
+    """Share of failures that are the only one of their direction, with which the search for
+    directions ends: the part of what chains lead to that is still to be found (Good 1953)."""
+    singleton_count: int = 3
     """The same as a number."""
-    endless: float = 0.5
-    """Part of them above which it ends too, as more chains would not change it."""
-    slow: float = 0.85
-    """What a round of descents may leave unexplained of what was before it."""
-    new: float = 0.25
-    """Part of its descents that come to new points."""
-    anchor_least: float = 0.05
+    singleton_share_most: float = 0.5
+    """Share above which it ends too, as more chains would not change it."""
+    unexplained_ratio: float = 0.85
+    """Factor by which a round of descents must reduce the share of unexplained failures."""
+    new_point_share: float = 0.25
+    """Share of its descents that must come to new points."""
+    anchor_weight_least: float = 0.05
     """Weight of a design point far beyond the nearest, which may lead to more."""
 
     # fits
     gain: float = 1.15
     """Factor of effective draws by which a batch must gain on the best before it, to count as
     better: two batches of one proposal differ by less."""
-    enough: float = 0.1
+    refit_efficiency: float = 0.1
     """Effective draws of a draw with which one batch without gain ends the refits."""
     stalls: int = 2
-    """Batches without gain that end the refits of a poor proposal, too."""
+    """Batches without gain that end the refits of an inefficient proposal."""
     refits: int = 8
     """Batches of a search at most: twice what most systems need."""
     refits_end: float = 0.6
-    """Where the refits of Gaussians end, as a share of what their search began with."""
-    kept: int = 1200
+    """What the refits of Gaussians may spend of what was left when their search began."""
+    failures_kept: int = 1200
     """Failures that a batch of tilts keeps: the densities of whole traces are the dear part."""
-    model: float = 0.1
+    model_share: float = 0.1
     """Share of the model in a proposal where failures are not rare, and among tilts."""
-    defensive: float = 0.2
+    defensive_share: float = 0.2
     """Share of wide components, under which no weight is without variance."""
-    halfway: float = 0.75
-    """Of the way of a tilt, how far its defensive copy goes."""
-    rare: float = 1e-4
+    defensive_scale: float = 0.75
+    """Factor on the coefficients of a tilt in its defensive copy."""
+    rare_probability: float = 1e-4
     """Probability below which a proposal of Gaussians needs no share of the model."""
-    narrowest: float = 0.3
-    """Of the model's, the least variance of what an audit takes in."""
-    direction_least: float = 0.05
-    """Share of a direction at the least, and the part of an even share from which a component is
-    one: what few failures tell of a mass is mostly too little."""
-    directions_least: float = 0.2
+    variance_least: float = 0.3
+    """Least variance, the model's being 1, of what an audit takes in."""
+    direction_share_least: float = 0.05
+    """Share of a direction at the least, and the part of an even share from which a component
+    counts as one: the mass that few failures tell is mostly too small."""
+    directions_share_least: float = 0.2
     """Share of all directions together at the least."""
-    group_least: float = 0.1
+    group_share_least: float = 0.1
     """Share of a group of tilts at the least."""
     direction_failures: int = 20
-    """Failures from which a direction is fitted by itself."""
-    dense: int = 16
+    """Failures from which a direction has a fit of its own."""
+    dense_directions: int = 16
     """Directions above which each has too few failures for a covariance of all numbers."""
-    sparse: int = 4
-    """Numbers, at most, that a direction of many is fitted in."""
-    prior: float = 3.0
+    sparse_numbers: int = 4
+    """Numbers, at most, that a direction is fitted in where there are many."""
+    variance_prior: float = 3.0
     """Failures that the model's variance counts for in such a fit."""
-    prior_share: float = 5.0
+    share_prior: float = 5.0
     """Failures that each direction counts for in its share."""
-    tempered: int = 200
-    """Effective failures of a fit, to which weights are tempered: a few great ones would fit their
-    own noise."""
+    tempered_size: int = 200
+    """Effective failures of a fit, to which weights are tempered: a fit to a few great ones
+    would be a fit to their noise."""
 
     # tilts
-    elite: float = 0.1
-    """Share of a batch that comes to the next level."""
+    elite_share: float = 0.1
+    """Share of a batch that reaches the next level."""
     elite_least: int = 10
     """Episodes below the last level, of fewer than which no level is made."""
-    failures: int = 50
+    level_failures: int = 50
     """Failures of a batch from which tilts are fitted to failures alone."""
-    raised: float = 2.0
+    raised_choices: float = 2.0
     """Rare choices an episode that the first batch has."""
-    raised_most: float = 0.25
+    raised_probability_most: float = 0.25
     """Probability of a rare choice there at most."""
-    given: float = 0.05
-    """How many of the failures that came with the call are looked at."""
-    places: int = 2
+    given_replay_share: float = 0.05
+    """How many of the failures that came with the call are replayed."""
+    given_tilts: int = 2
     """How many of those that the tilts hardly draw get a tilt of their own."""
 
     # the audit
     audits: int = 3
-    """Of them all but the last may take in what is missing."""
-    refits_of_audit: int = 2
+    """Audits at most; all but the last may absorb what is missing."""
+    audit_refits: int = 2
     """What an audit found is weighted by the first batch, and fitted to by the second."""
-    tolerated: float = 0.01
+    tolerated_mass: float = 0.01
     """Part of the probability that may be missing: about the standard error of the estimate."""
-    covered: float = 50.0
-    """Factor of its mean weight up to which a failure is covered."""
-    thin: float = 0.06
-    """Part of the probability, by the batches, that may lie where it is not covered."""
-    met: int = 20
-    """Draws that are to meet so great a part, wherever it is covered."""
-    known: int = 10
-    """Effective draws in the batches that know such a part well enough."""
+    coverage_factor: float = 50.0
+    """Factor on the mean weight up to which a failure is covered."""
+    uncovered_share: float = 0.06
+    """Part of the probability, by the batches, that may be uncovered."""
+    coverage_draws: int = 20
+    """Draws that so great a part is to have, wherever it is covered."""
+    uncovered_ess: int = 10
+    """Effective draws of the batches with which an uncovered part is known well enough."""
     audit_share: float = 0.15
     """What a population of an audit is to cost."""
-    ties: float = 1.5
-    """Factor of that, as levels fall more slowly where miss distances are few."""
-    fewest: int = 40
-    """Points of a population of an audit: ten of them go on to the next level."""
-    search_ends: float = 0.85
-    """Where the search ends, audits included."""
-    settling: float = 0.06
-    """What the moves of failures that wide noise led to may cost."""
-    moves: int = 25
+    audit_overrun: float = 1.5
+    """Factor on that, as levels fall more slowly where miss distances take few values."""
+    audit_population_least: int = 40
+    """Points of a population of an audit at the least: ten of them reach the next level."""
+    search_end: float = 0.85
+    """Evaluations at which the search ends, audits included."""
+    burn_in_share: float = 0.06
+    """What the burn-in of failures that wide noise led to may cost."""
+    burn_in_moves: int = 25
     """Markov moves after which a failure of great norm lies among those of its mode, or on the way
     (walks of `benchmarks.limit_states`: 10 were too few)."""
-    stray: float = 0.025
-    """Part of these failures that may lie outside by chance."""
-    stray_least: int = 2
+    stray_share: float = 0.025
+    """Share of these failures that may be uncovered by chance."""
+    stray_count: int = 2
     """The same as a number."""
-    unknown: float = 0.15
-    """Share of a proposal for what an audit found, at the least, until batches weigh it."""
-    lost: float = 2.0
-    """What a proposal has lost, as a multiple of what it found, from which it is given up."""
+    absorbed_share_least: float = 0.15
+    """Share of the proposal for what an audit found, at the least, until batches weigh it."""
+    missing_most: float = 2.0
+    """Missing probability, as a multiple of what was found, above which a proposal is given up."""
 
     # the last draws
     plain_failures: int = 100
     """Failures of the model from which plain draws tell a probability where no proposal does."""
-    exact: float = 0.01
-    """Relative standard error beyond which draws serve better as the model's own."""
-    of_the_model: float = 0.1
+    exact_error: float = 0.01
+    """Relative standard error that the proposal's draws are to reach; others are the model's."""
+    model_draws_least: float = 0.1
     """Share of the last draws that are the model's own, at the least."""
-    of_the_model_most: float = 0.4
+    model_draws_most: float = 0.4
     """The same at most."""
 
 

@@ -21,23 +21,25 @@ from jast.simulator import Simulator
 
 __all__ = [
     "Batch",
-    "Chance",
     "Family",
-    "State",
-    "begun",
-    "log_ratios",
-    "mixed_ratio",
-    "promise",
-    "serves",
-    "taken",
+    "SearchContext",
+    "SearchState",
+    "add_batch",
+    "efficiency",
+    "failure_log_ratios",
+    "is_efficient",
+    "pooled_log_ratio",
+    "search_context",
 ]
+
+NO_BETTER = 1.01  # times as efficient as the model: a batch of the model is so by chance
 
 
 class Batch(NamedTuple):
     """Episodes that one proposal has drawn; of these, the failing ones."""
 
     q: Any
-    """The proposal"""
+    """The proposal, of its `Family`"""
     points: Any
     """[m] of its `Family`"""
     log_weight: np.ndarray
@@ -47,11 +49,11 @@ class Batch(NamedTuple):
     invalid: int = 0
 
 
-class State(NamedTuple):
+class SearchState(NamedTuple):
     """What a search knows."""
 
     q: Any = None
-    """The proposal that is best so far; None before any failure"""
+    """The best proposal so far, of its `Family`; None before any failure"""
     batches: tuple[Batch, ...] = ()
     ratios: tuple[np.ndarray, ...] = ()
     """Of batch j: log q_i - log p [i, m] of its failing points by the proposal of each batch i"""
@@ -59,23 +61,23 @@ class State(NamedTuple):
     """Of the failing points of all batches, by the balance heuristic"""
     log_mean: float = -math.inf
     """Log of the probability by these"""
-    promised: float = 0.0
-    """Effective draws of a draw of ``q``"""
-    anchors: Any = None
+    efficiency: float = 0.0
+    """Of ``q``: effective draws of a draw"""
+    anchors: np.ndarray | None = None
     """[m, D] design points that the proposal began with"""
-    cooled: Any = None
+    cooled: np.ndarray | None = None
     """[m, D] failures that wide noise led to"""
     given: Any = None
-    """Failures that came with the call"""
+    """Failures that came with the call: `jast.estimate.tilt_start.Given`"""
     populations: tuple[Any, ...] = ()
     """Those that the search began with: `jast.estimate.populations.Explored`"""
     missing: float = 0.0
-    """What the proposal has lost, as a multiple of what it found"""
+    """Probability that the proposal has missed, as a multiple of what it found"""
     spent: int = 0
     """Evaluations"""
     history: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
-    """That speak against the proposal"""
+    """Against the proposal"""
     plain: tuple[int, int, int] = (0, 0, 0)
     """(failing, invalid, episodes) of draws of the model"""
 
@@ -86,33 +88,33 @@ class State(NamedTuple):
 
     @property
     def log_p(self) -> float:
-        """Of the probability, as far as anything tells; -inf where no failure was seen."""
+        """Log of the probability, as far as anything tells; -inf where no failure was seen."""
         return max(self.log_mean, *(p.log_mean for p in self.populations), -math.inf)
 
-    def noted(self, text: str, evaluations: int = 0) -> State:
-        """The same with a line of history, and what it cost."""
+    def note(self, text: str, evaluations: int = 0) -> SearchState:
+        """The state with a line of history, and what it cost."""
         text = f"{text}, {evaluations} evaluations" if evaluations else text
         return self._replace(spent=self.spent + evaluations, history=(*self.history, text))
 
-    def carried(self) -> State:
-        """What a search of another family begins with."""
-        return State(spent=self.spent, history=self.history, plain=self.plain)
+    def for_next_family(self) -> SearchState:
+        """The state that a search of another family begins with."""
+        return SearchState(spent=self.spent, history=self.history, plain=self.plain)
 
-    def after(self, other: State) -> State:
-        """The same, after a search that went on from it."""
+    def with_costs_of(self, other: SearchState) -> SearchState:
+        """The state after ``other``, a search that began where this one ended."""
         return self._replace(spent=other.spent, history=other.history, plain=other.plain)
 
-    def against(self, reason: str) -> State:
-        """The same with a reason against the proposal."""
+    def with_reason(self, reason: str) -> SearchState:
+        """The state with a reason against the proposal."""
         return self._replace(reasons=(*self.reasons, reason))
 
 
-class Chance(NamedTuple):
-    """Where a search takes its random numbers from."""
+class SearchContext(NamedTuple):
+    """The random numbers of a search, and where it stands."""
 
     root: np.random.Generator
     rng: np.random.Generator
-    latest: list[tuple[Family, State]]
+    latest: list[tuple[Family, SearchState]]
     """The family and the state after the last batch, for an interruption"""
 
     def next_key(self) -> jax.Array:
@@ -121,10 +123,10 @@ class Chance(NamedTuple):
         return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
-def begun(key: jax.Array) -> Chance:
-    """The `Chance` of a call."""
+def search_context(key: jax.Array) -> SearchContext:
+    """The `SearchContext` of a call."""
     root = numpy_generator(key, 1)
-    return Chance(root, numpy_generator(Chance(root, root, []).next_key()), [])
+    return SearchContext(root, numpy_generator(SearchContext(root, root, []).next_key()), [])
 
 
 class Family(Protocol):
@@ -137,7 +139,7 @@ class Family(Protocol):
     budget: int
     batch: int
     """Episodes of a batch"""
-    chance: Chance
+    context: SearchContext
     settings: SearchSettings
 
     def draw(self, q: Any) -> Batch:
@@ -146,33 +148,37 @@ class Family(Protocol):
     def log_ratio(self, q: Any, points: Any) -> np.ndarray:
         """log q - log p [m] of the ``points`` [m]."""
 
-    def refit(self, state: State) -> dict[str, Any]:
+    def refit(self, state: SearchState) -> dict[str, Any]:
         """Proposals that are fitted to the failures of all batches, by what they are called."""
 
-    def absorbed(self, state: State, points: Any, share: float) -> State:
-        """The proposal with ``points`` taken in, which carry ``share`` of what it found."""
-
-    def points_of(self, state: State, z: np.ndarray, used: np.ndarray) -> tuple[State, Any]:
-        """The points of failures that a population found, ``z`` [m, D] of which they ``used`` so
-        many numbers; and what this costs.
+    def absorb(self, state: SearchState, points: Any, share: float) -> SearchState:
+        """The proposal with a component for ``points``, whose probability is ``share`` times what
+        it found.
         """
 
-    def rows(self, points: Any, rows: np.ndarray) -> Any:
+    def as_points(
+        self, state: SearchState, z: np.ndarray, used: np.ndarray
+    ) -> tuple[SearchState, Any]:
+        """The points of failures that a population found, ``z`` [m, D] of which they ``used`` so
+        many numbers; and the state, with what this costs.
+        """
+
+    def select(self, points: Any, rows: np.ndarray) -> Any:
         """Some of the ``points``."""
 
     def on_device(self, q: Any) -> Any:
         """``q`` as an `Estimate` has it."""
 
     def with_model(self, q: Any, share: float) -> Any:
-        """The same, of which the model has so great a ``share``."""
+        """``q`` on the device, with so great a ``share`` of the model."""
 
-    def left_out(self, q: Any, threshold: float) -> Any:
+    def exclusion(self, q: Any, threshold: float) -> Any:
         """What keeps populations out of where log q - log p is above the ``threshold``."""
 
 
-def taken(family: Family, state: State, batch: Batch) -> State:
+def add_batch(family: Family, state: SearchState, batch: Batch) -> SearchState:
     """The state with one more `Batch`: the weights of all failures, the probability by them, and
-    of the proposals that have drawn the one that promises the least variance.
+    of the proposals that have drawn the most efficient one.
     """
     old = zip(state.ratios, state.batches, strict=True)
     ratios = [np.vstack([r, family.log_ratio(batch.q, b.points)]) for r, b in old]
@@ -187,14 +193,14 @@ def taken(family: Family, state: State, batch: Batch) -> State:
     if len(log_w):
         log_mean = float(np.logaddexp.reduce(log_w) - math.log(total))
         new = new._replace(log_weight=log_w, log_mean=log_mean)
-        promised = [promise(new, r) for r in over]
-        best = int(np.argmax(promised))
-        new = new._replace(q=batches[best].q, promised=promised[best])
-    family.chance.latest[:] = [(family, new._replace(spent=state.spent + family.batch))]
+        each = [efficiency(new, r) for r in over]
+        best = int(np.argmax(each))
+        new = new._replace(q=batches[best].q, efficiency=each[best])
+    family.context.latest[:] = [(family, new._replace(spent=state.spent + family.batch))]
     return new
 
 
-def promise(state: State, log_ratio: np.ndarray) -> float:
+def efficiency(state: SearchState, log_ratio: np.ndarray) -> float:
     """Effective draws of a draw of a proposal that has this log q - log p [N] on the failures of
     all batches: P^2 / E_q[w^2], by these.
     """
@@ -202,22 +208,20 @@ def promise(state: State, log_ratio: np.ndarray) -> float:
     return math.exp(min(2 * state.log_mean - second, 0.0))
 
 
-def log_ratios(family: Family, q: Any, batches: Sequence[Batch]) -> np.ndarray:
+def failure_log_ratios(family: Family, q: Any, batches: Sequence[Batch]) -> np.ndarray:
     """log q - log p of the failing points of all ``batches``."""
-    of = lambda b: -b.log_weight if b.q is q else family.log_ratio(q, b.points)
-    return np.concatenate([of(b) for b in batches])
+    return np.concatenate(
+        [-b.log_weight if b.q is q else family.log_ratio(q, b.points) for b in batches]
+    )
 
 
-def mixed_ratio(family: Family, state: State, points: Any) -> np.ndarray:
-    """log q - log p [m] of ``points``, q being all batches together."""
+def pooled_log_ratio(family: Family, state: SearchState, points: Any) -> np.ndarray:
+    """log q - log p [m] of ``points``, q being the mixture of the proposals of all batches."""
     each = [family.log_ratio(b.q, points) + math.log(b.size / state.size) for b in state.batches]
     return np.logaddexp.reduce(each)
 
 
-def serves(state: State, least: float) -> bool:
-    """Whether a draw of the proposal has more effective ones than ``least``, and than one of the
-    model has.
-    """
+def is_efficient(state: SearchState, least: float) -> bool:
+    """Whether the efficiency of the proposal is above ``least``, and above that of the model."""
     plain = math.exp(min(state.log_mean, 0.0))
-    # the batch of the model itself promises as much as it has
-    return state.q is not None and state.promised > max(least, 1.01 * plain)
+    return state.q is not None and state.efficiency > max(least, NO_BETTER * plain)

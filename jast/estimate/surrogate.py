@@ -13,13 +13,48 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Surrogate", "covariance", "fit", "normal_cdf", "predict"]
+__all__ = ["Surrogate", "covariance", "fit", "predict", "probability_below_zero"]
 
-ROUNDS, ASCENTS, STEP = 2, 8, 0.15
-SWEEPS, DAMPING, SETTLED = 12, 0.8, 0.01
-JITTER, LEAST, BLOCK = 1e-8, 1e-12, 500
-SHAPE = math.sqrt(5.0)
-_erfc = np.frompyfunc(math.erfc, 1, 1)
+ROUNDS = 2  # hyperparameters and sites are fitted in turn; a round costs `ASCENTS` inverses
+ASCENTS = 8  # steps of the hyperparameters in a round
+FIRST_STEP = 0.15  # of the logarithm of each hyperparameter
+STEP_RANGE = 1e-3, 1.0
+TURNED = 0.5  # factor on a step whose gradient changed its sign (Riedmiller and Braun 1993)
+NOT_TURNED = 1.3  # factor on a step whose gradient did not
+SWEEPS = 12  # of expectation propagation, at most
+DAMPING = 0.8  # part of the way to its new value that a site goes: moved at once, they overshoot
+CONVERGED = 0.01  # change of all means, in standard deviations, that ends the sweeps
+PRECISIONS = 1e-8, 1e8  # of sites: beyond these, matrices are singular in double precision
+UNSEEN_PRECISION = 1e-6  # of the first site of a failure: nothing is known of its value
+JITTER = 1e-8  # part of the mean variance, added to a diagonal against rounding
+LEAST_VARIANCE = 1e-12  # a smaller difference of variances is rounding
+BLOCK = 500  # points of a prediction at a time, whose covariances fit a cache
+MATERN_SCALE = math.sqrt(5.0)  # of a scaled distance in the Matern 5/2 covariance
+
+
+class Prior(NamedTuple):
+    """Independent normal prior of the logarithms of the hyperparameters, and their range."""
+
+    mean: np.ndarray
+    """[3 + D]"""
+    deviation: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def log_density(self, logs: np.ndarray) -> float:
+        """Without its constant."""
+        return -0.5 * (((logs - self.mean) / self.deviation) ** 2).sum()
+
+
+def _prior(dimension):
+    """The `Prior`: weak; lengthscales are in proportion to the norm of a normal vector."""
+    lengthscale = (-math.log(3 * math.sqrt(dimension)), 1.0, -8.0, 3.0)
+    rows = [
+        (math.log(4.0), 1.5, -9.0, 7.0),  # variance of the constant, the Matern part's being 1
+        (math.log(0.1), 2.0, -12.0, 4.0),  # of the linear part
+        (math.log(1e-5), 2.0, -16.0, 0.0),  # of the noise
+    ]
+    return Prior(*np.array([*rows, *[lengthscale] * dimension]).T)
 
 
 class Surrogate(NamedTuple):
@@ -36,7 +71,7 @@ class Surrogate(NamedTuple):
     """[n]: the inverse times the targets"""
     inverse: np.ndarray
     """[n, n] of the covariance with noise and sites"""
-    sites: tuple
+    sites: tuple[np.ndarray, np.ndarray]
     """Precisions [n], and these times the means [n], of what stands for the values"""
     warp: float
     """inf: none"""
@@ -49,9 +84,11 @@ class Surrogate(NamedTuple):
         return math.exp(self.logs[2])
 
 
-def normal_cdf(x: np.ndarray) -> np.ndarray:
-    """Phi(x), exact in the lower tail."""
-    return 0.5 * _erfc(-np.asarray(x, float) / math.sqrt(2)).astype(float)
+def probability_below_zero(mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """The probability that a normal number is below 0."""
+    from scipy.special import ndtr  # here: slow to import
+
+    return ndtr(-mean / deviation)
 
 
 def fit(
@@ -65,42 +102,49 @@ def fit(
     """The `Surrogate` of points ``z`` [n, D] with ``distance`` [n] where not ``failing`` [n];
     ``before``: one of the first of them, to start from.
     """
-    safe, d = ~failing, z.shape[1]
+    safe = ~failing
     t = distance if math.isinf(warp) else warp * np.log1p(distance / warp)
     seen = t[safe] if safe.any() else np.ones(1)
     scale = max(float(seen.std()), 0.1 * float(np.abs(seen).mean()), 1e-300)
     t = np.where(failing, 0.0, t / scale)
-    prior = np.concatenate([np.log([4.0, 0.1, 1e-5]), np.full(d, -math.log(3 * math.sqrt(d)))])
-    spread = np.concatenate([[1.5, 2.0, 2.0], np.ones(d)])
-    logs = prior if before is None else before.logs
-    tau, nu = np.where(failing, 1e-6, 1.0), np.zeros(len(z))
+    prior = _prior(z.shape[1])
+    logs = prior.mean if before is None else before.logs
+    tau, nu = np.where(failing, UNSEEN_PRECISION, 1.0), np.zeros(len(z))
     if before is not None:
         for new, old in zip((tau, nu), before.sites, strict=True):
             new[: len(old)] = old
     for i in range(rounds + 1):
         noise, k = math.exp(logs[2]), covariance(z, z, logs)[0]
         tau, nu = np.where(failing, tau, 1 / noise), np.where(failing, nu, t / noise)
-        tau, nu = _sites(k, tau, nu, failing, noise)
+        tau, nu = _fit_sites(k, tau, nu, failing, noise)
         if i < rounds:
-            logs = _climbed(z, nu / tau, 1 / tau, failing, logs, prior, spread)
+            logs = _climb(z, nu / tau, 1 / tau, failing, logs, prior)
     inverse = np.linalg.inv(_with_noise(k, 1 / tau))
-    value = _evidence(k, tau, nu, failing, noise) - 0.5 * (((logs - prior) / spread) ** 2).sum()
+    value = _evidence(k, tau, nu, failing, noise) + prior.log_density(logs)
     # densities of the distances themselves: the derivative of the warp and the scale
-    bent = 0.0 if math.isinf(warp) else np.log1p(distance[safe] / warp).sum()
-    value -= bent + safe.sum() * math.log(scale)
-    return Surrogate(z, logs, inverse @ (nu / tau), inverse, (tau, nu), warp, float(value))
+    log_slope = 0.0 if math.isinf(warp) else np.log1p(distance[safe] / warp).sum()
+    value -= log_slope + safe.sum() * math.log(scale)
+    return Surrogate(
+        z=z,
+        logs=logs,
+        weights=inverse @ (nu / tau),
+        inverse=inverse,
+        sites=(tau, nu),
+        warp=warp,
+        evidence=float(value),
+    )
 
 
-def predict(s: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def predict(surrogate: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation [m] of the scaled limit state at ``z`` [m, D]."""
-    constant, linear, _ = np.exp(s.logs[:3])
-    mean, known = np.empty(len(z)), np.empty(len(z))
-    for i in range(0, len(z), BLOCK):  # what fits a cache
-        k, _ = covariance(z[i : i + BLOCK], s.z, s.logs)
-        mean[i : i + BLOCK] = k @ s.weights
-        known[i : i + BLOCK] = ((k @ s.inverse) * k).sum(axis=1)
+    constant, linear, _ = np.exp(surrogate.logs[:3])
+    mean, explained = np.empty(len(z)), np.empty(len(z))
+    for i in range(0, len(z), BLOCK):
+        k, _ = covariance(z[i : i + BLOCK], surrogate.z, surrogate.logs)
+        mean[i : i + BLOCK] = k @ surrogate.weights
+        explained[i : i + BLOCK] = ((k @ surrogate.inverse) * k).sum(axis=1)
     own = constant + linear * (z**2).sum(axis=1) + 1.0
-    return mean, np.sqrt(np.maximum(own - known, LEAST))
+    return mean, np.sqrt(np.maximum(own - explained, LEAST_VARIANCE))
 
 
 def covariance(a: np.ndarray, b: np.ndarray, logs: np.ndarray) -> tuple[np.ndarray, Any]:
@@ -108,7 +152,7 @@ def covariance(a: np.ndarray, b: np.ndarray, logs: np.ndarray) -> tuple[np.ndarr
     constant, linear, _ = np.exp(logs[:3])
     x, y = a * np.exp(logs[3:]), b * np.exp(logs[3:])
     square = (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None] - 2 * x @ y.T
-    r = SHAPE * np.sqrt(np.maximum(square, 0.0))
+    r = MATERN_SCALE * np.sqrt(np.maximum(square, 0.0))
     e = np.exp(-r)
     k = (1 + r * (1 + r / 3)) * e
     k += linear * (a @ b.T) + constant
@@ -126,12 +170,12 @@ def _cavities(k, tau, nu, failing):
     """Means and variances of the failing points without their own sites."""
     f = np.flatnonzero(failing)
     gain = k[f] @ np.linalg.inv(_with_noise(k, 1 / tau))
-    variance = np.maximum(k[f, f] - (gain * k[f]).sum(axis=1), LEAST)
-    v = 1 / np.maximum(1 / variance - tau[f], 1e-8)
+    variance = np.maximum(k[f, f] - (gain * k[f]).sum(axis=1), LEAST_VARIANCE)
+    v = 1 / np.maximum(1 / variance - tau[f], PRECISIONS[0])
     return v * (gain @ (nu / tau) / variance - nu[f]), v
 
 
-def _sites(k, tau, nu, failing, noise):
+def _fit_sites(k, tau, nu, failing, noise):
     """Precisions and precision-weighted means [n], those of the failures by expectation
     propagation, all at once and damped.
     """
@@ -145,10 +189,10 @@ def _sites(k, tau, nu, failing, noise):
         h = _hazard(-m / sd)
         mean = m - v / sd * h
         variance = v * np.maximum(1 - v / sd**2 * h * (h - m / sd), 1e-9)
-        new = np.clip(1 / variance - 1 / v, 1e-8, 1e8)
+        new = np.clip(1 / variance - 1 / v, *PRECISIONS)
         tau[failing] += DAMPING * (new - tau[failing])
         nu[failing] += DAMPING * (mean / variance - m / v - nu[failing])
-        if (np.abs(mean - last) < SETTLED * np.sqrt(variance)).all():
+        if (np.abs(mean - last) < CONVERGED * np.sqrt(variance)).all():
             break
         last = mean
     return tau, nu
@@ -157,37 +201,33 @@ def _sites(k, tau, nu, failing, noise):
 def _evidence(k, tau, nu, failing, noise):
     """Log probability of what was seen, by the sites (R&W eq. 3.65)."""
     target, matrix = nu / tau, _with_noise(k, 1 / tau)
-    value = _gaussian(target, matrix) - 0.5 * (~failing).sum() * math.log(2 * math.pi)
+    value = -0.5 * target @ np.linalg.solve(matrix, target) - 0.5 * _log_det(matrix)
+    value -= 0.5 * (~failing).sum() * math.log(2 * math.pi)
     if failing.any():
+        from scipy.special import log_ndtr  # here: slow to import
+
         m, v = _cavities(k, tau, nu, failing)
         both = v + 1 / tau[failing]
         terms = 0.5 * np.log(both) + 0.5 * (m - target[failing]) ** 2 / both
-        value += (_log_cdf(-m / np.sqrt(v + noise)) + terms).sum()
+        value += (log_ndtr(-m / np.sqrt(v + noise)) + terms).sum()
     return value
 
 
-def _gaussian(target, matrix):
-    """Log density without its constant (R&W eq. 2.30)."""
-    return -0.5 * target @ np.linalg.solve(matrix, target) - 0.5 * _log_det(matrix)
-
-
-def _climbed(z, target, extra, failing, logs, prior, spread):
+def _climb(z, target, extra, failing, logs, prior):
     """Ascents of the likelihood with its sites and the prior, by the signs of the gradient
     (Riedmiller and Braun 1993): the best of ``logs`` on the way.
     """
-    d = z.shape[1]
-    low, high = np.array([-9, -12, -16, *[-8] * d]), np.array([7, 4, 0, *[3] * d])
-    size, last, best, top = np.full(3 + d, STEP), np.zeros(3 + d), logs, -math.inf
+    step, last = np.full(len(logs), FIRST_STEP), np.zeros(len(logs))
+    best, highest = logs, -math.inf
     for _ in range(ASCENTS):
         value, slope = _likelihood(z, target, extra, failing, logs)
-        value -= 0.5 * (((logs - prior) / spread) ** 2).sum()
-        slope = slope - (logs - prior) / spread**2
-        if value > top:
-            top, best = value, logs
-        size = np.clip(
-            size * np.choose(1 + np.sign(slope * last).astype(int), (0.5, 1, 1.3)), 1e-3, 1
-        )
-        logs, last = np.clip(logs + size * np.sign(slope), low, high), slope
+        value += prior.log_density(logs)
+        slope = slope - (logs - prior.mean) / prior.deviation**2
+        if value > highest:
+            highest, best = value, logs
+        turn = np.sign(slope * last).astype(int)
+        step = np.clip(step * np.choose(1 + turn, (TURNED, 1, NOT_TURNED)), *STEP_RANGE)
+        logs, last = np.clip(logs + step * np.sign(slope), prior.low, prior.high), slope
     return best
 
 
@@ -218,14 +258,6 @@ def _log_det(matrix):
 
 def _hazard(a):
     """phi(a) / Phi(a)."""
-    low = a < -12
-    b, c = np.where(low, 0.0, a), np.where(low, a, -12.0)
-    exact = np.exp(-0.5 * b**2) / math.sqrt(2 * math.pi) / normal_cdf(b)
-    return np.where(low, -c / (1 - 1 / c**2 + 3 / c**4), exact)
+    from scipy.special import erfcx  # here: slow to import
 
-
-def _log_cdf(a):
-    """log Phi(a)."""
-    low = np.minimum(a, 0.0)
-    lower = -0.5 * low**2 - 0.5 * math.log(2 * math.pi) - np.log(_hazard(low))
-    return np.where(a < 0, lower, np.log1p(-normal_cdf(-np.maximum(a, 0.0))))
+    return math.sqrt(2 / math.pi) / erfcx(-a / math.sqrt(2))

@@ -11,19 +11,43 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jast.estimate import gaussians
+from jast import limit_state as latent
+from jast.estimate import batches
 from jast.estimate.design_points import distinct
-from jast.estimate.gaussians import Gaussians, unit
-from jast.estimate.surrogate import Surrogate, normal_cdf, predict
+from jast.estimate.gaussians import as_latent, fit_mixture, unit_gaussians
+from jast.estimate.surrogate import Surrogate, predict, probability_below_zero
+from jast.markov import proposed
 
-__all__ = ["Pool", "pool"]
+__all__ = ["DOUBT", "Pool", "expected", "pool"]
 
-POPULATION, QUANTILE, MOVES, LAST, ACCEPTANCE, LEVELS = 600, 0.2, 3, 3, 0.35, 40
-PLAUSIBLE = 2.5
-"""Standard deviations within which a failure is plausible."""
-DOUBT = 2.0
-"""By which those of the surrogate are multiplied where it is asked what it does not know."""
-SAMPLE, FITTED, DISTINCT, COMPONENTS = 3000, 600, 12, 8
+POPULATION = 600  # points that go down the levels
+QUANTILE = 0.2  # share of them that comes to the next level
+MOVES = 3  # Markov moves at each level: they cost no call
+LAST_MOVES = 6  # the same at the last one, whose points are used
+ACCEPTANCE = 0.35  # share of moves that the size of the moves is adapted to
+FIRST_SCALE = 0.7  # the first size of the moves, as in `jast.estimate.populations`
+LEAST_SCALE = 0.05  # the least size
+LEVELS = 40  # at most
+PLAUSIBLE = 2.5  # standard deviations within which a failure is plausible
+DOUBT = 2.0  # factor on the surrogate's deviations where it is asked what it does not know
+SAMPLE = 3000  # weighted points that the mixture is fitted to
+FITTED = 600  # of these, drawn by weight; the effective number that a fit counts at most
+DISTINCT = 12  # failures seen that get a Gaussian
+COMPONENTS = 8  # of a fitted mixture, at most
+FAILURES = 0.3  # weight of an expected failure beside the doubt about it
+FEW = 10  # effective points below which weights are softened
+COVARIANCE_SHARE = 1 / 3  # of the effective number, what counts for covariances
+NARROWEST = 0.3  # least variance of a fitted Gaussian
+WIDER = 1.3  # factor on the variances of its wide copy
+OF_WIDE_COPIES = 0.3  # share of wide copies in a fitted mixture
+OF_FITTED = 0.7  # share of what is fitted in the mixture that is drawn from, and below of others
+OF_WIDE = 0.1
+OF_SEEN = 0.2
+OF_BEFORE = 0.5
+OF_POPULATION = 0.4
+FEW_NUMBERS = 6  # dimensions up to which wide noise is wider
+WIDE_FEW = 2.25  # variance of wide noise there
+WIDE_MANY = 1.5  # the same of more dimensions
 
 
 class Pool(NamedTuple):
@@ -31,95 +55,94 @@ class Pool(NamedTuple):
 
     z: np.ndarray
     weights: np.ndarray
-    mixture: Gaussians
+    mixture: latent.Latent
 
 
 def pool(
     rng: np.random.Generator,
-    s: Surrogate,
+    surrogate: Surrogate,
     failures: np.ndarray,
-    before: Gaussians | None,
+    before: list | None,
     n: int,
     anew: bool = True,
-) -> tuple[Pool, Gaussians]:
-    """`Pool` of ``n`` points, and the `Gaussians` fitted on the way: ``before`` of the next one.
-    ``anew``: with a population.
+) -> tuple[Pool, list]:
+    """`Pool` of ``n`` points, and the parts [(share, `Gaussians`), ...] fitted on the way:
+    ``before`` of the next one. ``anew``: with a population.
     """
-    d = s.z.shape[1]
-    origin = unit(np.zeros((1, d)))
-    wide = origin._replace(values=origin.values * (2.25 if d <= 6 else 1.5))
-    seen = [(0.2, unit(distinct(failures, DISTINCT)))] if len(failures) else []
-    parts = [(0.1, wide), *seen, *([(0.5, before)] if before is not None else [])]
-    population = plausible(rng, s) if anew else None
+    d = surrogate.z.shape[1]
+    wide = unit_gaussians(np.zeros((1, d)))
+    wide = wide._replace(values=wide.values * (WIDE_FEW if d <= FEW_NUMBERS else WIDE_MANY))
+    always = [(OF_WIDE, wide)]
+    if len(failures):
+        always.append((OF_SEEN, unit_gaussians(distinct(failures, DISTINCT))))
+    parts = [*always, *_scaled(OF_BEFORE, before or [])]
+    population = plausible(rng, surrogate) if anew else None
     if population is not None:
-        parts.append((0.4, _fitted(rng, population, np.full(len(population), 1.0))))
-    z, w = drawn(rng, mixed(parts), SAMPLE)
-    _, p = expected(s, z)
-    fitted = _fitted(rng, z, w * (np.sqrt(p * (1 - p)) + 0.3 * p))
-    mixture = mixed([(0.7, fitted), (0.1, wide), *seen])
-    return Pool(*drawn(rng, mixture, n), mixture), fitted
+        parts += _scaled(OF_POPULATION, _fit(rng, population, np.ones(len(population))))
+    z, weights = _draw(rng, as_latent(parts, np.float64), SAMPLE)
+    _, p = expected(surrogate, z)
+    fitted = _fit(rng, z, weights * (np.sqrt(p * (1 - p)) + FAILURES * p))
+    mixture = as_latent([*_scaled(OF_FITTED, fitted), *always], np.float64)
+    return Pool(*_draw(rng, mixture, n), mixture), fitted
 
 
-def expected(s: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def expected(surrogate: Surrogate, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probability [n] that the surrogate gives to a failure at ``z`` [n, D], and in `DOUBT`."""
-    mean, sd = predict(s, z)
-    return normal_cdf(-mean / sd), normal_cdf(-mean / (DOUBT * sd))
+    mean, deviation = predict(surrogate, z)
+    return tuple(probability_below_zero(mean, by * deviation) for by in (1.0, DOUBT))
 
 
-def plausible(rng: np.random.Generator, s: Surrogate) -> np.ndarray | None:
+def plausible(rng: np.random.Generator, surrogate: Surrogate) -> np.ndarray | None:
     """A population [n, D] of the model given that a failure is plausible; None where it does not
     get there.
     """
-    score = lambda z: np.subtract(
-        *(a * b for a, b in zip(predict(s, z), (1, PLAUSIBLE), strict=True))
-    )
-    z, scale = rng.standard_normal((POPULATION, s.z.shape[1])), 0.7
-    now = score(z)
+
+    def score(z):
+        mean, deviation = predict(surrogate, z)
+        return mean - PLAUSIBLE * deviation
+
+    z, scale = rng.standard_normal((POPULATION, surrogate.z.shape[1])), FIRST_SCALE
+    scores = score(z)
     for _ in range(LEVELS):
-        level = max(float(np.quantile(now, QUANTILE)), 0.0)
-        elites = np.flatnonzero(now <= level)
+        level = max(float(np.quantile(scores, QUANTILE)), 0.0)
+        elites = np.flatnonzero(scores <= level)
         rows = elites[np.arange(POPULATION) % len(elites)]
-        z, now = z[rows], now[rows]
-        for _ in range(MOVES if level > 0 else MOVES + LAST):
-            new = math.sqrt(1 - scale**2) * z + scale * rng.standard_normal(z.shape)
-            value = score(new)
-            good = value <= level
-            z, now = np.where(good[:, None], new, z), np.where(good, value, now)
-            scale = float(np.clip(scale * math.exp(good.mean() - ACCEPTANCE), 0.05, 1.0))
+        z, scores = z[rows], scores[rows]
+        for _ in range(MOVES if level > 0 else LAST_MOVES):
+            candidates = proposed(z, rng.standard_normal(z.shape), scale, 1.0)
+            values = score(candidates)
+            accepted = values <= level
+            z = np.where(accepted[:, None], candidates, z)
+            scores = np.where(accepted, values, scores)
+            scale *= math.exp(accepted.mean() - ACCEPTANCE)
+            scale = float(np.clip(scale, LEAST_SCALE, 1.0))
         if level == 0:
             return z
     return None
 
 
-def mixed(parts: list) -> Gaussians:
-    """One mixture of [(share, `Gaussians`), ...]; shares of any sum."""
-    weights = np.concatenate([share * g.weights for share, g in parts])
-    rest = (np.concatenate([g[i] for _, g in parts]) for i in (1, 2, 3))
-    return Gaussians(weights / weights.sum(), *rest)
+def _scaled(share, parts):
+    """The ``parts`` of a mixture, of ``share`` in all."""
+    return [(share * of, g) for of, g in parts]
 
 
-def drawn(rng: np.random.Generator, q: Gaussians, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, D] of ``q`` and their weights p / q."""
-    k, z = rng.choice(len(q.weights), n, p=q.weights), rng.standard_normal((n, q.means.shape[1]))
-    for i in np.unique(k):
-        rows = k == i
-        z[rows] = q.means[i] + (np.sqrt(q.values[i]) * z[rows]) @ q.vectors[i].T
-    log_p = -0.5 * (z**2).sum(axis=1) - 0.5 * z.shape[1] * math.log(2 * math.pi)
-    return z, np.exp(log_p - gaussians.log_density(q, z))
+def _draw(rng, q, n):
+    """Points [n, D] of the `Latent` ``q``, and their weights p / q."""
+    d = q.means.shape[1]
+    z = latent.place(q, *batches.random_numbers(rng, n, d, np.float64))
+    return z, np.exp(-batches.log_ratio(q, z, np.full(n, d)))
 
 
-def _fitted(rng, z, weights):
-    """`Gaussians` of weighted points, and wide copies."""
+def _fit(rng, z, weights):
+    """The parts of a mixture: `Gaussians` of weighted points, and wide copies."""
     weights = weights + 1e-300
     weights = weights / weights.sum()
-    if 1 / (weights**2).sum() < 10:  # few great weights: softened, so that they do not stand alone
+    if 1 / (weights**2).sum() < FEW:  # so that few great ones do not stand alone
         weights = np.sqrt(weights) / np.sqrt(weights).sum()
     count = min(1 / (weights**2).sum(), FITTED)
     rows = rng.choice(len(z), FITTED, p=weights)
-    g = gaussians.fit(rng, z[rows], np.full(FITTED, 1 / FITTED), count, count / 3, COMPONENTS)
-    return mixed(
-        [
-            (0.7, g._replace(values=np.maximum(g.values, 0.3))),
-            (0.3, g._replace(values=np.maximum(1.3 * g.values, 1.0))),
-        ]
-    )
+    even = np.full(FITTED, 1 / FITTED)
+    g = fit_mixture(rng, z[rows], even, count, COVARIANCE_SHARE * count, COMPONENTS)
+    wide = g._replace(values=np.maximum(WIDER * g.values, 1.0))
+    narrow = g._replace(values=np.maximum(g.values, NARROWEST))
+    return [(1 - OF_WIDE_COPIES, narrow), (OF_WIDE_COPIES, wide)]

@@ -13,7 +13,7 @@ from jast import limit_state as latent
 from jast.counter import numpy_generator
 from jast.episode import Episode
 from jast.estimate.estimate import Estimate
-from jast.estimate.gaussians import effective
+from jast.estimate.gaussians import effective_sample_size
 from jast.explain.drawn import UNRELIABLE, failing_draws, free_undecided, normalised
 from jast.explain.gathered import gather_episodes
 from jast.explain.point import number_names, number_steps, used_numbers
@@ -158,7 +158,7 @@ def eigenfailures(
     if len(ways) > 1:
         rows = _modes_of(sim, z, length, ways) == mode
         z, log_w, length, spent = z[rows], log_w[rows], length[rows], spent + len(ways)
-    ess = float(effective(log_w)) if len(z) else 0.0
+    ess = float(effective_sample_size(log_w)) if len(z) else 0.0
     if ess < FAILURES:
         raise ValueError(
             f"{name}: failures must be at least {FAILURES} effective ones of the mode, received"

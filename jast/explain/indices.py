@@ -12,9 +12,9 @@ from jast import _checks, results
 from jast import limit_state as latent
 from jast.counter import numpy_generator
 from jast.estimate.answers import draws_and_level
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.estimate import Estimate
-from jast.estimate.gaussians import effective
+from jast.estimate.gaussians import effective_sample_size
 from jast.explain.drawn import UNRELIABLE, failing_draws, free_undecided, normalised
 from jast.explain.point import number_names, number_steps
 from jast.intervals import clopper_pearson, log_normal
@@ -156,9 +156,9 @@ def indices(
     z, log_w, length, spent = failing_draws(name, sim, estimate, KEPT)
     z = free_undecided(sim, z, length, rng)
     w = normalised(log_w)
-    p, n_eff = float(estimate.mean), float(effective(log_w))
+    p, n_eff = float(estimate.mean), float(effective_sample_size(log_w))
     samples = kept.samples * len(z) / np.count_nonzero(kept.failure)
-    judge, picks = Judge(sim), resampled(log_w, draws, rng.random()) if draws else None
+    judge, picks = Judge(sim), resample(log_w, draws, rng.random()) if draws else None
     rows = []
     for i, (called, step) in enumerate(zip(number_names(sim), number_steps(sim), strict=True)):
         gain, each = _gain(z[:, i], w)

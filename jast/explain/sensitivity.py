@@ -14,7 +14,7 @@ from jast import _checks, results
 from jast import limit_state as latent
 from jast.episode import replay
 from jast.estimate.estimate import Estimate
-from jast.estimate.gaussians import effective
+from jast.estimate.gaussians import effective_sample_size
 from jast.estimate.redrawn import is_proposal_of, redraw
 from jast.estimate.sample import Sample
 from jast.explain.drawn import UNRELIABLE, normalised
@@ -150,7 +150,7 @@ def sensitivity(
     slope = w @ s
     error = np.sqrt((w**2) @ (s - slope) ** 2)
     half = NormalDist().inv_cdf(0.5 + level / 2) * error
-    ess = float(effective(log_w))
+    ess = float(effective_sample_size(log_w))
     rows = zip(called, values, slope, error, slope - half, slope + half, strict=True)
     return Sensitivity(
         rows=tuple(

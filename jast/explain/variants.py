@@ -8,7 +8,7 @@ import numpy as np
 from jast import limit_state as latent
 from jast.counter import numpy_generator
 from jast.episode import Episode
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.draws import Draws
 from jast.estimate.estimate import Estimate
 from jast.estimate.redrawn import is_proposal_of, redraw_failures
@@ -225,4 +225,4 @@ def _shift_in_time(rng: np.random.Generator, sim: Simulator, z: np.ndarray) -> n
 def _draw_seeds(rng: np.random.Generator, seeds: Seeds, kind: int, n: int) -> np.ndarray:
     """Rows [n] of the seeds of one kind, by weight; all alike, so many times each."""
     rows = np.flatnonzero(seeds.label == kind)
-    return rows[resampled(seeds.log_weight[rows], n, rng.random())]
+    return rows[resample(seeds.log_weight[rows], n, rng.random())]

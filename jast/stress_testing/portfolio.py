@@ -20,7 +20,7 @@ from jast.episode import rollout
 from jast.estimate import budgets, few_calls
 from jast.estimate.adaptive import MIN_BUDGET as MIN_ESTIMATE_BUDGET
 from jast.estimate.adaptive import failure_probability
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.budgets import MIN_POPULATION_BUDGET
 from jast.estimate.descents import SETTINGS, cool_failures
 from jast.estimate.plain import monte_carlo
@@ -287,14 +287,14 @@ class _StressTest:
             if not len(self.pool):
                 self.search()
             return self.refine()
-        rows = resampled(sample.log_weight, SETTINGS.cooled_failures, 0.5)
-        for name, resample, share in (
+        rows = resample(sample.log_weight, SETTINGS.cooled_failures, 0.5)
+        for name, replace, share in (
             ("cooled", False, INDEPENDENT_SHARE),
             ("cooled together", True, 1 - INDEPENDENT_SHARE),
         ):
             self.watch.doing("cooling failures")
             points, spent = cool_failures(
-                self.next_key(), self.sim, sample.points[rows], int(share * cooling), resample
+                self.next_key(), self.sim, sample.points[rows], int(share * cooling), replace
             )
             self.add_failures(name, failures_at(self.sim, points)._replace(evaluations=spent))
         self.parts = BudgetShares(nominal=0, search=0, slow_search=0, refine=refining)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jast import limit_state as latent
 from jast.counter import numpy_generator
-from jast.estimate.batches import resampled
+from jast.estimate.batches import resample
 from jast.estimate.redrawn import redraw
 from jast.estimate.sample import Sample
 from jast.intervals import effective_interval
@@ -135,13 +135,13 @@ def _draw_failures(key, sim, q, n):
     were, and evaluations.
     """
     if isinstance(q, Sample):  # which have been run
-        rows = resampled(q.log_weight, n // DRAWS_PER_FAILURE, numpy_generator(key).random())
+        rows = resample(q.log_weight, n // DRAWS_PER_FAILURE, numpy_generator(key).random())
         return q.points[rows], q.group[rows], len(q.points), 0
     z, o, log_w = redraw(key, sim, q, n)
     if not (failing := int(o.failure.sum())):
         return z[:0], np.zeros(0, int), 0, n
     log_w = np.where(o.failure, log_w.astype(np.float64), -np.inf)
-    rows = resampled(log_w, n // DRAWS_PER_FAILURE, 0.5)
+    rows = resample(log_w, n // DRAWS_PER_FAILURE, 0.5)
     return z[rows], rows, failing, n
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import chex
 
     from jast.simulators.fms.events import Misses
-    from jast.simulators.fms.path import Path
+    from jast.simulators.fms.lateral import Path
 
 __all__ = ["MEANS", "SIGMAS", "FmsState", "fms", "fms_misses", "fms_path"]
 
