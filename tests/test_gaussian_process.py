@@ -25,8 +25,8 @@ def data(n, d, dtype=np.float64, seed=0):
 
 def sklearn_process(kernel, x, y, lengthscale, noise, variance):
     pytest.importorskip("sklearn")
-    from sklearn.surrogates import GaussianProcessRegressor
-    from sklearn.surrogates.kernels import RBF, ConstantKernel, Matern
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
     shape = (
         RBF(lengthscale)

@@ -16,10 +16,9 @@ from scipy import special
 from systems import S0, dice, plane, ring
 
 import jast
-from jast import heads as H
 from jast.actions import quantiles, samples, uniform
 from jast.distributions.numbers import flat, unflat
-from jast.heads import Heads, Lesson, Moments, make_head
+from jast.heads import MODES, Heads, Lesson, Moments, make_head, settings
 from jast.heads.heads import sample_bins, update_moments
 from jast.heads.rounds import best_trees, init_heads
 from jast.heads.samples import (
@@ -581,7 +580,9 @@ def test_a_lesson_that_is_not_finite_is_rejected(bad, key, equal):
         how |= dict(rate=1e30)
     before = init_head(jnp.asarray([0.5, -0.25], jnp.float32))
     after, lesson = train_head(key, before, jax.tree_util.Partial(apply), PLAIN, samples, **how)
-    assert lesson.rejected and not np.isfinite(lesson.loss) and lesson.steps == 20
+    assert lesson.rejected
+    assert not np.isfinite(lesson.loss)
+    assert lesson.steps == 20
     equal(after._replace(kept=None), before)
 
 
@@ -617,7 +618,7 @@ NUMBERS = dict(plane=(2, 2), walk1d=(1, 1), landing=(2, 1), ring=(5, 3))
 ACTIONS = dict(samples=samples(), quantiles=quantiles(), uniform=uniform(-2.0, 2.0))
 BONUS = jast.rewards.standard(event_bonus=10.0)
 SIZE = dict(trees=8, prunes=3, simulations=40, lanes=2, threads=1, reward=BONUS)
-QUICK = H.settings(round=4, steps=(50, 50), bins=8, hidden=(8,), batch=(16, 32))
+QUICK = settings(round=4, steps=(50, 50), bins=8, hidden=(8,), batch=(16, 32))
 TRAINED = dict(both=("policy", "value"), rollout=("policy",), value=("value",))
 
 
@@ -675,13 +676,11 @@ def test_forests_of_all_kinds_learn(name, heads, actions):
         replays(result.failures.episode(i), SYSTEMS[name], BONUS)
     assert [tuple(lesson) for lesson in result.lessons] == [TRAINED[heads]] * 2
     for of in (of for lesson in result.lessons for of in lesson.values()):
-        assert (
-            of.steps == 50
-            and of.samples > 0
-            and of.dropped == 0
-            and not of.rejected
-            and np.isfinite(of.loss)
-        )
+        assert of.steps == 50
+        assert of.samples > 0
+        assert of.dropped == 0
+        assert not of.rejected
+        assert np.isfinite(of.loss)
     made = init_heads(
         jax.random.fold_in(jax.random.key(5), 8), SYSTEMS[name], ACTIONS[actions], heads, QUICK
     ).heads
@@ -922,7 +921,7 @@ def test_the_published_heads(round, equal):
         PLANE,
         mode="code",
         heads="both",
-        head_settings=H.settings("code", round=round, hidden=(8,)),
+        head_settings=settings("code", round=round, hidden=(8,)),
         **PUBLISHED,
     )
     honest(result, PLANE, BONUS)
@@ -936,11 +935,11 @@ def test_the_published_heads(round, equal):
 
 def test_the_text_departs_from_the_code_where_the_table_says():
     """And "paper" is "code" by its earlier name."""
-    code, text = H.MODES["code"], H.MODES["text"]
+    code, text = MODES["code"], MODES["text"]
     differ = {name for name in code._fields if getattr(code, name) != getattr(text, name)}
-    named = H.settings.__doc__
+    named = settings.__doc__
     assert all(f"``{name}``" in named for name in differ - {"q_weight"}) and len(differ) == 6
-    assert H.MODES["paper"] is code
+    assert MODES["paper"] is code
     sees = {
         name: jast.simulators.ferry(observation=name)
         .observe(jast.simulators.ferry().init(()))
@@ -961,7 +960,7 @@ def test_statistics_counted_at_the_end_of_the_tree():
             PLANE,
             mode="code",
             heads="rollout",
-            head_settings=H.settings("code", round=4, hidden=(8,), counted=counted, steps=(0, 0)),
+            head_settings=settings("code", round=4, hidden=(8,), counted=counted, steps=(0, 0)),
             **PUBLISHED,
         ).roots
     )
@@ -1005,7 +1004,7 @@ def test_a_published_value_head_alone_is_not_trained(equal):
         (124, 64),
         (64, 1),
     ]
-    unchanged(result.heads, made("value", H.settings("code"), trees=4), equal)
+    unchanged(result.heads, made("value", settings("code"), trees=4), equal)
 
 
 # --- what it is for
@@ -1042,7 +1041,7 @@ def test_learned_heads_guide_another_search_from_its_first_tree():
         jax.random.key(9),
         jast.simulators.ferry(),
         heads=on_the_ferry("both").heads,
-        head_settings=H.settings(train=False),
+        head_settings=settings(train=False),
         trees=20,
         prunes=18,
         simulations=50,
@@ -1165,17 +1164,20 @@ def test_edges_need_states_at_every_node(memoize):
 def test_settings_out_of_range_are_named(name, values):
     for value in values:
         with pytest.raises(ValueError, match=f"heads.settings: {name} must be .*, received"):
-            H.settings(**{name: value})
+            settings(**{name: value})
         with pytest.raises(ValueError, match=f"heads.settings: {name} must be .*, received"):
             searched(head_settings=QUICK._replace(**{name: value}))
 
 
 def test_unknown_settings_are_named():
     with pytest.raises(ValueError, match="mode must .*received 'published'"):
-        H.settings("published")
+        settings("published")
     with pytest.raises(ValueError, match="expected settings among .*, received epochs, layers"):
-        H.settings(layers=3, epochs=2)
-    with pytest.raises(ValueError, match="head_settings must .*received dict"):
+        settings(layers=3, epochs=2)
+    with pytest.raises(
+        ValueError,
+        match="head_settings must .*received dict",
+    ):
         searched(head_settings=dict(round=3))
-    assert H.settings("code", round=8) == H.MODES["code"]._replace(round=8)
-    assert H.settings() == H.MODES["default"]
+    assert settings("code", round=8) == MODES["code"]._replace(round=8)
+    assert settings() == MODES["default"]

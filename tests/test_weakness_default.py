@@ -27,7 +27,8 @@ KEY = jax.random.key(0)
 @pytest.fixture
 def brief(monkeypatch):
     """Networks that learn a little only."""
-    monkeypatch.setattr(committee, "STEPS", (20, 20))
+    monkeypatch.setattr(committee, "LEAST_STEPS", 20)
+    monkeypatch.setattr(committee, "MOST_STEPS", 20)
 
 
 def table(n=400, seed=0):

@@ -132,7 +132,7 @@ def ask(plan: Plan, state: State) -> jax.Array:
 
 
 @partial(jax.jit, static_argnums=0)
-def tell(plan: Plan, settings: Settings, state: State, x: jax.Array, value: jax.Array) -> State:
+def tell(plan, settings, state, x, value):
     """The `State` after the values [max(m)] at ``x`` [max(m), d]."""
     k, rows = state.k, jnp.arange(max(plan.counts), dtype=jnp.int32)
     begins = np.cumsum((0, *plan.counts))

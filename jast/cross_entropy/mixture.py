@@ -4,7 +4,6 @@ maximisation (Bishop 2006, section 9.2).
 
 from __future__ import annotations
 
-import operator
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -14,6 +13,7 @@ from jax.lax import Precision
 from jax.scipy.special import logsumexp
 
 from jast import results
+from jast._checks import real_number, whole_number
 from jast._jax import is_traced
 from jast.cross_entropy import gaussian
 from jast.cross_entropy.gaussian import Gaussian
@@ -107,15 +107,8 @@ def responsibilities(m, x):
 
 
 def em(
-    m: Mixture,
-    x: jax.Array,
-    weights: jax.Array,
-    iterations: int = 10,
-    regularisation: chex.Numeric = 0.0,
-    least: chex.Numeric | None = None,
-    diagonal: bool = False,
-    least_variance: chex.Numeric = 0.0,
-) -> Mixture:
+    m, x, weights, iterations=10, regularisation=0.0, least=None, diagonal=False, least_variance=0.0
+):
     """``m`` after so many iterations of expectation maximisation for ``x`` [n, d], row i counted
     ``weights[i]`` times: a `Mixture` without NaN.
 
@@ -144,44 +137,26 @@ def em(
             f"mixture.em: x must be [n, {d}] and its weights [n], received {x.shape} and"
             f" {weights.shape}"
         )
-    try:
-        steps = -1 if isinstance(iterations, bool) else operator.index(iterations)
-    except TypeError:
-        steps = -1
-    if steps < 0:
-        raise ValueError(
-            f"mixture.em: iterations must be a whole number of at least 0, received {iterations!r}"
-        )
+    steps = whole_number("mixture.em", "iterations", iterations, 0)
     numbers = dict(
         regularisation=regularisation,
         least=x.shape[1] if least is None else least,
         least_variance=least_variance,
     )
     for name, value in numbers.items():
-        if jnp.shape(value) != () or not (is_traced(value) or value >= 0):
-            raise ValueError(
-                f"mixture.em: {name} must be a number of at least 0, received {value!r}"
-            )
-    numbers = {name: jnp.asarray(value).astype(x.dtype) for name, value in numbers.items()}
+        value = real_number("mixture.em", name, value, lambda v: v >= 0, "of at least 0")
+        numbers[name] = value.astype(x.dtype)
     weights = weights.astype(x.dtype)
     counted = weights > 0
     x, w = jnp.where(counted[:, None], x, 0), jnp.where(counted, weights, 0)
 
-    def iterate(_: int, m: Mixture) -> Mixture:
+    def iterate(_, m):
         return _em_iteration(m, x, w, diagonal, **numbers)
 
     return lax.fori_loop(0, steps, iterate, m)
 
 
-def _em_iteration(
-    m: Mixture,
-    x: jax.Array,
-    w: jax.Array,
-    diagonal: bool,
-    regularisation: jax.Array,
-    least: jax.Array,
-    least_variance: jax.Array,
-) -> Mixture:
+def _em_iteration(m, x, w, diagonal, regularisation, least, least_variance):
     """One E and one M step, Bishop eq. 9.23 to 9.27."""
     n, d = x.shape
     eye = jnp.eye(d, dtype=x.dtype)[None]

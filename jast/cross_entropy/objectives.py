@@ -16,6 +16,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jax.tree_util import Partial
 
+from jast._checks import real_number
 from jast._jax import is_traced
 from jast.cross_entropy.gaussian import widest_float
 
@@ -84,11 +85,19 @@ def sierra(
         raise ValueError(f'sierra: order must be "code" or "thesis", received {order!r}')
     if not isinstance(log, bool):
         raise ValueError(f"sierra: log must be True or False, received {log!r}")
-    _finite("mean", mean, (2,))
-    for name, value in dict(
-        variance=variance, spacing=spacing, sharpness=sharpness, decay=decay
-    ).items():
-        _finite(name, value, (), positive=name in ("variance", "sharpness"))
+    try:
+        if is_traced(mean):
+            good = jnp.asarray(mean).shape == (2,)
+        else:
+            good = np.shape(mean) == (2,) and np.isfinite(np.float64(mean)).all()
+    except (TypeError, ValueError):  # no numbers, or rows of different lengths
+        good = False
+    if not good:
+        raise ValueError(f"sierra: mean must be 2 finite numbers, received {mean!r}")
+    for name, value in dict(variance=variance, sharpness=sharpness).items():
+        real_number("sierra", name, value, lambda v: 0 < v < math.inf, "above 0")
+    for name, value in dict(spacing=spacing, decay=decay).items():
+        real_number("sierra", name, value, math.isfinite, "that is finite")
     given = (mean, variance, spacing, sharpness, decay)
     dtype = widest_float(*given)
     mean, variance, spacing, sharpness, decay = (jnp.asarray(v).astype(dtype) for v in given)
@@ -193,24 +202,3 @@ def _vector(function, x, d=None):
             f" {x.shape}; for more points use jax.vmap"
         )
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.zeros(()).dtype)
-
-
-def _finite(name, value, shape, positive=False):
-    """ValueError unless ``value`` is finite, of this shape and, if so wanted, positive; of a traced
-    value only the shape is looked at.
-    """
-    expected = (
-        f"{'a positive' if positive else 'a finite'} number"
-        if shape == ()
-        else f"{shape[0]} finite numbers"
-    )
-    try:
-        if is_traced(value):
-            good = jnp.asarray(value).shape == shape
-        else:
-            a = np.asarray(value, np.float64)
-            good = a.shape == shape and bool(np.isfinite(a).all() and (not positive or a > 0))
-    except (TypeError, ValueError):  # no numbers, or rows of different lengths
-        good = False
-    if not good:
-        raise ValueError(f"sierra: {name} must be {expected}, received {value!r}")

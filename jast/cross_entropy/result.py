@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from jast import results
 
 if TYPE_CHECKING:
     import chex
+
+    from jast.cross_entropy.gaussian import Gaussian
+    from jast.cross_entropy.mixture import Mixture
 
 __all__ = ["CEResult", "History", "Scores", "scores"]
 
@@ -28,20 +31,19 @@ class History(NamedTuple):
         ((10,), True)
     """
 
-    x: Any
+    x: chex.Array
     """[n, d]: every point that was truly evaluated, in order"""
-    value: Any
+    value: chex.Array
     """[n]: the objective there, NaN or infinite where it was"""
-    iteration: Any
+    iteration: chex.Array
     """[n] int: from 0"""
-    best_x: Any
+    best_x: chex.Array
     """[K, d]: the best point so far, after each iteration; NaN while there is none"""
-    best_value: Any
+    best_value: chex.Array
     """[K]; inf while no value was finite"""
-    proposals: Any
-    """A `Gaussian` or a `Mixture` with a leading axis [K + 1]: that of each iteration, and the last
-    """
-    model_x: Any
+    proposals: Gaussian | Mixture
+    """With a leading axis [K + 1]: that of each iteration, and the last"""
+    model_x: chex.Array
     """[K, m, d]: the points that the surrogate judged in each iteration; [K, 0, d] without one"""
 
 
@@ -57,14 +59,14 @@ class CEResult(NamedTuple):
         ((2,), True, 100)
     """
 
-    proposal: Any
-    """The last one, a `Gaussian` or a `Mixture`"""
-    best_x: Any
+    proposal: Gaussian | Mixture
+    """The last one"""
+    best_x: chex.Array
     """[d]: the point of the least finite value"""
-    best_value: Any
+    best_value: chex.Array
     """That value: b_v"""
     history: History
-    invalid: Any
+    invalid: chex.Array
     """int: evaluations that gave NaN or infinity; none of them was an elite"""
 
     @property
@@ -125,14 +127,14 @@ class Scores(NamedTuple):
         True
     """
 
-    best_value: Any
+    best_value: chex.Array
     """b_v"""
-    standard_error: Any
+    standard_error: chex.Array
     """Of ``best_value``"""
-    mean_distance: Any
-    rms_distance: Any
+    mean_distance: chex.Array
+    rms_distance: chex.Array
     """Root of the mean squared distance"""
-    frobenius: Any
+    frobenius: chex.Array
     """sqrt(50) times ``rms_distance``: the size of the 2 x 50 matrix of errors of 50 runs, which
     the thesis's b_d most likely is
     """

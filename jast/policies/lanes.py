@@ -84,9 +84,7 @@ def lane_at(sim: Simulator, dense_reward: bool, x0: Any, drift: Any = ()) -> Lan
     return _lane(sim, dense_reward, episode, jnp.int32(0), drift, jnp.zeros((), jnp.float32))
 
 
-def begin_lane(
-    sim: Simulator, dense_reward: bool, key: jax.Array, z0: jax.Array, drift: jax.Array
-) -> Lane:
+def begin_lane(sim, dense_reward, key, z0, drift):
     """A `Lane` at the start with the latents ``z0`` [n0]; where there are none, at one drawn with
     ``key``.
     """
@@ -174,9 +172,7 @@ def empty_buffer(capacity: int, m: int, n: int) -> Transitions:
     )
 
 
-def add_transitions(
-    buffer: Transitions, stored: jax.Array, new: Transitions, valid: jax.Array
-) -> tuple[Transitions, jax.Array]:
+def add_transitions(buffer, stored, new, valid):
     """``(buffer, stored)`` with those of ``new`` [lanes] that are ``valid`` in the places of the
     oldest ones; ``stored`` counts all that ever were.
     """

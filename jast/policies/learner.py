@@ -18,14 +18,13 @@ from jast.heads.networks import adam, adam_step
 from jast.policies import exploring
 from jast.policies.actor import (
     Networks,
-    Normalisation,
     entropy_term,
     init_parameters,
     latent_mixture,
     make_networks,
     network_inputs,
 )
-from jast.policies.lanes import Transitions, add_transitions
+from jast.policies.lanes import add_transitions
 from jast.simulator import Simulator
 
 __all__ = [
@@ -75,9 +74,7 @@ class Learner(NamedTuple):
     """Adam's state of the actor, the critics and log alpha."""
 
 
-def init_learner(
-    key: jax.Array, m: int, n: int, hidden: tuple[int, ...], components: int, alpha: jax.Array
-) -> Learner:
+def init_learner(key, m, n, hidden, components, alpha):
     """A `Learner` that has learned nothing, for ``m`` numbers observed."""
     (actor, critic), _ = make_networks(n, hidden, components)
     shapes = [
@@ -115,17 +112,7 @@ def _soft_values(networks, unit, actor, critic, inputs, noise):
     return jnp.sum(w * q), jnp.sum(w * log_pi)
 
 
-def update(
-    noise: jax.Array,
-    learner: Learner,
-    networks: Networks,
-    normalisation: Normalisation,
-    rates: Rates,
-    acting: jax.Array,
-    scale: jax.Array,
-    rows: Transitions,
-    horizon: int,
-) -> tuple[Learner, jax.Array]:
+def update(noise, learner, networks, normalisation, rates, acting, scale, rows, horizon):
     """One step of all networks on transitions, ``rows`` [batch], with ``noise`` [2, batch, n]:
     ``(Learner, critic loss)``; ``scale`` is lambda.
 

@@ -64,9 +64,7 @@ class Learner(NamedTuple):
     """Adam's state of both."""
 
 
-def init_learner(
-    key: jax.Array, m: int, n: int, hidden: tuple[int, ...], components: int, alpha: jax.Array
-) -> Learner:
+def init_learner(key, m, n, hidden, components, alpha):
     """A `Learner` that has learned nothing, for ``m`` numbers observed."""
     inputs = jnp.zeros((m + 2,), jnp.float32)
     inits, _ = make_networks(n, hidden, components)
