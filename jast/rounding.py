@@ -59,7 +59,7 @@ class Probe(NamedTuple):
     """bool: whether these disturbances differ."""
     distance_differs: chex.Array
     """bool: whether the miss distance does."""
-    jump_back: chex.Array
+    jump: chex.Array
     """The first step at which a state jumps back to its start; 0 where none does."""
 
 
@@ -129,7 +129,7 @@ def _probe(sim):
         unmoved=unmoved,
         differ=jnp.any(differ),
         distance_differs=jnp.any(distance[:, 3] != distance[:, 0]),
-        jump_back=jnp.min(jnp.where(back > 0, back, steps + 1)) % (steps + 1),
+        jump=jnp.min(jnp.where(back > 0, back, steps + 1)) % (steps + 1),
     )
 
 
@@ -144,7 +144,7 @@ class _Course(NamedTuple):
     """[d]: the greatest of each in one step."""
     ended: jax.Array
     back: jax.Array
-    """``jump_back`` of `Probe`."""
+    """``jump`` of `Probe`."""
 
 
 class _Paths(NamedTuple):

@@ -55,11 +55,11 @@ def traps(sim: Simulator) -> list[str]:
 
 
 def _jumps(seen: Probe) -> str | None:
-    if not seen.jump_back:
+    if not seen.jump:
         return None
     return (
         f"the state jumps back to its start, as that of an environment which resets itself does, at"
-        f" step {seen.jump_back} of one of 16 episodes: evaluate never sees the failure before; use"
+        f" step {seen.jump} of one of 16 episodes: evaluate never sees the failure before; use"
         " the step that does not reset (of gymnax step_env, of brax an environment without"
         " AutoResetWrapper)"
     )

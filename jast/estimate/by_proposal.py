@@ -24,6 +24,7 @@ from jast.estimate.gaussian_family import GaussianFamily
 from jast.estimate.gaussian_start import draw_model, explore_failures
 from jast.estimate.importance_sampling import Traces, chunks
 from jast.estimate.markov_tilts import Tilts, shape
+from jast.estimate.plain import simulate_points
 from jast.estimate.search_settings import SETTINGS, SearchSettings
 from jast.estimate.search_state import Family, SearchState, is_efficient, search_context
 from jast.estimate.subset import fallback_estimate
